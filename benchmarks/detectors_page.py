@@ -11,21 +11,21 @@ from benchmark_helpers import DOCS, markdown_table, replace_page_part
 from scipy.optimize import brentq
 
 from sweep.analysis import canvas
-from sweep.model import estimators
-from sweep.model.detectors import (
-    CA,
+from sweep.model.detection import estimators
+from sweep.model.detection.detectors import (
+    CA_CFAR,
     DETECTORS,
-    GOCA,
-    OS,
-    Setting,
+    GOCA_CFAR,
+    OS_CFAR,
+    SpectrumSettings,
+    cached_window_samples,
+    cfar_crossing_probability,
     cfar_factor,
-    crossing_probability,
-    taper,
 )
-from sweep.model.estimators import ESTIMATORS
-from sweep.model.window import window
+from sweep.model.detection.estimators import ESTIMATORS
+from sweep.model.window import get_window
 
-CFAR_KINDS = (CA, OS, GOCA)
+CFAR_KINDS = (CA_CFAR, OS_CFAR, GOCA_CFAR)
 RECORD_LENGTH, TRAINING_CELLS, GUARD_CELLS, PFA = 1024, 32, 4, 1e-3
 N_RECORDS = 4000
 WINDOWS_AND_PADDING = (
@@ -44,9 +44,9 @@ TONE_BIN, N_TONES, SNR_DB = 200, 500, np.arange(8, 61, 4.0)
 """Bin near which estimators are tried, tones of each SNR, SNR after the FFT [dB]."""
 
 
-def detector_setting(name: str, fft_size: int, **changes: float) -> Setting:
+def detector_setting(name: str, fft_size: int, **changes: float) -> SpectrumSettings:
     """Settings of detectors and estimators in noise of variance 1."""
-    w = window(name, RECORD_LENGTH)
+    w = get_window(name, RECORD_LENGTH)
     options = {
         "noise_power": w.energy,
         "training": TRAINING_CELLS,
@@ -55,7 +55,7 @@ def detector_setting(name: str, fft_size: int, **changes: float) -> Setting:
         "pfa": PFA,
     } | changes
     threshold = float(np.sqrt(-options["noise_power"] * np.log(options["pfa"])))
-    return Setting(
+    return SpectrumSettings(
         fft_size=fft_size, sample_rate=float(fft_size), window=w, threshold=threshold, **options
     )
 
@@ -64,9 +64,9 @@ def false_alarm_rows() -> Iterator[list[str]]:
     """Rows: false alarms a bin over those designed for, in windowed and padded noise."""
     for name, padding in WINDOWS_AND_PADDING:
         s = detector_setting(name, padding * RECORD_LENGTH)
-        noise = np.random.default_rng(1).standard_normal((N_RECORDS, RECORD_LENGTH)) * taper(
-            s.window
-        )
+        noise = np.random.default_rng(1).standard_normal(
+            (N_RECORDS, RECORD_LENGTH)
+        ) * cached_window_samples(s.window)
         power = np.abs(np.fft.rfft(noise, s.fft_size)) ** 2
         cells = [name, f"{padding}"]
         for detect in DETECTORS.values():
@@ -92,7 +92,9 @@ def cfar_loss_db(kind: str, training: int, pfa: float, pd: float = 0.5) -> float
     factor = cfar_factor(kind, training=training, rank=rank, pfa=pfa)
 
     def pd_shortfall(snr: float) -> float:
-        return crossing_probability(kind, factor / (1 + snr), training=training, rank=rank) - pd
+        return (
+            cfar_crossing_probability(kind, factor / (1 + snr), training=training, rank=rank) - pd
+        )
 
     return float(10 * np.log10(brentq(pd_shortfall, 1e-3, 1e9) / (np.log(pfa) / np.log(pd) - 1)))
 
@@ -131,7 +133,7 @@ def draw_masking(path: Path) -> None:
     canvas.save_sheet(figure, path)
 
 
-def masked_detections(detector: Setting, separation: float) -> Iterator[np.ndarray]:
+def masked_detections(detector: SpectrumSettings, separation: float) -> Iterator[np.ndarray]:
     """Flags of each detector in the weak return's bin, draw by draw; it may lie on a null."""
     rng, sample_numbers = np.random.default_rng(int(separation)), np.arange(RECORD_LENGTH)
     record = rng.standard_normal((MASKING_DRAWS, RECORD_LENGTH))
@@ -140,12 +142,12 @@ def masked_detections(detector: Setting, separation: float) -> Iterator[np.ndarr
         record += tone_amplitude(snr_db, detector) * np.cos(
             2 * np.pi * line_bin * sample_numbers / RECORD_LENGTH + phase
         )
-    power = np.abs(np.fft.rfft(record * taper(detector.window))) ** 2
+    power = np.abs(np.fft.rfft(record * cached_window_samples(detector.window))) ** 2
     for detect in DETECTORS.values():
         yield detect(power, detector)[:, int(WEAK_BIN)]
 
 
-def tone_amplitude(snr_db: float, detector: Setting) -> float:
+def tone_amplitude(snr_db: float, detector: SpectrumSettings) -> float:
     """Of a tone of some SNR after the FFT, in noise of variance 1."""
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (snr_db / 10), window=detector.window)
     return float(np.sqrt(2 * cnr))
@@ -165,7 +167,7 @@ def frequency_errors(name: str) -> dict[str, np.ndarray]:
     errors_by_estimator: dict[str, list[np.ndarray]] = {kind: [] for kind in ESTIMATORS}
     for snr_db in SNR_DB:
         record = tone_amplitude(snr_db, detector) * tones + noise
-        spectrum = np.fft.rfft(record * taper(detector.window))
+        spectrum = np.fft.rfft(record * cached_window_samples(detector.window))
         magnitudes_near_tone = np.abs(
             spectrum[:, TONE_BIN - 2 : TONE_BIN + 3]
         )  # given that the tone was detected
@@ -179,12 +181,12 @@ def frequency_errors(name: str) -> dict[str, np.ndarray]:
 
 def frequency_error_bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Cramer-Rao bound, and what the largest value of the windowed spectrum reaches [bins]."""
-    w = window(name, RECORD_LENGTH)
+    w = get_window(name, RECORD_LENGTH)
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (SNR_DB / 10), window=w)
     sample_rate = float(RECORD_LENGTH)
     return (
-        estimators.beat_deviation(cnr=cnr, samples=RECORD_LENGTH, sample_rate=sample_rate),
-        estimators.windowed_deviation(cnr=cnr, window=w, sample_rate=sample_rate),
+        estimators.beat_frequency_bound(cnr=cnr, n_samples=RECORD_LENGTH, sample_rate=sample_rate),
+        estimators.windowed_peak_deviation(cnr=cnr, window=w, sample_rate=sample_rate),
     )
 
 

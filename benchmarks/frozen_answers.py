@@ -135,9 +135,9 @@ def random_instrument(rng: np.random.Generator) -> dict[str, str]:
 
 def changed_effects_off() -> dict[str, str]:
     """Return the changed effects that the version knows, off."""
-    from sweep.model.effects.catalogue import NAMES
+    from sweep.model.effects.catalogue import EFFECT_NAMES
 
-    return {name: "off" for name in CHANGED_EFFECTS if name in NAMES}
+    return {name: "off" for name in CHANGED_EFFECTS if name in EFFECT_NAMES}
 
 
 def study_answers(name: str, mapping: dict[str, Any]) -> dict[str, np.ndarray]:

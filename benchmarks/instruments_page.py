@@ -14,7 +14,7 @@ import numpy as np
 from benchmark_helpers import markdown_table, replace_page_part
 
 import sweep
-from sweep.model import beam, shot
+from sweep.model import beam, evaluation
 from sweep.spec import GridSpec
 from sweep.spec.axes import remove_fields_on_axes
 from sweep.spec.yaml_document import library_instruments, read_document
@@ -68,9 +68,9 @@ WALL_TARGET = {"range": "7.2 m", "reflectance": 0.05}
 
 def half_power_range(name: str) -> float:
     """Range [m] at which the light that mixes is half of that at the lens."""
-    parameters = shot.DEFAULTS | spec_before_target(name, WALL_TARGET).parameters()
+    parameters = evaluation.PARAMETER_DEFAULTS | spec_before_target(name, WALL_TARGET).parameters()
     ranges = np.concatenate([[1e-3], np.linspace(1.0, 40.0, 39001)])
-    mixed_power = beam.collecting_area(parameters | {"target.range": ranges}) / ranges**2
+    mixed_power = beam.effective_collecting_area(parameters | {"target.range": ranges}) / ranges**2
     return float(ranges[mixed_power > mixed_power[0] / 2].max())
 
 

@@ -12,9 +12,9 @@ import time
 
 import numpy as np
 
-from sweep.model.effects.catalogue import CORE
-from sweep.model.shot import evaluate
-from sweep.model.waveform import ORDER
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import evaluate
+from sweep.model.waveform import SEGMENT_ORDER_PATH
 from sweep.spec import load
 
 SPEC = "experiments/single_shot_2000m.yaml"
@@ -29,7 +29,7 @@ def main(repeats: int) -> None:
     for round_number in range(repeats + 1):
         for order in seconds_by_order:
             start = time.process_time()
-            evaluate(parameters | {ORDER: order}, CORE)
+            evaluate(parameters | {SEGMENT_ORDER_PATH: order}, DEFAULT_EFFECTS)
             if round_number:  # all is compiled
                 seconds_by_order[order] = min(seconds_by_order[order], time.process_time() - start)
     three_segment_seconds, two_segment_seconds = seconds_by_order.values()

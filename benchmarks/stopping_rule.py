@@ -1,8 +1,8 @@
 """Coverage and bias of drawing until a tolerance is met, by simulation.
 
 Run with `make stopping`, two minutes on one core: points of known pd, many of each, are drawn
-until their half-width is within the tolerance, by the shipped rule (sweep.model.sampling) and by
-looking after every batch. Writes the table in docs/draws.md.
+until their half-width is within the tolerance, by the shipped rule (sweep.model.sampling.samplers)
+and by looking after every batch. Writes the table in docs/draws.md.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,9 +12,15 @@ import numpy as np
 from benchmark_helpers import markdown_table, replace_page_part
 from rich.progress import track
 
-from sweep.model.accuracy import COUNTED, Accuracy, Interval, bounded_mean, half_width
-from sweep.model.marcum import marcum_q1
-from sweep.model.sampling import PIECE, looks, settle
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.error_budget import (
+    COUNT_INTERVALS,
+    ConfidenceInterval,
+    ErrorBudget,
+    bounded_mean_interval,
+    interval_half_width,
+)
+from sweep.model.sampling.samplers import NOISE_DRAWS_PER_STEP, draw_until_accurate, stopping_checks
 
 CONFIDENCE_LEVEL, BATCH_DRAWS, DRAWS_MAX = 0.95, 100, 10**7
 TOLERANCES = (0.1, 0.03, 0.01)
@@ -71,7 +77,7 @@ class RepeatedPoint:
 
     def at_once(self, points: int) -> int:
         """Draws of each of so many points that one `take` is for."""
-        return PIECE
+        return NOISE_DRAWS_PER_STEP
 
     def take(self, points: np.ndarray, n_more: int) -> None:
         """Draw on, a stretch of points at a time [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""
@@ -89,20 +95,20 @@ class RepeatedPoint:
     def half_widths(self, points: np.ndarray) -> np.ndarray:
         """Half-widths of some of the points."""
         mean, n = self.mean[points], self.number[points]
-        interval: Interval
+        interval: ConfidenceInterval
         if self._method == "means":
             variance = self.squared_deviations[points] / np.maximum(n - 1, 1)
-            interval = bounded_mean(
-                mean=mean, variance=variance, number=n, confidence=CONFIDENCE_LEVEL
+            interval = bounded_mean_interval(
+                mean=mean, variance=variance, n_values=n, confidence=CONFIDENCE_LEVEL
             )
         else:
             successes = np.rint(mean * n)
-            interval = COUNTED[self._method](
+            interval = COUNT_INTERVALS[self._method](
                 successes=successes, trials=n, confidence=CONFIDENCE_LEVEL
             )
-        return half_width(mean, interval)
+        return interval_half_width(mean, interval)
 
-    def missed(self, points: np.ndarray, accuracy: Accuracy) -> np.ndarray:
+    def missed(self, points: np.ndarray, accuracy: ErrorBudget) -> np.ndarray:
         """By how much the tolerance is missed."""
         return np.maximum(self.half_widths(points) - accuracy.tolerance, 0.0)
 
@@ -123,11 +129,11 @@ def simulate_stopping(
     n_trials = N_TRIALS_BY_METHOD["means" if method == "means" else "counts"]
     trials, points = RepeatedPoint(n_trials, sampler, method), np.arange(n_trials)
     check_numbers = (
-        looks(BATCH_DRAWS, DRAWS_MAX)
+        stopping_checks(BATCH_DRAWS, DRAWS_MAX)
         if stopping_times == "shipped"
         else range(BATCH_DRAWS, DRAWS_MAX, BATCH_DRAWS)
     )
-    settle(trials, points, check_numbers, Accuracy(tolerance, CONFIDENCE_LEVEL))
+    draw_until_accurate(trials, points, check_numbers, ErrorBudget(tolerance, CONFIDENCE_LEVEL))
     is_within = abs(trials.mean - pd) <= trials.half_widths(points)
     return StoppingResult(pd, is_within.mean(), trials.mean.mean() - pd, trials.number.mean())
 

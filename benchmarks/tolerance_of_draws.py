@@ -17,11 +17,11 @@ import numpy as np
 from benchmark_helpers import markdown_table
 from scipy import stats
 
+from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.speckle import coherent_share
-from sweep.model.marcum import marcum_q1
-from sweep.model.outputs import PROMISED
-from sweep.model.shot import find, prepare
+from sweep.model.effects.speckle import coherent_power_fraction
+from sweep.model.evaluation import evaluate_segments, prepare_shots
+from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import GridSpec, load
 from sweep.tasks.accuracy.settings import ADAPTIVE_KIND, AccuracySetting
 from sweep.tasks.engine.blocks import ParameterBlockGrid
@@ -48,7 +48,7 @@ probabilities have the share of these points that is within its half-width, and 
 deviations of such a share it is from {confidence:.0%}. At most {sigmas:g} are allowed.
 """
 COLUMNS = (
-    "tolerance", "points", "within", "draws decide", "within of these", *PROMISED, "draws", "us",
+    "tolerance", "points", "within", "draws decide", "within of these", *PD_OUTPUTS, "draws", "us",
 )  # fmt: skip
 
 
@@ -78,13 +78,13 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
     parameters = grid.parameters_at(np.arange(grid.n_points))
     certain_effects = [effect.name for effect in EFFECTS if not effect.is_random]
     means, integral_error = np.full((4, grid.n_points), np.nan), 0.0
-    for index, shots in prepare(parameters, certain_effects):
-        if shots.amplitude.shape[1] != 1 or np.any(shots.pedestal):
+    for index, shots in prepare_shots(parameters, certain_effects):
+        if shots.relative_amplitude.shape[1] != 1 or np.any(shots.pedestal_variance_under_lines):
             raise ValueError("only of one beamlet, without a pedestal, the mean is known")
-        signal = find(shots)[:, 2] / shots.line_deviation
-        level = shots.threshold / shots.line_deviation
+        signal = evaluate_segments(shots)[:, 2] / shots.line_noise_sigma
+        level = shots.threshold / shots.line_noise_sigma
         kappa = np.broadcast_to(
-            coherent_share(
+            coherent_power_fraction(
                 roughness=parameters["target.roughness"],
                 wavelength=parameters["instrument.laser.wavelength"],
             ),
@@ -103,7 +103,7 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
             )
             pd_shot = float((pd_by_node[0] * pd_by_node[2]) @ weight)
             values = dict(zip(("pd_up", "pd_doppler", "pd_down"), closed_form[:, i], strict=True))
-            means[:, index[i]] = [(values | {"pd_shot": pd_shot})[name] for name in PROMISED]
+            means[:, index[i]] = [(values | {"pd_shot": pd_shot})[name] for name in PD_OUTPUTS]
     return means, integral_error
 
 
@@ -155,7 +155,7 @@ def _draw_with_seed(
         AccuracySetting(name="", kind=ADAPTIVE_KIND, overrides=overrides).apply_to(load(path))
     )
     study.compile_kernels()
-    names = [f"{name}{suffix}" for suffix in ("", "_half_width", "_error") for name in PROMISED]
+    names = [f"{name}{suffix}" for suffix in ("", "_half_width", "_error") for name in PD_OUTPUTS]
     values = np.empty((len(names) + 1, *study.grid.shape))
     start = thread_time()
     for block in range(study.grid.n_blocks):
@@ -163,7 +163,7 @@ def _draw_with_seed(
         for target, name in zip(values, [*names, "n_draws"], strict=True):
             target[study.grid.block_slices(block)] = results[name]
     cpu_seconds = thread_time() - start
-    pd, half_width, error = values[:-1].reshape(3, len(PROMISED), -1)
+    pd, half_width, error = values[:-1].reshape(3, len(PD_OUTPUTS), -1)
     return pd, half_width, error, values[-1].ravel(), cpu_seconds
 
 
@@ -173,7 +173,7 @@ def missed_tolerances(name: str, rows: Sequence[DrawnResults], confidence: float
         within = (row.error <= row.tolerance).all(axis=0).mean()
         if within < confidence:
             yield f"- {name} at {row.tolerance:g}: {within:.1%} of the points are within it"
-        for quantity, sigmas in zip(PROMISED, coverage(row, confidence)[1], strict=True):
+        for quantity, sigmas in zip(PD_OUTPUTS, coverage(row, confidence)[1], strict=True):
             if abs(sigmas) > ALLOWED_SIGMAS:
                 yield f"- {name} at {row.tolerance:g}: {quantity} covered {sigmas:+.1f} sigma off"
 

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from benchmark_helpers import TABLE_4_1, load_mapping, markdown_table
 
-from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
-from sweep.model.effects.planning import plan
-from sweep.model.effects.points import Points
-from sweep.model.resolution import effects_tolerance
-from sweep.model.shot import DEFAULTS
+from sweep.model.beamlet_counts import effects_tolerance
+from sweep.model.effects.catalogue import EFFECTS, pack_effect_flags, unpack_effect_flags
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.planning import plan_effects
+from sweep.model.evaluation import PARAMETER_DEFAULTS
 from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
 
@@ -129,8 +129,8 @@ def errors_at_tolerances(
     """Errors of a study's points at each tolerance."""
     spec = load_mapping(mapping)
     grid = ParameterBlockGrid(spec)
-    parameters = DEFAULTS | grid.parameters_at(np.arange(grid.n_points))
-    points = Points(parameters)
+    parameters = PARAMETER_DEFAULTS | grid.parameters_at(np.arange(grid.n_points))
+    points = PlannerInputs(parameters)
 
     def at_every_point(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, (grid.n_points,))
@@ -144,7 +144,7 @@ def errors_at_tolerances(
                 spec,
                 select_parameters(parameters_at_tolerance, index),
                 index.size,
-                names_of(int(flag)),
+                unpack_effect_flags(int(flag)),
             )
             for name in set(part) & set(COMPARED_OUTPUTS):
                 outputs.setdefault(name, np.empty(grid.n_points))[index] = part[name]
@@ -153,18 +153,22 @@ def errors_at_tolerances(
     n_beamlets = int(parameters["footprint.beamlets"])
     usable_effects = np.array([not effect.is_random or spec.draws.has_draws for effect in EFFECTS])
     absent_effects = [
-        effect.absent(parameters) | np.zeros(grid.n_points, bool) for effect in EFFECTS
+        effect.is_absent(parameters) | np.zeros(grid.n_points, bool) for effect in EFFECTS
     ]
     is_present = ~np.array(absent_effects)
-    exact = evaluate_with_flags(REFERENCE_TOLERANCE, flags_of(usable_effects[:, None] & is_present))
+    exact = evaluate_with_flags(
+        REFERENCE_TOLERANCE, pack_effect_flags(usable_effects[:, None] & is_present)
+    )
     rows = []
     for tolerance in tolerances:
         effects_error_max = effects_tolerance(
             parameters | {"accuracy.tolerance": tolerance}, n_beamlets
         )
-        effect_plan = plan(points, at_every_point, spec.effect_modes(), effects_error_max)
-        planned_outputs = evaluate_with_flags(tolerance, flags_of(effect_plan.kept & is_present))
-        error_bound = effect_plan.error - effect_plan.left
+        effect_plan = plan_effects(points, at_every_point, spec.effect_modes(), effects_error_max)
+        planned_outputs = evaluate_with_flags(
+            tolerance, pack_effect_flags(effect_plan.is_kept & is_present)
+        )
+        error_bound = effect_plan.total_error - effect_plan.residual_error
         rows.append(
             _compare_outputs(planned_outputs, exact, error_bound, "leakage" in mapping["effects"])
         )

@@ -17,7 +17,7 @@ from benchmark_helpers import DOCS, EXPERIMENTS, markdown_table, wrap_page
 from rich.console import Console
 from rich.progress import Progress
 
-from sweep.model.accuracy import Accuracy
+from sweep.model.error_budget import ErrorBudget
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
 from sweep.tasks.accuracy.measurement import (
     N_PROMISED_ERRORS,
@@ -104,8 +104,8 @@ RAYS_SECTION = f"""
 Each beamlet of a flight is a ray. If powers add, `footprint.beamlets: auto` casts few rays for
 every shot, and more for shots that need them. The rows show the number of rays of a shot, and
 the error against a reference. The reference has all effects on and {REFERENCE_RAYS:,} rays of every
-shot, or more until the estimated error is below {REFERENCE_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,}
-at
+shot, or more until the estimated error is below {REFERENCE_RAYS_TOLERANCE:g},
+{ErrorBudget.ray_counts[-1]:,} at
 the most. A number given by an experiment has a row too, with all effects on. The last row of each
 flight compares the reference with {CHECK_RAYS:,} rays and more, at a part of the flight. A cell has
 the share of shots within the tolerance, the largest error of the best 90 % of the shots, and the

@@ -16,8 +16,8 @@ from sweep.analysis import labels
 from sweep.analysis.shot_spectra import select_shot_parameters, simulate_shot
 from sweep.analysis.study_figures import GridResults
 from sweep.analysis.tables import false_alarm_records
-from sweep.model import noise_only
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import noise_false_alarms
 from sweep.spec import load
 
 TABLE_COLUMNS = ("shown", "experiment", "ours", "the thesis", "difference, and why")
@@ -93,7 +93,7 @@ def table_4_2():
     rows = []
     for tnr, printed_pfa in zip(mean_pfa.tnr.values, figure.printed, strict=True):
         our_pfa = float(mean_pfa.sel(tnr=tnr))
-        closed_form = noise_only.bin_probability(tnr)
+        closed_form = noise_false_alarms.bin_pfa(tnr)
         rows.append([
             f"{tnr:g}", f"{closed_form:.4g}", f"{our_pfa:.4g}", f"{printed_pfa:g}",
             f"{100 * (printed_pfa / our_pfa - 1):+.1f} "
@@ -113,7 +113,9 @@ def explain_printed_alarm(tnr, printed_pfa, our_pfa):
         return (
             f"a slip of the thesis: {printed_pfa / 10:g} is meant, {percent_off:+.1f} % from ours"
         )
-    variance_excess_percent = 100 * noise_only.variance_excess_of_bin(printed_pfa, tnr)
+    variance_excess_percent = 100 * noise_false_alarms.variance_excess_from_bin_pfa(
+        printed_pfa, tnr
+    )
     return f"its noise is {variance_excess_percent:.2f} % above what sets the threshold"
 
 

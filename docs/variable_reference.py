@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sweep.model import outputs
-from sweep.model.outputs import Output
+from sweep.model.outputs import OutputVariable
 
 PAGE = Path(__file__).with_name("variables.md")
 
@@ -37,21 +37,28 @@ ds.effects.cf.flags  # one boolean per effect
 ```
 """
 
-SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [
-    ("Grids", "`sweep.open` opens a grid.", "axes", [outputs.OUTPUTS, outputs.SIMULATED]),
+SECTIONS: list[tuple[str, str, str, list[Mapping[str, OutputVariable]]]] = [
+    (
+        "Grids",
+        "`sweep.open` opens a grid.",
+        "axes",
+        [outputs.GRID_OUTPUTS, outputs.EFFECT_VARIABLES],
+    ),
     (
         "Grids that report the strongest peak alone",
         "Further variables of a study with `instrument.processing.peaks: strongest`.",
         "axes",
-        [outputs.STRONGEST_OUTPUTS],
+        [outputs.STRONGEST_PEAK_OUTPUTS],
     ),
     (
         "Grids with draws",
         "Further variables of a study with `draws`, whose pd is a mean or a share over draws.",
         "axes",
         [
-            outputs.ACCURACY_OUTPUTS, outputs.ERROR_OUTPUTS, outputs.DRAW_OUTPUTS,
-            outputs.RUNNING_OUTPUTS,
+            outputs.ACCURACY_OUTPUTS,
+            outputs.STANDARD_ERROR_OUTPUTS,
+            outputs.DRAW_COUNT_OUTPUTS,
+            outputs.RUNNING_SUM_OUTPUTS,
         ],
     ),
     (
@@ -64,28 +71,28 @@ SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [
         "Flights: shots",
         "One group for each scanner; `sweep.open_scene` opens them. The geometry is the truth.",
         "",
-        [outputs.SHOTS, outputs.CYCLES],
+        [outputs.SHOT_VARIABLES, outputs.CYCLE_VARIABLES],
     ),
     (
         "Flights: probabilities",
         "Probabilities of each shot, before any draw.",
         "axes",
-        [outputs.STATISTICS, outputs.SIMULATED],
+        [outputs.SHOT_STATISTIC_VARIABLES, outputs.EFFECT_VARIABLES],
     ),
-    ("Flights: points", "The point cloud.", "axes", [outputs.POINTS]),
+    ("Flights: points", "The point cloud.", "axes", [outputs.POINT_VARIABLES]),
     (
         "Flights: navigation",
         "Velocity and altitude from each measurement cycle of three shots or more.",
         "axes",
-        [outputs.NAVIGATION],
+        [outputs.NAVIGATION_VARIABLES],
     ),
     (
         "Eyepoints",
         "The rays of each scanner, in a store of their own next to the flight's.",
         "",
-        [outputs.BEAMLETS, {"weight": outputs.WEIGHT}],
+        [outputs.BEAMLET_VARIABLES, {"weight": outputs.BEAMLET_WEIGHT_VARIABLE}],
     ),
-]  # fmt: skip
+]
 
 
 def text() -> str:
@@ -93,7 +100,7 @@ def text() -> str:
     return HEAD + "".join(_section(*section) for section in SECTIONS)
 
 
-def _section(title: str, about: str, axes: str, tables: list[Mapping[str, Output]]) -> str:
+def _section(title: str, about: str, axes: str, tables: list[Mapping[str, OutputVariable]]) -> str:
     """Return a table of variables; those of grids have the study's axes and no shots."""
     rows = []
     for name, output in ((n, o) for table in tables for n, o in table.items()):

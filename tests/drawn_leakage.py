@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sweep.model.detection import mark
-from sweep.model.search import centre_lines
-from sweep.model.segments import spectrum
+from sweep.model.detection.echo_detection import mark_exempt_bins
+from sweep.model.spectrum.search_restriction import axis_line_positions
+from sweep.model.spectrum.segment_spectra import segment_spectrum
 
 
 def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, own=True):
@@ -15,11 +15,11 @@ def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, own=True):
     """
     rng, size = np.random.default_rng(seed), shots.fft_size
     window, time = shots.window.samples(), np.arange(size)
-    bins, magnitude = spectrum(shots, i, 0)
-    sigma, level = float(shots.bin_deviation[i]), float(shots.threshold[i])
+    bins, magnitude = segment_spectrum(shots, i, 0)
+    sigma, level = float(shots.bin_noise_sigma[i]), float(shots.threshold[i])
     exempt = np.zeros(magnitude.size, bool)
-    mark(magnitude, magnitude.size, level, exempt, shots.echo_rule.beside)
-    place = centre_lines(shots)[0, i]
+    mark_exempt_bins(magnitude, magnitude.size, level, exempt, shots.detection_rule.lobe_half_width)
+    place = axis_line_positions(shots)[0, i]
     turn = np.exp(2j * np.pi * place * time / size)
     lines = np.fft.rfft(window * turn.real)[bins], np.fft.rfft(window * turn.imag)[bins]
     peak = magnitude.argmax()

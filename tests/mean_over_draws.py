@@ -4,9 +4,9 @@ from collections.abc import Collection
 
 import numpy as np
 
+from sweep.model.evaluation import shot_statistics
 from sweep.model.preparation import Parameters
-from sweep.model.realisations import Means, realise
-from sweep.model.shot import statistics
+from sweep.model.sampling.realisations import RunningMeans, iter_realisations
 
 
 def mean_statistics(
@@ -18,7 +18,9 @@ def mean_statistics(
     draws: int,
 ) -> dict[str, np.ndarray]:
     """Statistics of n shots, (n,) by name, means over draws of random effects as realised."""
-    means = Means(len(keys))
-    for batch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
-        means.add(batch.point, statistics(batch.shots))
+    means = RunningMeans(len(keys))
+    for batch in iter_realisations(
+        parameters, effects, keys=keys, first_draw=first_draw, draws=draws
+    ):
+        means.add(batch.point_indices, shot_statistics(batch.shots))
     return means.results()

@@ -16,15 +16,21 @@ from scatterers import (
     scatterer_delays,
 )
 
-from sweep.model import beam, link, window
-from sweep.model.detectors import main_lobe
-from sweep.model.effects.catalogue import CORE
-from sweep.model.shot import Shots, find, prepare
+from sweep.model import beam, receiver_chain, window
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import Shots, evaluate_segments, prepare_shots
 
 COMPARED_EFFECTS = (
-    *CORE, "footprint", "doppler_spread", "segment_motion", "range_walk", "image", "overlap",
+    *DEFAULT_EFFECTS,
+    "footprint",
+    "doppler_spread",
+    "segment_motion",
+    "range_walk",
+    "image",
+    "overlap",
     "fading",
-)  # fmt: skip
+)
 SEGMENTS = ("up", "doppler", "down")
 
 LANDER_PARAMETERS = {
@@ -46,7 +52,7 @@ SCATTERERS_PER_BIN = 24
 
 
 def prepare_single_category(parameters, effects=COMPARED_EFFECTS) -> Shots:
-    ((_, shots),) = prepare(parameters, tuple(dict.fromkeys(effects)))
+    ((_, shots),) = prepare_shots(parameters, tuple(dict.fromkeys(effects)))
     return shots
 
 
@@ -54,7 +60,7 @@ def with_signal_over_threshold(parameters, threshold_over_signal):
     """Parameters with a laser power for which the up-chirp's |X| is the threshold over a ratio."""
     shots = prepare_single_category(parameters)
     amplitude_factor = (
-        float(shots.threshold[0]) * threshold_over_signal / float(find(shots)[0, 2, 0])
+        float(shots.threshold[0]) * threshold_over_signal / float(evaluate_segments(shots)[0, 2, 0])
     )
     return parameters | {
         "instrument.laser.power": parameters["instrument.laser.power"] * amplitude_factor**2
@@ -69,7 +75,7 @@ def first_value(value) -> float:
 def point_facet(parameters, shots) -> Facet:
     """Facet that the single point of parameters by path sees, and its records."""
     distance = first_value(parameters["target.range"])
-    radius = first_value(beam.beams(parameters)[0].radius(distance))
+    radius = first_value(beam.sent_and_oscillator_beams(parameters)[0].radius(distance))
     return Facet(
         range=distance,
         grazing_angle=first_value(parameters["target.grazing_angle"]),
@@ -79,15 +85,15 @@ def point_facet(parameters, shots) -> Facet:
         duration=first_value(parameters["instrument.chirp.duration"]),
         sample_rate=first_value(parameters["instrument.processing.sample_rate"]),
         fft_size=int(first_value(parameters["instrument.processing.fft_size"])),
-        window=window.samples(shots.window.name, shots.window.length),
+        window=window.window_samples(shots.window.name, shots.window.length),
         acquisition_delay=first_value(parameters["instrument.processing.acquisition_delay"]),
         radial_velocity=first_value(parameters["target.radial_velocity"]),
         transverse_velocity=first_value(parameters["target.transverse_velocity"]),
-        segments=shots.order,
+        segments=shots.segment_order,
         gap=first_value(parameters.get("instrument.chirp.gap", 0.0)),
         complex_record=shots.complex_record,
         looks=shots.looks.number,
-        footprint_slide_speed=first_value(shots.approach - shots.radial_velocity),
+        footprint_slide_speed=first_value(shots.approach_speed - shots.radial_velocity),
     )
 
 
@@ -95,14 +101,16 @@ def segment_amplitudes(facet: Facet, shots) -> dict[str, float]:
     """Root mean square amplitude of each segment's beat, behind the receiver's poles [V]."""
     amplitude_by_segment = {}
     for segment in facet.segments:
-        gain = link.transfer(
+        gain = receiver_chain.receiver_transfer(
             np.array(echo_beat(facet, segment)),
             detector_bandwidth=shots.detector_bandwidth,
             amplifier_bandwidth=shots.amplifier_bandwidth,
         )
-        echo_amplitude = shots.beat_scale * np.sqrt(shots.relative_echo) * np.abs(gain)
+        echo_amplitude = (
+            shots.beat_amplitude_scale * np.sqrt(shots.total_relative_echo) * np.abs(gain)
+        )
         amplitude_by_segment[segment] = first_value(
-            echo_amplitude * shots.whitening[SEGMENTS.index(segment)]
+            echo_amplitude * shots.whitening_gain[SEGMENTS.index(segment)]
         )
     return amplitude_by_segment
 
@@ -133,7 +141,7 @@ def draw_shots(
     """Draw the spectra of a point about its echo, or those of another facet."""
     facet = facet or point_facet(parameters, shots)
     deviation, padding = line_deviation(facet), facet.fft_size / facet.window.size
-    lobe = main_lobe(shots.window)
+    lobe = main_lobe_half_width(shots.window)
     half_width_bins = (
         math.ceil((LOBES_EACH_SIDE * lobe + LINE_DEVIATIONS_EACH_SIDE * deviation) * padding) + 2
     )
@@ -152,7 +160,11 @@ def draw_shots(
             seed=seed,
             scatterers=SCATTERERS_MIN + int(SCATTERERS_PER_BIN * deviation),
             n_scatterer_sets=renewals,
-            speckle="independent" if looks.independent else "motion" if looks.moving else "common",
+            speckle="independent"
+            if looks.has_independent_speckle
+            else "motion"
+            if looks.has_moving_speckle
+            else "common",
         )
     )
     return SegmentSpectra(
@@ -187,7 +199,7 @@ def searched_bins(mean_power: np.ndarray, shots) -> np.ndarray:
     magnitude, positions = np.sqrt(mean_power), np.arange(mean_power.size)
     if shots.detection == "peak_bin":
         return positions == strongest_bin(mean_power)
-    half_lobe = math.ceil(main_lobe(shots.window) * shots.fft_size / shots.window.length)
+    half_lobe = math.ceil(main_lobe_half_width(shots.window) * shots.fft_size / shots.window.length)
     searched = np.zeros(positions.size, bool)
     for bins, reach in (
         (np.flatnonzero(magnitude >= magnitude.max() / 2), half_lobe),

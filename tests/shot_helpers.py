@@ -5,12 +5,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from sweep.model import line_shape, philox
-from sweep.model.effects.catalogue import CORE
-from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
-from sweep.model.segments import runs_of
-from sweep.model.shot import prepare
-from sweep.model.spectrum import IMAGED
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import prepare_shots
+from sweep.model.sampling import philox
+from sweep.model.spectrum import line_shape
+from sweep.model.spectrum.bin_spectrum import REAL_WITH_IMAGES
+from sweep.model.spectrum.lines import BLOCK, IM, PLACE, RE, compute_lines
+from sweep.model.spectrum.segment_spectra import iter_spans
 
 DRAWS = 10_000
 """5 sigma of a proportion are at most 5 sqrt(1/4 / 10,000) = 0.025: an error of 5 % of pd shows.
@@ -30,9 +31,9 @@ def parametrize_product(fast_step, *choice_lists):
     ]
 
 
-def prepare_single_category(parameters, effects=CORE):
+def prepare_single_category(parameters, effects=DEFAULT_EFFECTS):
     """Shots of parameters that are all of one category."""
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
@@ -64,8 +65,8 @@ def intersect_level_plane(axis_range, grazing, pointing_errors):
 
 def detected_window(shots, segment):
     """First bin and |X| of those that are looked at one by one, of the first point."""
-    (windows,) = runs_of(shots, points=np.zeros(1, np.int64))
-    return int(windows.low[segment, 0]), windows.run(segment, 0).copy()
+    (windows,) = iter_spans(shots, points=np.zeros(1, np.int64))
+    return int(windows.first_bin[segment, 0]), windows.span_magnitudes(segment, 0).copy()
 
 
 def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
@@ -76,55 +77,58 @@ def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
     """
     peak = exact_magnitude.max() if peak is None else peak
     error = np.abs(magnitude - exact_magnitude) / peak
-    if shots.incoherent:
+    if shots.adds_powers:
         error = np.minimum(error, 1e4 * np.abs(magnitude**2 - exact_magnitude**2) / peak**2)
     return error.max()
 
 
 def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
-    n, row = shots.offset.shape[1], int(shots.row[i])
+    n, row = shots.relative_range_offset.shape[1], int(shots.footprint_row[i])
     scratch = np.empty((BLOCK + 1, n))
     sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
-    point = np.ascontiguousarray(shots.point_table()[:, i])
-    origin = place_lines(point, segment, shots.footprint, row, sizes, scratch)
+    point = np.ascontiguousarray(shots.point_parameter_table()[:, i])
+    origin = compute_lines(point, segment, shots.beamlet_table, row, sizes, scratch)
     return origin, scratch[PLACE], scratch[RE] + 1j * scratch[IM]
 
 
-def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=IMAGED):
+def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=REAL_WITH_IMAGES):
     """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1.
 
     Its table; envelope and ends, as `spectrum` takes them; sizes; shift of the line [bins]; and
     modes, 0 of a table of all bins.
     """
     phase, table, n_modes = phase or np.zeros_like, None, 0
-    for tier, (modes_max, _, _) in enumerate(line_shape.TIERS):
-        if not line_shape.has_modes(window, fft_size):
+    for tier, (modes_max, _, _) in enumerate(line_shape.MODE_TIERS):
+        if not line_shape.window_has_modes(window, fft_size):
             break
         centre, modes = np.zeros((1, 1)), np.zeros((1, 1, 2, modes_max))
         mode_counts = np.zeros((1, 1), np.int64)
-        phase_at_nodes = phase(line_shape.record_places(2 * modes_max))[None, None]
-        line_shape.find_modes(
+        phase_at_nodes = phase(line_shape.chebyshev_nodes(2 * modes_max))[None, None]
+        line_shape.decompose_phase_errors(
             phase_at_nodes,
             np.empty((0, 0, 0)),
-            line_shape.to_modes(2 * modes_max),
+            line_shape.chebyshev_coefficient_matrix(2 * modes_max),
             centre,
             modes,
             mode_counts,
         )
         n_modes = int(mode_counts[0, 0])
         if n_modes:
-            shapes = line_shape.shapes(window, fft_size, power, tier)
-            table = np.empty((2, line_shape.places_of(shapes.sizes)))
-            outline = np.zeros((7, shapes.reach.shape[1]))
+            shapes = line_shape.line_shape_tables(window, fft_size, power, tier)
+            table = np.empty((2, line_shape.table_row_size(shapes.layout)))
+            outline = np.zeros((7, shapes.envelope_distances.shape[1]))
             mode_parts = centre, modes, mode_counts, np.empty((1, 2, 0))
-            line_shape.build(0, (0, -1), mode_parts, shapes, table, outline)
+            line_shape.build_line_shape(0, (0, -1), mode_parts, shapes, table, outline)
             break
     if table is None:
         x = 2 * np.arange(window.length) / window.length - 1
-        shapes, centre = line_shape.whole_shapes(window, fft_size, power, phase(x)[None]), None
-        table, outline = shapes.whole[0], np.zeros((7, shapes.reach.shape[1]))
-        outline[1:3] = shapes.outlines[0]
-    outline[0] = shapes.reach[0]
+        shapes, centre = (
+            line_shape.full_line_shape_tables(window, fft_size, power, phase(x)[None]),
+            None,
+        )
+        table, outline = shapes.full_tables[0], np.zeros((7, shapes.envelope_distances.shape[1]))
+        outline[1:3] = shapes.full_envelopes[0]
+    outline[0] = shapes.envelope_distances[0]
     shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
-    return table, outline, np.append(shapes.sizes, (view, 0)), shift, n_modes
+    return table, outline, np.append(shapes.layout, (view, 0)), shift, n_modes

@@ -280,21 +280,21 @@ def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):
 
 
 def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
-    from sweep.model.effects.catalogue import NAMES
-    from sweep.model.outputs import OUTPUTS
+    from sweep.model.effects.catalogue import EFFECT_NAMES
+    from sweep.model.outputs import GRID_OUTPUTS
 
     result = sweep("plan", "small.yaml", "--workers", "2")
     assert result.exit_code == 0
     told, _, table = result.stdout.partition("Effects")
     lines = dict(line.strip().split("  ", 1) for line in told.splitlines())
-    arrays = len(OUTPUTS) + 2  # what was simulated, and what that leaves out
+    arrays = len(GRID_OUTPUTS) + 2  # what was simulated, and what that leaves out
     assert lines["points"] == "80"
     assert lines["blocks"] == "10 of at most 4 range x 2 power"
     assert lines["chunks"] == f"{10 * arrays} files"
     size = 80 * (8 * arrays - 4)  # flags of effects take four bytes
     assert lines["bytes"] == f"{size / 1000:.3g} kB before compression"
     assert lines["time"].endswith("on 2 workers")
-    assert all(name.replace("_", " ") in " ".join(table.split()) for name in NAMES)
+    assert all(name.replace("_", " ") in " ".join(table.split()) for name in EFFECT_NAMES)
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
 
 
@@ -456,11 +456,11 @@ def test_a_cost_is_told_of_what_is_simulated_and_is_no_more_than_that_of_its_poi
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
     here, monkeypatch
 ):
-    from sweep.model.unsupported import UnsupportedShot
+    from sweep.model.unsupported_shot import UnsupportedShotError
     from sweep.tasks.studies import study_plan
 
     def beyond(spec, **how):
-        raise UnsupportedShot("full scale is exceeded: raise it")
+        raise UnsupportedShotError("full scale is exceeded: raise it")
 
     monkeypatch.setattr(study_plan, "effects_table", beyond)
     refused(sweep("plan", "small.yaml"), "full scale is exceeded: raise it")
@@ -572,7 +572,7 @@ for command in ('status s.zarr', 'run wrong.yaml', 'run scene.yaml'):
 slow = ('distributed', 'netCDF4', 'pyproj', 'rasterio', 'trimesh')
 print([m for m in slow if m in sys.modules])
 import sweep.tasks.driver, sweep.model.window
-sweep.model.window.samples('hann', 8)
+sweep.model.window.window_samples('hann', 8)
 slow = ('stats', 'signal', 'optimize', 'interpolate', 'ndimage')
 print([m for m in slow if f'scipy.{m}' in sys.modules])
 """

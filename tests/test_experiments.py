@@ -11,10 +11,10 @@ from sweep.analysis.selection import matches_any
 from sweep.analysis.study_figures import draw_figures
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
+    DRAW_COUNT_OUTPUTS,
+    GRID_OUTPUTS,
     SPECTRA_OUTPUTS,
+    STANDARD_ERROR_OUTPUTS,
 )
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.yaml_document import read_document
@@ -82,10 +82,14 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)
-    drawn = {*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS} if spec.draws.has_draws else set()
-    stored = {*OUTPUTS, *drawn}
+    drawn = (
+        {*STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
+        if spec.draws.has_draws
+        else set()
+    )
+    stored = {*GRID_OUTPUTS, *drawn}
     if spec.draws.draws_whole_spectra:
-        stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
+        stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     assert set(dataset.data_vars) == {*stored, "effects", "effects_error"}
     seen = dataset.pd_doppler > 0.2  # else there may be no draw to average over
     footprint = spec.footprint

@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 from test_triangle import STREET, instrument
 
 import sweep
-from sweep.model import segments, truth
-from sweep.model.effects.catalogue import CORE
-from sweep.model.pairing import MISPAIRED, MISREAD, TRUE
-from sweep.model.shot import prepare, statistics
-from sweep.model.waveform import resolve
-from sweep.model.window import samples
+from sweep.model import time_domain_truth
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import prepare_shots, shot_statistics
+from sweep.model.pointcloud.pairing import MISPAIRED_FLAG, MISREAD_FLAG, TRUE_FLAG
+from sweep.model.spectrum import segment_spectra
+from sweep.model.waveform import resolve_range_velocity
+from sweep.model.window import window_samples
 from sweep.spec import GridSpec, SceneSpec, SpecError
 
 RECORD = "instrument.receiver.record"
@@ -33,9 +34,9 @@ def test_signs_tell_range_and_velocity_whichever_is_larger(near, fast, equal, do
     f_d = (fast if equal is None else equal * near) * rate
     seen = [(f + rate / 2) % rate - rate / 2 for f in (f_d - f_r, f_d, f_d + f_r)]
     up, middle, down = (np.array(f) for f in seen)
-    found = resolve(
+    found = resolve_range_velocity(
         up=up, doppler=middle if doppler else None, down=down, sample_rate=np.array(rate),
-        bin_width=np.array(1e5), signed=True, **CHIRP,
+        bin_width=np.array(1e5), has_signs=True, **CHIRP,
     )  # fmt: skip
     velocity = f_d * 299792458 / 2 / (1.93e14 + 5e8)
     assert found.radial_velocity == pytest.approx(velocity, abs=1e-6)
@@ -43,8 +44,8 @@ def test_signs_tell_range_and_velocity_whichever_is_larger(near, fast, equal, do
     assert found.range == pytest.approx(299792458 / 2 * delay, abs=1e-6)
 
 
-def shots_of(scene, effects=CORE):
-    ((_, shots),) = prepare(scene, effects)
+def shots_of(scene, effects=DEFAULT_EFFECTS):
+    ((_, shots),) = prepare_shots(scene, effects)
     return shots
 
 
@@ -59,13 +60,13 @@ def test_noise_is_that_of_two_receivers_with_half_the_light(source, table_4_1):
         "target.reflectance": 1.0 if source == "amplifier" else 1e-4,
         "instrument.laser.relative_intensity_noise": 1e-11 if source == "intensity" else 0.0,
     }  # fmt: skip
-    effects = (*CORE, "relative_intensity_noise")
+    effects = (*DEFAULT_EFFECTS, "relative_intensity_noise")
     real, both = (
-        statistics(shots_of(quiet | {RECORD: kind}, effects)) for kind in ("real", "complex")
+        shot_statistics(shots_of(quiet | {RECORD: kind}, effects)) for kind in ("real", "complex")
     )
     rng, length, trials = np.random.default_rng(3), 1024, 4000
     cycles = np.arange(length) * (100 / length)
-    tone, w = np.exp(2j * np.pi * cycles), samples("hamming", length)
+    tone, w = np.exp(2j * np.pi * cycles), window_samples("hamming", length)
     # Share of the variance in each receiver; a laser's intensity is the same in both.
     light = {"shot": 0.5, "amplifier": 1.0, "intensity": 0.25}[source]
     noise = rng.normal(size=(2, trials, length))
@@ -94,18 +95,18 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
         window="hann", phases=phases, fft_size=4096, beamlets=7, range=30.0,
         radial_velocity=velocity,
     ) | {RECORD: "complex", GAIN: 10**0.05, PHASE: np.deg2rad(3.0)}  # fmt: skip
-    shots = replace(shots_of(scene, (*CORE, "iq_imbalance")), phase_errors=())
+    shots = replace(shots_of(scene, (*DEFAULT_EFFECTS, "iq_imbalance")), phase_errors=())
     g = np.sqrt(10**0.05) * np.exp(1j * np.deg2rad(3.0))
     leak = abs(1 - g) / abs(1 + g)
     assert shots.image_gain == pytest.approx(leak)
-    w = samples("hann", 4096)
+    w = window_samples("hann", 4096)
     for segment in range(3):
-        exact = truth.spectrum(shots, 0, segment, range_walk=False)
-        bins, magnitude = segments.spectrum(shots, 0, segment)
+        exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
+        bins, magnitude = segment_spectra.segment_spectrum(shots, 0, segment)
         found = np.zeros(4096)
         found[(bins + 2048) % 4096] = magnitude
         assert np.abs(found - exact).max() < 1e-9 * exact.max()
-        record = truth.analytic_record(shots, 0, segment, 3, range_walk=False)
+        record = time_domain_truth.analytic_record(shots, 0, segment, 3, with_range_walk=False)
         unequal = record.real + 1j * (g * record / 1j).real  # Q by its own gain and phase
         spectrum = np.abs(np.fft.fft(w * unequal))
         k = spectrum.argmax()
@@ -152,8 +153,8 @@ def test_a_street_in_complex_records(speed, tmp_path):
         store = tmp_path / f"{kind}.zarr"
         assert sweep.run(spec, store=store, scheduler="none", progress=False).complete
         clouds[kind] = sweep.open_scene(store)["frame"].to_dataset().load()
-    real, both = ((cloud["flags"] & TRUE > 0).sum().item() for cloud in clouds.values())
-    wrong = (clouds["complex"]["flags"] & (MISREAD | MISPAIRED) > 0).sum().item()
+    real, both = ((cloud["flags"] & TRUE_FLAG > 0).sum().item() for cloud in clouds.values())
+    wrong = (clouds["complex"]["flags"] & (MISREAD_FLAG | MISPAIRED_FLAG) > 0).sum().item()
     assert (real == 0) == (speed == 90)  # |f_d| > f_r: exchanged
     assert both > 1000 and both >= 0.99 * real and wrong <= 1e-3 * both
 

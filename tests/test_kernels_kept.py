@@ -16,7 +16,7 @@ from numba.core.errors import NumbaError, TypingError
 
 import sweep
 import sweep.kernel_cache
-from sweep.model.detection import detect_rows
+from sweep.model.detection.echo_detection import detect_in_spectra
 
 PACKAGE = Path(sweep.__file__).parent
 
@@ -331,7 +331,7 @@ def test_kernels_are_cached_among_temporary_files_where_the_user_has_no_home(mon
 
 def test_the_model_is_cached_by_the_fingerprint():
     folder = sweep.kernel_cache.cache_folder()
-    assert Path(detect_rows.stats.cache_path).parent == folder.path and folder.reason == ""
+    assert Path(detect_in_spectra.stats.cache_path).parent == folder.path and folder.reason == ""
 
 
 def _sum_of_first_row(table):

@@ -149,7 +149,7 @@ def none(): ...
 def test_the_walk_sees_what_it_must():
     """A rule that looks at nothing would pass: the walk finds the package and its imports."""
     assert len(MODULES) > 30
-    assert "sweep.model.preparation" in _imports(PACKAGE / "model" / "shot.py")
+    assert "sweep.model.preparation" in _imports(PACKAGE / "model" / "evaluation.py")
 
 
 def test_stores_are_opened_by_their_checked_document_alone():

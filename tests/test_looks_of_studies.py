@@ -9,8 +9,8 @@ import yaml
 from shot_helpers import parametrize_product
 
 import sweep
-from sweep.model.detection import RAYLEIGH_DEVIATION
-from sweep.model.looks import Looks
+from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION
+from sweep.model.detection.looks import Looks
 from sweep.spec import GridSpec, SceneSpec, SpecError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -76,10 +76,12 @@ def test_looks_reach_grids_and_flights(kind, looks, tmp_path):
         **({"footprint": {"speckle": "none"}} if steady else {}),
     )  # fmt: skip
     found = results(spec, tmp_path / "study.zarr")
-    law = Looks.of(spec.parameters())
+    law = Looks.from_parameters(spec.parameters())
     assert law.number == looks["number"]
     signal = np.sqrt(2 * np.ravel(found.snr_up))
-    told, _ = (law.steady if steady else law.faded)(signal, np.full(signal.shape, LEVEL))
+    told, _ = (law.pd_and_miss_steady if steady else law.pd_and_miss_in_speckle)(
+        signal, np.full(signal.shape, LEVEL)
+    )
     # The echo's own shot noise is no part of the noise that the threshold is set on.
     np.testing.assert_allclose(np.ravel(found.pd_up), told, rtol=2e-3)
     assert 0.3 < told.min() < 1 - 1e-6
@@ -113,9 +115,11 @@ def test_curves_of_looks_go_by_their_own_alarms(tmp_path):
     law, signal = Looks(4), np.sqrt(2 * found.snr_up.item())
     chances = np.array([1e-8, 1e-3])
     curve = found.sweep.roc(chances, segment="up")
-    level = law.level(np.log(chances))
+    level = law.threshold_ratio_from_log_pfa(np.log(chances))
     np.testing.assert_allclose(np.ravel(curve["curve_tnr"]), level / RAYLEIGH_DEVIATION, rtol=1e-6)
-    np.testing.assert_allclose(np.ravel(curve["pd"]), law.steady(signal, level)[0], rtol=2e-3)
+    np.testing.assert_allclose(
+        np.ravel(curve["pd"]), law.pd_and_miss_steady(signal, level)[0], rtol=2e-3
+    )
 
 
 REFUSED = [

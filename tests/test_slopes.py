@@ -7,14 +7,21 @@ import pytest
 import yaml
 
 import sweep
-from sweep.model import philox, truth, waveform
-from sweep.model.detection import RAYLEIGH_DEVIATION, Fading
-from sweep.model.draws import BOTH, Rows, count_by_chance, count_in_noise, fading_factors
-from sweep.model.estimators import resolved_deviation
-from sweep.model.looks import fading_any_two
-from sweep.model.outputs import DRAW_OUTPUTS
-from sweep.model.shot import find, prepare, statistics
-from sweep.model.waveform import ANY_TWO, DOPPLER_SLOPE, DOWN_SLOPE, SHOT_DETECTION
+from sweep.model import time_domain_truth, waveform
+from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION, SegmentCorrelations
+from sweep.model.detection.estimators import range_velocity_deviation
+from sweep.model.detection.looks import pd_and_miss_any_two_in_speckle
+from sweep.model.evaluation import evaluate_segments, prepare_shots, shot_statistics
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS
+from sweep.model.sampling import philox
+from sweep.model.sampling.draws import (
+    PD_BOTH_CHIRPS,
+    DrawRanges,
+    count_by_probability,
+    count_in_noise,
+    speckle_factors,
+)
+from sweep.model.waveform import ANY_TWO, DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH, SHOT_DETECTION_PATH
 from sweep.spec import GridSpec, SpecError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -24,7 +31,7 @@ SAMPLES, SAMPLE_RATE = 4096, 1e9
 
 def prepared(p, effects):
     """Shots of one category."""
-    ((_, shots),) = prepare(p, effects)
+    ((_, shots),) = prepare_shots(p, effects)
     return shots
 
 
@@ -32,7 +39,7 @@ def beats_of(slopes, far, speed):
     """Carriers, chirp rates and signed beats of segments of such slopes, (k, n) each."""
     carriers = np.array(waveform.carrier_frequencies(
         "homodyne", wavelength=waveform.SPEED_OF_LIGHT / CARRIER, start_frequency=0.0,
-        bandwidth=BANDWIDTH, slopes=slopes,
+        bandwidth=BANDWIDTH, chirp_slopes=slopes,
     ))[:, None]  # fmt: skip
     rates = RATE * np.array(slopes)[:, None]
     tau, beta = 2 * far / waveform.SPEED_OF_LIGHT, 2 * speed / waveform.SPEED_OF_LIGHT
@@ -44,10 +51,10 @@ def fitted(slopes, used, far, speed, *, signed, assumed="far", noise=0.0):
     beats = beats + noise
     turns = np.rint(beats / SAMPLE_RATE)
     peaks = beats - SAMPLE_RATE * turns
-    return waveform.fit(
-        peaks if signed else np.abs(peaks), carriers=carriers, rates=rates,
+    return waveform.fit_range_velocity(
+        peaks if signed else np.abs(peaks), carriers=carriers, chirp_rates=rates,
         weights=np.array(used, float)[:, None] + 0 * far, sample_rate=SAMPLE_RATE,
-        bin_width=SAMPLE_RATE / SAMPLES, signed=signed, assumed=assumed,
+        bin_width=SAMPLE_RATE / SAMPLES, has_signs=signed, two_beat_assumption=assumed,
     )  # fmt: skip
 
 
@@ -104,12 +111,16 @@ def test_standard_errors_are_those_of_drawn_beats(slopes, used):
     far, speed = np.full(number, 300.0), np.full(number, 5.0)
     carriers, rates, beats = beats_of(slopes, far, speed)
     peaks = beats + noise
-    found = waveform.fit(
-        np.abs(peaks), carriers=carriers, rates=rates, sample_rate=SAMPLE_RATE, bin_width=2.5e5,
+    found = waveform.fit_range_velocity(
+        np.abs(peaks),
+        carriers=carriers,
+        chirp_rates=rates,
+        sample_rate=SAMPLE_RATE,
+        bin_width=2.5e5,
         weights=np.array(used)[:, None] / deviations[:, None] ** 2 + 0 * far,
-    )  # fmt: skip
+    )
     up, doppler, down = np.where(used, deviations, np.inf)
-    told = resolved_deviation(
+    told = range_velocity_deviation(
         up=up, doppler=doppler, down=down, carriers=tuple(carriers[:, 0]), chirp_rate=RATE,
         range=300.0, radial_velocity=5.0, slopes=slopes,
     )  # fmt: skip
@@ -124,14 +135,14 @@ def test_any_two_of_three_that_fade(snr, near):
     """Against drawn amplitudes: of their own, in one speckle, and as it moves on."""
     number, level, snr = 200_000, 4.0, np.array(snr)
     over = near**4  # of Gaussian footprints
-    fading = Fading(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
-    key, mixing = (np.uint64(3), np.uint64(5)), fading.mixing()[:, 0]
-    factors = np.array([fading_factors(key, draw, 0, mixing) for draw in np.arange(number)]).T
+    fading = SegmentCorrelations(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
+    key, mixing = (np.uint64(3), np.uint64(5)), fading.cholesky_factors()[:, 0]
+    factors = np.array([speckle_factors(key, draw, 0, mixing) for draw in np.arange(number)]).T
     rng = np.random.default_rng(5)
     real, imaginary = rng.normal(size=(2, 3, number))
     hit = np.hypot(np.sqrt(2 * snr)[:, None] * factors + real, imaginary) >= level
     y = level**2 / (2 * (1 + snr))[:, None]
-    pd, miss = fading_any_two(
+    pd, miss = pd_and_miss_any_two_in_speckle(
         np.exp(-y), -np.expm1(-y), np.array([level]), np.abs(np.array(fading))
     )
     share = (hit.sum(axis=0) >= 2).mean()
@@ -145,7 +156,7 @@ def test_any_two_of_three_of_which_two_are_all_but_one(chance, apart):
     """These two are detected together, and a third adds next to nothing: the series' 0.002."""
     pd = np.full((3, 1), chance)
     correlations = np.array([[1 - apart], [0.84], [0.8394]])
-    found, missed = fading_any_two(pd, 1 - pd, np.array([1e6]), correlations)
+    found, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, np.array([1e6]), correlations)
     assert found[0] == pytest.approx(chance, rel=2e-3, abs=2e-3)
     assert found[0] + missed[0] == pytest.approx(1.0, abs=1e-12)
 
@@ -154,27 +165,29 @@ def test_any_two_of_three_of_which_two_are_all_but_one(chance, apart):
 @pytest.mark.parametrize("speckle", ["none", "developed"])
 def test_draws_count_the_shots_that_the_closed_form_tells(table_4_1, noisy, speckle):
     number, key = 20_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=7)
-    rule = {SHOT_DETECTION: ANY_TWO, "footprint.speckle": speckle}
+    rule = {SHOT_DETECTION_PATH: ANY_TWO, "footprint.speckle": speckle}
     rule |= {"target.range": 4000.0, "instrument.processing.detection": "peak_bin"}
     effects = ("doppler", "footprint", "doppler_spread", "fading")
     if speckle == "none":  # a threshold at the up-chirp's own magnitude
-        snr = statistics(prepared(table_4_1() | rule, effects))["snr_up"][0]
+        snr = shot_statistics(prepared(table_4_1() | rule, effects))["snr_up"][0]
         rule["instrument.processing.tnr"] = np.sqrt(2 * snr) / RAYLEIGH_DEVIATION
     shots = prepared(table_4_1() | rule, effects)
-    outputs = statistics(shots)
-    counts = np.zeros((len(DRAW_OUTPUTS), 1, 1), np.int64)
-    rows = Rows(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
+    outputs = shot_statistics(shots)
+    counts = np.zeros((len(DRAW_COUNT_OUTPUTS), 1, 1), np.int64)
+    rows = DrawRanges(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
     if noisy:
         count_in_noise(rows, np.array([0, number]), shots, counts)
     else:
-        count_by_chance(rows, np.array([0, number]), outputs, counts)
+        count_by_probability(rows, np.array([0, number]), outputs, counts)
     told = np.array([outputs[f"pd_{name}"][0] for name in ("up", "down", "doppler", "shot")])
     share = counts[:4, 0, 0] / number
     assert np.all(np.abs(share - told) < 5 * np.sqrt(told * (1 - told) / number)), (share, told)
-    assert told[3] > outputs[BOTH][0] + 0.02
+    assert told[3] > outputs[PD_BOTH_CHIRPS][0] + 0.02
     assert outputs["miss_shot"][0] == pytest.approx(1 - told[3], abs=1e-12)
-    both = statistics(prepared(table_4_1() | rule | {SHOT_DETECTION: "both_chirps"}, effects))
-    assert outputs[BOTH] == both["pd_shot"]
+    both = shot_statistics(
+        prepared(table_4_1() | rule | {SHOT_DETECTION_PATH: "both_chirps"}, effects)
+    )
+    assert outputs[PD_BOTH_CHIRPS] == both["pd_shot"]
 
 
 FLAT = {
@@ -263,10 +276,13 @@ def test_lists_that_do_not_tell_range_and_velocity_are_refused(chirp, processing
 
 def test_lines_of_any_slope_are_those_of_the_record(table_4_1):
     """Sampled in time, and transformed: |X| of the peak, of every segment."""
-    p = table_4_1() | {DOPPLER_SLOPE: 0.3, DOWN_SLOPE: 0.75, "target.range": 411.0}
+    p = table_4_1() | {DOPPLER_SLOPE_PATH: 0.3, DOWN_SLOPE_PATH: 0.75, "target.range": 411.0}
     p |= {"instrument.processing.fft_size": 4096, "instrument.chirp.duration": 1e-4}
     shots = prepared(p, ("doppler", "footprint"))
-    found, true = find(shots), truth.find(shots, range_walk=False)
+    found, true = (
+        evaluate_segments(shots),
+        time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False),
+    )
     assert found[:, 2:4] == pytest.approx(true[:, 2:4], rel=1e-9)
 
 
@@ -274,5 +290,5 @@ def test_segments_of_which_two_are_never_detected_are_no_shot():
     pd = np.array([[0.0, 0.0, 0.5], [0.0, 0.3, 0.0], [0.0, 0.0, 0.5]])
     alike = np.full((3, 3), 0.9)
     for level in (np.full(3, 5.0), np.full(3, 1e100)):
-        found, missed = fading_any_two(pd, 1 - pd, level, alike)
+        found, missed = pd_and_miss_any_two_in_speckle(pd, 1 - pd, level, alike)
         assert (found[:2] == 0.0).all() and (missed[:2] == 1.0).all() and found[2] > 0.1

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 import sweep
-from sweep.model.pairing import TRUE, UNCONFIRMED
+from sweep.model.pointcloud.pairing import TRUE_FLAG, UNCONFIRMED_FLAG
 from sweep.spec import GridSpec, SceneSpec
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -104,10 +104,12 @@ def test_no_point_of_a_street_is_lost_whatever_the_slopes(tmp_path, three, recor
     As many true points as by the lander's three segments, but for what three beats tell apart.
     """
     found = flown(tmp_path, record, **chirp)
-    kept, before = ((each["flags"] & TRUE > 0).sum().item() for each in (found, three))
+    kept, before = ((each["flags"] & TRUE_FLAG > 0).sum().item() for each in (found, three))
     assert kept >= 0.995 * before > 500
     if "doppler" in chirp["segments"]:  # whose beat, with its sign, confirms what belongs together
-        assert (found["flags"] & (TRUE | UNCONFIRMED) == TRUE).sum().item() >= 0.99 * kept
+        assert (
+            found["flags"] & (TRUE_FLAG | UNCONFIRMED_FLAG) == TRUE_FLAG
+        ).sum().item() >= 0.99 * kept
     nothing = found["flags"] == 0
     assert nothing.any()
     for name in ("range", "radial_velocity"):

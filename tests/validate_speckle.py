@@ -33,8 +33,8 @@ from scatterer_shots import (
 )
 from scatterers import SPEED_OF_LIGHT, Facet, echo_beat
 
-from sweep.model.shot import Shots, find
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.evaluation import Shots, evaluate_segments
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.spec import GridSpec, SpecError
 from sweep.tasks.studies.grid_study import GridStudy
 
@@ -146,7 +146,7 @@ def random_valid_spec(seed: int, spec_number: int) -> RandomSpec:
         signal_over_threshold = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
         try:
             found = spec_of_ratio(mapping, signal_over_threshold)
-        except (SpecError, UnsupportedShot):
+        except (SpecError, UnsupportedShotError):
             continue
         chirp_pd = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
         if PD_RANGE[0] < min(chirp_pd) and max(chirp_pd) < PD_RANGE[1]:
@@ -157,7 +157,7 @@ def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
     study = GridStudy(GridSpec.from_mapping(with_units(mapping)))
     shots = prepare_single_category(study.grid.parameters(0), COMPARED_EFFECTS)
-    magnitude = np.nanmax(find(shots)[[0, 2], 2, 0])
+    magnitude = np.nanmax(evaluate_segments(shots)[[0, 2], 2, 0])
     mapping["instrument"]["laser"]["power"] = (
         ratio * first_value(shots.threshold) / magnitude
     ) ** 2
@@ -168,7 +168,7 @@ def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
         name: first_value(results[name]) for name in (*(f"pd_{s}" for s in SEGMENTS), "pd_shot")
     }
     if np.isnan(stored["pd_shot"]):
-        raise UnsupportedShot("beyond the model")
+        raise UnsupportedShotError("beyond the model")
     parameters = study.grid.parameters(0)
     return RandomSpec(
         mapping, spec, parameters, prepare_single_category(parameters, COMPARED_EFFECTS), stored
@@ -310,8 +310,8 @@ WIDE_LINE_BINS = 4.0
 
 def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
     """Largest error that docs/physics.md states for the law of a segment or of the shot."""
-    if shots.looks.several:
-        if not shots.looks.moving:
+    if shots.looks.is_noncoherent:
+        if not shots.looks.has_moving_speckle:
             return STATED_ERRORS.alike_looks if quantity == "shot" else STATED_ERRORS.peak_bin
         return STATED_ERRORS.moving_looks if quantity == "shot" else STATED_ERRORS.moving_looks / 2
     if shots.detection == "peak_bin":
@@ -340,8 +340,14 @@ def is_near_end(facet: Facet, line_deviation_bins: float) -> bool:
 def detection_rule_text(shots: Shots) -> str:
     """Rule of detection in a few words."""
     looks, rule = shots.looks, shots.detection
-    if looks.several:
-        speckle = "independent" if looks.independent else "motion" if looks.moving else "common"
+    if looks.is_noncoherent:
+        speckle = (
+            "independent"
+            if looks.has_independent_speckle
+            else "motion"
+            if looks.has_moving_speckle
+            else "common"
+        )
         votes = f"{looks.votes} of" if looks.combine == "binary" else "mean of"
         rule = f"{votes} {looks.number} {speckle}"
     return rule + (" any_two" if shots.any_two else "")
@@ -385,7 +391,7 @@ def compare_spec(seed: int, spec_number: int, draws: int = DRAWS) -> ComparisonR
         grazing_angle_deg=math.degrees(facet.grazing_angle),
         line_deviation_bins=line_deviation(facet),
         bins_from_end=distance_from_end(facet),
-        threshold_over_noise=first_value(shots.threshold / shots.bin_deviation),
+        threshold_over_noise=first_value(shots.threshold / shots.bin_noise_sigma),
         comparisons=tuple(comparisons),
     )
 

@@ -22,7 +22,7 @@ from sweep.analysis.answers import (
 )
 from sweep.analysis.answers.dataset_lookup import STUDY_ID, marker_name
 from sweep.messages import suggestion
-from sweep.model.outputs import RUNNING
+from sweep.model.outputs import RUNNING_SUMS
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.locations import JOURNAL_DIR, Location, parse_location
@@ -115,7 +115,7 @@ def open(
     )
     effect_flags = dataset["effects"]
     n_blocks = _count_chunks(effect_flags)
-    dataset = rechunk_for_reading(dataset.drop_vars(RUNNING, errors="ignore"))
+    dataset = rechunk_for_reading(dataset.drop_vars(RUNNING_SUMS, errors="ignore"))
     if BATCH_DIM in dataset.dims:
         dataset = sum_batches(dataset)
     dataset = _add_study_id(_load_coordinates(dataset), attributes["study_id"])

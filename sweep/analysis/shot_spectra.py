@@ -16,16 +16,16 @@ from matplotlib.figure import Figure as Sheet
 from sweep.analysis import canvas, labels
 from sweep.analysis.selection import GRAZING_ANGLE_PATH
 from sweep.analysis.tables import PageTable, TablePage
-from sweep.model import shot as shot_model
+from sweep.model import evaluation as shot_model
 from sweep.model import waveform, window
-from sweep.model.beam import DIVERGENCE, WAIST
+from sweep.model.beam import DIVERGENCE_PATH, WAIST_PATH
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import CORE, EFFECTS
-from sweep.model.eyepoints import Eyepoints
-from sweep.model.returns import beamlet_lines
-from sweep.model.segments import whole_spectrum
-from sweep.model.shot import prepare
-from sweep.model.threshold import WAYS
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS
+from sweep.model.evaluation import prepare_shots
+from sweep.model.pointcloud.eyepoints import Eyepoints
+from sweep.model.pointcloud.returns import beamlet_line_positions
+from sweep.model.spectrum.segment_spectra import full_segment_spectrum
+from sweep.model.threshold import THRESHOLD_PATHS
 from sweep.spec import GridSpec, SpecError
 from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
@@ -88,7 +88,7 @@ class SimulatedShot:
     @property
     def bin_deviation(self) -> float:
         """Noise of a bin, per quadrature [V]."""
-        return float(self.prepared_shot.bin_deviation[0])
+        return float(self.prepared_shot.bin_noise_sigma[0])
 
     @property
     def threshold(self) -> float:
@@ -117,13 +117,13 @@ class SimulatedShot:
 
 def simulate_shot(
     parameters: Parameters,
-    effects: Collection[str] = CORE,
+    effects: Collection[str] = DEFAULT_EFFECTS,
     *,
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
     """One shot on a flat plane."""
-    ((_, prepared_shot),) = prepare(parameters, effects)
+    ((_, prepared_shot),) = prepare_shots(parameters, effects)
     return simulate_prepared_shot(prepared_shot, parameters, label=label, seed=seed)
 
 
@@ -135,24 +135,25 @@ def simulate_prepared_shot(
     seed: int | None = None,
 ) -> SimulatedShot:
     """One shot that is prepared already, whatever it looks at."""
-    segment_results = shot_model.find(prepared_shot)
+    segment_results = shot_model.evaluate_segments(prepared_shot)
     segments = tuple(
         _segment_spectrum(prepared_shot, segment_results[k, :, 0], k, seed)
         for k in range(3)
-        if prepared_shot.segments[k]
+        if prepared_shot.has_segment[k]
     )
     peak_results = segment_results.copy()
     for segment in segments:
         peak_results[SEGMENT_NAMES.index(segment.name), 3, 0] = segment.frequency[
             segment.peak_index
         ]
-    measurement = shot_model.report(prepared_shot, peak_results)
+    measurement = shot_model.measure_range_velocity(prepared_shot, peak_results)
     return SimulatedShot(
         label=label,
         parameters=parameters,
         prepared_shot=prepared_shot,
         outputs={
-            name: float(value[0]) for name, value in shot_model.statistics(prepared_shot).items()
+            name: float(value[0])
+            for name, value in shot_model.shot_statistics(prepared_shot).items()
         },
         segments=segments,
         reported_range=float(measurement.range[0]),
@@ -167,8 +168,8 @@ def _segment_spectrum(
     seed: int | None,
 ) -> SegmentSpectrum:
     signed_bins, signal_magnitude = (
-        prepared_shot.signed_bins,
-        whole_spectrum(prepared_shot, 0, segment_index),
+        prepared_shot.all_signed_bins,
+        full_segment_spectrum(prepared_shot, 0, segment_index),
     )
     magnitude, looks = np.abs(signal_magnitude), prepared_shot.looks
     if seed is not None:
@@ -180,21 +181,25 @@ def _segment_spectrum(
                 for look in range(looks.number)
             ]
         )
-        noise = noise if looks.added == 1 else noise.mean(axis=0, keepdims=True)
+        noise = noise if looks.n_coherent == 1 else noise.mean(axis=0, keepdims=True)
         noisy_magnitudes = np.abs(signal_magnitude + noise)
-        magnitude = looks.shown(noisy_magnitudes) if looks.several else noisy_magnitudes[0]
-    segment = prepared_shot.waveform[segment_index]
+        magnitude = (
+            looks.decisive_magnitude(noisy_magnitudes)
+            if looks.is_noncoherent
+            else noisy_magnitudes[0]
+        )
+    segment = prepared_shot.waveform_segments[segment_index]
     carrier_frequency = np.asarray(segment.carrier).item()
     beat_frequency = waveform.beat_frequency(
-        segment.slope,
+        segment.chirp_slope,
         carrier=carrier_frequency,
         chirp_rate=np.asarray(prepared_shot.chirp_rate),
-        range=prepared_shot.range[0] - np.ravel(segment.nearer)[0],
-        radial_velocity=np.ravel(segment.beta)[0] * SPEED_OF_LIGHT / 2,
+        range=prepared_shot.range[0] - np.ravel(segment.range_decrease)[0],
+        radial_velocity=np.ravel(segment.doppler_ratio)[0] * SPEED_OF_LIGHT / 2,
     )
     return SegmentSpectrum(
         name=SEGMENT_NAMES[segment_index],
-        slope=segment.slope,
+        slope=segment.chirp_slope,
         bins=signed_bins,
         frequency=signed_bins * float(prepared_shot.sample_rate[0]) / prepared_shot.fft_size,
         signal_magnitude=signal_magnitude,
@@ -219,7 +224,7 @@ def draw_noise_spectrum(
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=spawn_key))
     deviation = float(np.sqrt(prepared_shot.noise_variance[0]))
     in_phase = generator.normal(0.0, deviation, window_shape.length)
-    taper = window.samples(window_shape.name, window_shape.length)
+    taper = window.window_samples(window_shape.name, window_shape.length)
     if prepared_shot.complex_record:
         quadrature = generator.normal(0.0, deviation, window_shape.length)
         return np.fft.fft((in_phase + 1j * quadrature) / np.sqrt(2) * taper, prepared_shot.fft_size)
@@ -248,7 +253,7 @@ def range_or_velocity_at(
     signed_frequency = fold_frequency + (-1.0 if is_mirrored else 1.0) * np.asarray(frequency)
     if segment.slope == 0:
         return signed_frequency * SPEED_OF_LIGHT / (2 * segment.carrier_frequency)
-    beta = float(np.asarray(prepared_shot.beta).flat[0])
+    beta = float(np.asarray(prepared_shot.doppler_ratio).flat[0])
     range_beat = (segment.carrier_frequency * beta - signed_frequency) / segment.slope
     return (
         range_beat * SPEED_OF_LIGHT / (2 * np.asarray(prepared_shot.chirp_rate).item() * (1 + beta))
@@ -441,7 +446,7 @@ def draw_scene_shot_sheet(
     sheet = draw_spectra_sheet(
         [shot], title=title, footnote=labels.join_sentences(notes), shows_detections=True
     )
-    is_hit, line_bins = eyepoints.surface[0] >= 0, beamlet_lines(shot.prepared_shot)[0]
+    is_hit, line_bins = eyepoints.surface[0] >= 0, beamlet_line_positions(shot.prepared_shot)[0]
     bin_width = float(shot.prepared_shot.sample_rate[0]) / shot.prepared_shot.fft_size
     for i, segment in enumerate(shot.segments):
         line_frequencies = line_bins[SEGMENT_NAMES.index(segment.name), is_hit] * bin_width / 1e6
@@ -469,7 +474,7 @@ def draw_scene_shot_sheet(
 def _noise_table(shot: SimulatedShot) -> PageTable:
     """Noise at the ADC by source, in volts and shares of the variance."""
     variance_by_source = {
-        n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_sources.items()
+        n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_variances.items()
     }
     total_variance = sum(variance_by_source.values())
     rows = [
@@ -549,10 +554,19 @@ DRAWN_VALUES_MAX = 3
 """Values of a study's only axis up to which each is drawn."""
 
 _DESCRIBED_PATHS = (
-    "target.range", "target.grazing_angle", "target.radial_velocity", "target.reflectance",
-    "target.reflectance_law", "instrument.laser.power", "instrument.telescope.aperture",
-    DIVERGENCE, WAIST, "instrument.processing.fft_size", "instrument.processing.window", *WAYS,
-)  # fmt: skip
+    "target.range",
+    "target.grazing_angle",
+    "target.radial_velocity",
+    "target.reflectance",
+    "target.reflectance_law",
+    "instrument.laser.power",
+    "instrument.telescope.aperture",
+    DIVERGENCE_PATH,
+    WAIST_PATH,
+    "instrument.processing.fft_size",
+    "instrument.processing.window",
+    *THRESHOLD_PATHS,
+)
 
 
 def write_shot_report(
@@ -640,7 +654,9 @@ def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tu
         value = shot.parameters.get(path)
         if value is None:  # the threshold is set otherwise
             continue
-        if path in (DIVERGENCE, WAIST) and value == 0:  # the beam is stated by the other one
+        if (
+            path in (DIVERGENCE_PATH, WAIST_PATH) and value == 0
+        ):  # the beam is stated by the other one
             continue
         if isinstance(value, str):
             value_text = value

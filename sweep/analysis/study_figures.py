@@ -41,8 +41,8 @@ from sweep.analysis.selection import (
 )
 from sweep.analysis.shot_spectra import draw_scene_shot_sheet, simulate_prepared_shot
 from sweep.analysis.tables import TablePage
-from sweep.model.effects.catalogue import names_of
-from sweep.model.eyepoints import prepare_eyepoints
+from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
 from sweep.spec import (
     FalseAlarmTable,
     GridFigure,
@@ -453,11 +453,13 @@ def _draw_shot(
     if shot_number >= recording.n_shots:
         return f"there is no shot {shot_number}"
     eyepoints = read_eyepoints(results.store_path, recording.dataset, np.array([shot_number]))
-    if not eyepoints.seen.all():
+    if not eyepoints.has_target.all():
         return f"shot {shot_number} sees nothing"
     parameters = parameters_at(results.spec, axis_position.axis_indices)
-    effects = names_of(int(recording.read("effects", slice(shot_number, shot_number + 1))[0]))
-    prepared = prepare_eyepoints(eyepoints, parameters, results.spec.surfaces(), effects)
+    effects = unpack_effect_flags(
+        int(recording.read("effects", slice(shot_number, shot_number + 1))[0])
+    )
+    prepared = prepare_eyepoint_shots(eyepoints, parameters, results.spec.surfaces(), effects)
     shot_remark = (
         f"shot {shot_number:,} of {recording.n_shots:,} at {eyepoints.time[0]:.6g} s, "
         f"beam {eyepoints.beam[0]}, noise drawn for the picture"

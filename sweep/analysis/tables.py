@@ -24,10 +24,10 @@ from sweep.analysis.selection import (
     split_by_coordinates,
     study_cuts,
 )
-from sweep.model import noise_only
-from sweep.model.looks import Looks
-from sweep.model.shot import evaluate
-from sweep.model.threshold import tnr_of
+from sweep.model.detection import noise_false_alarms
+from sweep.model.detection.looks import Looks
+from sweep.model.evaluation import evaluate
+from sweep.model.threshold import tnr_from_parameters
 from sweep.units import percent
 
 if TYPE_CHECKING:
@@ -235,10 +235,12 @@ def noise_only_reference(
     """
     first_parameters = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first_parameters | setting_parameters | {"target.reflectance": 0.0}
-    tnr = float(tnr_of(parameters))
-    pfa_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
-    n_bins = [noise_only.bins_counted(parameters, pfa_bin, s) for s in ("up", "down")]
-    closed_form = noise_only.segment_probability(np.asarray(pfa_bin), n_bins).prod()
+    tnr = float(tnr_from_parameters(parameters))
+    pfa_bin = noise_false_alarms.bin_pfa(tnr, Looks.from_parameters(parameters))
+    n_bins = [
+        noise_false_alarms.alarm_equivalent_bins(parameters, pfa_bin, s) for s in ("up", "down")
+    ]
+    closed_form = noise_false_alarms.segment_pfa(np.asarray(pfa_bin), n_bins).prod()
     outputs = evaluate(parameters)
     return {
         "tnr": tnr,
@@ -284,7 +286,7 @@ def false_alarm_records(
     ):
         noise_reference, printed_value = noise_references[i], _printed_value(printed, i, j)
         mean_excess, printed_excess = (
-            noise_only.variance_excess_of_shot(
+            noise_false_alarms.variance_excess_from_shot_pfa(
                 p, float(noise_reference["tnr"]), float(noise_reference["bins"])
             )
             for p in (pfa_statistic.mean, printed_value)
@@ -370,7 +372,7 @@ def threshold_page(
     for i, (name, setting, _) in enumerate(setting_parts):
         noise_reference, pfa_bin = noise_only_reference(spec, setting)
         tnr = float(noise_reference["tnr"])
-        closed_form = noise_only.bin_probability(tnr)
+        closed_form = noise_false_alarms.bin_pfa(tnr)
         printed_value = _printed_value(printed, i, 0)
         records.append(
             {
@@ -381,7 +383,9 @@ def threshold_page(
                 "study_mean": pfa_statistics[i].mean,
                 "printed": printed_value,
                 "printed_over_closed_form": printed_value / closed_form,
-                "printed_variance_excess": noise_only.variance_excess_of_bin(printed_value, tnr),
+                "printed_variance_excess": noise_false_alarms.variance_excess_from_bin_pfa(
+                    printed_value, tnr
+                ),
             }
         )
     heading = "Probability that a bin of noise crosses the threshold"

@@ -148,7 +148,7 @@ class CommandGroup(click.Group):
             raise
         except Exception as error:
             from sweep.extras import install_hint
-            from sweep.model.unsupported import UnsupportedShot
+            from sweep.model.unsupported_shot import UnsupportedShotError
             from sweep.regular_files import RefusedFileError
             from sweep.scenes.scene_files import SceneError
             from sweep.spec import SpecError
@@ -159,7 +159,7 @@ class CommandGroup(click.Group):
 
             user_error_types = (
                 DamagedChunkError, ObjectStoreError, StoreReplacedError, SceneError, SpecError,
-                StoreError, TaskError, RefusedFileError, UnsupportedShot,
+                StoreError, TaskError, RefusedFileError, UnsupportedShotError,
             )  # fmt: skip
             readable_error = to_readable_error(error)
             if message := install_hint(readable_error):

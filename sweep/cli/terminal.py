@@ -407,11 +407,13 @@ def _print_scene_summary(store: Location) -> None:
 
 def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
     """Return what is not checked of the number of beamlets, and why; '' where it is estimated."""
-    from sweep.model.resolution import BEAMLETS, is_open
+    from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge
 
     parameters = spec.parameters()
     is_given = spec.footprint.beamlets > 0
-    is_varied = any(member.path == BEAMLETS for axis in spec.axes for member in axis.parameters)
+    is_varied = any(
+        member.path == BEAMLETS_PATH for axis in spec.axes for member in axis.parameters
+    )
     if spec.effect_modes()["footprint"] == "off":
         return ""
     if is_given or is_varied:
@@ -421,7 +423,7 @@ def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
             "it "
             "out to have beamlets counted by the tolerance"
         )
-    if not is_open(parameters):
+    if not beamlets_converge(parameters):
         return (
             "whether the number of beamlets keeps accuracy.tolerance, as their amplitudes add, or "
             "their pattern is given"
@@ -614,15 +616,18 @@ def plan_rows(
 
 
 def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[str, str]]:
-    from sweep.model.accuracy import Accuracy
-    from sweep.model.resolution import BEAMLETS
+    from sweep.model.beamlet_counts import BEAMLETS_PATH
+    from sweep.model.error_budget import ErrorBudget
     from sweep.tasks.studies.flight_coverage import sample_coverage
 
     for report in study_plan.scene_reports:
         yield "scene", report
     if spec.is_ray_number_set_by_tolerance:
         parameters = spec.parameters()
-        rays_min, rays_max = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
+        rays_min, rays_max = (
+            int(parameters[BEAMLETS_PATH]),
+            ErrorBudget.from_parameters(parameters).ray_counts[-1],
+        )
         yield "beamlets", f"{rays_min:,} a shot, more where it needs them, at most {rays_max:,}"
     for scanner_plan in study_plan.scanners:
         yield (

@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, footprint
+from sweep.model import beam, beamlets
+from sweep.model.beamlets import OffsetMoments
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.footprint import Moments
 
-LAWS = ("thesis", "lambert", "lommel_seeliger")
+REFLECTANCE_LAWS = ("thesis", "lambert", "lommel_seeliger")
 
 
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
@@ -44,56 +44,67 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     return np.full_like(cos_incidence, 1 / math.pi)
 
 
-class Footprints(NamedTuple):
+class BeamletTable(NamedTuple):
     """Places and echoes of beamlets, in rows that points share."""
 
-    row: np.ndarray
+    row_of_point: np.ndarray
     """(n,) int64: the row of each point."""
-    offset: np.ndarray
+    relative_range_offset: np.ndarray
     """(rows, beamlets): (R_b - R_0) / R_0."""
-    doppler: np.ndarray
+    doppler_ratio_offset: np.ndarray
     """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
-    echo: np.ndarray
+    relative_echo: np.ndarray
     """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
 
 
-class Slopes(NamedTuple):
+class BeamGradients(NamedTuple):
     """Changes across a beam for one of its standard deviations, (n,) each."""
 
-    beta: np.ndarray
+    doppler_ratio: np.ndarray
     """Of the Doppler ratio 2 v_r / c."""
-    range: np.ndarray
+    relative_range: np.ndarray
     """Of the range over that on the axis."""
-    echo: np.ndarray
+    relative_echo: np.ndarray
     """Of the echo power over that on the axis."""
 
 
-class Plane:
+class FlatGround:
     """A flat plane, for `size` points of one category, parameters as arrays.
 
     If beamlets see no velocities of their own (`moving`), points that differ in velocity alone
     share their rows.
     """
 
-    beside = None
+    off_axis_surface = None
 
-    def __init__(self, p: Mapping[str, np.ndarray], size: int, *, moving: bool = True) -> None:
-        self._law = str(p["target.reflectance_law"])
-        self._number = int(p["footprint.beamlets"])
-        self._pattern = pattern(p)
-        places, directions = beam.angles(p)
-        names = "target.radial_velocity", "target.transverse_velocity"
-        velocities = [p[name] if moving else 0.0 for name in names]
-        further = () if beam.is_thesis(p) else (directions, *beam.dimming(p))
-        columns = np.broadcast_arrays(p["target.grazing_angle"], places, *velocities, *further)
-        self._columns, self._size = [np.atleast_1d(column) for column in columns], size
+    def __init__(
+        self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True
+    ) -> None:
+        self._reflectance_law = str(parameters["target.reflectance_law"])
+        self._n_beamlets = int(parameters["footprint.beamlets"])
+        self._beamlet_pattern = beamlet_pattern(parameters)
+        position_angles, direction_angles = beam.footprint_angles(parameters)
+        velocity_paths = "target.radial_velocity", "target.transverse_velocity"
+        velocities = [parameters[name] if has_velocities else 0.0 for name in velocity_paths]
+        single_mode_columns = (
+            ()
+            if beam.has_constant_divergence(parameters)
+            else (direction_angles, *beam.range_loss_coefficients(parameters))
+        )
+        columns = np.broadcast_arrays(
+            parameters["target.grazing_angle"], position_angles, *velocities, *single_mode_columns
+        )
+        self._geometry_columns, self._n_points = (
+            [np.atleast_1d(column) for column in columns],
+            n_points,
+        )
 
-    def mean_phasor(self, turn: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
+    def mean_phasor(self, doppler_cycles: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
         """Mean of exp(2 pi i (turn dbeta - delay_cycles dR / R)) over the beam, (n,) complex.
 
         Parameters
         ----------
-        turn
+        doppler_cycles
             Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is beta_b - beta_0.
         delay_cycles
             Cycles per unit of relative range, (n,) or scalar; dR / R is (R_b - R_0) / R_0.
@@ -105,143 +116,194 @@ class Plane:
 
             (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
-        _, _, radial, _, *further = self._columns
-        slopes = self.slopes
-        sigma = (further[0] if further else self._columns[1]) / 4
-        phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
-        t = 2 * np.pi * (np.asarray(turn, float) * slopes.beta - delay_cycles * slopes.range)
-        curve = phase * radial * sigma**2
-        curve = curve + 2 * np.pi * np.asarray(delay_cycles, float) * (self._columns[1] / 4) ** 2
-        bent = 1 / (1 + 1j * curve)
-        mean = (1 + 1j * slopes.echo * t * bent) * np.exp(-0.5 * t * t * bent) * bent
-        return np.asarray(mean + np.zeros(self._size))
+        _, _, radial_velocity, _, *single_mode_columns = self._geometry_columns
+        gradients = self.gradients
+        direction_sigma = (
+            single_mode_columns[0] if single_mode_columns else self._geometry_columns[1]
+        ) / 4
+        phase_per_speed = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(
+            doppler_cycles, float
+        )  # by 1 m/s
+        t = (
+            2
+            * np.pi
+            * (
+                np.asarray(doppler_cycles, float) * gradients.doppler_ratio
+                - delay_cycles * gradients.relative_range
+            )
+        )
+        curvature_phase = phase_per_speed * radial_velocity * direction_sigma**2
+        curvature_phase = (
+            curvature_phase
+            + 2 * np.pi * np.asarray(delay_cycles, float) * (self._geometry_columns[1] / 4) ** 2
+        )
+        curvature_factor = 1 / (1 + 1j * curvature_phase)
+        mean = (
+            (1 + 1j * gradients.relative_echo * t * curvature_factor)
+            * np.exp(-0.5 * t * t * curvature_factor)
+            * curvature_factor
+        )
+        return np.asarray(mean + np.zeros(self._n_points))
 
     @property
-    def slopes(self) -> "Slopes":
+    def gradients(self) -> "BeamGradients":
         """Changes for a standard deviation of the beam towards the near side, (n,) each."""
-        angle, places, _, transverse, *further = self._columns
-        lean = (places / 4) / np.tan(angle)
-        sigma = (further[0] if further else places) / 4
-        power = 3 if self._law == "lambert" else 2
-        columns = 2 / SPEED_OF_LIGHT * transverse * sigma, -lean, power * lean
-        return Slopes(*(np.broadcast_to(column, self._size) for column in columns))
+        grazing_angle, position_angles, _, transverse_velocity, *single_mode_columns = (
+            self._geometry_columns
+        )
+        range_gradient = (position_angles / 4) / np.tan(grazing_angle)
+        direction_sigma = (single_mode_columns[0] if single_mode_columns else position_angles) / 4
+        echo_exponent = 3 if self._reflectance_law == "lambert" else 2
+        columns = (
+            2 / SPEED_OF_LIGHT * transverse_velocity * direction_sigma,
+            -range_gradient,
+            echo_exponent * range_gradient,
+        )
+        return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
-    def axis(self, size: int) -> Footprints:
+    def axis_line(self, n_points: int) -> BeamletTable:
         """One line for each point: a row for each distinct grazing angle."""
-        angles, row = np.unique(self._columns[0], return_inverse=True)
-        echo = backscatter(self._law, np.sin(angles))[:, None]
-        nothing = np.zeros_like(echo)
-        return Footprints(_rows(row, size), nothing, nothing, echo)
+        grazing_angles, angle_index = np.unique(self._geometry_columns[0], return_inverse=True)
+        relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
+        zeros = np.zeros_like(relative_echo)
+        return BeamletTable(_row_indices(angle_index, n_points), zeros, zeros, relative_echo)
 
     @cached_property
-    def beamlets(self) -> Footprints:
+    def beamlets(self) -> BeamletTable:
         """The whole footprint: a row for each distinct geometry."""
-        first, row = different_rows(self._columns)
-        shapes = np.stack(self._columns)[:, first]
-        offset, cos_incidence, weights, closing = footprint.plane_footprint(
-            grazing_angle=shapes[0],
-            beam_divergence=shapes[1],
-            number=self._number,
-            pattern=self._pattern,
-            radial=shapes[2],
-            transverse=shapes[3],
-            directions=shapes[4] if len(shapes) > 4 else None,
+        first, geometry_of_point = distinct_rows(self._geometry_columns)
+        geometries = np.stack(self._geometry_columns)[:, first]
+        relative_range_offset, cos_incidence, weights, closing_offset = beamlets.plane_footprint(
+            grazing_angle=geometries[0],
+            beam_divergence=geometries[1],
+            n_beamlets=self._n_beamlets,
+            pattern=self._beamlet_pattern,
+            radial_velocity=geometries[2],
+            transverse_velocity=geometries[3],
+            direction_angle=geometries[4] if len(geometries) > 4 else None,
         )
-        loss = (1 + offset) ** 2
-        if len(shapes) > 4:
-            first, second = shapes[5:, :, None]
-            loss = 1 + offset * (first + offset * second)
-        echo = weights * backscatter(self._law, cos_incidence) / loss
-        doppler = np.where(weights > 0, 2 * closing / SPEED_OF_LIGHT, 0.0)
-        return Footprints(_rows(row, self._size), offset, doppler, echo)
+        range_loss = (1 + relative_range_offset) ** 2
+        if len(geometries) > 4:
+            first, second = geometries[5:, :, None]
+            range_loss = 1 + relative_range_offset * (first + relative_range_offset * second)
+        relative_echo = weights * backscatter(self._reflectance_law, cos_incidence) / range_loss
+        doppler_ratio_offset = np.where(weights > 0, 2 * closing_offset / SPEED_OF_LIGHT, 0.0)
+        return BeamletTable(
+            _row_indices(geometry_of_point, self._n_points),
+            relative_range_offset,
+            doppler_ratio_offset,
+            relative_echo,
+        )
 
 
-class Cast:
-    """Footprints that rays have found; `beside` (rows, beamlets): not on the axis's surface."""
+class RayTracedGround:
+    """Footprints by rays; `off_axis_surface` (rows, beamlets): not on the axis's surface."""
 
-    def __init__(self, footprints: Footprints, beside: np.ndarray | None = None) -> None:
-        self.beamlets, self.beside = footprints, beside
+    def __init__(
+        self, beamlet_table: BeamletTable, off_axis_surface: np.ndarray | None = None
+    ) -> None:
+        self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
 
-    def axis(self, size: int) -> Footprints:
+    def axis_line(self, n_points: int) -> BeamletTable:
         """One line for each point, with the echo of all its beamlets."""
-        whole = self.beamlets.echo.sum(axis=1)[:, None]
-        nothing = np.zeros_like(whole)
-        return Footprints(self.beamlets.row, nothing, nothing, whole)
+        total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
+        zeros = np.zeros_like(total_echo)
+        return BeamletTable(self.beamlets.row_of_point, zeros, zeros, total_echo)
 
 
-Ground = Plane | Cast
+Ground = FlatGround | RayTracedGround
 """Ground that the beams of n points meet."""
 
 
-def powers_add(p: Mapping[str, Any]) -> bool:
+def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
     """Return true if the beamlets of points of one category add as powers."""
-    incoherent = str(p["footprint.phases"]) == "incoherent"
-    return incoherent and str(p["instrument.receiver.architecture"]) != "direct"
+    incoherent = str(parameters["footprint.phases"]) == "incoherent"
+    return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
 
 
-def pattern(p: Mapping[str, Any]) -> str:
+def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
     """Arrangement of the beamlets: as chosen, or hexagonal where powers add, else unsymmetric."""
-    chosen = str(p["footprint.pattern"])
-    if chosen != "auto":
-        return chosen
-    return "hexagonal" if powers_add(p) else "sunflower"
+    stated = str(parameters["footprint.pattern"])
+    if stated != "auto":
+        return stated
+    return "hexagonal" if beamlets_add_as_powers(parameters) else "sunflower"
 
 
-def _rows(row: np.ndarray, size: int) -> np.ndarray:
-    return np.broadcast_to(row.ravel(), size).astype(np.int64)
+def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
+    return np.broadcast_to(row_of_point.ravel(), n_points).astype(np.int64)
 
 
-class Extent(NamedTuple):
+class FootprintExtent(NamedTuple):
     """A footprint and the line on its axis, by point."""
 
-    echo: np.ndarray
+    axis_echo: np.ndarray
     """Of the bare line, for a reflectance of 1 [1/sr]."""
-    echo_ratio: np.ndarray | float
+    total_echo_ratio: np.ndarray | float
     """Echo of all beamlets over that of the bare line."""
-    ranges: Moments
+    range_offsets: OffsetMoments
     """Of (R_b - R_0) / R_0."""
-    own_ranges: Moments
+    axis_surface_range_offsets: OffsetMoments
     """Likewise, of the beamlets on the axis's surface only."""
-    velocities: Moments
+    velocity_offsets: OffsetMoments
     """Of the beamlets' radial velocities less the axis's [m/s]."""
-    gain: np.ndarray | float = 1.0
+    amplitude_gain_max: np.ndarray | float = 1.0
     """Most that all beamlets' amplitudes make over the bare line's: all in phase, or as powers."""
-    beside: np.ndarray | float = 0.0
+    off_axis_fraction: np.ndarray | float = 0.0
     """Share of the echo that comes from other surfaces than the axis's, 0..1."""
-    apart: np.ndarray | float = 0.0
+    off_axis_range_offset_max: np.ndarray | float = 0.0
     """Largest |R_b - R_0| / R_0 there."""
 
 
-def of_rays(cast: Cast) -> Extent:
+def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
     """Footprints that rays have found."""
-    _, offset, doppler, echo = cast.beamlets
-    beside = cast.beside
-    whole = echo.sum(axis=1)
-    share = echo / np.where(whole > 0, whole, 1.0)[:, None]
-    ranges = _moments(offset, share)
-    moved = _moments(doppler, share).times(np.asarray(SPEED_OF_LIGHT / 2))
-    gain = np.sqrt(share).sum(axis=1)
-    if beside is None or not beside.any():
-        return Extent(whole, 1.0, ranges, ranges, moved, gain)
-    other = np.where(beside, share, 0.0)
-    own = share - other
-    rest = own.sum(axis=1)
-    own_ranges = _moments(offset, own / np.where(rest > 0, rest, 1.0)[:, None])
-    apart = np.where(other > 0, np.abs(offset), 0.0).max(axis=1)
-    return Extent(whole, 1.0, ranges, own_ranges, moved, gain, other.sum(axis=1), apart)
+    _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
+    off_axis_surface = ground.off_axis_surface
+    total_echo = relative_echo.sum(axis=1)
+    power_fraction = relative_echo / np.where(total_echo > 0, total_echo, 1.0)[:, None]
+    range_offsets = _weighted_moments(relative_range_offset, power_fraction)
+    velocity_offsets = _weighted_moments(doppler_ratio_offset, power_fraction).scaled_by(
+        np.asarray(SPEED_OF_LIGHT / 2)
+    )
+    amplitude_gain = np.sqrt(power_fraction).sum(axis=1)
+    if off_axis_surface is None or not off_axis_surface.any():
+        return FootprintExtent(
+            total_echo, 1.0, range_offsets, range_offsets, velocity_offsets, amplitude_gain
+        )
+    off_axis_fraction = np.where(off_axis_surface, power_fraction, 0.0)
+    on_axis_fraction = power_fraction - off_axis_fraction
+    on_axis_total = on_axis_fraction.sum(axis=1)
+    on_axis_range_offsets = _weighted_moments(
+        relative_range_offset,
+        on_axis_fraction / np.where(on_axis_total > 0, on_axis_total, 1.0)[:, None],
+    )
+    off_axis_range_max = np.where(off_axis_fraction > 0, np.abs(relative_range_offset), 0.0).max(
+        axis=1
+    )
+    return FootprintExtent(
+        total_echo,
+        1.0,
+        range_offsets,
+        on_axis_range_offsets,
+        velocity_offsets,
+        amplitude_gain,
+        off_axis_fraction.sum(axis=1),
+        off_axis_range_max,
+    )
 
 
-def _moments(values: np.ndarray, weight: np.ndarray) -> Moments:
-    weighted = weight * values
-    extreme = np.where(weight > 0, np.abs(values), 0.0).max(axis=1)
-    return Moments(np.abs(weighted.sum(axis=1)), np.sqrt((weighted * values).sum(axis=1)), extreme)
+def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
+    weighted = weights * values
+    extreme = np.where(weights > 0, np.abs(values), 0.0).max(axis=1)
+    return OffsetMoments(
+        np.abs(weighted.sum(axis=1)), np.sqrt((weighted * values).sum(axis=1)), extreme
+    )
 
 
-def different_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Find the distinct rows of columns: a row of each kind (kinds,), and each row's kind (n,)."""
     order = np.lexsort(columns)
     rows = np.stack(columns)[:, order]
     is_new = np.append(True, (rows[:, 1:] != rows[:, :-1]).any(axis=0))
-    kind = np.empty(order.size, np.int64)
-    kind[order] = np.cumsum(is_new) - 1
-    return order[is_new], kind
+    group_of_row = np.empty(order.size, np.int64)
+    group_of_row[order] = np.cumsum(is_new) - 1
+    return order[is_new], group_of_row

@@ -10,8 +10,8 @@ sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
     design_pfa_shot      the same of a shot: of any of its segments, one after the other
 
 Design probabilities are those of noise alone, before a detection takes bins away. In several looks
-(:mod:`sweep.model.looks`) b is that of each record, or of the root of their mean power, over sigma
-of one record, and the probabilities are those of all of them together.
+(:mod:`sweep.model.detection.looks`) b is that of each record, or of the root of their mean power,
+over sigma of one record, and the probabilities are those of all of them together.
 """
 
 import math
@@ -21,91 +21,137 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import alarms
-from sweep.model.band import band_of, number_of
-from sweep.model.looks import Looks, level_of
-from sweep.model.waveform import DEFAULTS, ORDER, SEGMENTS, order_of, record_length
-from sweep.model.window import canonical_name, window
+from sweep.model.detection import bin_noise
+from sweep.model.detection.looks import Looks, solve_threshold_ratio
+from sweep.model.spectrum.search_band import n_alarm_bins, search_band_bins
+from sweep.model.waveform import (
+    SEGMENT_NAMES,
+    SEGMENT_ORDER_PATH,
+    WAVEFORM_DEFAULTS,
+    existing_segments,
+    record_length,
+)
+from sweep.model.window import canonical_window_name, get_window
 
-PROCESSING = "instrument.processing."
-TNR, TO_MEAN, PFA_BIN, PFA_SEGMENT, PFA_SHOT = WAYS = tuple(
-    PROCESSING + name
+PROCESSING_PREFIX = "instrument.processing."
+(
+    TNR_PATH,
+    THRESHOLD_TO_MEAN_PATH,
+    DESIGN_PFA_BIN_PATH,
+    DESIGN_PFA_SEGMENT_PATH,
+    DESIGN_PFA_SHOT_PATH,
+) = THRESHOLD_PATHS = tuple(
+    PROCESSING_PREFIX + name
     for name in (
-        "tnr", "threshold_to_mean", "design_pfa_bin", "design_pfa_segment", "design_pfa_shot",
+        "tnr",
+        "threshold_to_mean",
+        "design_pfa_bin",
+        "design_pfa_segment",
+        "design_pfa_shot",
     )
-)  # fmt: skip
+)
 """Parameters of which exactly one is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
 
 
-def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
+def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
     """Threshold-to-noise ratio of points that share their words and sizes, however it is written.
 
-    A ValueError where none of the parameters :data:`WAYS` is there, or several.
+    A ValueError where none of the parameters :data:`THRESHOLD_PATHS` is there, or several.
 
     >>> four_times_the_mean = tnr_of({"instrument.processing.threshold_to_mean": 4.0})
     >>> round(float(four_times_the_mean), 2)
     7.65
     """
-    from sweep.model.detection import RAYLEIGH_DEVIATION
-    from sweep.model.marcum import log_at_least_one
+    from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION
+    from sweep.model.detection.marcum import log_at_least_one_probability
 
-    given = [way for way in WAYS if way in p]
-    if len(given) != 1:
-        raise ValueError(f"give exactly one of {', '.join(WAYS)}, not {len(given)}")
-    value = np.asarray(p[given[0]], float)
-    if given[0] == TNR:
-        return value
-    if given[0] == TO_MEAN:
-        return value * (RAYLEIGH_MEAN / RAYLEIGH_DEVIATION)
-    log_pfa, looks = np.log(value), Looks.of(p)
-    if given[0] == PFA_BIN:
-        return looks.level(log_pfa) / RAYLEIGH_DEVIATION
-    band, segments = band_of(p), ["up"]
-    if given[0] == PFA_SHOT:  # segments are independent
-        order = order_of(
-            str(p["instrument.receiver.architecture"]), str(p.get(ORDER, DEFAULTS[ORDER]))
+    given_paths = [path for path in THRESHOLD_PATHS if path in parameters]
+    if len(given_paths) != 1:
+        raise ValueError(
+            f"give exactly one of {', '.join(THRESHOLD_PATHS)}, not {len(given_paths)}"
         )
-        if band is None:
-            log_pfa = log_at_least_one(log_pfa, 1 / len(order))
+    value = np.asarray(parameters[given_paths[0]], float)
+    if given_paths[0] == TNR_PATH:
+        return value
+    if given_paths[0] == THRESHOLD_TO_MEAN_PATH:
+        return value * (RAYLEIGH_MEAN / RAYLEIGH_DEVIATION)
+    log_pfa, looks = np.log(value), Looks.from_parameters(parameters)
+    if given_paths[0] == DESIGN_PFA_BIN_PATH:
+        return looks.threshold_ratio_from_log_pfa(log_pfa) / RAYLEIGH_DEVIATION
+    band_bins, segments = search_band_bins(parameters), ["up"]
+    if given_paths[0] == DESIGN_PFA_SHOT_PATH:  # segments are independent
+        segment_order = existing_segments(
+            str(parameters["instrument.receiver.architecture"]),
+            str(parameters.get(SEGMENT_ORDER_PATH, WAVEFORM_DEFAULTS[SEGMENT_ORDER_PATH])),
+        )
+        if band_bins is None:
+            log_pfa = log_at_least_one_probability(log_pfa, 1 / len(segment_order))
         else:
-            segments = list(order)
-    if band is not None:
-        log_pfa = log_pfa + np.zeros(band.shape[2:])
-    return level_of(log_pfa, _law(p, segments)) / RAYLEIGH_DEVIATION
+            segments = list(segment_order)
+    if band_bins is not None:
+        log_pfa = log_pfa + np.zeros(band_bins.shape[2:])
+    return solve_threshold_ratio(log_pfa, _log_pfa_law(parameters, segments)) / RAYLEIGH_DEVIATION
 
 
-def _law(p: Mapping[str, Any], segments: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
+def _log_pfa_law(
+    parameters: Mapping[str, Any], segments: Sequence[str]
+) -> Callable[[np.ndarray], np.ndarray]:
     """Logarithm of the probability that noise alone raises an alarm in segments, by the level."""
-    from sweep.model.marcum import log_any, log_at_least_one
+    from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
-    alarm = Looks.of(p).log_alarm
-    return lambda level: reduce(
-        log_any, (log_at_least_one(alarm(level), segment_bins(p, level, s)) for s in segments)
+    bin_log_pfa = Looks.from_parameters(parameters).log_pfa
+    return lambda threshold_ratio: reduce(
+        log_either_probability,
+        (
+            log_at_least_one_probability(
+                bin_log_pfa(threshold_ratio), segment_alarm_bins(parameters, threshold_ratio, s)
+            )
+            for s in segments
+        ),
     )
 
 
-def segment_bins(p: Mapping[str, Any], level: np.ndarray, segment: str = "up") -> np.ndarray:
+def segment_alarm_bins(
+    parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
+) -> np.ndarray:
     """Independent bins that alarm as often as those of a segment that a detection takes none of.
 
-    As :meth:`sweep.model.preparation.Shots.counted_bins`. Segments differ where a band is searched.
+    As :meth:`sweep.model.preparation.Shots.alarm_equivalent_bins`. Segments differ where a band is
+    searched.
     """
-    size = int(np.max(p[PROCESSING + "fft_size"]))
-    is_all = str(p[PROCESSING + "bins_counted"]) == "all"
-    in_quadrature = str(p.get("instrument.receiver.record", "real")) == "complex"
-    is_all |= in_quadrature
-    band, row = band_of(p), SEGMENTS.index(segment)
-    if str(p[PROCESSING + "noise_bins"]) == "independent":
-        if band is not None:
-            number = number_of(band, size, 1, is_signed=in_quadrature)[row]
-            return number + np.zeros(np.shape(level))
-        return np.full(np.shape(level), float(size if is_all else size // 2))
-    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record_length(p))))
-    first = 1 if in_quadrature else alarms.first_circular(taper, size)
-    bins = size if is_all else max(size // 2 + 1 - 2 * first, 0)
-    if band is not None:
-        bins = number_of(band, size, first, is_signed=in_quadrature)[row]
-    correlation = alarms.neighbour_correlation(taper, size)
-    return alarms.independent_bins(bins, level=level, correlation=correlation, looks=Looks.of(p))
+    fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
+    counts_all_bins = str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"
+    is_complex_record = str(parameters.get("instrument.receiver.record", "real")) == "complex"
+    counts_all_bins |= is_complex_record
+    band_bins, segment_index = search_band_bins(parameters), SEGMENT_NAMES.index(segment)
+    if str(parameters[PROCESSING_PREFIX + "noise_bins"]) == "independent":
+        if band_bins is not None:
+            n_searched = n_alarm_bins(band_bins, fft_size, 1, is_signed=is_complex_record)[
+                segment_index
+            ]
+            return n_searched + np.zeros(np.shape(threshold_ratio))
+        return np.full(
+            np.shape(threshold_ratio), float(fft_size if counts_all_bins else fft_size // 2)
+        )
+    record_window = get_window(
+        canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"])),
+        int(np.max(record_length(parameters))),
+    )
+    first_alarm_bin = (
+        1 if is_complex_record else bin_noise.first_circular_bin(record_window, fft_size)
+    )
+    n_bins = fft_size if counts_all_bins else max(fft_size // 2 + 1 - 2 * first_alarm_bin, 0)
+    if band_bins is not None:
+        n_bins = n_alarm_bins(band_bins, fft_size, first_alarm_bin, is_signed=is_complex_record)[
+            segment_index
+        ]
+    correlation = bin_noise.neighbour_noise_correlation(record_window, fft_size)
+    return bin_noise.alarm_equivalent_bins(
+        n_bins,
+        threshold_ratio=threshold_ratio,
+        correlation=correlation,
+        looks=Looks.from_parameters(parameters),
+    )

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-COSINE_SUMS: dict[str, tuple[str, ...]] = {
+COSINE_SUM_COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "rectangular": ("1", "0"),
     "hann": ("0.5", "0.5"),
     "hamming": ("0.54", "0.46"),
@@ -18,13 +18,13 @@ COSINE_SUMS: dict[str, tuple[str, ...]] = {
 }
 """Coefficients c_m, as written in scipy.signal.windows; alternating signs are applied outside."""
 
-ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
+WINDOW_NAME_ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
 
-OVERSAMPLING = 16
+ENVELOPE_SAMPLES_PER_BIN = 16
 """Samples a bin in the tabulated kernel."""
 
-_SHORTEST_CLOSED_FORM = 64
-_STAND_IN = 256
+_CLOSED_FORM_LENGTH_MIN = 64
+_WEIGHT_SAMPLES_MAX = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,50 +34,54 @@ class Window:
     name: str
     length: int
     """Number of samples L."""
-    edge: float
+    first_value: float
     """First sample w[0]."""
     sum: float
     """sum w, W at its peak."""
     energy: float
     """E_w = sum w^2."""
-    reach: np.ndarray
-    envelope: np.ndarray
-    """(m,): max |W(y)| / sum over |y| >= `reach` [bins of fs/L]."""
-    missing: int = 0
-    """First samples that are 0, as of :func:`last_part`."""
+    envelope_distances: np.ndarray
+    sidelobe_envelope: np.ndarray
+    """(m,): max |W(y)| / sum over |y| >= `envelope_distances` [bins of fs/L]."""
+    n_missing: int = 0
+    """First samples that are 0, as of :func:`zero_first_samples`."""
 
     def samples(self) -> np.ndarray:
         """All samples (L,)."""
-        w = samples(self.name, self.length)
-        if self.missing:
+        w = window_samples(self.name, self.length)
+        if self.n_missing:
             w = w.copy()
-            w[: self.missing] = 0.0
+            w[: self.n_missing] = 0.0
         return w
 
-    def band_weights(self, power: bool) -> tuple[float, ...]:
+    def weights_by_record_position(self, adds_powers: bool) -> tuple[float, ...]:
         """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
 
         Of powers those of its autocorrelation, of transform |W|^2: t is the lag over L. All at the
         end for other windows than sums of cosines: an upper bound.
         """
-        if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
+        if self.name not in COSINE_SUM_COEFFICIENTS or self.length < _CLOSED_FORM_LENGTH_MIN:
             return 0.0, 1.0
-        length = min(self.length, _STAND_IN)
-        w = np.abs(samples(self.name, length if power else length // 2 * 2))
-        if power:
+        length = min(self.length, _WEIGHT_SAMPLES_MAX)
+        w = np.abs(window_samples(self.name, length if adds_powers else length // 2 * 2))
+        if adds_powers:
             weights = np.append(np.correlate(w, w, "full")[w.size - 1 :], 0.0)
             weights[1:] *= 2  # either sign
         else:
-            half = w.size // 2
-            weights = np.append(w[half:], 0.0) + np.append(0.0, w[half - 1 :: -1])
+            n_half = w.size // 2
+            weights = np.append(w[n_half:], 0.0) + np.append(0.0, w[n_half - 1 :: -1])
         return tuple(map(float, weights / weights.sum()))
 
-    def node_limits(self, power: bool) -> np.ndarray:
-        """Return the limits pi h of J equivalent lines (:func:`sweep.model.lines.node_limits`)."""
-        from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
+    def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
+        """Half-widths pi h up to which J nodes stand for all lines, by tolerance."""
+        from sweep.model.spectrum.lines import (
+            AMPLITUDE_TOLERANCES,
+            POWER_TOLERANCES,
+            node_phase_limits,
+        )
 
-        tolerances = POWER_TOLERANCES if power else AMPLITUDE_TOLERANCES
-        return node_limits(self.band_weights(power), tolerances)
+        tolerances = POWER_TOLERANCES if adds_powers else AMPLITUDE_TOLERANCES
+        return node_phase_limits(self.weights_by_record_position(adds_powers), tolerances)
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
@@ -85,121 +89,148 @@ class Window:
         return self.length * self.energy / self.sum**2
 
 
-def canonical_name(name: str) -> str:
+def canonical_window_name(name: str) -> str:
     """One spelling for every window: aliases resolved, blanks dropped, lower case."""
     compact = re.sub(r"\s+", "", name).lower()
-    return ALIASES.get(compact, compact)
+    return WINDOW_NAME_ALIASES.get(compact, compact)
 
 
-def samples(name: str, length: int) -> np.ndarray:
+def window_samples(name: str, length: int) -> np.ndarray:
     """DFT-even window samples (length,), peak about 1.
 
     ``name`` is a cosine sum, or any window of scipy.signal.get_window, its parameters in brackets:
     ``kaiser(8.6)``; a ValueError where scipy knows none such or refuses its parameters.
     """
-    name = canonical_name(name)
-    if name in COSINE_SUMS:
-        return _cosine_samples(name, length)
+    name = canonical_window_name(name)
+    if name in COSINE_SUM_COEFFICIENTS:
+        return _cosine_sum_samples(name, length)
 
     from scipy import signal  # which takes longer to import than all else that a spec needs
 
-    match = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
-    if match:
-        parameters = tuple(float(p) for p in match[2].split(",") if p)
-        return np.asarray(signal.get_window((match[1], *parameters), length, fftbins=True))
+    name_and_parameters = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
+    if name_and_parameters:
+        parameters = tuple(float(p) for p in name_and_parameters[2].split(",") if p)
+        return np.asarray(
+            signal.get_window((name_and_parameters[1], *parameters), length, fftbins=True)
+        )
     return np.asarray(signal.get_window(name, length, fftbins=True))
 
 
-def _cosine_samples(name: str, length: int) -> np.ndarray:
+def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
     """Compute a cosine sum's samples, bit for bit those of scipy.signal."""
-    c = [float(t) for t in COSINE_SUMS[name]]
+    c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
         c[1] = 1.0 - c[0]
     if length == 1 or name == "rectangular":
         return np.ones(length)
-    turn = np.linspace(-np.pi, np.pi, length + 1)
+    phase = np.linspace(-np.pi, np.pi, length + 1)
     w = np.zeros(length + 1)
     for m, weight in enumerate(c):
-        w += weight * np.cos(m * turn)
+        w += weight * np.cos(m * phase)
     return w[:-1]
 
 
 @lru_cache(maxsize=32)
-def window(name: str, length: int) -> Window:
+def get_window(name: str, length: int) -> Window:
     """Return the window of this name and length, prepared once and cached."""
-    name = canonical_name(name)
-    if name in COSINE_SUMS and length >= _SHORTEST_CLOSED_FORM:
-        return _closed_form(name, length)
-    return _tabulated(name, length)
+    name = canonical_window_name(name)
+    if name in COSINE_SUM_COEFFICIENTS and length >= _CLOSED_FORM_LENGTH_MIN:
+        return _cosine_sum_window(name, length)
+    return _window_from_samples(name, length)
 
 
-PARTS = 32
-"""Steps of the length in which :func:`last_part` counts the samples that lack."""
+MISSING_STEPS = 32
+"""Steps of the length in which :func:`zero_first_samples` counts the samples that lack."""
 
 
-def last_part(window: Window, missing: int) -> Window:
-    """Return the window with some of its first samples 0, to a step of :data:`PARTS` of them.
+def zero_first_samples(window: Window, n_missing: int) -> Window:
+    """Return the window with its first samples 0, in steps of :data:`MISSING_STEPS`.
 
     For the sums over a window that depend little on how many these are: the envelope stays.
     """
-    step = min(round(PARTS * missing / window.length), PARTS - 1)
-    return _last_part(window, step) if step else window
+    step = min(round(MISSING_STEPS * n_missing / window.length), MISSING_STEPS - 1)
+    return _zero_first_steps(window, step) if step else window
 
 
-@lru_cache(maxsize=2 * PARTS)
-def _last_part(window: Window, step: int) -> Window:
-    part = replace(window, missing=step * window.length // PARTS)
-    w = part.samples()
-    return replace(part, sum=float(w.sum()), energy=float((w**2).sum()))
+@lru_cache(maxsize=2 * MISSING_STEPS)
+def _zero_first_steps(window: Window, step: int) -> Window:
+    shortened = replace(window, n_missing=step * window.length // MISSING_STEPS)
+    w = shortened.samples()
+    return replace(shortened, sum=float(w.sum()), energy=float((w**2).sum()))
 
 
-def transform(window: Window, y: np.ndarray) -> np.ndarray:
+def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
     """W(y) by direct sum over the samples: slow and plain, (n,) complex for (n,) bins of fs/L."""
-    w, n = samples(window.name, window.length), np.arange(window.length)
-    turns = np.outer(np.asarray(y, float), n) / window.length
+    w, n = window_samples(window.name, window.length), np.arange(window.length)
+    cycles = np.outer(np.asarray(y, float), n) / window.length
     # A sum, not a product of matrices, whose order depends on the number of threads.
-    return (np.exp(-2j * np.pi * (turns - np.rint(turns))) * w).sum(axis=-1)
+    return (np.exp(-2j * np.pi * (cycles - np.rint(cycles))) * w).sum(axis=-1)
 
 
-def _closed_form(name: str, length: int) -> Window:
-    c = tuple(float(t) for t in COSINE_SUMS[name])
-    reach, envelope = _sidelobe_envelope(c, length)
-    edge = math.fsum((-1) ** m * x for m, x in enumerate(c))
-    energy = length * (c[0] ** 2 + sum(x * x for x in c[1:]) / 2)
-    return Window(name, length, edge, length * c[0], energy, reach, envelope)
+def _cosine_sum_window(name: str, length: int) -> Window:
+    coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])
+    envelope_distances, sidelobe_envelope = _cosine_sum_envelope(coefficients, length)
+    first_value = math.fsum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
+    energy = length * (
+        coefficients[0] ** 2
+        + sum(coefficient * coefficient for coefficient in coefficients[1:]) / 2
+    )
+    return Window(
+        name,
+        length,
+        first_value,
+        length * coefficients[0],
+        energy,
+        envelope_distances,
+        sidelobe_envelope,
+    )
 
 
-def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, np.ndarray]:
+def _cosine_sum_envelope(
+    coefficients: tuple[float, ...], length: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Largest |W| / sum at and beyond each distance, from dense samples of the closed form."""
-    near = np.arange(1, min(256, length // 2) * 8) / 8
-    far = np.geomspace(256, length / 2, 64) if length > 512 else np.empty(0)
-    y = np.unique(np.concatenate([near, np.floor(far) + 0.5, [length / 2]]))
-    y = y[y <= length / 2]
-    theta = np.pi * (y + 1e-9) / length
-    kernel = c[0] / np.tan(theta)
-    for m in range(1, len(c)):
+    near_distances = np.arange(1, min(256, length // 2) * 8) / 8
+    far_distances = np.geomspace(256, length / 2, 64) if length > 512 else np.empty(0)
+    distances = np.unique(
+        np.concatenate([near_distances, np.floor(far_distances) + 0.5, [length / 2]])
+    )
+    distances = distances[distances <= length / 2]
+    theta = np.pi * (distances + 1e-9) / length
+    kernel = coefficients[0] / np.tan(theta)
+    for m in range(1, len(coefficients)):
         a = np.pi * m / length
-        kernel += (-1) ** m * c[m] / 2 * (1 / np.tan(theta - a) + 1 / np.tan(theta + a))
-    edge = sum((-1) ** m * x for m, x in enumerate(c))
-    magnitude = np.abs(np.sin(np.pi * (y + 1e-9))) * np.hypot(kernel, edge) / (length * c[0])
-    return _thinned(y, np.maximum.accumulate(magnitude[::-1])[::-1])
+        kernel += (-1) ** m * coefficients[m] / 2 * (1 / np.tan(theta - a) + 1 / np.tan(theta + a))
+    first_value = sum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
+    magnitude = (
+        np.abs(np.sin(np.pi * (distances + 1e-9)))
+        * np.hypot(kernel, first_value)
+        / (length * coefficients[0])
+    )
+    return _thin_envelope(distances, np.maximum.accumulate(magnitude[::-1])[::-1])
 
 
-def _thinned(y: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _thin_envelope(distances: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Thin the envelope to some 2 % steps of distance, each a bound for all beyond it.
 
     The 3 % on top is for sidelobes whose peaks lie between samples.
     """
-    keep = np.unique(np.searchsorted(y, np.geomspace(y[0], y[-1], 512)).clip(0, y.size - 1))
-    return y[keep].copy(), 1.03 * envelope[keep]
+    kept_indices = np.unique(
+        np.searchsorted(distances, np.geomspace(distances[0], distances[-1], 512)).clip(
+            0, distances.size - 1
+        )
+    )
+    return distances[kept_indices].copy(), 1.03 * envelope[kept_indices]
 
 
-def _tabulated(name: str, length: int) -> Window:
-    w = samples(name, length)
-    size = OVERSAMPLING * length
-    y = np.arange(size // 2 + 1) / OVERSAMPLING
-    spectrum = np.fft.rfft(w, size)
+def _window_from_samples(name: str, length: int) -> Window:
+    w = window_samples(name, length)
+    fft_size = ENVELOPE_SAMPLES_PER_BIN * length
+    distances = np.arange(fft_size // 2 + 1) / ENVELOPE_SAMPLES_PER_BIN
+    spectrum = np.fft.rfft(w, fft_size)
     magnitude = np.abs(spectrum) / w.sum()
-    reach, envelope = _thinned(y[1:], np.maximum.accumulate(magnitude[::-1])[::-1][1:])
-    sums = float(w[0]), float(w.sum()), float((w**2).sum())
-    return Window(name, length, *sums, reach, envelope)
+    envelope_distances, sidelobe_envelope = _thin_envelope(
+        distances[1:], np.maximum.accumulate(magnitude[::-1])[::-1][1:]
+    )
+    first_value_and_sums = float(w[0]), float(w.sum()), float((w**2).sum())
+    return Window(name, length, *first_value_and_sums, envelope_distances, sidelobe_envelope)

@@ -33,11 +33,16 @@ from sweep.analysis.selection import (
     thin_evenly,
 )
 from sweep.analysis.study_figures import GridResults
-from sweep.model import noise_only
-from sweep.model.effects.catalogue import EFFECTS, names_of
-from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
-from sweep.model.shot import prepare
-from sweep.model.threshold import WAYS, tnr_of
+from sweep.model.detection import noise_false_alarms
+from sweep.model.detection.looks import (
+    LOOKS_COMBINE_PATH,
+    LOOKS_NUMBER_PATH,
+    LOOKS_VOTES_PATH,
+    Looks,
+)
+from sweep.model.effects.catalogue import EFFECTS, unpack_effect_flags
+from sweep.model.evaluation import prepare_shots
+from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 from sweep.report.html_page import HtmlTable
 from sweep.units import percent
 
@@ -160,9 +165,9 @@ def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: 
 
 
 _PFA_FROM_BIN = {
-    "in a segment": noise_only.segment_probability,
+    "in a segment": noise_false_alarms.segment_pfa,
     "in a bin": lambda bin_probability, bins: bin_probability,
-    "in both chirps": lambda p, bins: noise_only.segment_probability(p, bins) ** 2,
+    "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
 """Probability of a false alarm from that in a bin, and the number of bins that are counted."""
 
@@ -176,7 +181,8 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
         parameters = parameters_at(results.spec, profile.axis_indices(index))
         study_pfa, study_pd = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
         n_bins, study_n_bins = (
-            noise_only.bins_counted(parameters, p) for p in (ROC_PFA_BIN_VALUES, study_pfa)
+            noise_false_alarms.alarm_equivalent_bins(parameters, p)
+            for p in (ROC_PFA_BIN_VALUES, study_pfa)
         )
         tnr_texts = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
         for alarm, pfa_from_bin in _PFA_FROM_BIN.items():
@@ -232,9 +238,11 @@ def noise_budget_of_grid(
         budgets = []
         for index, flags in zip(indices, profile.variable_values("effects", indices), strict=True):
             parameters = parameters_at(results.spec, profile.axis_indices(index))
-            effects = [name for name in names_of(int(flags)) if name not in _RANDOM_EFFECTS]
-            ((_, shots),) = prepare(parameters, effects)
-            budgets.append(shots.noise_sources)
+            effects = [
+                name for name in unpack_effect_flags(int(flags)) if name not in _RANDOM_EFFECTS
+            ]
+            ((_, shots),) = prepare_shots(parameters, effects)
+            budgets.append(shots.noise_variances)
         if profile.coordinate is None:
             x_axis, x = ChartAxis(), indices
         else:
@@ -323,10 +331,13 @@ def false_alarm_chart(
     # The same for all points where no axis moves it, and no number of bins.
     off_axes = results.spec.parameters_off_axes()
     has_one_threshold = (
-        set(WAYS[:3]) & off_axes.keys() and {NUMBER, COMBINE, VOTES} <= off_axes.keys()
+        set(THRESHOLD_PATHS[:3]) & off_axes.keys()
+        and {LOOKS_NUMBER_PATH, LOOKS_COMBINE_PATH, LOOKS_VOTES_PATH} <= off_axes.keys()
     )
     parameters = results.spec.parameters()
-    closed_form = noise_only.bin_probability(float(tnr_of(parameters)), Looks.of(parameters))
+    closed_form = noise_false_alarms.bin_pfa(
+        float(tnr_from_parameters(parameters)), Looks.from_parameters(parameters)
+    )
     return Chart(
         "False alarms",
         charts.lines_alt_text(

@@ -41,10 +41,10 @@ from sweep.analysis.scene_results.recordings import (
 )
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.study_figures import SceneResults
-from sweep.model.effects.catalogue import names_of
-from sweep.model.eyepoints import prepare_eyepoints
-from sweep.model.navigation import EXCLUDED
-from sweep.model.pairing import TRUE
+from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
+from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.report.detector_charts import NOISE_BUDGET_POINTS, noise_budget_chart, noise_budget_panel
 from sweep.report.html_page import (
     COLOUR_BAR,
@@ -404,7 +404,7 @@ def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | Non
     """Errors of range and velocity of true points against truth; none where there are none."""
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
-        is_true = (column_arrays["flags"].astype(int) & TRUE) > 0
+        is_true = (column_arrays["flags"].astype(int) & TRUE_FLAG) > 0
         for name in MEASURED_QUANTITIES if is_true.any() else ():
             error_column = {"error": column_arrays[name] - column_arrays[f"true_{name}"]}
             true_columns = {
@@ -530,7 +530,8 @@ def returns_sentences(
     status = [group["velocity_status"] for group in groups if "velocity_status" in group]
     if n_known := sum(int((status_array >= 0).sum()) for status_array in status):
         n_solved = sum(
-            int(((status_array >= 0) & (status_array <= EXCLUDED)).sum()) for status_array in status
+            int(((status_array >= 0) & (status_array <= STATUS_EXCLUDED)).sum())
+            for status_array in status
         )
         messages.append(f"Velocity was solved in {n_solved:,} of {n_known:,} cycles.")
     return messages
@@ -594,16 +595,16 @@ def _noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
         np.linspace(0, n_shots - 1, min(NOISE_BUDGET_POINTS, n_shots)).round().astype(int)
     )
     eyepoints = read_eyepoints(results.store_path, recording.dataset, shot_indices)
-    seen_indices = np.flatnonzero(eyepoints.seen)
+    seen_indices = np.flatnonzero(eyepoints.has_target)
     flags = np.asarray(recording.dataset["effects"].isel(shot=shot_indices[seen_indices]).values)
     parameters, surfaces = (
         parameters_at(results.spec, labelled.axis_position.axis_indices),
         results.spec.surfaces(),
     )
     budgets = [
-        prepare_eyepoints(
-            eyepoints.some(np.array([i])), parameters, surfaces, names_of(int(flag))
-        ).noise_sources
+        prepare_eyepoint_shots(
+            eyepoints.select(np.array([i])), parameters, surfaces, unpack_effect_flags(int(flag))
+        ).noise_variances
         for i, flag in zip(seen_indices, flags, strict=True)
     ]
     facet_choices = {"part": labelled.label}

@@ -490,7 +490,7 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
                 modes[effect.name],
                 round(100 * n_with_effect / n_points, 2),
                 where_text,
-                effect.about,
+                effect.description,
             )
         )
     rows.sort(key=lambda row: -row[2])

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sweep.model.eyepoints import Eyepoints
-from sweep.model.outputs import BEAMLETS, SHOTS
+from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
+from sweep.model.pointcloud.eyepoints import Eyepoints
 
 _FIELD_OF_ARRAY = {
     "time": "time",
@@ -19,24 +19,24 @@ _FIELD_OF_ARRAY = {
     "beam_range": "range",
     "beam_radial_velocity": "radial_velocity",
     "beam_acceleration": "acceleration",
-    "beam_approach": "approach",
+    "beam_approach": "approach_speed",
     "beam_turn_rate": "turn_rate",
-    "beam_turning": "turning",
+    "beam_turning": "direction_rate",
     "platform_acceleration": "platform_acceleration",
-    **dict(zip(BEAMLETS, BEAMLETS, strict=True)),
+    **dict(zip(BEAMLET_VARIABLES, BEAMLET_VARIABLES, strict=True)),
 }
 """Field of :class:`Eyepoints` that each array holds."""
 
 
 def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
     """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store."""
-    outputs = {**SHOTS, **BEAMLETS}
+    outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
     arrays = {
         name: np.asarray(getattr(eyepoints, field), outputs[name].dtype)
         for name, field in _FIELD_OF_ARRAY.items()
     }
     shots = np.arange(len(eyepoints.time))
-    arrays["beam_surface"] = arrays["surface"][shots, eyepoints.reference]
+    arrays["beam_surface"] = arrays["surface"][shots, eyepoints.reference_beamlet]
     return arrays
 
 
@@ -49,7 +49,11 @@ def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) 
     fields["cycle"] = fields["cycle"].astype(np.int64)
     weight = np.asarray(weight, float)
     for name, field in _FIELD_OF_ARRAY.items():
-        trailing_shape = {1: (), 2: (3,)}[len(SHOTS[name].dims)] if name in SHOTS else weight.shape
+        trailing_shape = (
+            {1: (), 2: (3,)}[len(SHOT_VARIABLES[name].dims)]
+            if name in SHOT_VARIABLES
+            else weight.shape
+        )
         expected_shape = (fields["time"].size, *trailing_shape)
         if fields[field].shape != expected_shape:
             raise ValueError(f"{name} has shape {fields[field].shape}, not {expected_shape}")

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.mesh import Mesh, normals, require_shapes, round_centre
-from sweep.model.geometry.quaternion import about, rotate
+from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_shapes
+from sweep.model.geometry.quaternion import axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
 from sweep.scenes.polygons import triangulate
 from sweep.scenes.scene_files import SceneError, read_companion, require_file, require_memory
@@ -103,7 +103,7 @@ class Facets:
             )
         if self.is_grid:
             _require_faces(len(self.faces), len(self.faces))
-            centre = round_centre(self.vertices)
+            centre = exact_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
             return mesh, MeshReport(len(self.vertices), len(self.faces), notes=self.notes)
         mesh, report = clean_mesh(self.vertices, self.faces, self.surface)
@@ -188,7 +188,7 @@ def clean_mesh(
         len(used) - len(kept_vertices),
     )
     positions = positions[kept_vertices]
-    origin = round_centre(positions)
+    origin = exact_centre(positions)
     positions -= origin
     has_area = np.flatnonzero(_have_area(positions, face_corners))
     kept_faces = has_area[_distinct_rows(np.sort(face_corners[has_area], axis=1))[0]]
@@ -234,7 +234,7 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
     has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _AREA_ROUNDING * longest)
     doubtful_faces = np.flatnonzero(~has_area)
-    exact_normals, _ = normals(vertices[faces[doubtful_faces]].transpose(1, 2, 0))
+    exact_normals, _ = facet_normals(vertices[faces[doubtful_faces]].transpose(1, 2, 0))
     has_area[doubtful_faces] = exact_normals.any(axis=0)
     return has_area
 
@@ -272,7 +272,7 @@ def read_mesh(
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
     is_y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
-    rotation = about(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
+    rotation = axis_angle(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
     return join_facets(parts).transform(
         rotation=rotation, scale=scale * _metres_per_unit(path, unit or file_unit)
     )

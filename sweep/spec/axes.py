@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.outputs import GRID_VARIABLES
+from sweep.model.outputs import GRID_VARIABLE_NAMES
 from sweep.spec.rules import (
     Finding,
     Findings,
@@ -378,7 +378,7 @@ def _coordinate_name(path: str, paths: list[str]) -> str:
     for length in range(1, len(keys) + 1):
         name = "_".join(keys[-length:])
         is_shared = any(other[-length:] == keys[-length:] for other in other_keys)
-        if not is_shared and name not in GRID_VARIABLES:
+        if not is_shared and name not in GRID_VARIABLE_NAMES:
             break
     return name
 
@@ -415,7 +415,7 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
             findings.append(
                 Finding(("axes", axis.name), "bears the name of a coordinate", _NAME_REMEDY)
             )
-        elif axis.is_zipped and axis.name in GRID_VARIABLES:
+        elif axis.is_zipped and axis.name in GRID_VARIABLE_NAMES:
             problem = "bears the name of a variable of the store"
             findings.append(Finding(("axes", axis.name), problem, _NAME_REMEDY))
     return findings

@@ -16,8 +16,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
-from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
-from sweep.model.effects.effect import MODES, Parameter
+from sweep.model.effects.catalogue import EFFECT_PARAMETERS, EFFECTS
+from sweep.model.effects.effect import EFFECT_MODES, Parameter
 from sweep.scenes.scene_files import SceneError, file_digest
 from sweep.spec.rules import (
     MISSING,
@@ -32,7 +32,7 @@ from sweep.spec.rules import (
     TextRule,
 )
 
-AUTO, ON, OFF = MODES
+AUTO, ON, OFF = EFFECT_MODES
 ModelClasses = tuple[type[BaseModel], ...]
 KeyPath = tuple[str, ...]
 SectionT = TypeVar("SectionT", bound=BaseModel)
@@ -261,11 +261,12 @@ def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[
     field_definitions = {
         parameter.path.removeprefix(f"{section_path}."): (
             Annotated[
-                str if parameter.options or parameter.table else float, _parameter_rule(parameter)
+                str if parameter.options or parameter.is_table else float,
+                _parameter_rule(parameter),
             ],
             parameter.default,
         )
-        for parameter in PARAMETERS
+        for parameter in EFFECT_PARAMETERS
         if parameter.path.rpartition(".")[0] == section_path
     }
     return lambda section: _extend_section(section, field_definitions)
@@ -275,7 +276,7 @@ def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
     """Add a mode for every effect to the section, `auto` by default."""
     mode_rules = {
         effect.name: ChoiceRule(
-            description=effect.about[0].upper() + effect.about[1:], options=MODES
+            description=effect.description[0].upper() + effect.description[1:], options=EFFECT_MODES
         )
         for effect in EFFECTS
     }
@@ -285,12 +286,12 @@ def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
 
 
 def _parameter_rule(parameter: Parameter) -> Rule:
-    if parameter.table:
-        return FrequencyErrorTableRule(description=parameter.about)
+    if parameter.is_table:
+        return FrequencyErrorTableRule(description=parameter.description)
     if parameter.options:
-        return ChoiceRule(description=parameter.about, options=parameter.options)
+        return ChoiceRule(description=parameter.description, options=parameter.options)
     return NumericRule(
-        description=parameter.about,
+        description=parameter.description,
         si_unit=parameter.unit,
         example=parameter.example,
         at_least=parameter.limits[0],

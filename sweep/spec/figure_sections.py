@@ -209,9 +209,11 @@ GridFigure = Annotated[
 
 # Figures of scenes
 
-_FIGURE_OUTPUTS = outputs.SHOTS | outputs.STATISTICS | outputs.POINTS
+_FIGURE_OUTPUTS = (
+    outputs.SHOT_VARIABLES | outputs.SHOT_STATISTIC_VARIABLES | outputs.POINT_VARIABLES
+)
 FIGURE_QUANTITIES = (
-    *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ not in output.dims),
+    *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
 """Quantities of shots and of points that a figure can show."""
@@ -462,8 +464,10 @@ def _variable_findings(
     variable = getattr(figure, "variable", None)
     amount_fields = ("number", "limit") if isinstance(draws, Mapping) else ()
     has_draws = any(draws.get(name, 0) not in (0, "0") for name in amount_fields)  # type: ignore[attr-defined]
-    draw_variables = outputs.DRAW_OUTPUTS | outputs.ERROR_OUTPUTS | outputs.ACCURACY_OUTPUTS
-    known_variables = {*outputs.OUTPUTS, *extra_variables}
+    draw_variables = (
+        outputs.DRAW_COUNT_OUTPUTS | outputs.STANDARD_ERROR_OUTPUTS | outputs.ACCURACY_OUTPUTS
+    )
+    known_variables = {*outputs.GRID_OUTPUTS, *extra_variables}
     if (
         variable is None
         or variable in known_variables
@@ -477,7 +481,7 @@ def _variable_findings(
     if variable in draw_variables:
         problem = "is found over draws, and this study has none"
         remedy = "set draws: {number: ...} or {limit: ...}"
-    elif variable in outputs.STRONGEST_OUTPUTS:
+    elif variable in outputs.STRONGEST_PEAK_OUTPUTS:
         problem = "is found where segments report their strongest peak alone"
         remedy = "set instrument.processing.peaks: strongest"
     yield Finding((*location, "variable"), problem, remedy, variable)
@@ -485,7 +489,9 @@ def _variable_findings(
 
 def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
     """Report closed forms that a study of whole spectra does not store."""
-    stored_variables = outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_OUTPUTS
+    stored_variables = (
+        outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
+    )
     variable = getattr(figure, "variable", None)
     if variable is None:
         problem = "shows closed forms, which a study of whole spectra does not store"

@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import Field
 
 import sweep.spec.fields as declare
-from sweep.model.geometry import platform as motion_laws
+from sweep.model.geometry import body_motion as motion_laws
 from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as scan_patterns
-from sweep.model.geometry.scanner import Scanner
+from sweep.model.geometry.scanner import ScanPattern
 from sweep.spec.fields import SpecFiles, SpecSection
 from sweep.spec.rules import Json, ListRule, Rule, read_element
 from sweep.units import QuantityError
@@ -31,11 +31,11 @@ class StraightPath(SpecSection):
     initial_speed: float = declare.speed("Speed at the beginning")
     final_speed: float | None = declare.speed("Speed at the end; the initial one", default=None)
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the straight path."""
-        return motion_laws.straight(
-            begin=self.begin,
-            end=self.to,
+        return motion_laws.straight_trajectory(
+            start_point=self.begin,
+            end_point=self.to,
             initial_speed=self.initial_speed,
             final_speed=self.final_speed,
         )
@@ -50,7 +50,7 @@ class AccelerationPath(SpecSection):
     acceleration: Vector = declare.vector("Acceleration", "m/s^2", "1 m/s^2", default=(0, 0, 0))
     duration: float = declare.duration("How long it lasts", at_least="1 ns")
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the path of constant acceleration."""
         path_class = motion_laws.ConstantAcceleration
         return path_class(self.position, self.velocity, self.acceleration, self.duration)
@@ -63,12 +63,12 @@ class WaypointPath(SpecSection):
     file: str = declare.file_path("CSV table with time, x, y, z and, if it likes, attitude")
     smooth: bool = declare.flag("Join them by a cubic spline, not by straight lines", default=True)
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the path through the file's waypoints."""
         from sweep.scenes.scene_files import read_waypoints
 
         table = read_waypoints(files.resolve(self.file), files.time_origin)
-        return motion_laws.Waypoints(table.time, table.position, smooth=self.smooth)
+        return motion_laws.Waypoints(table.time, table.position, is_smooth=self.smooth)
 
 
 class StationaryPath(SpecSection):
@@ -80,13 +80,13 @@ class StationaryPath(SpecSection):
         "How long; a target stays throughout the flight by default", at_least="1 ns", default=None
     )
 
-    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the path of a platform that stays in place."""
         if self.duration is not None:
             span = (0.0, self.duration)
         if span is None:
             raise ValueError("a platform that stays needs a duration")
-        return motion_laws.Waypoints(span, [self.position, self.position], smooth=False)
+        return motion_laws.Waypoints(span, [self.position, self.position], is_smooth=False)
 
 
 AnyPath = Annotated[
@@ -122,9 +122,9 @@ class NadirAttitude(SpecSection):
         keyword="track", keyword_value="track", default=0.0,
     )  # fmt: skip
 
-    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the law of attitude."""
-        return motion_laws.Nadir(None if self.heading == "track" else float(self.heading))
+        return motion_laws.NadirAttitude(None if self.heading == "track" else float(self.heading))
 
 
 class AlongTrackAttitude(SpecSection):
@@ -133,9 +133,9 @@ class AlongTrackAttitude(SpecSection):
     kind: Literal["along_track"]
     roll: float = declare.angle("Left side up", default=0.0)
 
-    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the law of attitude."""
-        return motion_laws.AlongTrack(self.roll)
+        return motion_laws.AlongTrackAttitude(self.roll)
 
 
 class FixedAttitude(Orientation):
@@ -143,9 +143,9 @@ class FixedAttitude(Orientation):
 
     kind: Literal["fixed"]
 
-    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the law of attitude."""
-        return motion_laws.Fixed(self.to_quaternion())
+        return motion_laws.FixedAttitude(self.to_quaternion())
 
 
 class SpinningAttitude(Orientation):
@@ -156,9 +156,9 @@ class SpinningAttitude(Orientation):
         "Angular velocity about the world's axes", "rad/s", "10 deg/s"
     )
 
-    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the law of attitude."""
-        return motion_laws.Spin(self.angular_velocity, self.to_quaternion(), path.start)
+        return motion_laws.SpinningAttitude(self.angular_velocity, self.to_quaternion(), path.start)
 
 
 class TabulatedAttitude(SpecSection):
@@ -169,7 +169,7 @@ class TabulatedAttitude(SpecSection):
         "CSV table with time, position and attitude; the path's by default", None
     )
 
-    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the law of attitude."""
         from sweep.scenes.scene_files import SceneError, read_waypoints
 
@@ -179,7 +179,7 @@ class TabulatedAttitude(SpecSection):
         if table.attitude is None:
             remedy = "add heading, pitch and roll, or qw, qx, qy and qz"
             raise SceneError(self.file, "has no attitude to follow", remedy)
-        return motion_laws.Track(table.time, table.attitude)
+        return motion_laws.AttitudeTrack(table.time, table.attitude)
 
 
 AnyAttitude = Annotated[
@@ -194,12 +194,16 @@ class RigidMotion(SpecSection):
     path: AnyPath
     attitude: AnyAttitude = FixedAttitude(kind="fixed")
 
-    def build_flight(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Flight:
+    def build_flight(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.MovingBody:
         """Movement of the body; one that stays does so throughout `span`."""
         path = self.path.build_path(files, span)
-        return motion_laws.Flight(path, self.build_attitude(files, path))
+        return motion_laws.MovingBody(path, self.build_attitude(files, path))
 
-    def build_attitude(self, files: SpecFiles, path: motion_laws.Path) -> motion_laws.Attitude:
+    def build_attitude(
+        self, files: SpecFiles, path: motion_laws.Trajectory
+    ) -> motion_laws.AttitudeLaw:
         """Return the law of attitude along a path."""
         attitude = self.attitude
         if (
@@ -232,16 +236,18 @@ class Platform(RigidMotion):
             return Decimal(0)
         return read_first_time(files.resolve(self.path.file))
 
-    def build_flight(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Flight:
+    def build_flight(
+        self, files: SpecFiles, span: TimeSpan | None = None
+    ) -> motion_laws.MovingBody:
         """Movement of the instrument."""
         mounting = self.mounting.to_quaternion()
         path = self.path.build_path(files, span)
-        mounted_attitude = motion_laws.Mounted(self.build_attitude(files, path), mounting)
+        mounted_attitude = motion_laws.MountedAttitude(self.build_attitude(files, path), mounting)
         # A flight's arm is told in the frame of its attitude, which is the instrument's.
         instrument_arm = quaternion.rotate(
             quaternion.conjugate(mounting), np.asarray(self.lever_arm, float)
         )
-        return motion_laws.Flight(path, mounted_attitude, instrument_arm)
+        return motion_laws.MovingBody(path, mounted_attitude, instrument_arm)
 
 
 # Scan patterns
@@ -311,12 +317,12 @@ class ConeScanner(SpecSection):
     rate: float = _CYCLE_RATE_FIELD
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
-        directions = scan_patterns.cone(
+        directions = scan_patterns.cone_directions(
             self.beams, half_angle=self.half_angle, azimuth=self.azimuth
         )
-        return scan_patterns.fixed(directions, rate=self.rate, interval=self.interval)
+        return scan_patterns.fixed_beams(directions, rate=self.rate, interval=self.interval)
 
 
 class FixedBeamsScanner(SpecSection):
@@ -332,13 +338,15 @@ class FixedBeamsScanner(SpecSection):
     rate: float = _CYCLE_RATE_FIELD
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
         directions = [
-            scan_patterns.steered(*beam) if len(beam) == 2 else np.array(beam)  # type: ignore[arg-type]
+            scan_patterns.steered_directions(*beam) if len(beam) == 2 else np.array(beam)  # type: ignore[arg-type]
             for beam in self.beams
         ]
-        return scan_patterns.fixed(np.array(directions), rate=self.rate, interval=self.interval)
+        return scan_patterns.fixed_beams(
+            np.array(directions), rate=self.rate, interval=self.interval
+        )
 
 
 class CornersScanner(SpecSection):
@@ -349,10 +357,10 @@ class CornersScanner(SpecSection):
     rate: float = _CYCLE_RATE_FIELD
     interval: float | None = _EVEN_INTERVAL_FIELD
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
-        return scan_patterns.fixed(
-            scan_patterns.corners(self.angle), rate=self.rate, interval=self.interval
+        return scan_patterns.fixed_beams(
+            scan_patterns.corner_directions(self.angle), rate=self.rate, interval=self.interval
         )
 
 
@@ -367,9 +375,9 @@ class SquaresScanner(SpecSection):
     rate: float = _CYCLE_RATE_FIELD
     interval: float | None = _EVEN_INTERVAL_FIELD
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
-        directions, visited_directions = scan_patterns.squares(self.elements)
+        directions, visited_directions = scan_patterns.square_patterns(self.elements)
         return scan_patterns.BeamCycle(directions, visited_directions, self.rate, self.interval)
 
 
@@ -386,9 +394,9 @@ class RasterScanner(SpecSection):
     rate: float = _CYCLE_RATE_FIELD
     both_ways: bool = declare.flag("Every other row runs backwards", default=True)
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
-        return scan_patterns.raster(**self.model_dump(exclude={"kind"}))
+        return scan_patterns.raster_scan(**self.model_dump(exclude={"kind"}))
 
 
 class LineScanner(SpecSection):
@@ -407,7 +415,7 @@ class LineScanner(SpecSection):
     wave: str = declare.choice("Constant rate or resonant mirror", ("triangle", "sine"))
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
-    def build_pattern(self) -> Scanner:
+    def build_pattern(self) -> ScanPattern:
         """Return the scan pattern."""
         return scan_patterns.LineScan(**self.model_dump(exclude={"kind"}))
 
@@ -418,8 +426,8 @@ AnyScanner = Annotated[
 ]
 
 
-def shots_per_cycle(pattern: Scanner) -> int:
+def shots_per_cycle(pattern: ScanPattern) -> int:
     """Shots of one measurement cycle."""
     if isinstance(pattern, scan_patterns.BeamCycle):
         return pattern.beams_per_cycle
-    return pattern.beams
+    return pattern.n_beams

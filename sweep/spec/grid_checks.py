@@ -16,18 +16,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, looks, waveform
+from sweep.model import beam, waveform
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
-from sweep.model.detectors import FIXED
+from sweep.model.detection import looks
+from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.estimators import (
+    DETECTOR_PREFIX,
+    ESTIMATOR_PREFIX,
+    SPECTRUM_METHOD_DEFAULTS,
+)
 from sweep.model.effects import circulator_leak, iq_imbalance
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
-from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
-from sweep.model.effects.sweep_table import sweep_table
-from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
-from sweep.model.preparation import RECORD
-from sweep.model.waveform import ENDS, RANGES, VELOCITIES
+from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
+from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.preparation import RECORD_PATH
+from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 from sweep.spec.axes import Axis, parameter_location
 from sweep.spec.fields import AUTO, OFF, ON, rules_by_path
 from sweep.spec.rules import MISSING, Finding
@@ -51,7 +56,9 @@ DETECTION_PATH = "instrument.processing.detection"
 BINS_COUNTED_PATH = "instrument.processing.bins_counted"
 LINE_WIDTH_PATH, LINE_SHAPE_PATH = "instrument.laser.line_width", "instrument.laser.line_shape"
 ROUGHNESS_PATH = "target.roughness"
-TRAINING_PATH, GUARD_PATH, RANK_PATH = (DETECTOR + name for name in ("training", "guard", "rank"))
+TRAINING_PATH, GUARD_PATH, RANK_PATH = (
+    DETECTOR_PREFIX + name for name in ("training", "guard", "rank")
+)
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
 """Samples with which windows are tried as they are read: with more they can be had."""
@@ -326,7 +333,7 @@ def _window_findings(grid: GridValues) -> Iterator[Finding]:
     length = int(min(grid.values_of(FFT_SIZE_PATH).min(), samples + 1e-6))
     for name in dict.fromkeys(grid.values_of(WINDOW_PATH).tolist()):
         try:
-            window.samples(name, min(length, _WINDOW_TRIAL_SAMPLES_MAX))
+            window.window_samples(name, min(length, _WINDOW_TRIAL_SAMPLES_MAX))
         except ValueError:
             problem = f"must be one that has {length} samples, as many as the shortest record, and "
             problem += f"{name} has none of so few"
@@ -339,7 +346,7 @@ def _photon_findings(grid: GridValues) -> Iterator[Finding]:
     """More electrons than photons."""
     responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
     least_margin = _least_weighted_sum(
-        grid, {beam.WAVELENGTH: responsivity_per_metre, RESPONSIVITY_PATH: -1.0}
+        grid, {beam.WAVELENGTH_PATH: responsivity_per_metre, RESPONSIVITY_PATH: -1.0}
     )
     if least_margin is not None and least_margin < 0:
         problem = (
@@ -353,36 +360,41 @@ def _photon_findings(grid: GridValues) -> Iterator[Finding]:
 
 def _table_findings(grid: GridValues) -> Iterator[Finding]:
     """Report a table of the sweep's error that does not cover the chirp."""
-    table_text = grid.values.get(ERROR_TABLE, NO_TABLE)
+    table_text = grid.values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
-    table, duration_max = sweep_table(table_text), float(grid.values_of(CHIRP_DURATION_PATH).max())
-    if table.first > 1e-9 * duration_max or table.last < (1 - 1e-9) * duration_max:
+    table, duration_max = (
+        fit_sweep_error(table_text),
+        float(grid.values_of(CHIRP_DURATION_PATH).max()),
+    )
+    if table.first_time > 1e-9 * duration_max or table.last_time < (1 - 1e-9) * duration_max:
         problem = (
-            f"must cover the chirp, 0 to {duration_max:g} s: it has {table.first:g} to "
-            f"{table.last:g}"
+            f"must cover the chirp, 0 to {duration_max:g} s: it has {table.first_time:g} to "
+            f"{table.last_time:g}"
         )
-        yield grid.make_finding(ERROR_TABLE, f"{problem} s", "add the rows that it lacks")
+        yield grid.make_finding(ERROR_TABLE_PATH, f"{problem} s", "add the rows that it lacks")
 
 
 # Beams
 
 _SINGLE_MODE_CONDITIONS = {
-    beam.COUPLING: _equals(beam.SINGLE_MODE),
-    beam.ARCHITECTURE: _differs_from("direct"),
+    beam.COUPLING_PATH: _equals(beam.SINGLE_MODE),
+    beam.ARCHITECTURE_PATH: _differs_from("direct"),
 }
 
 
 def _beam_findings(grid: GridValues) -> Iterator[Finding]:
     """Beams that are given twice or not at all, too wide for their aperture, or too narrow."""
-    if not grid.has_values(beam.WAVELENGTH, beam.DIAMETER, beam.DIVERGENCE, beam.WAIST):
+    if not grid.has_values(
+        beam.WAVELENGTH_PATH, beam.APERTURE_DIAMETER_PATH, beam.DIVERGENCE_PATH, beam.WAIST_PATH
+    ):
         return
-    if grid.has_point({beam.DIVERGENCE: _is_zero, beam.WAIST: _is_zero}):
+    if grid.has_point({beam.DIVERGENCE_PATH: _is_zero, beam.WAIST_PATH: _is_zero}):
         problem = "must be given, or beam_waist in its place"
-        yield grid.make_finding(beam.DIVERGENCE, problem, "write e.g. '50 urad'")
-    elif grid.has_point({beam.DIVERGENCE: _is_positive, beam.WAIST: _is_positive}):
+        yield grid.make_finding(beam.DIVERGENCE_PATH, problem, "write e.g. '50 urad'")
+    elif grid.has_point({beam.DIVERGENCE_PATH: _is_positive, beam.WAIST_PATH: _is_positive}):
         problem = "stands beside beam_divergence, and each follows from the other"
-        yield grid.make_finding(beam.WAIST, problem, "leave one of them out")
+        yield grid.make_finding(beam.WAIST_PATH, problem, "leave one of them out")
     else:
         yield from _width_findings(grid)
 
@@ -395,25 +407,28 @@ def _width_findings(grid: GridValues) -> Iterator[Finding]:
         problem = (
             f"must be at least {1e6 * limit:.3g} urad, 4 M^2 lambda / (pi D): no narrower beam "
         )
-        problem += f"leaves an aperture of {1e3 * narrow_beam[beam.DIAMETER]:.3g} mm"
+        problem += f"leaves an aperture of {1e3 * narrow_beam[beam.APERTURE_DIAMETER_PATH]:.3g} mm"
         yield grid.make_finding(
-            beam.DIVERGENCE, problem, f"widen the beam or the aperture, {remedy}"
+            beam.DIVERGENCE_PATH, problem, f"widen the beam or the aperture, {remedy}"
         )
-    for path in (beam.WAIST, beam.RECEIVED_WAIST):
+    for path in (beam.WAIST_PATH, beam.OSCILLATOR_WAIST_PATH):
         widest = _argmax_of_product(
-            grid, {path: 1.0, beam.DIAMETER: -1.0}, _SINGLE_MODE_CONDITIONS | {path: _is_positive}
+            grid,
+            {path: 1.0, beam.APERTURE_DIAMETER_PATH: -1.0},
+            _SINGLE_MODE_CONDITIONS | {path: _is_positive},
         )
-        if widest and widest[path] > widest[beam.DIAMETER] / 2:
+        if widest and widest[path] > widest[beam.APERTURE_DIAMETER_PATH] / 2:
             problem = (
-                f"must be at most {500 * widest[beam.DIAMETER]:.3g} mm, the radius of the aperture"
+                f"must be at most {500 * widest[beam.APERTURE_DIAMETER_PATH]:.3g} mm, the radius "
+                "of the aperture"
             )
             yield grid.make_finding(
                 path, problem, f"take a smaller one, or a larger aperture, {remedy}"
             )
-        powers = {beam.QUALITY: 1.0, beam.WAVELENGTH: 1.0, path: -1.0}
+        powers = {beam.QUALITY_PATH: 1.0, beam.WAVELENGTH_PATH: 1.0, path: -1.0}
         narrowest_waist = _argmax_of_product(grid, powers, {path: _is_positive})
         if narrowest_waist and narrowest_waist[path] < (
-            waist_min := _divergence_or_waist(narrowest_waist, beam.WIDEST)
+            waist_min := _divergence_or_waist(narrowest_waist, beam.FOOTPRINT_ANGLE_MAX)
         ):
             problem = (
                 f"must be at least {1e6 * waist_min:.3g} um, for the beam to spread by 90 deg at "
@@ -428,13 +443,17 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
     Only where all light in the aperture mixes: elsewhere such a beam is refused.
     """
     for conditions in (
-        {beam.COUPLING: _equals(beam.APERTURE)},
-        {beam.ARCHITECTURE: _equals("direct")},
+        {beam.COUPLING_PATH: _equals(beam.APERTURE)},
+        {beam.ARCHITECTURE_PATH: _equals("direct")},
     ):
         if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
             narrow_beam, limit = narrowest
-            aperture_text = f"an aperture of {1e3 * narrow_beam[beam.DIAMETER]:.3g} mm makes"
-            beam_text = f"a beam of {1e6 * narrow_beam[beam.DIVERGENCE]:.3g} urad is narrower than"
+            aperture_text = (
+                f"an aperture of {1e3 * narrow_beam[beam.APERTURE_DIAMETER_PATH]:.3g} mm makes"
+            )
+            beam_text = (
+                f"a beam of {1e6 * narrow_beam[beam.DIVERGENCE_PATH]:.3g} urad is narrower than"
+            )
             return f"{beam_text} {aperture_text}, 4 M^2 lambda / (pi D) = {1e6 * limit:.3g} urad"
     return ""
 
@@ -444,11 +463,14 @@ def _narrowest_impossible_beam(
 ) -> tuple[dict[str, float], float] | None:
     """Parameters of the narrowest beam that no aperture under a law makes, and its limit [rad]."""
     # The product of these powers is the waist over the aperture's radius, but for 4 / pi.
-    rising, falling = (beam.QUALITY, beam.WAVELENGTH), (beam.DIVERGENCE, beam.DIAMETER)
+    rising, falling = (
+        (beam.QUALITY_PATH, beam.WAVELENGTH_PATH),
+        (beam.DIVERGENCE_PATH, beam.APERTURE_DIAMETER_PATH),
+    )
     powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
-    narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE: _is_positive})
-    if narrowest and narrowest[beam.DIVERGENCE] < (
-        limit := _divergence_or_waist(narrowest, narrowest[beam.DIAMETER] / 2)
+    narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE_PATH: _is_positive})
+    if narrowest and narrowest[beam.DIVERGENCE_PATH] < (
+        limit := _divergence_or_waist(narrowest, narrowest[beam.APERTURE_DIAMETER_PATH] / 2)
     ):
         return narrowest, limit
     return None
@@ -457,8 +479,8 @@ def _narrowest_impossible_beam(
 def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
     """Divergence [rad] of a beam with a waist [m], or waist of one with a divergence."""
     return float(
-        beam.divergence_of(
-            waist_or_divergence, parameters[beam.WAVELENGTH], parameters[beam.QUALITY]
+        beam.divergence_from_waist(
+            waist_or_divergence, parameters[beam.WAVELENGTH_PATH], parameters[beam.QUALITY_PATH]
         )
     )
 
@@ -487,67 +509,90 @@ def _exceeds_one(number: np.ndarray) -> np.ndarray:
 
 def _looks_findings(grid: GridValues) -> Iterator[Finding]:
     """Report looks whose probabilities are not known, or that contradict each other."""
-    several_looks: dict[str, Condition] = {looks.NUMBER: _exceeds_one}
+    several_looks: dict[str, Condition] = {looks.LOOKS_NUMBER_PATH: _exceeds_one}
     combined_by_bin: dict[str, Condition] = {
-        looks.COMBINE: _differs_from(looks.COHERENT),
+        looks.LOOKS_COMBINE_PATH: _differs_from(looks.COMBINE_COHERENT),
         **several_looks,
     }
     added_in_amplitude: dict[str, Condition] = {
-        looks.COMBINE: _equals(looks.COHERENT),
+        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_COHERENT),
         **several_looks,
     }
-    voted_on: dict[str, Condition] = {looks.COMBINE: _equals(looks.BINARY), **several_looks}
+    voted_on: dict[str, Condition] = {
+        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_BINARY),
+        **several_looks,
+    }
     if grid.has_point(combined_by_bin | {DETECTION_PATH: _equals("any_bin")}):
         problem = "detects by the largest bin of an echo where several records are not added in "
         problem += "amplitude: the chance that any of its bins does is known for one record alone"
         yield grid.make_finding(
             DETECTION_PATH, problem, "write 'detection: peak_bin', or combine: coherent"
         )
-    if grid.has_point(voted_on | {looks.NUMBER: lambda number: number > VOTING_LOOKS_MAX}):
+    if grid.has_point(
+        voted_on | {looks.LOOKS_NUMBER_PATH: lambda number: number > VOTING_LOOKS_MAX}
+    ):
         problem = f"counts the votes of at most {VOTING_LOOKS_MAX} records"
-        yield grid.make_finding(looks.NUMBER, problem, "take fewer, or combine: power")
+        yield grid.make_finding(looks.LOOKS_NUMBER_PATH, problem, "take fewer, or combine: power")
     fewest_looks = grid.argmin_of_sum(
-        {looks.NUMBER: lambda n: n, looks.VOTES: lambda parameter: -parameter}, voted_on
+        {
+            looks.LOOKS_NUMBER_PATH: lambda n: n,
+            looks.LOOKS_VOTES_PATH: lambda parameter: -parameter,
+        },
+        voted_on,
     )
-    if fewest_looks and fewest_looks[looks.VOTES] > fewest_looks[looks.NUMBER]:
+    if (
+        fewest_looks
+        and fewest_looks[looks.LOOKS_VOTES_PATH] > fewest_looks[looks.LOOKS_NUMBER_PATH]
+    ):
         problem = (
-            f"asks for more than the {fewest_looks[looks.NUMBER]:g} records of "
+            f"asks for more than the {fewest_looks[looks.LOOKS_NUMBER_PATH]:g} records of "
             "instrument.looks.number"
         )
-        yield grid.make_finding(looks.VOTES, problem, "lower it, or take more looks")
-    if grid.has_point(added_in_amplitude | {looks.SPECKLE: _equals(looks.INDEPENDENT)}):
+        yield grid.make_finding(looks.LOOKS_VOTES_PATH, problem, "lower it, or take more looks")
+    if grid.has_point(
+        added_in_amplitude | {looks.LOOKS_SPECKLE_PATH: _equals(looks.SPECKLE_INDEPENDENT)}
+    ):
         problem = "gives each record a phase of its own, in which amplitudes do not add up"
-        yield grid.make_finding(looks.SPECKLE, problem, "take common, or combine: power")
+        yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, "take common, or combine: power")
     if grid.has_point(
         added_in_amplitude | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _equals("gaussian")}
     ):
         problem = "tells nothing of the phase from one record to the next, of which the sum is made"
         yield grid.make_finding(LINE_SHAPE_PATH, problem, "take lorentzian, or combine: power")
     if grid.has_point(
-        combined_by_bin | {looks.SPECKLE: _equals(looks.INDEPENDENT), ROUGHNESS_PATH: _is_positive}
+        combined_by_bin
+        | {
+            looks.LOOKS_SPECKLE_PATH: _equals(looks.SPECKLE_INDEPENDENT),
+            ROUGHNESS_PATH: _is_positive,
+        }
     ):
         problem = "is drawn once a shot for a surface of stated roughness, for all its records"
         remedy = "take common, or footprint.speckle: developed without target.roughness"
-        yield grid.make_finding(looks.SPECKLE, problem, remedy)
+        yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, remedy)
     if grid.has_point(
         {
-            looks.COMBINE: _equals(looks.POWER),
+            looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_POWER),
             **several_looks,
-            DETECTOR + "kind": _differs_from(FIXED),
+            DETECTOR_PREFIX + "kind": _differs_from(FIXED_THRESHOLD),
         }
     ):
         problem = "sets its threshold by the noise of one record, and here powers are averaged"
         remedy = "take fixed, or combine: binary or coherent"
-        yield grid.make_finding(DETECTOR + "kind", problem, remedy)
+        yield grid.make_finding(DETECTOR_PREFIX + "kind", problem, remedy)
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
     """Noise drawn where a line of leaked light stands, or in the bins of several records."""
-    if method != "probabilities" and grid.has_point({circulator_leak.PATH: _is_positive}):
+    if method != "probabilities" and grid.has_point(
+        {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
+    ):
         problem = "draws noise, and instrument.telescope.leak_path has a line that is not drawn"
         yield Finding(("draws", "method"), problem, "take draws.method: probabilities", method)
     if method == "noise" and grid.has_point(
-        {looks.NUMBER: _exceeds_one, looks.COMBINE: _differs_from(looks.COHERENT)}
+        {
+            looks.LOOKS_NUMBER_PATH: _exceeds_one,
+            looks.LOOKS_COMBINE_PATH: _differs_from(looks.COMBINE_COHERENT),
+        }
     ):
         problem = (
             "adds noise to the bins of one record, and instrument.looks.number asks for several"
@@ -558,11 +603,11 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
 
 def _search_findings(grid: GridValues) -> Iterator[Finding]:
     """Search bands that lack an end, are upside down, or count bins that are not searched."""
-    missing_ends = [path for path in ENDS if not grid.values_of(path).size]
-    if 0 < len(missing_ends) < len(ENDS):
+    missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.values_of(path).size]
+    if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
         problem = "is left out, and a beat tells of range and velocity both"
         yield Finding(tuple(missing_ends[0].split(".")), problem, "give all four ends, or none")
-    for low, high in (RANGES, VELOCITIES):
+    for low, high in (SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS):
         least_span = _least_weighted_sum(grid, {high: 1.0, low: -1.0})
         if least_span is not None and least_span <= 0:
             yield grid.make_finding(
@@ -614,41 +659,44 @@ REQUIREMENTS = (
         ParameterRequirement(
             path, lambda value: value != 0, other, _equals(word), *_SINGLE_MODE_PROBLEM_AND_REMEDY
         )
-        for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
-        for other, word in ((beam.COUPLING, beam.APERTURE), (beam.ARCHITECTURE, "direct"))
+        for path in (beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH)
+        for other, word in ((beam.COUPLING_PATH, beam.APERTURE), (beam.ARCHITECTURE_PATH, "direct"))
     ),
     *(
         ParameterRequirement(
             path,
             _differs_from(default),
-            RECORD,
+            RECORD_PATH,
             _equals("real"),
             "is one of I and Q, and the record is real",
             "set instrument.receiver.record: complex",
         )
-        for path, default in ((iq_imbalance.GAIN, 1.0), (iq_imbalance.PHASE, 0.0))
+        for path, default in (
+            (iq_imbalance.GAIN_IMBALANCE_PATH, 1.0),
+            (iq_imbalance.PHASE_IMBALANCE_PATH, 0.0),
+        )
     ),
     _require_positive("instrument.processing.bits", _is_positive, FULL_SCALE_PATH),
     ParameterRequirement(
-        circulator_leak.PATH,
+        circulator_leak.LEAK_LENGTH_PATH,
         _is_positive,
-        circulator_leak.ISOLATION,
+        circulator_leak.ISOLATION_PATH,
         lambda ratio: ratio >= 1e30,
         "is that of light which leaks, and none does at an isolation of 300 dB",
         "set instrument.telescope.isolation",
     ),
     ParameterRequirement(
-        circulator_leak.PATH,
+        circulator_leak.LEAK_LENGTH_PATH,
         _is_positive,
-        looks.NUMBER,
+        looks.LOOKS_NUMBER_PATH,
         _exceeds_one,
         "is that of a line which is known in one record of each segment alone",
         "take instrument.looks.number: 1",
     ),
     ParameterRequirement(
-        circulator_leak.PATH,
+        circulator_leak.LEAK_LENGTH_PATH,
         _is_positive,
-        RANGES[0],
+        SEARCH_RANGE_PATHS[0],
         _is_positive,
         "is that of a line which masks bins, and no law joins that with a search band",
         "leave instrument.processing.search out",
@@ -659,7 +707,7 @@ REQUIREMENTS = (
     ParameterRequirement(
         "target.roughness",
         _is_positive,
-        beam.ARCHITECTURE,
+        beam.ARCHITECTURE_PATH,
         _equals("direct"),
         "makes speckle, of which direct detection averages over an unknown number",
         "take a coherent receiver",
@@ -676,7 +724,7 @@ REQUIREMENTS = (
     ParameterRequirement(
         "target.sun_distance",
         lambda distance: (distance > 0) & (distance < SUN_RADIUS),
-        beam.WAVELENGTH,
+        beam.WAVELENGTH_PATH,
         _is_positive,
         f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
         "set it to 1 au or so",
@@ -686,7 +734,7 @@ REQUIREMENTS = (
 
 def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
     """Effects that are on within others that are off."""
-    outer_of_effect = {effect.name: effect.within for effect in EFFECTS}
+    outer_of_effect = {effect.name: effect.parent for effect in EFFECTS}
     for name, outer in outer_of_effect.items():
         while outer and grid.effect_modes.get(name) == ON:
             if grid.effect_modes.get(outer) == OFF:
@@ -722,9 +770,9 @@ def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
 
 def _record_findings(grid: GridValues) -> Iterator[Finding]:
     """Complex records of direct detection; filters before the ADC that let noise fold, or stay."""
-    if grid.has_point({RECORD: _equals("complex"), beam.ARCHITECTURE: _equals("direct")}):
+    if grid.has_point({RECORD_PATH: _equals("complex"), beam.ARCHITECTURE_PATH: _equals("direct")}):
         problem = "samples I and Q, of which direct detection has one"
-        yield grid.make_finding(RECORD, problem, "take a coherent receiver, or record: real")
+        yield grid.make_finding(RECORD_PATH, problem, "take a coherent receiver, or record: real")
     if (
         _least_weighted_sum(grid, {SAMPLE_RATE_PATH: 1.0, ANTIALIAS_BANDWIDTH_PATH: -1.0}) or 0.0
     ) < 0.0:
@@ -771,29 +819,36 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
     for effect in EFFECTS:
         is_of_target = any(parameter.path.startswith("target.") for parameter in effect.parameters)
         if (
-            (effect.turn or is_of_target)
+            (effect.perturb_parameters or is_of_target)
             and effect.is_random
             and grid.effect_modes.get(effect.name) == ON
         ):
-            instead_text = ": beams wander by platform.jitter" if effect.turn is not None else ""
+            instead_text = (
+                ": beams wander by platform.jitter" if effect.perturb_parameters is not None else ""
+            )
             yield _mode_finding(effect.name, problem, f"leave it out{instead_text}")
     yield from spectra_findings(draws, grid)
-    if grid.has_point({waveform.SHOT_DETECTION: _equals(waveform.ANY_TWO)}):
+    if grid.has_point({waveform.SHOT_DETECTION_PATH: _equals(waveform.ANY_TWO)}):
         problem, remedy = "is not known to flights, which pair peaks", "take both_chirps"
         yield grid.make_finding(
-            waveform.SHOT_DETECTION, problem, f"{remedy}, or study a flat target"
+            waveform.SHOT_DETECTION_PATH, problem, f"{remedy}, or study a flat target"
         )
     if not draws.draws_whole_spectra and grid.has_point(
-        {waveform.PEAKS: _equals(waveform.STRONGEST)}
+        {waveform.PEAKS_PATH: _equals(waveform.STRONGEST_PEAK)}
     ):
         problem = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
         yield grid.make_finding(
-            waveform.PEAKS, problem, f"set draws.method: {SPECTRA_METHOD}, or take all"
+            waveform.PEAKS_PATH, problem, f"set draws.method: {SPECTRA_METHOD}, or take all"
         )
-    voted_on = {looks.NUMBER: _exceeds_one, looks.COMBINE: _equals(looks.BINARY)}
+    voted_on = {
+        looks.LOOKS_NUMBER_PATH: _exceeds_one,
+        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_BINARY),
+    }
     if grid.has_point(voted_on | {"footprint.speckle": _equals("developed")}):
         problem = "counts records, and flights draw no powers of echoes that fade in several"
-        yield grid.make_finding(looks.COMBINE, problem, "take power, or footprint.speckle: none")
+        yield grid.make_finding(
+            looks.LOOKS_COMBINE_PATH, problem, "take power, or footprint.speckle: none"
+        )
 
 
 def _mode_finding(effect: str, problem: str, remedy: str) -> Finding:
@@ -808,7 +863,7 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
             for parameter in effect.parameters:
                 # One that is something by default only says how an effect acts.
                 is_not_default = _differs_from(parameter.default)  # type: ignore[arg-type]
-                if parameter.brings and grid.has_point({parameter.path: is_not_default}):
+                if parameter.enables_effect and grid.has_point({parameter.path: is_not_default}):
                     yield effect, parameter
 
 
@@ -817,7 +872,7 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
 
 def is_detector_or_estimator(path: str) -> bool:
     """Return true if a parameter sets the detector or estimator for whole spectra."""
-    return path.startswith((DETECTOR, ESTIMATOR))
+    return path.startswith((DETECTOR_PREFIX, ESTIMATOR_PREFIX))
 
 
 def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
@@ -845,7 +900,9 @@ def _changed_method_paths(grid: GridValues) -> list[str]:
     ]
     values = grid.values
     changed_paths = [
-        path for path in DEFAULTS if values.get(path, DEFAULTS[path]) != DEFAULTS[path]
+        path
+        for path in SPECTRUM_METHOD_DEFAULTS
+        if values.get(path, SPECTRUM_METHOD_DEFAULTS[path]) != SPECTRUM_METHOD_DEFAULTS[path]
     ]
     return [*paths_on_axes, *(path for path in changed_paths if path not in paths_on_axes)]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 import sweep.spec.fields as declare
-from sweep.model.ground import LAWS
+from sweep.model.ground import REFLECTANCE_LAWS
 from sweep.scenes.rasters import BYTES_PER_CELL, GRID_CELLS_MAX, raster_digest, read_raster
 from sweep.scenes.scene_files import require_memory
 from sweep.spec.fields import SpecFiles, SpecSection
@@ -36,7 +36,7 @@ class Material(SpecSection):
     """Optical properties of a surface."""
 
     reflectance: float = REFLECTANCE_FIELD
-    reflectance_law: str = declare.choice("How it scatters", LAWS, "lambert")
+    reflectance_law: str = declare.choice("How it scatters", REFLECTANCE_LAWS, "lambert")
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)

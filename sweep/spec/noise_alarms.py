@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sweep.model.detectors import DETECTORS, FIXED
-from sweep.model.estimators import DETECTOR
-from sweep.model.looks import Looks
-from sweep.model.noise_only import bin_probability, bins_counted, segment_probability
-from sweep.model.threshold import WAYS, tnr_of
+from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD
+from sweep.model.detection.estimators import DETECTOR_PREFIX
+from sweep.model.detection.looks import Looks
+from sweep.model.detection.noise_false_alarms import alarm_equivalent_bins, bin_pfa, segment_pfa
+from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
@@ -43,18 +43,20 @@ def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]
         parameters = spec.parameters()
         for axis, index in zip(axes, indices, strict=True):
             parameters |= {member.path: member.values[index] for member in axis.parameters}
-        kind = parameters.get("instrument.processing.detector.kind", FIXED)
-        if kind == FIXED:
-            pfa_bin = bin_probability(float(tnr_of(parameters)), Looks.of(parameters))
+        kind = parameters.get("instrument.processing.detector.kind", FIXED_THRESHOLD)
+        if kind == FIXED_THRESHOLD:
+            pfa_bin = bin_pfa(
+                float(tnr_from_parameters(parameters)), Looks.from_parameters(parameters)
+            )
         elif kind in DETECTORS:
             pfa_bin = float(parameters["instrument.processing.detector.pfa"])
         else:
             continue
         n_bins_up, n_bins_down = (
-            float(bins_counted(parameters, pfa_bin, segment)) for segment in ("up", "down")
+            float(alarm_equivalent_bins(parameters, pfa_bin, segment)) for segment in ("up", "down")
         )
         pfa_up, pfa_down, pfa_any = (
-            float(segment_probability(np.asarray(pfa_bin), bins))
+            float(segment_pfa(np.asarray(pfa_bin), bins))
             for bins in (n_bins_up, n_bins_down, n_bins_up + n_bins_down)
         )
         probabilities.append((pfa_any, pfa_up * pfa_down))
@@ -73,19 +75,22 @@ def iter_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
 
 def fewer_alarms_remedy(spec: GridSpec | SceneSpec) -> str:
     """Fields of a study to change for fewer false alarms, as an imperative."""
-    parameters, kind_path = spec.parameters(), f"{DETECTOR}kind"
+    parameters, kind_path = spec.parameters(), f"{DETECTOR_PREFIX}kind"
     values_by_path = {
         member.path: member.values for axis in spec.axes for member in axis.parameters
     }
     kinds = {
-        str(name) for name in values_by_path.get(kind_path, [parameters.get(kind_path, FIXED)])
+        str(name)
+        for name in values_by_path.get(kind_path, [parameters.get(kind_path, FIXED_THRESHOLD)])
     }
     remedies = []
-    if FIXED in kinds:
+    if FIXED_THRESHOLD in kinds:
         (threshold_path,) = (
-            threshold_path for threshold_path in WAYS if parameters.get(threshold_path) is not None
+            threshold_path
+            for threshold_path in THRESHOLD_PATHS
+            if parameters.get(threshold_path) is not None
         )
         remedies.append(f"{'lower' if 'pfa' in threshold_path else 'raise'} {threshold_path}")
-    if kinds & set(DETECTORS) - {FIXED}:
-        remedies.append(f"lower {DETECTOR}pfa")
+    if kinds & set(DETECTORS) - {FIXED_THRESHOLD}:
+        remedies.append(f"lower {DETECTOR_PREFIX}pfa")
     return " and ".join(remedies)

@@ -26,8 +26,8 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from sweep.messages import escape_unprintable
 from sweep.model.effects.phase_errors import NO_TABLE
-from sweep.model.effects.sweep_table import sweep_table
-from sweep.model.window import ALIASES, COSINE_SUMS
+from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, WINDOW_NAME_ALIASES
 from sweep.scenes.scene_files import file_digest
 from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
 
@@ -632,7 +632,7 @@ class FrequencyErrorTableRule(Rule):
             raise QuantityError("has times that do not rise", "sort the rows by time")
         table_text = ", ".join(f"{time!r} {error!r}" for time, error in rows)
         try:
-            sweep_table(table_text)
+            fit_sweep_error(table_text)
         except ValueError as error:
             raise QuantityError(str(error), "smooth it, or give more rows") from None
         return table_text
@@ -653,7 +653,7 @@ class FrequencyErrorTableRule(Rule):
         return {"anyOf": [rows_schema, {"type": "string"}]}
 
 
-COSINE_SUM_WINDOWS = tuple(COSINE_SUMS)
+COSINE_SUM_WINDOWS = tuple(COSINE_SUM_COEFFICIENTS)
 """Windows that need no look at scipy, which is slow to import; all others are put to it."""
 SCIPY_WINDOWS = (
     "barthann", "bartlett", "bohman", "chebwin", "cosine", "dpss", "exponential", "gaussian",
@@ -677,7 +677,7 @@ class WindowFunctionRule(Rule):
         if match is None:
             remedy = "write e.g. 'hamming' or 'kaiser(8.6)'"
             raise QuantityError("must be the name of a window", remedy)
-        name = ALIASES.get(match["name"], match["name"])
+        name = WINDOW_NAME_ALIASES.get(match["name"], match["name"])
         parameters_text = match["parameters"]
         if name in COSINE_SUM_WINDOWS and parameters_text is None:
             return name

@@ -17,9 +17,15 @@ import sweep.spec.fields as declare
 import sweep.spec.flight_sections as flight_sections
 import sweep.spec.scene_sections as scene_sections
 from sweep.model import beam
-from sweep.model.ground import pattern as beamlet_pattern
-from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
-from sweep.model.resolution import PATTERN
+from sweep.model.beamlet_counts import PATTERN_PATH
+from sweep.model.ground import beamlet_pattern as beamlet_pattern
+from sweep.model.outputs import (
+    CYCLE_VARIABLES,
+    NAVIGATION_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+)
 from sweep.scenes.map_frames import metres_per_height_unit
 from sweep.scenes.scene_files import SceneError
 from sweep.spec.axes import parameter_location
@@ -344,7 +350,10 @@ def _scanner_findings(
         return
     pattern = scanner.build_pattern()
     shots_per_cycle = flight_sections.shots_per_cycle(pattern)
-    shots, flight = pattern.number(span[1] - span[0]), f"in a flight of {span[1] - span[0]:.6g} s"
+    shots, flight = (
+        pattern.count_shots(span[1] - span[0]),
+        f"in a flight of {span[1] - span[0]:.6g} s",
+    )
     if shots < shots_per_cycle:
         problem = f"makes no whole cycle of {shots_per_cycle} shots {flight}"
         yield Finding((*location, "rate"), problem, "raise it, or lengthen the flight")
@@ -362,23 +371,34 @@ def _scanner_findings(
 
 def stored_names() -> frozenset[str]:
     """Names of a store's arrays and dimensions."""
-    output_tables = (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
+    output_tables = (
+        SHOT_VARIABLES,
+        CYCLE_VARIABLES,
+        SHOT_STATISTIC_VARIABLES,
+        POINT_VARIABLES,
+        NAVIGATION_VARIABLES,
+    )
     dims = (output.dims for table in output_tables for output in table.values())
     return frozenset().union(*output_tables, *dims)
 
 
 _OTHER_STUDY_REMEDY = "make another study of it"
 _BEAM_PATHS = (
-    beam.DIVERGENCE,
-    beam.WAIST,
-    beam.QUALITY,
-    beam.FOCUS,
-    beam.RECEIVED_WAIST,
-    beam.COUPLING,
+    beam.DIVERGENCE_PATH,
+    beam.WAIST_PATH,
+    beam.QUALITY_PATH,
+    beam.FOCUS_PATH,
+    beam.OSCILLATOR_WAIST_PATH,
+    beam.COUPLING_PATH,
 )
 _ARRANGEMENT_PATHS = (
-    PATTERN, "footprint.phases", beam.ARCHITECTURE, beam.COUPLING, beam.WAIST, beam.FOCUS
-)  # fmt: skip
+    PATTERN_PATH,
+    "footprint.phases",
+    beam.ARCHITECTURE_PATH,
+    beam.COUPLING_PATH,
+    beam.WAIST_PATH,
+    beam.FOCUS_PATH,
+)
 """Parameters that say where beamlets go."""
 _MOVES_BEAMLETS_REFUSAL = (
     "moves the beamlets, and a study casts its rays once",
@@ -411,15 +431,15 @@ def variation_findings(
     problem, remedy = axis_refusal(path)
     if problem:
         return [Finding(location, problem, remedy)]
-    if path == beam.WAVELENGTH and not beam.is_thesis(parameters):
+    if path == beam.WAVELENGTH_PATH and not beam.has_constant_divergence(parameters):
         problem = "moves the beamlets, as the beam's radius follows from it, and rays are cast once"
         return [Finding(location, problem, f"{_OTHER_STUDY_REMEDY}, or take coupling: aperture")]
-    if path != beam.ARCHITECTURE:
+    if path != beam.ARCHITECTURE_PATH:
         return []
     variants = [parameters, *({**parameters, path: str(value)} for value in values)]
     is_direct = {variant[path] == "direct" for variant in variants}
     if len(set(map(beamlet_pattern, variants))) > 1 or (
-        len(is_direct) > 1 and not all(map(beam.is_thesis, variants))
+        len(is_direct) > 1 and not all(map(beam.has_constant_divergence, variants))
     ):
         problem = "moves the beamlets between direct detection and the others"
         remedy = f"{_OTHER_STUDY_REMEDY}, or take coherent phases and coupling: aperture"
@@ -430,9 +450,9 @@ def variation_findings(
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
     """Axes of what can not vary on one geometry."""
     parameters = {path: default_value(path) for path in _ARRANGEMENT_PATHS} | dict(grid.values)
-    if parameters[PATTERN] in ("line", "square"):
+    if parameters[PATTERN_PATH] in ("line", "square"):
         problem = "stands for a plane alone, and the ground of a scene is none"
-        yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN])
+        yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN_PATH])
     for axis in grid.axes:
         for parameter in axis.parameters:
             location = parameter_location(parameter.path, grid.axes)

@@ -31,9 +31,9 @@ from sweep.spec.rules import rule_error
 from sweep.spec.sections import SPECTRA_METHOD, sunlight_field
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.mesh import Mesh, Surface
-    from sweep.model.geometry.platform import Flight
-    from sweep.model.geometry.rays import Caster
+    from sweep.model.geometry.body_motion import MovingBody
+    from sweep.model.geometry.mesh import Mesh, SurfaceMaterial
+    from sweep.model.geometry.ray_casting import RayCaster
     from sweep.scenes.meshes import Facets, MeshReport
     from sweep.scenes.scattered_objects import SizeFrequencyLaw
     from sweep.scenes.terrain import Terrain
@@ -426,11 +426,11 @@ class SceneStorage(SpecSection):
 class BuiltScene(NamedTuple):
     """Bodies that rays are cast at, in the scene's frame."""
 
-    caster: Caster
+    caster: RayCaster
     """The bodies: all that rests is the first, if there is any, and each that moves another."""
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[SurfaceMaterial, ...]
     """Surfaces by their numbers."""
-    body_flights: tuple[Flight | None, ...]
+    body_flights: tuple[MovingBody | None, ...]
     """Motion of each of the caster's bodies; None for one at rest."""
     mesh_reports: tuple[str, ...]
     """Report of what loading found and mended, a line an object."""
@@ -440,12 +440,12 @@ class BuiltScene(NamedTuple):
     """What is doubtful about the scene's files."""
 
 
-def scene_surfaces(scene: Scene) -> tuple[Surface, ...]:
+def scene_surfaces(scene: Scene) -> tuple[SurfaceMaterial, ...]:
     """Surfaces of a scene in the order of their numbers."""
-    from sweep.model.geometry.mesh import Surface
+    from sweep.model.geometry.mesh import SurfaceMaterial
 
     return tuple(
-        Surface(name, material.reflectance, material.reflectance_law)
+        SurfaceMaterial(name, material.reflectance, material.reflectance_law)
         for key, scene_object in scene.objects.items()
         for name, material in named_materials(key, scene_object)
     )
@@ -479,12 +479,12 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
 
     An object that stays in place does so for the `span` of the flight [s].
     """
-    from sweep.model.geometry.mesh import merge
-    from sweep.model.geometry.rays import Caster
+    from sweep.model.geometry.mesh import merge_meshes
+    from sweep.model.geometry.ray_casting import RayCaster
 
     origin, grounds, warnings = _build_grounds(scene, files)
     resting_meshes: list[Mesh] = []
-    moving_meshes: list[tuple[Mesh, Flight]] = []
+    moving_meshes: list[tuple[Mesh, MovingBody]] = []
     reports = []
     first_surface = 0
     for name, scene_object in scene.objects.items():
@@ -503,10 +503,10 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
         reports.append(f"{name}: {report.summary()}")
         first_surface += len(named_materials(name, scene_object))
     del grounds  # before the trees are built, which take the most memory
-    merged_meshes = [merge(resting_meshes)] if resting_meshes else []
+    merged_meshes = [merge_meshes(resting_meshes)] if resting_meshes else []
     resting_meshes.clear()
     return BuiltScene(
-        Caster([*merged_meshes, *(mesh for mesh, _ in moving_meshes)]),
+        RayCaster([*merged_meshes, *(mesh for mesh, _ in moving_meshes)]),
         scene_surfaces(scene),
         (*(None for _ in merged_meshes), *(flight for _, flight in moving_meshes)),
         tuple(reports),

@@ -14,13 +14,13 @@ from pydantic import BaseModel, model_validator
 
 import sweep.spec.fields as declare
 from sweep.model import waveform
-from sweep.model.accuracy import AUTOMATIC, COUNTED
 from sweep.model.beam import COUPLINGS
-from sweep.model.detectors import DETECTORS, FIXED
-from sweep.model.estimators import ESTIMATORS, PEAK_BIN
-from sweep.model.ground import LAWS
-from sweep.model.looks import COMBINED, SPECKLES
-from sweep.model.threshold import PROCESSING, WAYS
+from sweep.model.detection.detectors import DETECTORS, FIXED_THRESHOLD
+from sweep.model.detection.estimators import ESTIMATORS, PEAK_BIN
+from sweep.model.detection.looks import COMBINE_KINDS, SPECKLE_KINDS
+from sweep.model.error_budget import AUTOMATIC, COUNT_INTERVALS
+from sweep.model.ground import REFLECTANCE_LAWS
+from sweep.model.threshold import PROCESSING_PREFIX, THRESHOLD_PATHS
 from sweep.spec.fields import SpecSection, add_effect_modes, add_effect_parameters, rules_by_path
 from sweep.spec.rules import (
     ChoiceOrFunctionRule,
@@ -76,7 +76,7 @@ class Chirp(SpecSection):
         "Segments of a shot in the order of time: up- and down-chirp, and the light without a "
         "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
         "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
-        waveform.ORDERS,
+        waveform.SEGMENT_ORDERS,
     )
     doppler_slope: float = declare.number(
         "Chirp rate of the segment 'doppler' over that of the segment 'up', with its sign: 0 for "
@@ -201,7 +201,7 @@ class Detector(SpecSection):
         ChoiceOrFunctionRule(
             description="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)
         ),
-        FIXED,
+        FIXED_THRESHOLD,
     )
     training: int = declare.count(
         "Training cells of a CFAR detector, half of them on either side; even",
@@ -313,7 +313,7 @@ class Processing(SpecSection):
         "What is taken for granted where two beats of a real record tell range and velocity: far, "
         "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
         "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
-        waveform.ASSUMPTIONS,
+        waveform.TWO_BEAT_ASSUMPTIONS,
     )
     noise_bins: str = declare.choice(
         "Noise of bins: correlated as window and padding make it, and real at DC and "
@@ -327,7 +327,9 @@ class Processing(SpecSection):
     @model_validator(mode="after")
     def _check_single_threshold(self) -> Self:
         """Refuse a threshold that is not set, or that is set in several ways."""
-        threshold_fields = [field_name.removeprefix(PROCESSING) for field_name in WAYS]
+        threshold_fields = [
+            field_name.removeprefix(PROCESSING_PREFIX) for field_name in THRESHOLD_PATHS
+        ]
         given_fields = [
             field_name for field_name in threshold_fields if getattr(self, field_name) is not None
         ]
@@ -358,7 +360,7 @@ class LooksOfShot(SpecSection):
         "Detection from several records: by their mean power, by the number of those that cross, "
         "or by their sum in amplitude, with the phases that a steady velocity makes put right. "
         "tnr and threshold_to_mean are over the noise of one record, or of the mean of a sum",
-        COMBINED,
+        COMBINE_KINDS,
     )
     votes: int = declare.count(
         "Records that must cross in a bin; binary only", "3", "1", "256", default=1
@@ -367,7 +369,7 @@ class LooksOfShot(SpecSection):
         "Speckle of the records: as the motion from one to the next changes it; common to all; or "
         "independent, where the beam moves on by its own width. Surfaces of a stated "
         "target.roughness have one speckle for all records of a shot",
-        SPECKLES,
+        SPECKLE_KINDS,
     )
 
 
@@ -407,7 +409,9 @@ class Target(SpecSection):
     )
     reflectance: float = REFLECTANCE_FIELD
     reflectance_law: str = declare.choice(
-        "How it scatters: Lambertian, as regolith, or as the thesis has it", LAWS, "lambert"
+        "How it scatters: Lambertian, as regolith, or as the thesis has it",
+        REFLECTANCE_LAWS,
+        "lambert",
     )
     radial_velocity: float = declare.quantity(
         "Speed along the line of sight, positive when closing", "m/s", "150 m/s", default=0.0
@@ -498,7 +502,7 @@ class Draws(SpecSection):
     interval: str = declare.choice(
         "Interval of the share of draws with a detection, where noise alone is drawn: "
         "at least as sure as promised everywhere, or on the average",
-        tuple(COUNTED),
+        tuple(COUNT_INTERVALS),
     )
 
     @property

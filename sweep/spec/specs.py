@@ -18,13 +18,14 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 import sweep.spec.fields as declare
 import sweep.spec.scene_sections as scene_sections
 import sweep.spec.sections as sections
-from sweep.model import VERSION, accuracy, beam, looks, waveform
+from sweep.model import VERSION, beam, error_budget, waveform
+from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge, initial_ray_count
+from sweep.model.detection import looks
 from sweep.model.effects import circulator_leak
-from sweep.model.ground import pattern as beamlet_pattern
-from sweep.model.outputs import STRONGEST_OUTPUTS
-from sweep.model.resolution import BEAMLETS, is_open, rays_needed
-from sweep.model.threshold import WAYS
-from sweep.model.waveform import ENDS
+from sweep.model.ground import beamlet_pattern as beamlet_pattern
+from sweep.model.outputs import STRONGEST_PEAK_OUTPUTS
+from sweep.model.threshold import THRESHOLD_PATHS
+from sweep.model.waveform import SEARCH_BAND_PATHS
 from sweep.safe_json import parse_json
 from sweep.spec.axes import (
     Axis,
@@ -95,9 +96,9 @@ from sweep.spec.yaml_document import (
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
-    from sweep.model.geometry.mesh import Surface
-    from sweep.model.geometry.platform import Flight
-    from sweep.model.geometry.scanner import PointingJitter, Scanner
+    from sweep.model.geometry.body_motion import MovingBody
+    from sweep.model.geometry.mesh import SurfaceMaterial
+    from sweep.model.geometry.scanner import PointingJitter, ScanPattern
 
 
 GRID_POINTS_MAX = 10**15
@@ -266,17 +267,19 @@ class BaseSpec(SpecSection):
         parameters = self.parameters()
         findings = []
         for name, raw_value in overrides.items():
-            path, rule = _find_parameter(name, parameters | dict.fromkeys((*WAYS, *ENDS)))
+            path, rule = _find_parameter(
+                name, parameters | dict.fromkeys((*THRESHOLD_PATHS, *SEARCH_BAND_PATHS))
+            )
             if rule is None:
                 suggestion = sections.suggest_parameter(name, parameters)
                 findings.append(Finding((name,), "is no parameter", suggestion))
                 continue
             try:
-                if path in WAYS:  # one takes another's place
+                if path in THRESHOLD_PATHS:  # one takes another's place
                     parameters = {
                         other_path: other_value
                         for other_path, other_value in parameters.items()
-                        if other_path not in WAYS
+                        if other_path not in THRESHOLD_PATHS
                     }
                 parameters[path] = rule.read(raw_value)
             except QuantityError as error:
@@ -393,25 +396,27 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
 
 def _segment_findings(grid: GridValues) -> Iterator[Finding]:
     """Report segments whose beats do not tell range and velocity apart, and rules without laws."""
-    if grid.has_point({waveform.DOWN_SLOPE: lambda slope: slope == 1.0}):
+    if grid.has_point({waveform.DOWN_SLOPE_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
-        yield grid.make_finding(waveform.DOWN_SLOPE, problem, "write another, or -1 for a triangle")
+        yield grid.make_finding(
+            waveform.DOWN_SLOPE_PATH, problem, "write another, or -1 for a triangle"
+        )
     any_two_condition: dict[str, Condition] = {
-        waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO
+        waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO
     }
-    slopes = {1.0, *grid.values_of(waveform.DOWN_SLOPE)}
+    slopes = {1.0, *grid.values_of(waveform.DOWN_SLOPE_PATH)}
     if grid.has_point(
         any_two_condition
-        | {waveform.DOPPLER_SLOPE: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
+        | {waveform.DOPPLER_SLOPE_PATH: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
     ):
         problem = "is another segment's too, and these two tell neither range nor velocity: any_two"
         yield grid.make_finding(
-            waveform.DOPPLER_SLOPE, problem, "write another, or take both_chirps"
+            waveform.DOPPLER_SLOPE_PATH, problem, "write another, or take both_chirps"
         )
 
 
 STRONGEST_PEAK_CONDITION: dict[str, Condition] = {
-    waveform.PEAKS: lambda peaks: peaks == waveform.STRONGEST
+    waveform.PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
 """Condition on points whose segments report their strongest peak alone."""
 
@@ -419,22 +424,22 @@ STRONGEST_PEAK_CONDITION: dict[str, Condition] = {
 def _strongest_findings(grid: GridValues) -> Iterator[Finding]:
     """Report the strongest peak alone where no law of it is known."""
     several_looks: dict[str, Condition] = {
-        looks.NUMBER: lambda number: number > 1,
-        looks.COMBINE: lambda combination: combination != looks.COHERENT,
+        looks.LOOKS_NUMBER_PATH: lambda number: number > 1,
+        looks.LOOKS_COMBINE_PATH: lambda combination: combination != looks.COMBINE_COHERENT,
     }
     refused_combinations: tuple[tuple[dict[str, Condition], str, str], ...] = (
         (several_looks, "is that of one record, and instrument.looks.number asks for several",
          "combine: coherent"),
-        ({circulator_leak.PATH: lambda path: path > 0},
+        ({circulator_leak.LEAK_LENGTH_PATH: lambda path: path > 0},
          "may be the line of instrument.telescope.leak_path, whose noise has no law",
          "leave the leak's path out"),
-        ({waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO},
+        ({waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO},
          "may be wrong in one of three segments, and shot_detection: any_two cannot tell in which",
          "shot_detection: both_chirps"),
     )  # fmt: skip
     for conditions, problem, remedy in refused_combinations:
         if grid.has_point(STRONGEST_PEAK_CONDITION | conditions):
-            yield grid.make_finding(waveform.PEAKS, problem, f"take all, or {remedy}")
+            yield grid.make_finding(waveform.PEAKS_PATH, problem, f"take all, or {remedy}")
 
 
 def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
@@ -463,7 +468,7 @@ class GridSpec(BaseSpec):
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
         """Figures of what the study lacks, random effects without draws, draws without an end."""
-        extra_variables = STRONGEST_OUTPUTS if grid.has_point(STRONGEST_PEAK_CONDITION) else ()
+        extra_variables = STRONGEST_PEAK_OUTPUTS if grid.has_point(STRONGEST_PEAK_CONDITION) else ()
         findings = (
             list(grid_figure_findings(raw_spec, grid.axes, extra_variables))
             if all_axes_read
@@ -474,7 +479,9 @@ class GridSpec(BaseSpec):
             findings += spectra_findings(draws, grid)
             if draws.has_draws and grid.has_point(STRONGEST_PEAK_CONDITION):
                 problem = "has chances in closed form alone, and the study has draws"
-                findings.append(grid.make_finding(waveform.PEAKS, problem, "take all, or no draws"))
+                findings.append(
+                    grid.make_finding(waveform.PEAKS_PATH, problem, "take all, or no draws")
+                )
             findings += () if draws.has_draws else undrawn_effect_findings(grid)
             if draws.number and draws.limit:
                 problem = f"stands beside draws.number, {draws.number}: only one of them can say "
@@ -581,18 +588,18 @@ class SceneSpec(BaseSpec):
         parameters = super().parameters()
         if not self.draws.draws_whole_spectra:
             parameters = {p: v for p, v in parameters.items() if not is_detector_or_estimator(p)}
-        n_rays = rays_needed(parameters, accuracy.Accuracy.of(parameters))
+        n_rays = initial_ray_count(parameters, error_budget.ErrorBudget.from_parameters(parameters))
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,
-            BEAMLETS: self.footprint.beamlets or n_rays,
+            BEAMLETS_PATH: self.footprint.beamlets or n_rays,
         }
 
     @property
     def is_ray_number_set_by_tolerance(self) -> bool:
         """True if the tolerance says how many rays there are of each shot."""
-        return self.footprint.beamlets == 0 and is_open(self.parameters())
+        return self.footprint.beamlets == 0 and beamlets_converge(self.parameters())
 
-    def surfaces(self) -> tuple[Surface, ...]:
+    def surfaces(self) -> tuple[SurfaceMaterial, ...]:
         """Surfaces by their numbers; no file is looked at."""
         return scene_sections.scene_surfaces(self.scene)
 
@@ -601,11 +608,11 @@ class SceneSpec(BaseSpec):
         flight = self.build_flight()
         return scene_sections.build_scene(self.scene, self.files, (flight.start, flight.stop))
 
-    def build_flight(self) -> Flight:
+    def build_flight(self) -> MovingBody:
         """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
         return self.platform.build_flight(self.files)
 
-    def scan_pattern(self, name: str) -> Scanner:
+    def scan_pattern(self, name: str) -> ScanPattern:
         """Return the scan pattern of a scanner."""
         return self.scanners[name].build_pattern()
 
@@ -692,17 +699,21 @@ class SceneSpec(BaseSpec):
     def number_of_cycles(self, name: str) -> int:
         """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""
         flight, pattern = self.build_flight(), self.scan_pattern(name)
-        return pattern.number(flight.stop - flight.start) // shots_per_cycle(pattern)
+        return pattern.count_shots(flight.stop - flight.start) // shots_per_cycle(pattern)
 
     @property
     def beamlet_pattern(self) -> str:
-        """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
+        """Arrangement of the beamlets, `sweep.model.beamlets.place_beamlets`'s word."""
         return beamlet_pattern(self.parameters())
 
-    def footprint_angles(self) -> Callable[[np.ndarray], beam.Angles] | None:
+    def footprint_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
         """Angles of the beam's footprint by range; None where its divergence says all."""
         parameters = self.parameters()
-        return None if beam.is_thesis(parameters) else partial(beam.angles, parameters)
+        return (
+            None
+            if beam.has_constant_divergence(parameters)
+            else partial(beam.footprint_angles, parameters)
+        )
 
     def interface_with(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
         """Return the unit's interface with some fields set anew, written as in a spec."""
@@ -756,11 +767,11 @@ class SceneSpec(BaseSpec):
             "platform": values_by_path(self.platform, digests=digests),
             "scanner": values_by_path(self.scanners[name], digests=digests),
             "model": VERSION,
-            "beamlets": parameters[BEAMLETS],
+            "beamlets": parameters[BEAMLETS_PATH],
             "pattern": self.beamlet_pattern,
-            "beam": {beam.DIVERGENCE: parameters[beam.DIVERGENCE]}
-            if beam.is_thesis(parameters)
-            else beam.shape(parameters),
+            "beam": {beam.DIVERGENCE_PATH: parameters[beam.DIVERGENCE_PATH]}
+            if beam.has_constant_divergence(parameters)
+            else beam.beam_shape_parameters(parameters),
             "seed": self.seed if self.platform.jitter else 0,
             "rotation": self.effect_modes()["rotation"] != "off",
         }
@@ -777,7 +788,7 @@ class SceneSpec(BaseSpec):
         """
         digests, automatic_beamlets = (
             self._file_digests,
-            {BEAMLETS: 0} if self.is_ray_number_set_by_tolerance else {},
+            {BEAMLETS_PATH: 0} if self.is_ray_number_set_by_tolerance else {},
         )
         return super().identity() | {
             "parameters": self.parameters_off_axes() | automatic_beamlets,

@@ -17,8 +17,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 import sweep.spec.fields as spec_fields
-from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
-from sweep.model.threshold import PROCESSING, WAYS
+from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
+from sweep.model.threshold import PROCESSING_PREFIX, THRESHOLD_PATHS
 from sweep.regular_files import RefusedFileError, open_regular
 from sweep.safe_json import is_utf8_encodable
 from sweep.scenes.scene_files import SceneError, read_csv_columns
@@ -52,7 +52,7 @@ _INSTRUMENT_FILE_SECTIONS = frozenset(
 )
 """Sections of an instrument's file; a study takes the last two."""
 _LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
-_THRESHOLD_FIELDS = {way.removeprefix(PROCESSING) for way in WAYS}
+_THRESHOLD_FIELDS = {way.removeprefix(PROCESSING_PREFIX) for way in THRESHOLD_PATHS}
 
 _NUMBER_DIGITS_MAX = 4000
 """Of a number: Python reads no more, unless it is asked to."""
@@ -479,7 +479,7 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
 
 def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
     """Put the rows of a CSV file of the sweep's error in the place of its path."""
-    chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE.split(".")
+    chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE_PATH.split(".")
     if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
         return
     if (raw_path := chirp[name]) == NO_TABLE:
@@ -489,7 +489,7 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
         table = read_csv_columns(base / os.path.expanduser(raw_path), columns, columns, example)
     except SceneError as error:
         problem = f"names a file that {error.problem}"
-        location = tuple(ERROR_TABLE.split("."))
+        location = tuple(ERROR_TABLE_PATH.split("."))
         document.findings.append(Finding(location, problem, error.remedy, raw_path))
         chirp[name] = NO_TABLE
         return
@@ -692,7 +692,11 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
     location = resolved.location
     if error_type == RULE_ERROR_TYPE:
         context, path = detail["ctx"], dotted_path(location)
-        if isinstance(raw_value, list | dict) and path in parameter_rules() and path != ERROR_TABLE:
+        if (
+            isinstance(raw_value, list | dict)
+            and path in parameter_rules()
+            and path != ERROR_TABLE_PATH
+        ):
             values = "[...]" if isinstance(raw_value, list) else "{linear: [...], number: ...}"
             remedy = f"put several under axes: '{path}: {values}'"
             return Finding(location, "takes one value", remedy, raw_value)

@@ -29,4 +29,4 @@ def dask_setup(worker: Any) -> None:
         if get_address_host(worker.address) == get_address_host(worker.scheduler.address):
             # The driver compiles the same kernels, and says once that they can't be cached.
             logging.getLogger("sweep").setLevel(logging.ERROR)
-    import sweep.model.shot  # noqa: F401
+    import sweep.model.evaluation  # noqa: F401

@@ -9,7 +9,7 @@ from stored_studies import INSTRUMENT, run_into_store, spec_over_axes
 from synthetic_datasets import dataset_of_deviates
 
 import sweep
-from sweep.model.shot import evaluate
+from sweep.model.evaluation import evaluate
 
 LEVEL = float(ndtri(0.9))
 RANGES = np.array([100.0, 200.0, 400.0, 700.0, 1100.0])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sweep.analysis.scene_results.navigation_errors import ErrorTally, merge_tallies, tally_errors
-from sweep.model.geometry.scanner import corners
-from sweep.model.navigation import velocity
+from sweep.model.geometry.scanner import corner_directions
+from sweep.model.pointcloud.navigation import solve_velocity
 
 FIELDS = (
     "attempts", "n_solutions", "mean_error", "squared_deviation", "mean_stated_variance",
@@ -110,17 +110,17 @@ def test_what_is_not_there_is_nan_and_never_a_warning():
 
 def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_variance():
     n, pd, moving = 20_000, 0.8, np.array([5.0, -3.0, -60.0])
-    beams, rng = corners(math.radians(22.5)), np.random.default_rng(3)
+    beams, rng = corner_directions(math.radians(22.5)), np.random.default_rng(3)
     measured = beams @ moving + rng.normal(0, 0.01, (n, 4))
     measured[rng.random((n, 4)) >= pd] = np.nan
-    found = velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
+    found = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
     stated = np.diagonal(found.covariance, axis1=-2, axis2=-1)
-    result = _of_all(found.value - moving, stated, found.available)
+    result = _of_all(found.value - moving, stated, found.is_available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
     assert (np.abs(result.bias) <= 5 * np.sqrt(result.stated_variance / result.n_solutions)).all()
     # draws of three and of four beams mix, so the spread of squares is taken from themselves
-    off = found.value[found.available] - moving
+    off = found.value[found.is_available] - moving
     spread = np.std(off**2, axis=0) / np.sqrt(result.n_solutions)
     assert (np.abs(result.variance - result.stated_variance) <= 5 * spread).all()
     assert (5 * spread < 0.07 * result.stated_variance).all()  # a variance 7 % off would show

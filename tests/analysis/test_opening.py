@@ -10,8 +10,16 @@ import sweep
 from sweep.analysis.datasets import NotAStoreError, open_scene, read_slices, sum_batches
 from sweep.analysis.datasets import open as open_store
 from sweep.analysis.scene_results.recordings import read_eyepoints
-from sweep.model.eyepoints import observe
-from sweep.model.outputs import CYCLES, NAVIGATION, OUTPUTS, POINTS, SHOTS, SIMULATED, STATISTICS
+from sweep.model.outputs import (
+    CYCLE_VARIABLES,
+    EFFECT_VARIABLES,
+    GRID_OUTPUTS,
+    NAVIGATION_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+)
+from sweep.model.pointcloud.eyepoints import observe_eyepoints
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +32,7 @@ def test_dimensions_and_units_are_those_of_the_spec(surface):
     assert dict(dataset.sizes) == {"range": 24, "grazing_angle": 9}
     assert dataset.range.attrs["units"] == "m"
     assert dataset.grazing_angle.values[0] == 10
-    for name, output in OUTPUTS.items():
+    for name, output in GRID_OUTPUTS.items():
         assert dataset[name].attrs["units"] == output.units
         assert dataset[name].attrs["long_name"] == output.long_name
 
@@ -116,11 +124,16 @@ def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_sto
     for name, navigates in (("square", True), ("pair", False)):
         group = tree.children[name].to_dataset(inherit=False)
         outputs = (
-            SHOTS | CYCLES | STATISTICS | SIMULATED | POINTS | (NAVIGATION if navigates else {})
+            SHOT_VARIABLES
+            | CYCLE_VARIABLES
+            | SHOT_STATISTIC_VARIABLES
+            | EFFECT_VARIABLES
+            | POINT_VARIABLES
+            | (NAVIGATION_VARIABLES if navigates else {})
         )
         assert set(group.data_vars) == set(outputs)
         for output, described in outputs.items():
-            along = ("power",) if output not in SHOTS | CYCLES else ()
+            along = ("power",) if output not in SHOT_VARIABLES | CYCLE_VARIABLES else ()
             assert group[output].dims == along + described.dims
             assert group[output].attrs["units"] == described.units
             assert group[output].dtype == described.dtype
@@ -156,15 +169,15 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
     index = np.array([3, 77, 130, 311])
     for name in spec.scanners:
         found = read_eyepoints(scene_store, tree[name].to_dataset(), index)
-        cast = observe(
+        cast = observe_eyepoints(
             index,
             flight=spec.build_flight(),
             scanner=spec.scan_pattern(name),
             caster=world.caster,
             beam_divergence=spec.instrument.laser.beam_divergence,
-            number=spec.footprint.beamlets,
+            n_beamlets=spec.footprint.beamlets,
             pattern=spec.beamlet_pattern,
-            bodies=world.body_flights,
+            body_motions=world.body_flights,
         )
         for field, array in cast._asdict().items():
             equal_nan = array.dtype.kind == "f"

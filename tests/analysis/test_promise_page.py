@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerance_of_draws
 
-from sweep.model.outputs import PROMISED
+from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import load
 from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting
 from sweep.tasks.studies.grid_study import GridStudy
@@ -34,7 +34,7 @@ def test_exact_means_are_those_of_many_draws(few):
     study = GridStudy(few)
     found = study.evaluate(0)
     assert study.grid.n_blocks == 1 and off < 1e-12
-    for name, mean in zip(PROMISED, means, strict=True):
+    for name, mean in zip(PD_OUTPUTS, means, strict=True):
         error = found[f"{name}_error"].ravel()
         assert (abs(found[name].ravel() - mean) <= 5 * error + 1e-9).all(), name
         assert ((error > 1e-4) & (error < 0.01)).sum() >= 4

@@ -9,7 +9,7 @@ from stored_scenes import copy_without_last_cycles, run_flight_into_store
 
 import sweep
 from sweep.analysis.scene_results.interface_reports import REPORT_COLUMNS, make_reports, quantise
-from sweep.model.pairing import TRUE, UNCONFIRMED
+from sweep.model.pointcloud.pairing import TRUE_FLAG, UNCONFIRMED_FLAG
 from sweep.spec import SpecError
 from sweep.spec.scene_sections import Interface
 
@@ -27,7 +27,7 @@ def made(n=2000, beams=2, every=5e-3, *, noise=0.0, seed=1):
     time = np.arange(n) * every + 3.0
     speed = 40.0 + FALL * (time - 3.0)
     range_ = 3000.0 - 40.0 * (time - 3.0) - FALL * (time - 3.0) ** 2 / 2
-    shots = {"time": time, "beam": np.arange(n) % beams, "flags": np.full(n, TRUE, np.uint8)}
+    shots = {"time": time, "beam": np.arange(n) % beams, "flags": np.full(n, TRUE_FLAG, np.uint8)}
     shots |= {"range": range_ + noise * rng.normal(size=n)}
     shots |= {"radial_velocity": speed + noise * rng.normal(size=n)}
     shots |= dict.fromkeys(
@@ -110,13 +110,13 @@ def test_a_mean_of_n_shots_has_their_mean_time_and_an_error_less_by_the_root_of_
 def test_the_last_is_the_last_valid_shot_of_the_period():
     shots = made(400, noise=0.2)
     shots["flags"][np.random.default_rng(2).random(400) < 0.5] = 0
-    shots["flags"][::7] |= UNCONFIRMED
+    shots["flags"][::7] |= UNCONFIRMED_FLAG
     found = make_reports(shots, interface(rate="20 Hz", value="last"))
     for row, (beam, period) in enumerate((b, p) for p in range(40) for b in range(2)):
         there = [
             i for i in range(400)
             if shots["beam"][i] == beam and int(i * 5e-3 / 50e-3 + 1e-9) == period
-            and shots["flags"][i] == TRUE
+            and shots["flags"][i] == TRUE_FLAG
         ]  # fmt: skip
         assert found["shots"][row] == len(there) and found["valid"][row] == bool(there)
         wanted = shots["range"][there[-1]] if there else np.nan
@@ -153,7 +153,7 @@ def test_reports_of_a_store_are_those_of_its_first_returns(scene_store, tmp_path
     found = sweep.reports(scene_store, **asked)
     arrays = xr.open_zarr(scene_store, group="square", chunks=None).isel(power=1, draw=1).load()
     flags = arrays.flags.values[:, 0]
-    valid = (flags > 0) & (flags & UNCONFIRMED == 0)
+    valid = (flags > 0) & (flags & UNCONFIRMED_FLAG == 0)
     assert valid.any() and np.array_equal(found.valid, valid)
     first = arrays.radial_velocity_interpolated.values[:, 0]
     assert np.array_equal(found.radial_velocity, np.where(valid, first, np.nan), equal_nan=True)

@@ -17,7 +17,7 @@ from sweep.analysis.scene_results.recordings import (
     find_axis_position,
     gather_cloud,
 )
-from sweep.model.pairing import TRUE
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,10 @@ def small_cloud(points, **changes):
     """A cloud of points given as columns x, y, z, all true."""
     table = dict(zip(WORLD_AXES, np.asarray(points, float), strict=True))
     number = table["x"].size
-    table |= {"range": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
+    table |= {
+        "range": np.arange(number, dtype=float),
+        "flags": np.full(number, TRUE_FLAG, np.uint8),
+    }
     box = {
         axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in WORLD_AXES
     }
@@ -98,7 +101,7 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
         with_path=True,
     )  # fmt: skip
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.axis_indices, draw=draw)
-    true = (arrays.flags.values & TRUE) > 0
+    true = (arrays.flags.values & TRUE_FLAG) > 0
     position = arrays.position.values
     for k, axis in enumerate(WORLD_AXES):
         low, high = found.box[axis]
@@ -147,7 +150,7 @@ def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, a
     found = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True)
     sheet = drawn(found, tree, view=view, height_map=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
-    true = (found.points["flags"] & TRUE) > 0
+    true = (found.points["flags"] & TRUE_FLAG) > 0
     (shown,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
     expected = np.column_stack([found.points[axis][true] for axis in axes])
     assert np.array_equal(np.sort(shown, axis=0), np.sort(expected, axis=0))

@@ -19,7 +19,7 @@ from sweep.analysis.scene_results.recordings import (
     to_shown_units,
 )
 from sweep.analysis.selection import parameters_at
-from sweep.model.pairing import FLAGS, TRUE
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
 from sweep.spec import SpecError
 from sweep.spec.figure_sections import FIGURE_QUANTITIES as OF_SPECS
 
@@ -134,7 +134,9 @@ def test_few_rows_are_not_thinned_and_none_are_none():
 
 
 def test_flags_say_one_kind_each_and_ratios_are_shown_in_decibels():
-    flags = np.array([0, TRUE, FLAGS["sidelobe"] | FLAGS["unconfirmed"], FLAGS["false_alarm"]])
+    flags = np.array(
+        [0, TRUE_FLAG, FLAG_BITS["sidelobe"] | FLAG_BITS["unconfirmed"], FLAG_BITS["false_alarm"]]
+    )
     names = list(POINT_KINDS)
     assert [names[i] if i >= 0 else "" for i in point_kinds(flags)] == [
         "", "true", "sidelobe", "false_alarm",

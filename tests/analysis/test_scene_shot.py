@@ -14,9 +14,9 @@ from sweep.analysis.scene_results.recordings import (
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.shot_spectra import BinGroup, SegmentSpectrum, simulate_prepared_shot
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import names_of
-from sweep.model.eyepoints import prepare_eyepoints
-from sweep.model.pairing import TRUE
+from sweep.model.effects.catalogue import unpack_effect_flags
+from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,8 @@ def arrays(scene_store):
 def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(scene_store, recording.dataset, np.array([number]))
     parameters = parameters_at(spec, find_axis_position(spec, {"power": "1 W"}).axis_indices)
-    effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
-    prepared = prepare_eyepoints(eyepoints, parameters, spec.surfaces(), effects)
+    effects = unpack_effect_flags(int(recording.read("effects", slice(number, number + 1))[0]))
+    prepared = prepare_eyepoint_shots(eyepoints, parameters, spec.surfaces(), effects)
     return eyepoints, simulate_prepared_shot(prepared, parameters, seed=seed)
 
 
@@ -49,7 +49,7 @@ def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recor
                         arrays.surface.values[shot, draw], arrays.flags.values[shot, draw],
                         strict=True,
                     )
-                    if flags & TRUE
+                    if flags & TRUE_FLAG
                 }
             ) == 2
         )  # fmt: skip

@@ -3,7 +3,7 @@ import pytest
 from stored_studies import INSTRUMENT, SURFACE_AXES, TARGET, spec_over_axes
 
 from sweep.analysis import shot_spectra
-from sweep.model import shot as shot_model
+from sweep.model import evaluation as shot_model
 from sweep.spec import SpecError
 
 

@@ -7,7 +7,7 @@ import pytest
 import validation_page
 
 import sweep
-from sweep.model.noise_only import bin_probability
+from sweep.model.detection.noise_false_alarms import bin_pfa
 from sweep.spec import GridSpec, load
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +67,7 @@ def test_every_experiment_on_the_page_is_there():
 
 
 def test_what_explains_a_printed_number_follows_from_it():
-    closed = bin_probability(5.0)
+    closed = bin_pfa(5.0)
     told = {
         float(f"{closed:.2g}"): "the same in 2 digits",
         float(f"{closed:.1g}"): "the same in 1 digit,",
@@ -77,7 +77,7 @@ def test_what_explains_a_printed_number_follows_from_it():
     for printed, words in told.items():
         assert re.match(words, validation_page.explain_printed_alarm(5.0, printed, closed))
     # TNR is a ratio of magnitudes, whose squares grow with the noise's variance
-    assert bin_probability(5.0 / 1.0181**0.5) == pytest.approx(1.1 * closed, rel=5e-3)
+    assert bin_pfa(5.0 / 1.0181**0.5) == pytest.approx(1.1 * closed, rel=5e-3)
 
 
 def test_bins_that_verdicts_are_held_against_are_the_published_ones():

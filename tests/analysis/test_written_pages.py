@@ -8,15 +8,15 @@ import yaml
 from stored_studies import spec_over_axes
 
 import sweep
+from sweep.model.detection.estimators import ESTIMATORS
 from sweep.model.effects import noise_sources
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.estimators import ESTIMATORS
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    RUNNING_OUTPUTS,
+    DRAW_COUNT_OUTPUTS,
+    RUNNING_SUM_OUTPUTS,
     SPECTRA_OUTPUTS,
+    STANDARD_ERROR_OUTPUTS,
 )
 from sweep.spec import Draws, GridSpec
 from sweep.spec.sections import Detector
@@ -63,7 +63,12 @@ def test_every_field_and_every_array_of_draws_is_listed():
     arrays = {name.split("`")[1] for name, _ in rows(DRAWS_PAGE) if "." not in name}
     assert arrays == {"n_draws", "pd_up_half_width", "accuracy_missed", "pd_up_error",
                       "n_detected_up", "running_sums"}  # fmt: skip
-    assert arrays <= {*ACCURACY_OUTPUTS, *ERROR_OUTPUTS, *DRAW_OUTPUTS, *RUNNING_OUTPUTS}
+    assert arrays <= {
+        *ACCURACY_OUTPUTS,
+        *STANDARD_ERROR_OUTPUTS,
+        *DRAW_COUNT_OUTPUTS,
+        *RUNNING_SUM_OUTPUTS,
+    }
 
 
 def test_the_spec_of_detectors_is_one():
@@ -77,7 +82,7 @@ def test_every_field_estimator_and_array_of_detectors_is_listed():
     fields = {name for name in named(DETECTORS) if name.startswith("detector.")}
     assert fields == {f"detector.{name}" for name in Detector.model_fields}
     assert set(ESTIMATORS) <= set(named(DETECTORS))
-    stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
+    stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
     about = named(DETECTORS.partition("## What is drawn")[2].partition("## False alarms")[0])
     assert {name for name in about if name != "array"} <= stored
     exported = named(DETECTORS.partition("try code outside of a study")[2])

@@ -8,11 +8,17 @@ from pathlib import Path
 import numpy as np
 from study_checks import Verdict, check_mistake, mistake_kind, warnings_as_errors
 
-from sweep.model.detectors import FIXED
-from sweep.model.estimators import DETECTOR
-from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
-from sweep.model.unsupported import UnsupportedShot
-from sweep.model.waveform import PEAKS, STRONGEST, order_of
+from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.estimators import DETECTOR_PREFIX
+from sweep.model.outputs import (
+    CYCLE_VARIABLES,
+    NAVIGATION_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+)
+from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.waveform import PEAKS_PATH, STRONGEST_PEAK, existing_segments
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
@@ -45,7 +51,7 @@ def check_flight(file: Path) -> Verdict:
             # Of a field of the spec, or of a file that the scene names.
             assert error.problem and error.remedy, f"no remedy: {error}"
             return Verdict((error.problem[:50],))
-        except UnsupportedShot as error:
+        except UnsupportedShotError as error:
             assert "instrument." in str(error), f"no field named: {error}"
             return Verdict((str(error)[:50],))
     return Verdict()
@@ -80,14 +86,14 @@ def _undefined_statistics(study: FlightStudy, tile: FlightBlock) -> set[str]:
         str(parameters[f"instrument.{name}"])
         for name in ("receiver.architecture", "chirp.segments")
     )
-    if "doppler" not in order_of(architecture, order):
+    if "doppler" not in existing_segments(architecture, order):
         undefined.add("pd_doppler")
     if study.ray_accuracy is None:
         undefined.add("beamlets_error")
-    is_threshold = parameters.get(DETECTOR + "kind", FIXED) == FIXED
-    has_probabilities = is_threshold and parameters.get(PEAKS) != STRONGEST
+    is_threshold = parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) == FIXED_THRESHOLD
+    has_probabilities = is_threshold and parameters.get(PEAKS_PATH) != STRONGEST_PEAK
     if study.spec.draws.draws_whole_spectra and not has_probabilities:
-        undefined |= {name for name in STATISTICS if name.startswith(("pd_", "pfa_"))}
+        undefined |= {name for name in SHOT_STATISTIC_VARIABLES if name.startswith(("pd_", "pfa_"))}
     return undefined
 
 
@@ -97,7 +103,7 @@ HIT_ONLY_OUTPUTS = ("beam_radial_velocity", "beam_acceleration", "beam_approach"
 
 def check_shots(eyepoint_results: Results) -> None:
     """Where the instrument is and what its beams hit: numbers throughout, but for misses."""
-    for name in (*SHOTS, *CYCLES):
+    for name in (*SHOT_VARIABLES, *CYCLE_VARIABLES):
         is_missing = (
             np.isinf(eyepoint_results[name]) if name in ("beam_range", "true_altitude") else False
         )
@@ -117,10 +123,14 @@ def check_point_cloud(
     eyepoint_results: Results, cloud: Results, *, navigates: bool, undefined: Collection[str]
 ) -> None:
     """Statistics, points and navigation: nan where there is nothing, and nowhere else."""
-    expected_outputs = {*STATISTICS, *POINTS, *(NAVIGATION if navigates else ())}
+    expected_outputs = {
+        *SHOT_STATISTIC_VARIABLES,
+        *POINT_VARIABLES,
+        *(NAVIGATION_VARIABLES if navigates else ()),
+    }
     assert set(cloud) == expected_outputs, "outputs are missing, or too many"
     sees_surface = (eyepoint_results["surface"] >= 0).any(axis=1)
-    for name in STATISTICS:
+    for name in SHOT_STATISTIC_VARIABLES:
         values = cloud[name]
         if values.dtype.kind != "f":
             continue
@@ -142,7 +152,7 @@ def _check_points(cloud: Results, sees_surface: np.ndarray) -> None:
     """Points where flags say so."""
     flags = cloud["flags"]
     is_point, is_true_point = flags > 0, (flags & 1) > 0
-    for name, output in POINTS.items():
+    for name, output in POINT_VARIABLES.items():
         values = cloud[name]
         if output.dtype != "float64":
             continue

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from value_strategies import CHOICE_NUMBERS, ChoiceSource, value_strategy, with_tighter_bounds
 
-from sweep.model.threshold import WAYS
+from sweep.model.threshold import THRESHOLD_PATHS
 from sweep.spec.fields import kind_of_model, models_of_annotation, rule_of_field, yaml_name
 from sweep.spec.rules import FilePathRule
 
-THRESHOLD_FIELDS = tuple(way.rsplit(".", 1)[-1] for way in WAYS)
+THRESHOLD_FIELDS = tuple(way.rsplit(".", 1)[-1] for way in THRESHOLD_PATHS)
 """Fields of which a spec has one."""
 
 DECADES_OF_SPREAD = (0.3, 0.3, 1.0, 1.0, 3.0)

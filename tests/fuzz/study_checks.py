@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
 from sweep.model.outputs import (
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    NO_BIN,
-    OUTPUTS,
-    STRONGEST_OUTPUTS,
-    WITHOUT_ECHO,
+    DRAW_COUNT_OUTPUTS,
+    GRID_OUTPUTS,
+    NAN_WITHOUT_ECHO_OUTPUTS,
+    NO_BIN_NOTE,
+    STANDARD_ERROR_OUTPUTS,
+    STRONGEST_PEAK_OUTPUTS,
 )
-from sweep.model.preparation import categories
-from sweep.model.resolution import BEAMLETS, is_open
-from sweep.model.unsupported import UnsupportedShot
-from sweep.model.waveform import ENDS
+from sweep.model.preparation import split_by_category
+from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.waveform import SEARCH_BAND_PATHS
 from sweep.spec import GridSpec, Mistake, SpecError, from_stored, load
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.studies import study_plan as planning
@@ -34,8 +34,10 @@ PROBABILITY_ROUNDING = 1e-9
 """What sums of probabilities may be off: 1e-12 seen, and no effect is as small."""
 
 PROBABILITY_PREFIXES = ("pd_", "miss_", "pfa_", "p_leakage_", "p_wrong_range_")
-FINITE_OUTPUTS = tuple(name for name in OUTPUTS if not name.endswith("_doppler"))
-OUTPUTS_WITHOUT_BINS = tuple(name for name, output in OUTPUTS.items() if output.comment == NO_BIN)
+FINITE_OUTPUTS = tuple(name for name in GRID_OUTPUTS if not name.endswith("_doppler"))
+OUTPUTS_WITHOUT_BINS = tuple(
+    name for name, output in GRID_OUTPUTS.items() if output.comment == NO_BIN_NOTE
+)
 
 
 class Verdict(NamedTuple):
@@ -80,9 +82,11 @@ def check_study(file: Path) -> Verdict:
             for block in range(study.n_blocks):
                 results = study.evaluate(block)
                 if (unsupported_points := np.flatnonzero(np.isnan(results["pd_shot"]))).size:
-                    raise UnsupportedShot(unsupported_reason(study, block, unsupported_points[:1]))
+                    raise UnsupportedShotError(
+                        unsupported_reason(study, block, unsupported_points[:1])
+                    )
                 check_results(spec, study, results, block)
-        except UnsupportedShot as error:
+        except UnsupportedShotError as error:
             assert "instrument." in str(error) and ": " in str(error)
             return Verdict((str(error)[:50],))
         assert study_plan.n_points == study.n_points > 0 and study_plan.wall_seconds > 0
@@ -123,13 +127,15 @@ def check_results(spec: GridSpec, study: GridStudy, results: Results, block: int
             _check_beamlets_error(parameters, values)
         elif name in FINITE_OUTPUTS:
             present_values = values[values != -np.inf] if name in OUTPUTS_WITHOUT_BINS else values
-            if name in WITHOUT_ECHO:  # told by all segments together
+            if name in NAN_WITHOUT_ECHO_OUTPUTS:  # told by all segments together
                 snr = np.stack([results[f"snr_{segment}"] for segment in ("up", "doppler", "down")])
                 present_values = values[np.where(np.isnan(snr), 1.0, snr).min(axis=0) > 0]
-            if name in WITHOUT_ECHO and ENDS[0] in parameters:  # nothing is told of echoes outside
+            if (
+                name in NAN_WITHOUT_ECHO_OUTPUTS and SEARCH_BAND_PATHS[0] in parameters
+            ):  # nothing is told of echoes outside
                 present_values = present_values[~np.isnan(present_values)]
             assert np.isfinite(present_values).all(), f"{name} is not finite"
-        elif name in OUTPUTS:
+        elif name in GRID_OUTPUTS:
             assert np.array_equal(np.isnan(values), no_doppler), f"{name} is nan for no reason"
     if spec.draws.draws_whole_spectra:
         _check_whole_spectra(results)
@@ -148,11 +154,11 @@ def _check_probability(name: str, values: np.ndarray) -> None:
 
 def _check_beamlets_error(parameters: Mapping[str, Any], values: np.ndarray) -> None:
     """Estimated where the tolerance sets the number of beamlets and their powers add, else nan."""
-    for index, category in categories(DEFAULTS | dict(parameters)):
+    for index, category in split_by_category(PARAMETER_DEFAULTS | dict(parameters)):
         errors = values.ravel()[index]
-        if int(category[BEAMLETS]) > 0:
+        if int(category[BEAMLETS_PATH]) > 0:
             assert np.isnan(errors).all(), "the error of a given number of beamlets is not checked"
-        elif is_open(category):
+        elif beamlets_converge(category):
             assert ((errors >= 0) & (errors <= 1)).all(), f"beamlets_error is {errors}"
         else:  # a lone beamlet, where no footprint is simulated, has no error
             assert (np.isnan(errors) | (errors == 0)).all(), f"beamlets_error is {errors}"
@@ -171,7 +177,7 @@ def _check_signal_and_noise(results: Results, any_two: bool) -> None:
     assert (results["pd_shot"] <= pd_bound + PROBABILITY_ROUNDING).all(), (
         "a shot is likelier than its segments"
     )
-    for name in STRONGEST_OUTPUTS.keys() & results.keys():
+    for name in STRONGEST_PEAK_OUTPUTS.keys() & results.keys():
         total = results[name] + results[name.replace("p_wrong_range", "pd")]
         assert not (total > 1 + PROBABILITY_ROUNDING).any(), (
             f"{name} and what is right are more than all"
@@ -205,14 +211,14 @@ def _check_draws(spec: GridSpec, results: Results, no_doppler: np.ndarray) -> No
     (batches,) = (
         array.values for array in GridStudy(spec).array_layouts() if array.name == "batch_draws"
     )
-    for name in DRAW_OUTPUTS:
+    for name in DRAW_COUNT_OUTPUTS:
         assert (results[name] <= batches).all(), f"{name} has more than all"
         if name != "n_detected_doppler":
             assert (results[name] >= 0).all(), name
     for event, joint in (("detected", "shot"), ("false_alarm", "both_chirps")):
         chirp_bound = np.minimum(results[f"n_{event}_up"], results[f"n_{event}_down"])
         assert (results[f"n_{event}_{joint}"] <= chirp_bound).all(), f"n_{event}_{joint}"
-    for name in ERROR_OUTPUTS if not spec.draws.draws_whole_spectra else ():
+    for name in STANDARD_ERROR_OUTPUTS if not spec.draws.draws_whole_spectra else ():
         nan = np.isnan(results[name])
         assert (results[name][~nan] >= 0).all(), name
         may_be_nan = (no_doppler & ("doppler" in name)) | (spec.draws.number == 1)

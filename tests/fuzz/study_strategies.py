@@ -89,11 +89,11 @@ QUANTUM_EFFICIENCY_PATHS = ("instrument.receiver.responsivity", "instrument.lase
 FFT_SIZE = "instrument.processing.fft_size"
 """Too small for whole spectra, which then are not drawn, or missing."""
 
-BEAM_PATHS = (beam.DIVERGENCE, beam.WAIST, beam.RECEIVED_WAIST, beam.COUPLING)
+BEAM_PATHS = (beam.DIVERGENCE_PATH, beam.WAIST_PATH, beam.OSCILLATOR_WAIST_PATH, beam.COUPLING_PATH)
 """Parameters of which some alone make a beam, such as an aperture can make."""
 
 WORKING_VALUES = {
-    beam.DIVERGENCE: "50 urad", beam.COUPLING: beam.APERTURE,
+    beam.DIVERGENCE_PATH: "50 urad", beam.COUPLING_PATH: beam.APERTURE,
     FFT_SIZE: "2^10",  # the usual size would cost much
     ACQUISITION_DELAY_PATH: "13.4 us",  # the echo of 2 km is there from 13.34 us on
 }  # fmt: skip

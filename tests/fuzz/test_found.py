@@ -12,10 +12,10 @@ from flight_checks import check_flight
 from study_checks import check_study, warnings_as_errors
 
 from sweep.cli import main
-from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
-from sweep.model.effects.noise_sources import SUN_RADIUS, sunlight
-from sweep.model.effects.saturation import MOST_BEYOND
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.effects.line_width import LINE_DEVIATION_MAX_WINDOW_BINS, gaussian_frequency_shifts
+from sweep.model.effects.noise_sources import SUN_RADIUS, solar_irradiance
+from sweep.model.effects.saturation import FULL_SCALE_EXCESS_MAX
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.terrain import Terrain, smooth
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
@@ -71,11 +71,15 @@ def test_a_shot_beyond_the_model_is_refused_with_field_limit_value_and_remedy(na
 
 
 def test_the_limits_of_the_model_are_where_they_are_said_to_be():
-    width = np.array([MOST_BINS / 0.4246609 * 0.99])  # of a record of 1 s, a bin is 1 Hz
-    assert gaussian_shifts(fwhm=width, duration=np.ones(1)).weight.sum() == pytest.approx(1)
-    with pytest.raises(UnsupportedShot, match="line_width"):
-        gaussian_shifts(fwhm=width * 1.02, duration=np.ones(1))
-    assert MOST_BEYOND**2 < 1e15  # what is left of 16 digits by variances that cancel
+    width = np.array(
+        [LINE_DEVIATION_MAX_WINDOW_BINS / 0.4246609 * 0.99]
+    )  # of a record of 1 s, a bin is 1 Hz
+    assert gaussian_frequency_shifts(fwhm=width, duration=np.ones(1)).weight.sum() == pytest.approx(
+        1
+    )
+    with pytest.raises(UnsupportedShotError, match="line_width"):
+        gaussian_frequency_shifts(fwhm=width * 1.02, duration=np.ones(1))
+    assert FULL_SCALE_EXCESS_MAX**2 < 1e15  # what is left of 16 digits by variances that cancel
 
 
 def test_nothing_that_comes_back_has_no_range_error_with_draws_or_without(tmp_path):
@@ -88,10 +92,12 @@ def test_nothing_that_comes_back_has_no_range_error_with_draws_or_without(tmp_pa
 
 def test_sunlight_of_the_far_ultraviolet_fades_to_nothing_in_silence():
     with warnings_as_errors():
-        light = sunlight(wavelength=[1e-9, 30e-9, 500e-9], distance=1.496e11, elevation=1.57)
+        light = solar_irradiance(
+            wavelength=[1e-9, 30e-9, 500e-9], distance=1.496e11, elevation=1.57
+        )
     assert light[0] == 0 and 0 < light[1] < 1e-3 * light[2]
     # Wien's limit, where e^u exceeds what 1 could matter to: u = 16.6 at 150 nm.
-    wien = sunlight(wavelength=[150e-9, 151e-9], distance=1.496e11, elevation=1.57)
+    wien = solar_irradiance(wavelength=[150e-9, 151e-9], distance=1.496e11, elevation=1.57)
     u = 6.62607015e-34 * 299792458 / (1.380649e-23 * 5772.0) / np.array([150e-9, 151e-9])
     ratio = (151 / 150) ** 5 * np.exp(u[1] - u[0])
     assert wien[0] / wien[1] == pytest.approx(ratio, rel=1e-6)

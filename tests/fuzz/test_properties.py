@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from study_strategies import remove_field, studies, without_rejected_parts
 
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.threshold import TNR, WAYS
+from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import GridSpec, SceneSpec, SpecError, from_stored
 from sweep.tasks.studies.flight_study import FlightStudy
@@ -124,9 +124,9 @@ def test_more_light_is_never_worse(path, factors, written):
 @given(written=studies())
 def test_a_higher_threshold_detects_less_and_alarms_less(written):
     written = steady(written)
-    for way in WAYS:  # that of the axis alone is left
+    for way in THRESHOLD_PATHS:  # that of the axis alone is left
         remove_field(written, way)
-    axes = {TNR: [0.01, 1, 5, 5.1, 30]}
+    axes = {TNR_PATH: [0.01, 1, 5, 5.1, 30]}
     results = results_of(written | {"axes": axes})
     for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot", "pfa_bin", "log10_pfa_bin"):
         values = results[name][::-1]

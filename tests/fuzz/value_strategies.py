@@ -242,7 +242,7 @@ def quantity_strategy(rule: NumericRule, decades: float) -> st.SearchStrategy[An
 @cache
 def window_strategy(rule: rules.WindowFunctionRule) -> st.SearchStrategy[str]:
     """Any window of scipy's that the rule takes, with parameters where it wants some."""
-    names = (*rules.COSINE_SUM_WINDOWS, *rules.ALIASES, *rules.SCIPY_WINDOWS)
+    names = (*rules.COSINE_SUM_WINDOWS, *rules.WINDOW_NAME_ALIASES, *rules.SCIPY_WINDOWS)
     parameter_texts = ("", "(0.5)", "(2.5)", "(8.6)", "(60)", "(1.5, 7)")
     window_names = [name + parameters for name in names for parameters in parameter_texts]
     return st.sampled_from([window for window in window_names if _is_readable(rule, window)])

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sweep.model.eyepoints import observe
-from sweep.model.geometry.platform import ConstantAcceleration, Fixed, Flight
-from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import fixed
+from sweep.model.geometry.body_motion import ConstantAcceleration, FixedAttitude, MovingBody
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.geometry.scanner import fixed_beams
+from sweep.model.pointcloud.eyepoints import observe_eyepoints
 from sweep.scenes.meshes import clean_mesh
 
 LEVEL_ATTITUDE = 1.0, 0.0, 0.0, 0.0
@@ -29,7 +29,7 @@ def straight_flight(
     """A straight flight of 10 s at constant velocity unless said otherwise."""
     acceleration = keywords.pop("acceleration", (0.0, 0.0, 0.0))
     path = ConstantAcceleration(position, velocity, acceleration, keywords.pop("duration", 10.0))
-    return Flight(path, attitude or Fixed(LEVEL_ATTITUDE), **keywords)
+    return MovingBody(path, attitude or FixedAttitude(LEVEL_ATTITUDE), **keywords)
 
 
 def observe_shots(
@@ -38,14 +38,14 @@ def observe_shots(
     """Eyepoints of shots over plates, 19 beamlets of 50 urad unless said otherwise."""
     meshes = [level_plate()] if bodies is None else bodies
     body_motion = keywords.pop("body_motion", None)
-    return observe(
+    return observe_eyepoints(
         np.asarray(index),
         flight=flight,
-        scanner=scanner or fixed(beams, rate=1.0),
-        caster=Caster(meshes),
+        scanner=scanner or fixed_beams(beams, rate=1.0),
+        caster=RayCaster(meshes),
         beam_divergence=keywords.pop("beam_divergence", 50e-6),
-        number=keywords.pop("number", 19),
-        bodies=body_motion,
+        n_beamlets=keywords.pop("number", 19),
+        body_motions=body_motion,
         **keywords,
     )
 

@@ -4,29 +4,30 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from sweep.model import philox, shot, truth
-from sweep.model.alarms import (
-    first_circular,
-    independent_bins,
-    neighbour_correlation,
+from sweep.model import evaluation, time_domain_truth
+from sweep.model.detection.bin_noise import (
+    alarm_equivalent_bins,
+    first_circular_bin,
+    neighbour_noise_correlation,
 )
-from sweep.model.detection import RAYLEIGH_DEVIATION, crossing_pair
-from sweep.model.marcum import log_at_least_one, marcum_q1
-from sweep.model.sampling import simulate
-from sweep.model.window import samples, window
+from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION, bin_crossing_tails
+from sweep.model.detection.marcum import log_at_least_one_probability, marcum_q1
+from sweep.model.sampling import philox
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.window import get_window, window_samples
 
 NOISE_BINS = "instrument.processing.noise_bins"
 
 
 def log_segment_pfa(bins, level, correlation):
     """Natural logarithm of the probability that noise alone crosses in any of n adjacent bins."""
-    number = independent_bins(bins, level=level, correlation=correlation)
-    return log_at_least_one(-0.5 * np.square(level), number)
+    number = alarm_equivalent_bins(bins, threshold_ratio=level, correlation=correlation)
+    return log_at_least_one_probability(-0.5 * np.square(level), number)
 
 
 def noise(name, length, fft_size, draws, seed):
     """|X| over sigma of the bins of records of white noise, 1,000 records at a time."""
-    rng, taper = np.random.default_rng(seed), samples(name, length)
+    rng, taper = np.random.default_rng(seed), window_samples(name, length)
     sigma = np.sqrt((taper**2).sum() / 2)
     for _ in range(draws // 1000):
         record = taper * rng.normal(size=(1000, length))
@@ -47,8 +48,8 @@ def test_a_segment_alarms_as_often_as_drawn_noise_does(table_4_1, name, length):
         reflectance=0.0, beamlets=1, fft_size=n, tnr=6.0, window=name, noise_bins="correlated",
         acquisition_delay=500e-6 - length / rate,
     )  # fmt: skip
-    results, level = shot.evaluate(scene), 6 * RAYLEIGH_DEVIATION
-    low, high = first_circular(window(name, length), n), n // 2 + 1
+    results, level = evaluation.evaluate(scene), 6 * RAYLEIGH_DEVIATION
+    low, high = first_circular_bin(get_window(name, length), n), n // 2 + 1
     low += 3  # evaluate has three bins occupied by the detection of no echo
     crossed = [
         (m[:, low : high - low + 3] >= level).any(axis=1) for m in noise(name, length, n, 20_000, 7)
@@ -88,18 +89,20 @@ def test_the_tail_keeps_its_digits_beyond_float64():
 def test_correlations_of_neighbours_are_those_of_the_windows_squares():
     """Hamming by its cosines: W2(1) / W2(0) = 0.54 0.46 / (0.54^2 + 0.46^2 / 2)."""
     known = 0.54 * 0.46 / (0.54**2 + 0.46**2 / 2)
-    assert neighbour_correlation(window("hamming", 1024), 1024) == pytest.approx(known, rel=1e-12)
-    assert neighbour_correlation(window("rectangular", 1000), 1000) == 0.0
-    padded = neighbour_correlation(window("rectangular", 1024), 2048)
+    assert neighbour_noise_correlation(get_window("hamming", 1024), 1024) == pytest.approx(
+        known, rel=1e-12
+    )
+    assert neighbour_noise_correlation(get_window("rectangular", 1000), 1000) == 0.0
+    padded = neighbour_noise_correlation(get_window("rectangular", 1024), 2048)
     assert padded == pytest.approx(2 / np.pi, rel=1e-5)
-    assert independent_bins(0, level=5.0, correlation=known) == 0.0
+    assert alarm_equivalent_bins(0, threshold_ratio=5.0, correlation=known) == 0.0
 
 
 @pytest.mark.parametrize("level", [1e-3, 1.0, 6.55, 40.0])
 def test_noise_at_dc_and_nyquist_is_that_of_a_real_bin(level):
     """|a + n|, n of variance 2: both tails by the normal distribution."""
     for a in (0.0, 0.5, 6.4, 8.0, 39.0):
-        found, missed = crossing_pair(a, level, True)
+        found, missed = bin_crossing_tails(a, level, True)
         normal = stats.norm(scale=np.sqrt(2))
         assert found == pytest.approx(normal.sf(level - a) + normal.cdf(-level - a), rel=1e-12)
         assert missed == pytest.approx(normal.cdf(level - a) - normal.cdf(-level - a), abs=1e-15)
@@ -115,17 +118,19 @@ def test_an_echo_on_dc_is_detected_as_often_as_in_drawn_records(table_4_1, name)
         beamlets=1, fft_size=256, tnr=5.0, window=name, noise_bins="correlated", power=2e-3,
         range=ranges, radial_velocity=299792458 / 2 * rate * delay / (carrier - rate * delay),
     )  # fmt: skip
-    pd, q1 = (shot.evaluate(s)["pd_up"] for s in (scene, scene | {NOISE_BINS: "independent"}))
-    ((_, shots),) = shot.prepare(scene)
+    pd, q1 = (evaluation.evaluate(s)["pd_up"] for s in (scene, scene | {NOISE_BINS: "independent"}))
+    ((_, shots),) = evaluation.prepare_shots(scene)
     drawn = []
     for i in range(6):
-        record = truth.analytic_record(shots, i, 0, 0, range_walk=False).real
+        record = time_domain_truth.analytic_record(shots, i, 0, 0, with_range_walk=False).real
         rng = np.random.default_rng(3)
         noisy = record + rng.normal(size=(10_000, 256)) * np.sqrt(shots.noise_variance[i])
-        dc = np.abs(noisy @ samples(name, 256))
+        dc = np.abs(noisy @ window_samples(name, 256))
         drawn.append((dc >= shots.threshold[i]).mean())
     assert (np.abs(pd - drawn) < 5 * np.sqrt(0.25 / 10_000)).all()
     assert np.abs(pd - q1).max() > 0.08
     keys = philox.point_keys(np.arange(6.0)[:, None], domain="tests", seed=7)
-    counts = simulate(scene, shot.CORE, keys=keys, batch_sizes=[10_000], method="noise")
+    counts = simulate_draws(
+        scene, evaluation.DEFAULT_EFFECTS, keys=keys, batch_sizes=[10_000], method="noise"
+    )
     assert (np.abs(pd - counts["n_detected_up"][:, 0] / 10_000) < 5 * np.sqrt(0.25 / 10_000)).all()

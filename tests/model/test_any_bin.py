@@ -12,13 +12,20 @@ import numpy as np
 import pytest
 from shot_helpers import parametrize_product
 
-from sweep.model import link, philox, shot, truth
-from sweep.model.alarms import first_circular, neighbour_correlation
-from sweep.model.detection import BinLevels, BinSpeckle, DetectionRule, found_pair, mark
-from sweep.model.detectors import main_lobe
-from sweep.model.sampling import simulate
-from sweep.model.speckle_modes import mode_table
-from sweep.model.window import samples, window
+from sweep.model import evaluation, receiver_chain, time_domain_truth
+from sweep.model.detection.bin_noise import first_circular_bin, neighbour_noise_correlation
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.detection.echo_detection import (
+    BinSpeckle,
+    BinThreshold,
+    DetectionRule,
+    mark_exempt_bins,
+    pd_and_miss,
+)
+from sweep.model.detection.speckle_modes import mode_table
+from sweep.model.sampling import philox
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.window import get_window, window_samples
 
 OVER, DRAWS = 8, 6_000
 NATURE = {"noise_bins": "correlated", "detection": "any_bin", "noise_shape": "receiver"}
@@ -28,11 +35,11 @@ class Instrument(NamedTuple):
     """A prepared shot and its parameters."""
 
     parameters: dict
-    shots: shot.Shots
+    shots: evaluation.Shots
 
     @classmethod
-    def of(cls, parameters, effects=shot.CORE):
-        ((_, shots),) = shot.prepare(parameters, effects)
+    def of(cls, parameters, effects=evaluation.DEFAULT_EFFECTS):
+        ((_, shots),) = evaluation.prepare_shots(parameters, effects)
         return cls(parameters, shots)
 
     @property
@@ -50,16 +57,16 @@ class Instrument(NamedTuple):
         # enough samples that what a transform's circle brings back is far from the record
         whole = OVER * (length + 64)
         high = np.fft.rfftfreq(whole, 1 / (OVER * rate))
-        gain = link.transfer(high, **poles)
-        within = link.electrical_bandwidth(poles) / (OVER * rate / 2)
+        gain = receiver_chain.receiver_transfer(high, **poles)
+        within = receiver_chain.electrical_bandwidth(poles) / (OVER * rate / 2)
         white = rng.normal(size=(draws, whole)) * np.sqrt(shots.noise_variance[0] / within)
         return np.fft.irfft(gain * np.fft.rfft(white, axis=1), axis=1)[:, : OVER * length : OVER]
 
     def spectra(self, records):
         """|X| of records, in every bin over the noise's density there."""
         shots = self.shots
-        taper = samples(shots.window.name, shots.window.length)
-        density = link.noise_density(
+        taper = window_samples(shots.window.name, shots.window.length)
+        density = receiver_chain.relative_noise_density(
             np.fft.rfftfreq(self.size, 1 / shots.sample_rate[0]),
             detector_bandwidth=shots.detector_bandwidth,
             amplifier_bandwidth=shots.amplifier_bandwidth,
@@ -74,17 +81,17 @@ class Instrument(NamedTuple):
         random complex amplitude, one for all segments.
         """
         shots, rng = self.shots, np.random.default_rng(seed)
-        lines, level = shots.offset.shape[1], float(shots.threshold[0])
-        lobe = int(np.ceil(main_lobe(shots.window) * self.size / shots.window.length))
-        edge = first_circular(shots.window, self.size)
+        lines, level = shots.relative_range_offset.shape[1], float(shots.threshold[0])
+        lobe = int(np.ceil(main_lobe_half_width(shots.window) * self.size / shots.window.length))
+        edge = first_circular_bin(shots.window, self.size)
         speckle = np.ones((DRAWS, lines), complex)
-        if shots.fading is not None:
+        if shots.segment_correlations is not None:
             speckle = rng.normal(size=(DRAWS, lines, 2)) @ [1, 1j] / np.sqrt(2)
         found, alarms = [], []
         for segment in (0, 2):
             beats = np.array(
-                [truth.analytic_record(shots, 0, segment, b) for b in range(lines)]
-            ) / shots.whitening[segment, 0]  # fmt: skip
+                [time_domain_truth.analytic_record(shots, 0, segment, b) for b in range(lines)]
+            ) / shots.whitening_gain[segment, 0]  # fmt: skip
             signal = np.sqrt((self.spectra(beats.real) ** 2).sum(axis=0))
             echo = np.zeros(signal.size, bool)
             for k in np.flatnonzero((signal >= signal.max() / 2) & (signal > 0)):
@@ -127,8 +134,8 @@ def random_scene(table_4_1, seed):
     )  # fmt: skip
     scene["target.acceleration"] = rng.uniform(-15, 15)
     scene["target.transverse_velocity"] = rng.uniform(0, 8)
-    effects = {*shot.CORE, "segment_motion", *(["fading"] if fades else [])}
-    faint = shot.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
+    effects = {*evaluation.DEFAULT_EFFECTS, "segment_motion", *(["fading"] if fades else [])}
+    faint = evaluation.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
     snr = 1e6 * faint["snr_up"][0]
     wanted = (scene["instrument.processing.tnr"] * 0.655 + rng.uniform(-1, 1)) ** 2 / 2
     wanted *= rng.uniform(1, 4) if fades else 1
@@ -145,7 +152,7 @@ def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, 
     rectangular windows) in speckle.
     """
     scene, effects = random_scene(table_4_1, seed)
-    instrument, outputs = Instrument.of(scene, effects), shot.evaluate(scene, effects)
+    instrument, outputs = Instrument.of(scene, effects), evaluation.evaluate(scene, effects)
     pd, alarm = instrument.drawn(seed)
     rule = 0.005
     if "fading" in effects:
@@ -167,11 +174,11 @@ def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1
         range=2000.0, radial_velocity=3.0, leakage_floor=0.0,
         acquisition_delay=500e-6 - 256 / 600e6,
     )  # fmt: skip
-    effects = {*shot.CORE, "fading"}
-    faint = shot.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
+    effects = {*evaluation.DEFAULT_EFFECTS, "fading"}
+    faint = evaluation.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
     scene["instrument.laser.power"] = snr / (1e6 * faint["snr_up"][0])
     pd, _ = Instrument.of(scene, effects).drawn(seed=1)
-    outputs = shot.evaluate(scene, effects)
+    outputs = evaluation.evaluate(scene, effects)
     for name, drawn in zip(("up", "down"), pd, strict=False):
         assert outputs[f"pd_{name}"][0] == pytest.approx(drawn, abs=0.005 + spread(drawn)), name
     assert -spread(pd[2]) < outputs["pd_shot"][0] - pd[2] < most + spread(pd[2])
@@ -186,19 +193,19 @@ def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1
 def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     """One line in speckle: sidelobes that cross raise pd no further. Drawn, bin by bin."""
     size, draws, level = 256, 20_000, 3.9
-    shape, w = window(name, size), samples(name, size)
+    shape, w = get_window(name, size), window_samples(name, size)
     line = np.exp(2j * np.pi * place * np.arange(size) / size)
     spectrum = np.fft.fft(w * line)[70:131]
     spectrum *= np.sqrt(2 * snr) / abs(spectrum).max()  # over the noise per quadrature
     magnitude, echo = abs(spectrum), np.zeros(61, bool)
-    beside = math.ceil(main_lobe(shape))
-    mark(magnitude, 61, level, echo, beside)
+    beside = math.ceil(main_lobe_half_width(shape))
+    mark_exempt_bins(magnitude, 61, level, echo, beside)
     rule = DetectionRule(
-        0, beside, np.empty((3, 0)), neighbour_correlation(shape, size), 0, np.empty(0),
+        0, beside, np.empty((3, 0)), neighbour_noise_correlation(shape, size), 0, np.empty(0),
         mode_table(shape, size),
     )  # fmt: skip
-    speckle, levels = BinSpeckle(0.0, np.empty(0)), BinLevels(1.0, level, 1.0, 1.0)
-    pd, _ = found_pair(magnitude, echo, int(magnitude.argmax()), 70, rule, levels, speckle)
+    speckle, levels = BinSpeckle(0.0, np.empty(0)), BinThreshold(1.0, level, 1.0, 1.0)
+    pd, _ = pd_and_miss(magnitude, echo, int(magnitude.argmax()), 70, rule, levels, speckle)
     rng, found = np.random.default_rng(int(10 * place) + snr), 0
     for _ in range(draws // 2000):
         noise = rng.normal(size=(2000, size, 2)) @ np.array([1, 1j])
@@ -213,8 +220,8 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
 def test_an_echo_without_light_is_found_as_often_as_its_bins_alarm(table_4_1):
     """Five bins beside each other of a Hamming window: pd goes over into pfa."""
     scene = table_4_1(**NATURE, reflectance=1e-12, beamlets=1, fft_size=4096, tnr=6.0)
-    shots, outputs = Instrument.of(scene).shots, shot.evaluate(scene)
-    occupied = shot.find(shots)[0, 4, 0]
+    shots, outputs = Instrument.of(scene).shots, evaluation.evaluate(scene)
+    occupied = evaluation.evaluate_segments(shots)[0, 4, 0]
     per_bin = -np.log1p(-outputs["pfa_segment"][0]) / (2045 - occupied)
     assert outputs["pd_up"][0] == pytest.approx(occupied * per_bin, rel=0.1)
     assert 5 <= occupied <= 7
@@ -228,11 +235,13 @@ def test_an_echo_over_many_bins_is_detected_by_any_of_them(table_4_1, method, in
         **(NATURE | changes), range=9000.0 + 0.17 * np.arange(2), grazing_angle=np.radians(10),
         phases="incoherent",
     )  # fmt: skip
-    outputs = shot.evaluate(scene)
-    peak = shot.evaluate(scene | {"instrument.processing.detection": "peak_bin"})
+    outputs = evaluation.evaluate(scene)
+    peak = evaluation.evaluate(scene | {"instrument.processing.detection": "peak_bin"})
     assert (outputs["pd_up"] > peak["pd_up"] + 0.1).all()
     keys = philox.point_keys(np.arange(2.0)[:, None], domain="tests", seed=3)
-    counts = simulate(scene, shot.CORE, keys=keys, batch_sizes=[DRAWS], method=method)
+    counts = simulate_draws(
+        scene, evaluation.DEFAULT_EFFECTS, keys=keys, batch_sizes=[DRAWS], method=method
+    )
     for name in ("up", "down", "shot"):
         drawn = counts[f"n_detected_{name}"][:, 0] / DRAWS
         assert drawn == pytest.approx(outputs[f"pd_{name}"], abs=0.01 + spread(0.5)), name

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from small_scenes import level_plate, straight_flight
 
-from sweep.model import beam, shot
-from sweep.model.beam import Beam
+from sweep.model import beam, evaluation
+from sweep.model.beam import GaussianBeam
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.eyepoints import observe, prepare_eyepoints
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import fixed
-from sweep.model.ground import Plane
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.geometry.scanner import fixed_beams
+from sweep.model.ground import FlatGround
+from sweep.model.pointcloud.eyepoints import observe_eyepoints, prepare_eyepoint_shots
 
 WAVELENGTH = 1550e-9
 SIDE, NUMBER = 0.12, 512
@@ -55,7 +55,10 @@ def test_the_overlap_is_that_of_two_propagated_fields(case):
     one = propagated(sent, range, focus=focus)
     other = propagated(received, range, focus=focus, centre=apart)
     seen = (np.abs(one * other) ** 2).sum() * (SIDE / NUMBER) ** 2
-    beams = [Beam.of(waist=w, wavelength=WAVELENGTH, focus=focus) for w in (sent, received)]
+    beams = [
+        GaussianBeam.from_waist(waist=w, wavelength=WAVELENGTH, focus=focus)
+        for w in (sent, received)
+    ]
     assert overlap(*beams, range, apart) == pytest.approx(seen, rel=1e-6)
 
 
@@ -64,20 +67,20 @@ def test_light_moves_as_the_moving_product_of_both_fields_says():
 
     Next to the telescope that is far less than the angle under which the footprint is seen.
     """
-    p = PARAMETERS | {beam.WAIST: 6e-3, "target.range": 8.0}
+    p = PARAMETERS | {beam.WAIST_PATH: 6e-3, "target.range": 8.0}
     spectrum = np.abs(np.fft.fft2(propagated(6e-3, 8.0) ** 2)) ** 2
     f = np.fft.fftfreq(NUMBER, SIDE / NUMBER)
     rms = np.sqrt((spectrum.sum(axis=1) * f**2).sum() / spectrum.sum()) * WAVELENGTH / 2
-    places, directions = beam.angles(p)
+    places, directions = beam.footprint_angles(p)
     assert directions / 4 == pytest.approx(rms, rel=1e-6) and places > 9 * directions
-    plane = Plane(p | {"target.transverse_velocity": np.array(100.0)}, 1)
+    plane = FlatGround(p | {"target.transverse_velocity": np.array(100.0)}, 1)
     _, _, doppler, echo = plane.beamlets
     share = echo / echo.sum()
     spread = np.sqrt((share * doppler**2).sum()) * SPEED_OF_LIGHT / 2
     assert spread == pytest.approx(100 * rms, rel=1e-3)
 
 
-PARAMETERS = DEFAULTS | {
+PARAMETERS = PARAMETER_DEFAULTS | {
     "instrument.laser.wavelength": WAVELENGTH,
     "instrument.telescope.aperture": 0.1,
     "instrument.receiver.architecture": "homodyne",
@@ -98,7 +101,7 @@ def test_beamlets_on_a_plane_come_to_the_integral_over_it(focus, angle):
     """I_T I_L over the plane, point by point: its whole, and the spread of ranges in it."""
     grazing, near = (
         np.radians(angle),
-        {beam.WAIST: 6e-3, beam.FOCUS: focus, beam.RECEIVED_WAIST: 9e-3},
+        {beam.WAIST_PATH: 6e-3, beam.FOCUS_PATH: focus, beam.OSCILLATOR_WAIST_PATH: 9e-3},
     )
     p = PARAMETERS | near | {"target.grazing_angle": grazing}
     across, along = np.linspace(-0.04, 0.04, 401), np.linspace(-0.04, 0.04, 401) / np.sin(grazing)
@@ -106,13 +109,15 @@ def test_beamlets_on_a_plane_come_to_the_integral_over_it(focus, angle):
     depth, height = 40.0 + s * np.cos(grazing), s * np.sin(grazing)
     seen = 1.0
     for waist in (6e-3, 9e-3):
-        width = Beam.of(waist=waist, wavelength=WAVELENGTH, focus=focus).radius(depth)
+        width = GaussianBeam.from_waist(waist=waist, wavelength=WAVELENGTH, focus=focus).radius(
+            depth
+        )
         seen = seen * 2 / (np.pi * width**2) * np.exp(-2 * (x**2 + height**2) / width**2)
     # A patch of the plane catches its sine of the light, and Lambert's law sends sine / pi back.
     cell = (across[1] - across[0]) * (along[1] - along[0]) * np.sin(grazing)
     whole = WAVELENGTH**2 * seen.sum() * cell * np.sin(grazing) / np.pi
-    area = beam.collecting_area(p)
-    _, offset, _, echo = Plane(p, 1).beamlets
+    area = beam.effective_collecting_area(p)
+    _, offset, _, echo = FlatGround(p, 1).beamlets
     assert area / 40.0**2 * echo.sum() == pytest.approx(whole, rel=2e-5)
     if angle < 90:
         spread = np.sqrt((seen * (depth - 40) ** 2).sum() / seen.sum()) / 40
@@ -120,7 +125,7 @@ def test_beamlets_on_a_plane_come_to_the_integral_over_it(focus, angle):
 
 
 def test_both_laws_are_the_same_where_the_aperture_is_two_waists_wide():
-    one = Beam.of(waist=12.5e-3, wavelength=WAVELENGTH)
+    one = GaussianBeam.from_waist(waist=12.5e-3, wavelength=WAVELENGTH)
     seen = WAVELENGTH**2 * 1e14 * overlap(one, one, 1e7)
     near = 1 + (np.pi * 12.5e-3**2 / WAVELENGTH / 1e7) ** 2  # 1 + 1e-9 of Rayleigh's range
     assert seen * near == pytest.approx(np.pi * 12.5e-3**2, rel=1e-14)
@@ -131,23 +136,23 @@ def test_beyond_the_limit_of_diffraction_a_decade_of_divergence_costs_20_db(tabl
         scene = table_4_1(
             coupling="single_mode", beam_divergence=divergence, range=3000.0, beamlets=1
         )
-        return 10 * np.log10(shot.evaluate(scene)["snr_up"][0])
+        return 10 * np.log10(evaluation.evaluate(scene)["snr_up"][0])
 
     angles = np.array([3e-4, 1e-3, 3e-3, 1e-2])
     lost = np.diff([snr(angle) for angle in angles]) / np.diff(np.log10(angles))
     assert lost == pytest.approx(-20.0, abs=0.02)
     # -8.1 dB at 200 urad for 25 mm, and -22.1 dB at 1 mrad, against all light in the aperture
-    whole = 10 * np.log10(shot.evaluate(table_4_1(range=3000.0, beamlets=1))["snr_up"][0])
+    whole = 10 * np.log10(evaluation.evaluate(table_4_1(range=3000.0, beamlets=1))["snr_up"][0])
     assert snr(2e-4) - whole == pytest.approx(-8.1, abs=0.1)
     assert snr(1e-3) - whole == pytest.approx(-22.06, abs=0.01)
 
 
 def test_a_focused_beam_of_settembrini_and_others():
     """w_0 1.31 mm in the focus at 11.1 m and 1310 nm: z_R 4.1 m, at 27.1 m 3 dB less than here."""
-    length = Beam.of(waist=1.31e-3, wavelength=1310e-9).rayleigh_range
+    length = GaussianBeam.from_waist(waist=1.31e-3, wavelength=1310e-9).rayleigh_range
     assert length == pytest.approx(4.1, abs=0.05)
     waist = 1.31e-3 * np.hypot(1, 11.1 / length)  # of the beam that narrows to w_0 at 11.1 m
-    sent = Beam.of(waist=waist, wavelength=1310e-9, focus=11.1 + length**2 / 11.1)
+    sent = GaussianBeam.from_waist(waist=waist, wavelength=1310e-9, focus=11.1 + length**2 / 11.1)
     far = np.linspace(1e-3, 40.0, 400001)
     power = overlap(sent, sent, far)
     assert far[power.argmax()] == pytest.approx(11.1, abs=1e-3)
@@ -169,58 +174,66 @@ def cut_off(fill, defocus):
 
 def test_no_beam_that_its_aperture_cuts_off_does_better_than_0_40():
     fills = np.linspace(0.5, 1.0, 51)
-    best = fills**2 * beam.truncation(fills)
+    best = fills**2 * beam.truncation_efficiency(fills)
     assert best.max() == pytest.approx(0.40, abs=0.01)
     assert fills[best.argmax()] == pytest.approx(0.8, abs=0.02)
     for fill, defocus in ((0.4, 0.0), (0.8, 0.0), (0.8, 2.5), (1.0, 0.7), (0.6, 9.0)):
         near = np.hypot(1, fill**2 * defocus)  # w(R) over its far-field law
         whole = fill**2 / near**2
-        found = whole * beam.truncation(fill, defocus)
+        found = whole * beam.truncation_efficiency(fill, defocus)
         assert found == pytest.approx(cut_off(fill, defocus), rel=3e-3)
 
 
 def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):
     """Grazing 53 deg next to a focus: places, directions, area and dimming by both ways."""
-    one = DEFAULTS | table_4_1(
+    one = PARAMETER_DEFAULTS | table_4_1(
         coupling="single_mode", beam_divergence=0.0, phases="incoherent", beamlets=37, range=50.0,
         grazing_angle=np.arctan2(4, 3), reflectance=1.0, reflectance_law="lambert",
         radial_velocity=60.0,
-    ) | {beam.WAIST: 5e-3, beam.FOCUS: 70.0}  # fmt: skip
+    ) | {beam.WAIST_PATH: 5e-3, beam.FOCUS_PATH: 70.0}  # fmt: skip
     path = straight_flight(position=(0.0, 0.0, 40.0), velocity=(36.0, 0.0, -48.0))
-    eyepoints = observe(
+    eyepoints = observe_eyepoints(
         np.array([0]),
         flight=path,
-        scanner=fixed(np.array([[0.6, 0.0, -0.8]]), rate=1.0),
-        caster=Caster([level_plate()]),
+        scanner=fixed_beams(np.array([[0.6, 0.0, -0.8]]), rate=1.0),
+        caster=RayCaster([level_plate()]),
         beam_divergence=0.0,
-        number=37,
-        angles=partial(beam.angles, one),
+        n_beamlets=37,
+        footprint_angles=partial(beam.footprint_angles, one),
     )
-    seen = shot.statistics(prepare_eyepoints(eyepoints, one, [Surface("ground", 1.0, "lambert")]))
-    grid = shot.evaluate(one)
+    seen = evaluation.shot_statistics(
+        prepare_eyepoint_shots(eyepoints, one, [SurfaceMaterial("ground", 1.0, "lambert")])
+    )
+    grid = evaluation.evaluate(one)
     for name in ("snr_up", "snr_doppler", "snr_down"):
         assert seen[name] == pytest.approx(grid[name], rel=2e-4)
     assert grid["snr_up"] != pytest.approx(
-        shot.evaluate(one | {beam.FOCUS: 0.0})["snr_up"], rel=0.1
+        evaluation.evaluate(one | {beam.FOCUS_PATH: 0.0})["snr_up"], rel=0.1
     )
 
 
 def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
     """A leaf at 11 m in half of a footprint on the ground at 50 m, focused at 50 m."""
-    one = DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=0.0, phases="incoherent") | {
-        beam.WAIST: 8e-3, beam.FOCUS: 50.0
-    }  # fmt: skip
+    one = (
+        PARAMETER_DEFAULTS
+        | table_4_1(coupling="single_mode", beam_divergence=0.0, phases="incoherent")
+        | {beam.WAIST_PATH: 8e-3, beam.FOCUS_PATH: 50.0}
+    )
     leaf = level_plate(x=(0.0, 10.0), height=39.0, surface=1)
-    eyepoints = observe(
-        np.array([0]), flight=straight_flight(position=(-1e-4, 0.0, 50.0)),
-        scanner=fixed(np.array([[0.0, 0.0, -1.0]]), rate=1.0), caster=Caster([level_plate(), leaf]),
-        beam_divergence=0.0, number=109, angles=partial(beam.angles, one),
-    )  # fmt: skip
-    surfaces = [Surface(name, 1.0, "thesis") for name in ("ground", "leaf")]
-    shots = prepare_eyepoints(eyepoints, one, surfaces, CORE)
-    echo = (shots.amplitude**2)[0] / eyepoints.weight
+    eyepoints = observe_eyepoints(
+        np.array([0]),
+        flight=straight_flight(position=(-1e-4, 0.0, 50.0)),
+        scanner=fixed_beams(np.array([[0.0, 0.0, -1.0]]), rate=1.0),
+        caster=RayCaster([level_plate(), leaf]),
+        beam_divergence=0.0,
+        n_beamlets=109,
+        footprint_angles=partial(beam.footprint_angles, one),
+    )
+    surfaces = [SurfaceMaterial(name, 1.0, "thesis") for name in ("ground", "leaf")]
+    shots = prepare_eyepoint_shots(eyepoints, one, surfaces, DEFAULT_EFFECTS)
+    echo = (shots.relative_amplitude**2)[0] / eyepoints.weight
     near = eyepoints.surface[0] == 1
-    sent = Beam.of(waist=8e-3, wavelength=WAVELENGTH, focus=50.0)
+    sent = GaussianBeam.from_waist(waist=8e-3, wavelength=WAVELENGTH, focus=50.0)
     ratio = overlap(sent, sent, 11.0) / overlap(sent, sent, 50.0)
     assert near.any() and not near.all()
     assert echo[near].mean() / echo[~near].mean() == pytest.approx(ratio, rel=1e-4)
@@ -228,28 +241,33 @@ def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
 
 
 LAGS = {
-    "scan": ({beam.SCAN_RATE: np.radians(300.0)}, np.radians(300.0) * 2 * 3000 / 299792458 * 3000),
-    "parallax": ({beam.SEPARATION: 0.05}, 0.05),
-    "misalignment": ({beam.MISALIGNMENT: -30e-6}, 0.09),
-    "toed in": ({beam.MISALIGNMENT: -30e-6, beam.SEPARATION: 0.09}, 0.0),
+    "scan": (
+        {beam.SCAN_RATE_PATH: np.radians(300.0)},
+        np.radians(300.0) * 2 * 3000 / 299792458 * 3000,
+    ),
+    "parallax": ({beam.SEPARATION_PATH: 0.05}, 0.05),
+    "misalignment": ({beam.MISALIGNMENT_PATH: -30e-6}, 0.09),
+    "toed in": ({beam.MISALIGNMENT_PATH: -30e-6, beam.SEPARATION_PATH: 0.09}, 0.0),
 }
 
 
 @pytest.mark.parametrize("case", LAGS.values(), ids=LAGS)
 def test_axes_apart_cost_what_the_overlap_loses(case, table_4_1):
     changes, apart = case
-    scene = DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=1e-4, range=3000.0)
+    scene = PARAMETER_DEFAULTS | table_4_1(
+        coupling="single_mode", beam_divergence=1e-4, range=3000.0
+    )
     waist = 2 * WAVELENGTH / (np.pi * 1e-4)
     radius = np.hypot(waist, WAVELENGTH * 3000.0 / (np.pi * waist))
-    effects = (*CORE, "lag")
-    quiet, parted = (shot.evaluate(p, effects)["snr_up"][0] for p in (scene, scene | changes))
+    effects = (*DEFAULT_EFFECTS, "lag")
+    quiet, parted = (evaluation.evaluate(p, effects)["snr_up"][0] for p in (scene, scene | changes))
     assert parted / quiet == pytest.approx(np.exp(-(apart**2) / radius**2), rel=2e-3)
-    for law in ({beam.COUPLING: "aperture"}, {"instrument.receiver.architecture": "direct"}):
-        kept, whole = (shot.evaluate(p | law, effects) for p in (scene | changes, scene))
+    for law in ({beam.COUPLING_PATH: "aperture"}, {"instrument.receiver.architecture": "direct"}):
+        kept, whole = (evaluation.evaluate(p | law, effects) for p in (scene | changes, scene))
         np.testing.assert_equal(kept, whole)
 
 
 def test_light_from_elsewhere_passes_one_mode(table_4_1):
-    p = DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=2e-4)
-    diameter, angle = beam.receiving_field(p)
+    p = PARAMETER_DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=2e-4)
+    diameter, angle = beam.receiving_aperture_and_angle(p)
     assert (np.pi / 4 * diameter * angle) ** 2 == pytest.approx(WAVELENGTH**2, rel=1e-12)

@@ -10,7 +10,7 @@ SCRIPT = """
 import sys
 import numpy as np
 from conftest import TABLE_4_1
-from sweep.model.shot import evaluate
+from sweep.model.evaluation import evaluate
 
 found = b""
 for phases in ("coherent", "incoherent"):

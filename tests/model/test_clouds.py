@@ -5,21 +5,37 @@ import pytest
 from shot_helpers import DRAWS, is_within_5_sigma
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model import beam, clouds, philox
-from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, flags_of, names_of
-from sweep.model.effects.scintillation import both_ways, turbulence_of
-from sweep.model.eyepoints import Eyepoints, prepare_eyepoints
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.scanner import LineScan, PointingJitter, cone
-from sweep.model.groups import groups
-from sweep.model.outputs import POINTS, STATISTICS
-from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
-from sweep.model.shot import evaluate
+from sweep.model import beam
+from sweep.model.effects.catalogue import (
+    DEFAULT_EFFECTS,
+    EFFECT_NAMES,
+    EFFECTS,
+    PARAMETER_DEFAULTS,
+    pack_effect_flags,
+    unpack_effect_flags,
+)
+from sweep.model.effects.scintillation import turbulence_profile, two_way_log_variances
+from sweep.model.evaluation import evaluate
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.scanner import LineScan, PointingJitter, cone_directions
+from sweep.model.outputs import POINT_VARIABLES, SHOT_STATISTIC_VARIABLES
+from sweep.model.pointcloud import point_cloud
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.eyepoints import Eyepoints, prepare_eyepoint_shots
+from sweep.model.pointcloud.pairing import (
+    FALSE_ALARM_FLAG,
+    MISPAIRED_FLAG,
+    MISREAD_FLAG,
+    SIDELOBE_FLAG,
+    TRUE_FLAG,
+    UNCONFIRMED_FLAG,
+)
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling import philox
 
 METHODS = pytest.mark.parametrize("method", ["probabilities", "noise"])
 RANGE_BIN, VELOCITY_BIN = 299792458.0 * 600e6 / (4e12 * 2**16), 1550e-9 * 600e6 / 2**17
-GROUND, TABLE = Surface("ground", 0.1), Surface("table", 0.08)
+GROUND, TABLE = SurfaceMaterial("ground", 0.1), SurfaceMaterial("table", 0.08)
 TABLE_HEIGHT, HEIGHT = 12.0, 412.0
 
 
@@ -50,7 +66,9 @@ def _edge(places, *, lift=0.0, velocity=(0.0, 0.0, -20.0)):
 
 def _cloud(seen, parameters, **keywords):
     keys = keywords.pop("keys", _keys(np.arange(len(seen.time))))
-    return cloud(seen, parameters=parameters, surfaces=[GROUND, TABLE], keys=keys, **keywords)
+    return simulate_cloud(
+        seen, parameters=parameters, surfaces=[GROUND, TABLE], keys=keys, **keywords
+    )
 
 
 def _strong(table_4_1, **changes):
@@ -62,7 +80,7 @@ def _weak(table_4_1, tnr, power=1.6e-3):
     return scene_parameters(table_4_1, fft_size=2**16, power=power, tnr=tnr)
 
 
-KIND = TRUE | FALSE_ALARM | MISPAIRED | MISREAD | SIDELOBE
+KIND = TRUE_FLAG | FALSE_ALARM_FLAG | MISPAIRED_FLAG | MISREAD_FLAG | SIDELOBE_FLAG
 ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
 
 
@@ -70,10 +88,10 @@ ON_GROUND, ON_TABLE, BOTH, BLIND = -1.0, 1.0, 1e-4, 60.0
 
 
 def test_arrays_are_those_of_the_table(table_4_1):
-    got = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns=2)
+    got = _cloud(_edge([ON_GROUND, BLIND]), _strong(table_4_1), draws=3, returns_max=2)
     sizes = {"shot": 2, "draw": 3, "return_number": 2, "xyz": 3}
-    assert got.keys() == STATISTICS.keys() | POINTS.keys()
-    for name, output in (STATISTICS | POINTS).items():
+    assert got.keys() == SHOT_STATISTIC_VARIABLES.keys() | POINT_VARIABLES.keys()
+    for name, output in (SHOT_STATISTIC_VARIABLES | POINT_VARIABLES).items():
         assert got[name].dtype == output.dtype, name
         assert got[name].shape == tuple(sizes[d] for d in output.dims), name
 
@@ -88,7 +106,7 @@ def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
     for shot, expected in ((0, {0}), (1, {0, 1}), (2, {1})):
         there = got["flags"][shot] > 0
         assert (there.sum(axis=1) == len(expected)).all()
-        assert (got["flags"][shot][there] == TRUE).all()
+        assert (got["flags"][shot][there] == TRUE_FLAG).all()
         surface = got["surface"][shot]
         assert all(set(row[row >= 0]) == expected for row in surface)
         for number in expected:
@@ -105,7 +123,7 @@ def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
 def test_without_the_platforms_motion_a_target_at_rest_stands_still(table_4_1, method):
     """An oblique flight: what is left is the table's own 5 m/s, and 0 for the ground."""
     seen = _edge([ON_GROUND, ON_TABLE], lift=5.0, velocity=(70.0, -30.0, -20.0))
-    got = _cloud(seen, _strong(table_4_1, power=1e-2), draws=DRAWS, method=method, returns=1)
+    got = _cloud(seen, _strong(table_4_1, power=1e-2), draws=DRAWS, method=method, returns_max=1)
     left, stated = (
         got[f"radial_velocity_{name}"][..., 0]
         for name in ("compensated", "interpolated_standard_error")
@@ -121,33 +139,35 @@ def test_without_the_platforms_motion_a_target_at_rest_stands_still(table_4_1, m
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has(table_4_1, phases):
     """Bit for bit, all combinations of effects that shots are not kept apart for."""
-    free = [k for k, effect in enumerate(EFFECTS) if not effect.apart]
-    assert {NAMES[k] for k in free} == {
+    free = [k for k, effect in enumerate(EFFECTS) if not effect.needs_own_batch]
+    assert {EFFECT_NAMES[k] for k in free} == {
         "several_returns", "doppler_spread", "signal_shot_noise", "solar_background",
     }  # fmt: skip
-    every = flags_of(np.array([[name in CORE] for name in NAMES]))[0]
+    every = pack_effect_flags(np.array([[name in DEFAULT_EFFECTS] for name in EFFECT_NAMES]))[0]
     off = [sum(1 << free[i] for i in range(4) if n >> i & 1) for n in range(16)]
     flags = np.array([int(every) & ~bits for bits in off], np.uint32)
     seen = _edge([BOTH] * 16, lift=5.0, velocity=(3.0, 0.0, -20.0))
     parameters = _strong(table_4_1, power=1e-2, phases=phases)
     parameters["target.solar_irradiance"] = 1e9
-    got = _cloud(seen, parameters, effects=CORE, flags=flags, draws=3)
+    got = _cloud(seen, parameters, effects=DEFAULT_EFFECTS, effect_flags=flags, draws=3)
     for shot in range(16):
-        own = names_of(int(flags[shot]))
+        own = unpack_effect_flags(int(flags[shot]))
         key, one = _keys([shot]), np.array([shot])
-        alone = _cloud(seen.some(one), parameters, effects=own, draws=3, keys=key)
+        alone = _cloud(seen.select(one), parameters, effects=own, draws=3, keys=key)
         for name, values in alone.items():
             np.testing.assert_array_equal(got[name][shot], values[0], err_msg=f"{name} {own}")
     for i in range(4):  # each of them makes a difference
         other = 1 << i
-        differs = [name for name in STATISTICS if (got[name][0] != got[name][other]).any()]
-        assert differs, NAMES[free[i]]
+        differs = [
+            name for name in SHOT_STATISTIC_VARIABLES if (got[name][0] != got[name][other]).any()
+        ]
+        assert differs, EFFECT_NAMES[free[i]]
 
 
 def test_points_lie_along_the_beam_as_commanded(table_4_1):
     seen = observe_shots(
         straight_flight(),
-        beams=cone(4, half_angle=0.4),
+        beams=cone_directions(4, half_angle=0.4),
         index=np.arange(8),
         jitter=PointingJitter(1e-3, 1),
     )
@@ -163,12 +183,16 @@ def test_points_lie_along_the_beam_as_commanded(table_4_1):
 def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
     """Equal parts of a tilted beam on two plates at one height: the powers' ratio is cos(i)."""
     bodies = [level_plate(y=(-1e4, 0.0)), level_plate(y=(0.0, 1e4), surface=1)]
-    beams = cone(1, half_angle=np.radians(60.0))
+    beams = cone_directions(1, half_angle=np.radians(60.0))
     seen = observe_shots(straight_flight(), bodies=bodies, beams=beams)
-    shots = prepare_eyepoints(
-        seen, _strong(table_4_1), [Surface("a", 0.1, "lommel_seeliger"), Surface("b", 0.1)]
+    shots = prepare_eyepoint_shots(
+        seen,
+        _strong(table_4_1),
+        [SurfaceMaterial("a", 0.1, "lommel_seeliger"), SurfaceMaterial("b", 0.1)],
     )
-    power = shots.amplitude[0] ** 2 / seen.weight * (1 + shots.offset[0]) ** 2
+    power = (
+        shots.relative_amplitude[0] ** 2 / seen.weight * (1 + shots.relative_range_offset[0]) ** 2
+    )
     first, second = (power[seen.surface[0] == s] for s in (0, 1))
     assert min(first.size, second.size) > 5
     np.testing.assert_allclose(first, 0.1 / np.pi, rtol=1e-12)
@@ -187,14 +211,14 @@ def test_a_shot_that_sees_nothing_has_the_false_alarms_of_noise_alone(table_4_1,
     chance = 1 - (1 - one) ** 2**15
     assert 0.1 < chance < 0.5
     known = {"surfaces_seen": 0, "beamlets": eyepoints.weight.size}
-    for name in STATISTICS:
+    for name in SHOT_STATISTIC_VARIABLES:
         if name.startswith("pfa"):
             np.testing.assert_allclose(got[name], chance, rtol=1e-9)
         else:
             np.testing.assert_array_equal(got[name], known.get(name, np.nan))
     assert (got["flags"][:, :, 1:] == 0).all()
     there = got["flags"][:, :, 0] > 0
-    assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM).all()
+    assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM_FLAG).all()
     assert is_within_5_sigma(there.sum(axis=1), chance**2).all()
     assert (got["surface"] == -1).all()
     for name in ("true_range", "true_radial_velocity", "pd"):
@@ -210,14 +234,14 @@ def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
     """
     seen, parameters = _edge([BOTH, -BOTH]), _weak(table_4_1, 10.0, power=2.3e-3)
     got = _cloud(seen, parameters, draws=DRAWS, method=method)
-    found = groups(prepare_eyepoints(seen, parameters, [GROUND, TABLE]))
+    found = list_bin_groups(prepare_eyepoint_shots(seen, parameters, [GROUND, TABLE]))
     slack = DRAWS * (1 - got["pd_doppler"] + 1e-4)
     assert (slack < 0.002 * DRAWS).all()
     np.testing.assert_array_equal(got["surfaces_seen"], 2)
     both = found.pd[:, 0, :2] * found.pd[:, 2, :2]
     assert ((both > 0.05) & (both < 0.999)).all()
     np.testing.assert_array_equal(both[:, 0], got["pd_shot"])
-    right = (got["flags"] & (TRUE | MISREAD)) > 0
+    right = (got["flags"] & (TRUE_FLAG | MISREAD_FLAG)) > 0
     counts = np.array([(right & (got["surface"] == s)).any(axis=2).sum(axis=1) for s in (0, 1)])
     # which is the stronger differs between the shots: the ground in one, the table in the other
     stronger = counts.argmax(axis=0)
@@ -237,13 +261,13 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
     power = {ON_GROUND: 6e-4, BOTH: 1.6e-3}[place]
     seen, parameters = _edge([place]), _weak(table_4_1, 7.6, power=power)
     got = _cloud(seen, parameters, draws=DRAWS, method=method)
-    found = groups(prepare_eyepoints(seen, parameters, [GROUND, TABLE]))
+    found = list_bin_groups(prepare_eyepoint_shots(seen, parameters, [GROUND, TABLE]))
     pfa = got["pfa_up"][0], got["pfa_down"][0]
     assert all(0.03 < chance < 0.5 for chance in pfa)
     tails = []
     for segment, alarm in zip((0, 2), pfa, strict=True):
         number = np.ones(1)
-        for chance in (*found.pd[0, segment][found.bin[0, segment] >= 0], alarm):
+        for chance in (*found.pd[0, segment][found.strongest_bin[0, segment] >= 0], alarm):
             number = np.convolve(number, [1 - chance, chance])
         tails.append(np.cumsum(number[::-1])[::-1])
     points = (got["flags"][0] > 0).sum(axis=1)
@@ -255,7 +279,7 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
         # what is neither the true pair nor missing holds a false peak; a false peak takes a true
         # one from its partner by chance, once in some 300
         mean = expected[1:].sum()
-        false = (got["flags"][0] & FALSE_ALARM > 0).sum()
+        false = (got["flags"][0] & FALSE_ALARM_FLAG > 0).sum()
         slack = DRAWS * pfa[0] / 300
         assert abs(false - DRAWS * (mean - got["pd_shot"][0])) < 5 * np.sqrt(DRAWS * mean) + slack
 
@@ -273,7 +297,7 @@ def test_leaked_signal_raises_the_false_alarms_stated(table_4_1, method):
     assert ((chance > 0.01) & (chance < 0.1)).all()
     whole = _cloud(seen, parameters, draws=spectra, method="spectra")
     for points, draws in ((got, DRAWS), (whole, spectra)):
-        second = (points["flags"][:, :, 1] & FALSE_ALARM) > 0
+        second = (points["flags"][:, :, 1] & FALSE_ALARM_FLAG) > 0
         deviation = np.sqrt(chance * (1 - chance) / draws)
         drawn = second.mean(axis=1)
         assert (abs(drawn - chance) < 5 * deviation).all(), (drawn, chance)
@@ -291,27 +315,30 @@ def test_flags_tell_what_a_point_is(table_4_1, method):
         _cloud(seen, _weak(table_4_1, 7.6, power=power), draws=5000, method=method)
         for power in (5e-4, 1.35e-3)
     ]
-    got = {name: np.concatenate([part[name] for part in parts]) for name in POINTS}
+    got = {name: np.concatenate([part[name] for part in parts]) for name in POINT_VARIABLES}
     kinds, there = got["flags"] & KIND, got["flags"] > 0
-    known = [TRUE, FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE]
+    known = [TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG]
     assert np.isin(kinds[there], known).all()
-    assert all((kinds == kind).sum() > 20 for kind in (TRUE, FALSE_ALARM, MISPAIRED, MISREAD))
-    truthful = np.isin(kinds, [TRUE, MISREAD])
+    assert all(
+        (kinds == kind).sum() > 20
+        for kind in (TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG)
+    )
+    truthful = np.isin(kinds, [TRUE_FLAG, MISREAD_FLAG])
     np.testing.assert_array_equal(got["surface"] >= 0, truthful)
     for name in ("true_range", "true_radial_velocity"):
         np.testing.assert_array_equal(np.isfinite(got[name]), truthful)
     np.testing.assert_array_equal(np.isfinite(got["range"]), there)
-    np.testing.assert_array_equal(np.isfinite(got["pd"]), there & (kinds != FALSE_ALARM))
-    true = kinds == TRUE
+    np.testing.assert_array_equal(np.isfinite(got["pd"]), there & (kinds != FALSE_ALARM_FLAG))
+    true = kinds == TRUE_FLAG
     assert np.abs(got["range"] - got["true_range"])[true].max() < 4 * RANGE_BIN
     assert np.abs(got["radial_velocity"] - got["true_radial_velocity"])[true].max() < (
         4 * VELOCITY_BIN
     )
     above = got["true_range"] < HEIGHT - TABLE_HEIGHT / 2
     np.testing.assert_array_equal(got["surface"][truthful] == 1, above[truthful])
-    misread = kinds == MISREAD
+    misread = kinds == MISREAD_FLAG
     assert np.abs(got["range"] - got["true_range"])[misread].min() > 4 * RANGE_BIN
-    assert (got["flags"][misread] & UNCONFIRMED > 0).mean() > 0.9
+    assert (got["flags"][misread] & UNCONFIRMED_FLAG > 0).mean() > 0.9
 
 
 # Invariance
@@ -326,23 +353,23 @@ def test_any_split_of_shots_and_of_draws_gives_the_same_bytes(table_4_1, method,
     whole = _cloud(seen, parameters, keys=keys, draws=40, method=method)
     assert len(np.unique(whole["flags"])) > 3
     for shots in (np.arange(7)[::-1], [2], [0], [1, 6], [5, 2, 3]):
-        some = _cloud(seen.some(shots), parameters, keys=keys[shots], draws=40, method=method)
+        some = _cloud(seen.select(shots), parameters, keys=keys[shots], draws=40, method=method)
         for name, values in some.items():
             assert values.tobytes() == whole[name][shots].tobytes(), (name, shots)
     for first, number in ((0, 1), (1, 25), (26, 14)):
         some = _cloud(seen, parameters, keys=keys, first_draw=first, draws=number, method=method)
-        for name in POINTS:
+        for name in POINT_VARIABLES:
             part = whole[name][:, first : first + number]
             assert some[name].tobytes() == part.tobytes(), (name, first)
-        for name in STATISTICS:
+        for name in SHOT_STATISTIC_VARIABLES:
             assert some[name].tobytes() == whole[name].tobytes(), name
-    monkeypatch.setattr(clouds, "STRETCH", 1)
+    monkeypatch.setattr(point_cloud, "VALUES_PER_BATCH", 1)
     for name, values in _cloud(seen, parameters, keys=keys, draws=40, method=method).items():
         assert values.tobytes() == whole[name].tobytes(), name
 
 
 def test_no_shots_give_no_points(table_4_1):
-    seen = _edge([ON_GROUND]).some(slice(0, 0))
+    seen = _edge([ON_GROUND]).select(slice(0, 0))
     got = _cloud(seen, _strong(table_4_1), draws=2)
     assert all(len(values) == 0 for values in got.values())
 
@@ -354,27 +381,31 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
     air = {"atmosphere.turbulence": "uniform", "atmosphere.structure_constant": 3e-14,
            "atmosphere.scintillation_law": law, "atmosphere.path": "level"}  # fmt: skip
     p = scene_parameters(table_4_1, fft_size=2**12) | air
-    seen = observe_shots(straight_flight(position=(0.0, 0.0, 300.0)), number=1).some(
+    seen = observe_shots(straight_flight(position=(0.0, 0.0, 300.0)), number=1).select(
         np.zeros(number, int)
     )
-    effects = set(CORE) - {"signal_shot_noise"}
-    still = _cloud(seen.some([0]), p, effects=effects)["snr_up"][0]
+    effects = set(DEFAULT_EFFECTS) - {"signal_shot_noise"}
+    still = _cloud(seen.select([0]), p, effects=effects)["snr_up"][0]
     found = _cloud(seen, p, effects=effects | {"scintillation"}, draws=2)
     factor = found["snr_up"] / still
-    given = prepare_eyepoints(seen.some([0]), p, [GROUND, TABLE])
-    legs = both_ways(turbulence_of(DEFAULTS | p), DEFAULTS | p, np.array([given.range[0]]))
+    given = prepare_eyepoint_shots(seen.select([0]), p, [GROUND, TABLE])
+    legs = two_way_log_variances(
+        turbulence_profile(PARAMETER_DEFAULTS | p),
+        PARAMETER_DEFAULTS | p,
+        np.array([given.range[0]]),
+    )
     variance = np.exp(sum(v[0] for leg in legs for v in leg)) - 1
     assert 0.02 < variance < 1
     assert abs(factor.mean() - 1) < 5 * np.sqrt(variance / number)
     spread = np.var((factor - 1) ** 2)
     assert abs(factor.var() - variance) < 5 * np.sqrt(spread / number)
-    alone = _cloud(seen.some([7]), p, effects=effects | {"scintillation"}, keys=_keys([7]))
+    alone = _cloud(seen.select([7]), p, effects=effects | {"scintillation"}, keys=_keys([7]))
     assert alone["snr_up"][0] == found["snr_up"][7]
 
 
 def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
     """Of the echo exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d what the axis moves by meanwhile."""
-    p = DEFAULTS | scene_parameters(table_4_1, fft_size=2**12, coupling="single_mode")
+    p = PARAMETER_DEFAULTS | scene_parameters(table_4_1, fft_size=2**12, coupling="single_mode")
     p["instrument.laser.beam_waist"] = 5e-3
     scanner = LineScan(0.4, 40.0, 1e4)
     seen = observe_shots(
@@ -382,10 +413,10 @@ def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
     )
     rate, far = seen.turn_rate[0], seen.range[0]
     found, straight = (
-        _cloud(seen, p, effects=(*set(CORE) - {"signal_shot_noise"}, *more))["snr_up"][0]
+        _cloud(seen, p, effects=(*set(DEFAULT_EFFECTS) - {"signal_shot_noise"}, *more))["snr_up"][0]
         for more in (["lag"], [])
     )
-    (waist, _), apart = beam.beams(p), 2 * rate * far**2 / 299792458.0
+    (waist, _), apart = beam.sent_and_oscillator_beams(p), 2 * rate * far**2 / 299792458.0
     expected = np.exp(-2 * apart**2 / (2 * waist.radius(far) ** 2))
     assert 0.1 < expected < 0.95
     assert found / straight == pytest.approx(expected, rel=1e-6)

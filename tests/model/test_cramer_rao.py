@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from sweep.model import estimators, waveform
+from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.window import samples, window
+from sweep.model.detection import estimators
+from sweep.model.window import get_window, window_samples
 
 LENGTH = 128
 RATE = 1e6
@@ -27,16 +28,16 @@ def test_the_bound_of_a_beat_is_that_of_the_fisher_information():
         ])  # fmt: skip
         least.append(np.linalg.inv(slopes @ slopes.T / deviation**2)[2, 2])
     cnr = amplitude**2 / (2 * deviation**2)
-    bound = estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=RATE)
+    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=LENGTH, sample_rate=RATE)
     assert bound**2 == pytest.approx(np.mean(least), rel=1e-3)
-    assert estimators.beat_deviation(cnr=0.0, samples=LENGTH, sample_rate=RATE) == np.inf
+    assert estimators.beat_frequency_bound(cnr=0.0, n_samples=LENGTH, sample_rate=RATE) == np.inf
 
 
 def test_the_ratio_before_the_fft_follows_from_that_after_it():
     """A tone and noise in the time domain: power over variance; |X|^2 over the noise's mean."""
-    w = window("hamming", 1024)
+    w = get_window("hamming", 1024)
     tone = 0.3 * np.cos(2 * np.pi * 100 * np.arange(1024) / 1024)
-    signal = abs(np.fft.rfft(tone * samples("hamming", 1024))[100]) ** 2
+    signal = abs(np.fft.rfft(tone * window_samples("hamming", 1024))[100]) ** 2
     snr = signal / (w.energy * 0.5**2)
     found = estimators.carrier_to_noise_ratio(snr=snr, window=w)
     assert found == pytest.approx((tone**2).mean() / 0.5**2, rel=1e-9)
@@ -46,7 +47,7 @@ def test_the_ratio_before_the_fft_follows_from_that_after_it():
 def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name):
     """Newton steps to the maximum of |X(f)| of 4000 noisy records; 5 sigma are 5 / sqrt(8000)."""
     generator, draws, n = np.random.default_rng(5), 4000, np.arange(LENGTH)
-    w, cnr = samples(name, LENGTH), 30.0
+    w, cnr = window_samples(name, LENGTH), 30.0
     noise = generator.normal(0, np.sqrt(1 / (2 * cnr)), (draws, LENGTH))
     record = (np.cos(2 * np.pi * 40.3 * n / LENGTH) + noise) * w
     f = np.full(draws, 40.3)
@@ -55,10 +56,10 @@ def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name)
         x = [(turning * (-2j * np.pi * n / LENGTH) ** k).sum(axis=1) for k in range(3)]
         slope = 2 * (x[1] * x[0].conj()).real
         f -= slope / (2 * (abs(x[1]) ** 2 + (x[2] * x[0].conj()).real))
-    expected = estimators.windowed_deviation(
-        cnr=cnr, window=window(name, LENGTH), sample_rate=float(LENGTH)
+    expected = estimators.windowed_peak_deviation(
+        cnr=cnr, window=get_window(name, LENGTH), sample_rate=float(LENGTH)
     )
-    bound = estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=float(LENGTH))
+    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=LENGTH, sample_rate=float(LENGTH))
     assert np.std(f) == pytest.approx(expected, rel=5 / np.sqrt(2 * draws) + 0.02)
     assert expected == pytest.approx(bound, rel=1e-9) if name == "rectangular" else expected > bound
 
@@ -72,7 +73,7 @@ def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler
     def beats(**at):
         return np.array([
             waveform.beat_frequency(sign, carrier=carrier, chirp_rate=2e12, **(where | at))
-            for sign, carrier in zip(waveform.SIGNS, carriers, strict=True)
+            for sign, carrier in zip(waveform.DEFAULT_CHIRP_SLOPES, carriers, strict=True)
         ])  # fmt: skip
 
     slopes = np.stack([
@@ -80,7 +81,7 @@ def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler
         (beats(radial_velocity=151.0) - beats(radial_velocity=149.0)) / 2,
     ], axis=1)  # fmt: skip
     expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ np.diag(spread**-2.0) @ slopes)))
-    found = estimators.resolved_deviation(
+    found = estimators.range_velocity_deviation(
         up=spread[0], doppler=spread[1], down=spread[2], carriers=carriers, chirp_rate=2e12, **where
     )
     assert found == pytest.approx(tuple(expected), rel=1e-6)
@@ -92,10 +93,10 @@ def test_range_and_velocity_take_two_beats():
         "carriers": (2e14,) * 3, "chirp_rate": 2e12, "range": 0.0, "radial_velocity": 0.0,
         "doppler": np.inf,
     }  # fmt: skip
-    found = estimators.resolved_deviation(up=3e3, down=4e3, **given)
+    found = estimators.range_velocity_deviation(up=3e3, down=4e3, **given)
     assert found.range == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e12))
     assert found.radial_velocity == pytest.approx(2.5e3 * SPEED_OF_LIGHT / (2 * 2e14))
-    blind = estimators.resolved_deviation(up=3e3, down=np.inf, **given)
+    blind = estimators.range_velocity_deviation(up=3e3, down=np.inf, **given)
     assert np.isinf(blind.range) and np.isinf(blind.radial_velocity)
 
 
@@ -108,5 +109,7 @@ def test_a_walking_phase_errs_as_the_straight_line_through_it_does(ratio):
     apart = np.abs(time[:, None] - time)
     covariance = 2 * np.pi * width * np.maximum(ratio * duration - apart, 0.0)
     expected = np.sqrt(slope @ covariance @ slope) / (2 * np.pi)
-    found = estimators.phase_deviation(line_width=width, delay=ratio * duration, duration=duration)
+    found = estimators.phase_noise_deviation(
+        line_width=width, delay=ratio * duration, duration=duration
+    )
     assert found == pytest.approx(expected, rel=0.02 if ratio < 0.01 else 1e-4)

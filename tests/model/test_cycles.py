@@ -6,19 +6,35 @@ from scipy.spatial.transform import Rotation
 from shot_helpers import DRAWS
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model import navigation, philox
-from sweep.model.clouds import cloud
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.platform import Fixed
-from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners, squares
-from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, solve
-from sweep.model.outputs import NAVIGATION
-from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
+from sweep.model.geometry.body_motion import FixedAttitude
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.scanner import (
+    BeamCycle,
+    PointingJitter,
+    cone_directions,
+    corner_directions,
+    square_patterns,
+)
+from sweep.model.outputs import NAVIGATION_VARIABLES
+from sweep.model.pointcloud import navigation
+from sweep.model.pointcloud.navigation import (
+    STATUS_EXCLUDED,
+    STATUS_SOLVED,
+    STATUS_UNDETERMINED,
+    STATUS_WITHHELD,
+    solve_navigation,
+)
+from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG, TRUE_FLAG, UNCONFIRMED_FLAG
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling import philox
 from sweep.spec.scene_sections import Navigation
 
 MOVING = np.array([12.0, -7.0, -85.0])
-THREE, FOUR = cone(3, half_angle=np.radians(22.5), azimuth=0.2), corners(np.radians(22.5))
-SIXTEEN = squares(np.radians([15.0, 7.5]))[0].reshape(-1, 3)
+THREE, FOUR = (
+    cone_directions(3, half_angle=np.radians(22.5), azimuth=0.2),
+    corner_directions(np.radians(22.5)),
+)
+SIXTEEN = square_patterns(np.radians([15.0, 7.5]))[0].reshape(-1, 3)
 PATTERNS = pytest.mark.parametrize("beams", [THREE, FOUR, SIXTEEN], ids=len)
 
 
@@ -27,7 +43,7 @@ def _shots(seen):
         "platform_position": seen.position,
         "platform_velocity": seen.velocity,
         "beam_direction": seen.direction,
-        "beam_turning": seen.turning,
+        "beam_turning": seen.direction_rate,
         "platform_acceleration": seen.platform_acceleration,
     }
 
@@ -36,7 +52,7 @@ def _points(seen, *, draws=1, returns=3, range_error=0.02, velocity_error=3e-4):
     """Points that state the truth exactly, one for each shot and draw, with standard errors."""
     shape = len(seen.time), draws, returns
     points = {"flags": np.zeros(shape, np.uint8)}
-    points["flags"][..., 0] = TRUE
+    points["flags"][..., 0] = TRUE_FLAG
     for name, value, error in (
         ("range", seen.range, range_error),
         ("radial_velocity", seen.radial_velocity, velocity_error),
@@ -63,8 +79,8 @@ def _seen(beams, *, number=6, path=None, rate=2.0, interval=None, **keywords):
 
 
 def _solved(seen, points, beams, ground_slope=0.0, **keywords):
-    given = {"shots_a_cycle": len(beams), "ground_slope": ground_slope}
-    return solve(_shots(seen), points, **given, **keywords)
+    given = {"shots_per_cycle": len(beams), "ground_slope": ground_slope}
+    return solve_navigation(_shots(seen), points, **given, **keywords)
 
 
 # Without chance
@@ -76,7 +92,9 @@ def test_true_points_give_the_mean_velocity_and_the_altitude_at_the_start(beams)
 
     A relative rounding of 2e-16 in ranges and velocities, times condition numbers under 10.
     """
-    attitude = Fixed(Rotation.from_euler("xyz", [0.1, -0.2, 0.7]).as_quat(scalar_first=True))
+    attitude = FixedAttitude(
+        Rotation.from_euler("xyz", [0.1, -0.2, 0.7]).as_quat(scalar_first=True)
+    )
     path = straight_flight((3.0, 4.0, 900.0), MOVING, attitude, acceleration=(3.0, -6.0, 9.0))
     seen = _seen(beams, path=path)
     got = _solved(seen, _points(seen, draws=2), beams, test_level=0.001)
@@ -86,13 +104,13 @@ def test_true_points_give_the_mean_velocity_and_the_altitude_at_the_start(beams)
     np.testing.assert_allclose(got["velocity"], expected, atol=1e-11)
     height = seen.position[:: len(beams), 2]
     np.testing.assert_allclose(got["altitude"], np.stack([height, height], 1), rtol=1e-12)
-    assert got.keys() == NAVIGATION.keys()
+    assert got.keys() == NAVIGATION_VARIABLES.keys()
     room = {"cycle": 6, "draw": 2, "xyz": 3, "xyz_again": 3}
-    for name, output in NAVIGATION.items():
+    for name, output in NAVIGATION_VARIABLES.items():
         assert got[name].dtype == output.dtype, name
         assert got[name].shape == tuple(room[d] for d in output.dims), name
     for name in ("velocity", "altitude"):
-        assert (got[f"{name}_status"] == SOLVED).all()
+        assert (got[f"{name}_status"] == STATUS_SOLVED).all()
         assert (got[f"{name}_beams"] == len(beams)).all()
 
 
@@ -102,33 +120,40 @@ def test_the_first_confirmed_point_of_a_shot_is_taken_whatever_it_is_in_truth():
     points, plain = _points(seen), _solved(seen, _points(seen), FOUR)
     for name in points:
         points[name][..., 1] = points[name][..., 0]  # the truth moves to the second place
-    points["flags"][..., 0] = FALSE_ALARM | UNCONFIRMED
-    points["flags"][..., 2] = TRUE
+    points["flags"][..., 0] = FALSE_ALARM_FLAG | UNCONFIRMED_FLAG
+    points["flags"][..., 2] = TRUE_FLAG
     for name in ("range", "radial_velocity"):
         for place in (0, 2):
             points[f"{name}_interpolated"][..., place] = 33.0
             points[f"{name}_interpolated_standard_error"][..., place] = 1e-9
             points[f"{name}_standard_error"][..., place] = 1e-3
     got = _solved(seen, points, FOUR)
-    for name in NAVIGATION:
+    for name in NAVIGATION_VARIABLES:
         np.testing.assert_array_equal(got[name], plain[name], err_msg=name)
-    points["flags"][..., 0] = FALSE_ALARM
+    points["flags"][..., 0] = FALSE_ALARM_FLAG
     fooled = _solved(seen, points, FOUR)
     assert (np.abs(fooled["altitude"] - plain["altitude"]) > 100.0).all()
-    assert (fooled["velocity_status"] == SOLVED).all()
+    assert (fooled["velocity_status"] == STATUS_SOLVED).all()
 
 
 def test_shots_without_a_confirmed_point_are_left_out():
     seen = _seen(FOUR)
     points = _points(seen)
     points["flags"][0] = 0  # nothing
-    points["flags"][4 + 1] = TRUE | UNCONFIRMED  # nothing to trust
+    points["flags"][4 + 1] = TRUE_FLAG | UNCONFIRMED_FLAG  # nothing to trust
     points["flags"][8:10] = 0  # two of four
     points["flags"][12:16] = 0  # all
     got = _solved(seen, points, FOUR)
     assert got["velocity_beams"][:, 0].tolist() == [3, 3, 0, 0, 4, 4]
     assert got["altitude_beams"][:, 0].tolist() == [3, 3, 2, 0, 4, 4]
-    status = [SOLVED, SOLVED, UNDETERMINED, UNDETERMINED, SOLVED, SOLVED]
+    status = [
+        STATUS_SOLVED,
+        STATUS_SOLVED,
+        STATUS_UNDETERMINED,
+        STATUS_UNDETERMINED,
+        STATUS_SOLVED,
+        STATUS_SOLVED,
+    ]
     assert got["velocity_status"][:, 0].tolist() == status
     assert np.isnan(got["velocity"][2:4]).all() and np.isnan(got["altitude"][3]).all()
     assert np.isnan(got["velocity_covariance"][2:4]).all()
@@ -146,7 +171,7 @@ def test_standard_errors_of_nothing_count_as_a_millionth_of_a_bin_and_others_not
         points[f"{name}_interpolated_standard_error"][12, :, 0] = np.inf
         points[f"{name}_interpolated_standard_error"][16, :, 0] = 0.0
         points[f"{name}_standard_error"][16, :, 0] = 0.0
-    got = _solved(seen, points, FOUR, jitter=1e-9)
+    got = _solved(seen, points, FOUR, pointing_jitter=1e-9)
     assert got["velocity_beams"][:, 0].tolist() == [4, 4, 3, 3, 3, 4]
     ratio = got["velocity_covariance"][1, 0] / got["velocity_covariance"][0, 0]
     expected = ((0.2e-6) ** 2 + (1e-9 * 90) ** 2) / (3e-4) ** 2
@@ -154,14 +179,14 @@ def test_standard_errors_of_nothing_count_as_a_millionth_of_a_bin_and_others_not
 
 
 def test_a_false_beam_is_found_among_sixteen_and_noticed_among_four():
-    for beams, status in ((SIXTEEN, EXCLUDED), (FOUR, WITHHELD)):
+    for beams, status in ((SIXTEEN, STATUS_EXCLUDED), (FOUR, STATUS_WITHHELD)):
         seen = _seen(beams)
         points = _points(seen)
         points["radial_velocity_interpolated"][1, :, 0] += 5.0
         got = _solved(seen, points, beams, test_level=0.001)
-        assert got["velocity_status"][:, 0].tolist() == [status, *[SOLVED] * 5]
+        assert got["velocity_status"][:, 0].tolist() == [status, *[STATUS_SOLVED] * 5]
         without = _solved(seen, points, beams, test_level=0.0)
-        assert (without["velocity_status"] == SOLVED).all()
+        assert (without["velocity_status"] == STATUS_SOLVED).all()
         assert np.abs(without["velocity"][0, 0] - MOVING).max() > 0.1
 
 
@@ -169,7 +194,9 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     """Free, the plane through sloping ground fits; held level, it does not; relief adds to it."""
     tilted = Rotation.from_euler("y", 0.2)
     path = straight_flight((0.0, 0.0, 900.0), (0.0, 0.0, 0.0))
-    rest = straight_flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
+    rest = straight_flight(
+        (0.0, 0.0, 0.0), attitude=FixedAttitude(tilted.as_quat(scalar_first=True))
+    )
     seen = _seen(FOUR, path=path, bodies=[level_plate()], body_motion=[rest])
     points = _points(seen)
     free, usual, held, contradicted = (
@@ -200,16 +227,16 @@ def test_any_split_of_cycles_gives_the_same_bytes(beams, monkeypatch):
     points["flags"][generator.random(points["flags"].shape) < 0.2] = 0
     for name in ("range", "radial_velocity"):
         points[f"{name}_interpolated"] += generator.normal(0, 1e-3, points["flags"].shape)
-    options = {"test_level": 0.05, "jitter": 1e-5, "ground_slope": 0.1}
+    options = {"test_level": 0.05, "pointing_jitter": 1e-5, "ground_slope": 0.1}
     whole = _solved(seen, points, beams, **options)
     assert len(np.unique(whole["velocity_status"])) > 1
     for first, last in ((0, 1), (1, 4), (5, 6)):
         some = slice(each * first, each * last)
         part = {name: values[some] for name, values in points.items()}
-        got = _solved(seen.some(some), part, beams, **options)
-        for name in NAVIGATION:
+        got = _solved(seen.select(some), part, beams, **options)
+        for name in NAVIGATION_VARIABLES:
             assert got[name].tobytes() == whole[name][first:last].tobytes(), name
-    monkeypatch.setattr(navigation, "STRETCH", 1)
+    monkeypatch.setattr(navigation, "BEAMS_PER_BATCH", 1)
     for name, values in _solved(seen, points, beams, **options).items():
         assert values.tobytes() == whole[name].tobytes(), name
 
@@ -222,10 +249,15 @@ def _flown(table_4_1, beams, *, draws=DRAWS, method="probabilities", **changes):
     seen = _seen(beams, number=1, interval=0.0)
     keys = philox.point_keys(np.arange(float(len(beams)))[:, None], domain="cycles", seed=8)
     parameters = scene_parameters(table_4_1, **({"fft_size": 2**16, "window": "hann"} | changes))
-    points = cloud(
-        seen, parameters=parameters, surfaces=[Surface("ground", 0.1)], keys=keys, draws=draws,
-        method=method, returns=2,
-    )  # fmt: skip
+    points = simulate_cloud(
+        seen,
+        parameters=parameters,
+        surfaces=[SurfaceMaterial("ground", 0.1)],
+        keys=keys,
+        draws=draws,
+        method=method,
+        returns_max=2,
+    )
     return seen, points
 
 
@@ -249,9 +281,9 @@ def test_mean_and_covariance_are_those_propagated_from_the_points(table_4_1, bea
     The interpolation is good to 1e-3 bins of bias there, under the 5 sigma of the mean.
     """
     seen, points = _flown(table_4_1, beams, method=method, power=30.0)
-    assert (points["flags"][:, :, 0] == TRUE).all()
+    assert (points["flags"][:, :, 0] == TRUE_FLAG).all()
     got = _solved(seen, points, beams)
-    assert (got["velocity_status"] == SOLVED).all()
+    assert (got["velocity_status"] == STATUS_SOLVED).all()
     off = {
         name: points[f"{name}_interpolated"][:, :, 0] - points[f"true_{name}"][:, :, 0]
         for name in ("range", "radial_velocity")
@@ -290,7 +322,7 @@ def test_velocity_is_there_as_often_as_three_beams_are_confirmed(table_4_1, meth
         if len(beams) == 4:
             chance += sum(np.prod(np.where(np.arange(4) == b, 1 - each, each)) for b in range(4))
         got = _solved(seen, points, beams)
-        there = (got["velocity_status"] == SOLVED).sum()
+        there = (got["velocity_status"] == STATUS_SOLVED).sum()
         allowed = 5 * np.sqrt(DRAWS * chance * (1 - chance)) + 1e-4 * DRAWS
         assert abs(there - DRAWS * chance) <= allowed
         assert np.isfinite(got["velocity"][0]).all(axis=1).sum() == there
@@ -308,7 +340,7 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
         jitter=PointingJitter(sigma, 4),
     )  # fmt: skip
     points = _points(seen, range_error=1e-9, velocity_error=1e-9)
-    got = _solved(seen, points, FOUR, jitter=sigma)
+    got = _solved(seen, points, FOUR, pointing_jitter=sigma)
     across = np.linalg.norm(np.cross(FOUR, [60.0, -20.0, 0.0]), axis=1)
     tangent = np.hypot(FOUR[:, 0], FOUR[:, 1]) / -FOUR[:, 2]
     ranges = 1000.0 / -FOUR[:, 2]
@@ -326,6 +358,6 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
     assert (np.abs(np.cov(error.T) - covariance) <= allowed).all()
     height = got["altitude"][:, 0] - 1000.0
     assert height.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / number))
-    screened = _solved(seen, points, FOUR, jitter=sigma, test_level=0.01)
-    withheld = (screened["velocity_status"] == WITHHELD).sum()
+    screened = _solved(seen, points, FOUR, pointing_jitter=sigma, test_level=0.01)
+    withheld = (screened["velocity_status"] == STATUS_WITHHELD).sum()
     assert abs(withheld - 0.01 * number) <= 5 * np.sqrt(0.01 * number)

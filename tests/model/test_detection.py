@@ -9,16 +9,25 @@ import pytest
 from scipy import stats
 from shot_helpers import prepare_single_category
 
-from sweep.model import shot, truth
-from sweep.model.accuracy import AUTOMATIC
-from sweep.model.crossings import MOST_TERMS, crossing_series, edge_crossing
-from sweep.model.detection import RAYLEIGH_DEVIATION, mark, quiet_below, threshold
-from sweep.model.interpolation import sidelobe_correlation
-from sweep.model.leakage import of_bins
-from sweep.model.marcum import excess_crossing, marcum_q1
-from sweep.model.segments import spectrum as segment_spectrum
-from sweep.model.spectrum import OUT, ROOM
-from sweep.model.window import samples
+from sweep.model import evaluation, time_domain_truth
+from sweep.model.detection.added_crossings import (
+    SERIES_TERMS_MAX,
+    edge_crossing_probability,
+    fill_crossing_series,
+)
+from sweep.model.detection.echo_detection import (
+    RAYLEIGH_DEVIATION,
+    mark_exempt_bins,
+    negligible_signal_ratio,
+    threshold_from_tnr,
+)
+from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
+from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
+from sweep.model.error_budget import AUTOMATIC
+from sweep.model.spectrum.bin_spectrum import N_SCRATCH_ROWS, OUT
+from sweep.model.spectrum.leakage import leakage_of_bins
+from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
+from sweep.model.window import window_samples
 
 # Threshold
 
@@ -26,7 +35,7 @@ from sweep.model.window import samples
 def test_the_threshold_counts_standard_deviations_of_a_bins_magnitude():
     """Not of its quadratures: the Rayleigh distribution's own deviation."""
     deviation = stats.rayleigh(scale=1.7).std()
-    assert threshold(tnr=3.0, bin_deviation=1.7) == pytest.approx(3 * deviation, rel=1e-14)
+    assert threshold_from_tnr(tnr=3.0, bin_deviation=1.7) == pytest.approx(3 * deviation, rel=1e-14)
     assert pytest.approx(stats.rayleigh.std(), rel=1e-14) == RAYLEIGH_DEVIATION
 
 
@@ -46,7 +55,7 @@ def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_ran
     enbw = (0.54**2 + 0.46**2 / 2) / 0.54**2
     snr = current**2 / 2 / variance * n / (2 * enbw)
     crossing = 100 * (2 - np.pi / 2)  # (Th / sigma)^2 at a TNR of 10
-    results = shot.evaluate(scene)
+    results = evaluation.evaluate(scene)
     assert results["snr_doppler"][0] == pytest.approx(snr, rel=1e-6)
     # 1e-9 of signal shot noise and the rounding of ncx2 are far below this.
     expected = stats.ncx2.sf(crossing, 2, 2 * snr)
@@ -62,14 +71,14 @@ def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_ran
 def assess(magnitude, sigma, level, floor, correlation=0.0):
     """Peak, exempt bins and leakage of a run of bins, as the model has them one by one."""
     count = magnitude.size
-    room, exempt = np.empty((ROOM, count + 16)), np.empty(count, np.bool_)
-    room[OUT, :count], series = magnitude, np.empty(MOST_TERMS)
-    crossing_series(level / sigma, series)
-    peak, exempted = mark(room[OUT], count, level, exempt, 0)
+    room, exempt = np.empty((N_SCRATCH_ROWS, count + 16)), np.empty(count, np.bool_)
+    room[OUT, :count], series = magnitude, np.empty(SERIES_TERMS_MAX)
+    fill_crossing_series(level / sigma, series)
+    peak, exempted = mark_exempt_bins(room[OUT], count, level, exempt, 0)
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
     noise = sigma, level, 0.0, correlation
-    return peak, marked, of_bins(count, noise, floor, room, exempt, series)
+    return peak, marked, leakage_of_bins(count, noise, floor, room, exempt, series)
 
 
 def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
@@ -86,7 +95,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
         for i, m in enumerate(magnitude):
             if i in exempt or m < floor * sigma:
                 if waits:
-                    joins = i in exempt and edge_crossing(
+                    joins = i in exempt and edge_crossing_probability(
                         m / sigma, magnitude[i - 1] / sigma, level / sigma, correlation
                     )
                     quiet, further = quiet + joins * waits, further + (1 - joins) * waits
@@ -95,7 +104,7 @@ def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
             crosses = 1 - (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
             joins = mpmath.mpf(0)
             if i > 0 and i - 1 in exempt:
-                joins = edge_crossing(
+                joins = edge_crossing_probability(
                     magnitude[i - 1] / sigma, m / sigma, level / sigma, correlation
                 )
             further += (1 - crosses) * waits
@@ -157,11 +166,11 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
             fft_size=1024, tnr=4.0, beamlets=19, leakage_floor=0.0, window=window,
             beam_divergence=1e-3, **changes,
         )  # fmt: skip
-        shots, results = prepare_single_category(scene), shot.evaluate(scene)
-        sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
+        shots, results = prepare_single_category(scene), evaluation.evaluate(scene)
+        sigma, level = float(shots.bin_noise_sigma[0]), float(shots.threshold[0])
         pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
         for segment, name in ((0, "up"), (2, "down")):
-            exact = truth.spectrum(shots, 0, segment, range_walk=False)
+            exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
             near = sidelobe_correlation(shots.window, shots.fft_size)
             peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0, near)
             assert results[f"snr_{name}"][0] == pytest.approx(
@@ -178,9 +187,11 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
 @pytest.mark.parametrize("tnr", [1e-3, 0.1, 1.0, 5.0, 12.0, 60.0, 1e3])
 @pytest.mark.parametrize("chance", [0.05, 5e-4, 5e-7, 1e-12])
 def test_bins_below_the_floor_leak_no_more_together_than_is_allowed(tnr, chance):
-    level, bins = threshold(tnr=tnr, bin_deviation=1.0), 2**15 + 1
-    floor = quiet_below(chance=np.array(chance), level=np.array(level), bins=bins)
-    each = excess_crossing(float(floor), level) / -math.expm1(-0.5 * level * level)
+    level, bins = threshold_from_tnr(tnr=tnr, bin_deviation=1.0), 2**15 + 1
+    floor = negligible_signal_ratio(
+        leakage_probability=np.array(chance), threshold_ratio=np.array(level), n_bins=bins
+    )
+    each = marcum_q1_excess(float(floor), level) / -math.expm1(-0.5 * level * level)
     assert bins * each <= chance * (1 + 1e-9)
     # and are no fewer than that asks for, but for those near the threshold
     assert bins * each >= 0.8 * chance or floor == pytest.approx(1 / level)
@@ -191,12 +202,16 @@ def test_bins_taken_one_by_one_leak_to_within_the_tolerance(table_4_1, tolerance
     """Many faint bins near a low threshold: below 0.1 sigma they leak 0.1 in some of these."""
     scene = table_4_1(range=np.geomspace(200, 3000, 12), tnr=1.0, leakage_floor=AUTOMATIC)
     scene |= {"accuracy.tolerance": tolerance, "accuracy.leakage_error": AUTOMATIC}
-    one_by_one = partial(shot.find, every_bin=True)
-    every = shot.evaluate(scene | {"accuracy.leakage_floor": 0.0}, look=one_by_one)
-    found = shot.evaluate(scene, look=one_by_one)
+    one_by_one = partial(evaluation.evaluate_segments, bin_by_bin=True)
+    every = evaluation.evaluate(
+        scene | {"accuracy.leakage_floor": 0.0}, segment_evaluator=one_by_one
+    )
+    found = evaluation.evaluate(scene, segment_evaluator=one_by_one)
     for name in ("p_leakage_up", "p_leakage_down"):
         assert found[name] == pytest.approx(every[name], abs=tolerance / 2), name
-    fixed = shot.evaluate(scene | {"accuracy.leakage_floor": 0.1}, look=one_by_one)
+    fixed = evaluation.evaluate(
+        scene | {"accuracy.leakage_floor": 0.1}, segment_evaluator=one_by_one
+    )
     assert (every["p_leakage_up"] - fixed["p_leakage_up"]).max() > 0.05
 
 
@@ -213,13 +228,16 @@ def within_five_sigma(rate, probability, draws):
 @pytest.mark.parametrize("window", ["rectangular", "hamming"])
 def test_noise_on_the_samples_detects_and_alarms_as_often_as_said(window, table_4_1):
     scene = table_4_1(fft_size=256, beamlets=3, tnr=3.0, window=window, range=1800.0)
-    shots, results = prepare_single_category(scene), shot.evaluate(scene)
-    record = sum(truth.analytic_record(shots, 0, 0, b, range_walk=False).real for b in range(3))
+    shots, results = prepare_single_category(scene), evaluation.evaluate(scene)
+    record = sum(
+        time_domain_truth.analytic_record(shots, 0, 0, b, with_range_walk=False).real
+        for b in range(3)
+    )
     rng = np.random.default_rng(51)
     noise = rng.normal(scale=np.sqrt(shots.noise_variance[0]), size=(DRAWS, 256))
     signal = segment_spectrum(shots, 0, 0)[1]
-    magnitude = np.abs(np.fft.rfft(samples(window, 256) * (record + noise), axis=1))
-    peak, level, sigma = signal.argmax(), shots.threshold[0], shots.bin_deviation[0]
+    magnitude = np.abs(np.fft.rfft(window_samples(window, 256) * (record + noise), axis=1))
+    peak, level, sigma = signal.argmax(), shots.threshold[0], shots.bin_noise_sigma[0]
     assert 0.2 < results["pd_up"][0] < 0.8
     detected = (magnitude[:, peak] >= level).mean()
     assert within_five_sigma(detected, results["pd_up"][0], DRAWS)

@@ -20,15 +20,21 @@ from scatterer_shots import (
 from shot_helpers import make_point_keys, parametrize_product
 from small_scenes import observe_shots, straight_flight
 
-from sweep.model import beam, speckle_lines
-from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.geometry.mesh import Surface
-from sweep.model.interpolation import interpolator, sub_bin
-from sweep.model.pairing import UNCONFIRMED
-from sweep.model.speckle_correlation import REACH, LineSpread, bin_correlation, window_transform
-from sweep.model.waveform import FAR, measured, reading
-from sweep.model.window import window
+from sweep.model import beam
+from sweep.model.detection.speckle_correlation import (
+    TRANSFORM_REACH_BINS,
+    LinePairGradients,
+    peak_bin_correlation,
+    window_transform,
+)
+from sweep.model.detection.sub_bin_interpolation import estimate_sub_bin_offset, interpolator
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling import speckle_lines
+from sweep.model.waveform import FAR_READING, range_velocity_of_beats, read_beats
+from sweep.model.window import get_window
 
 PROCESSING = "instrument.processing."
 ESTIMATOR = {PROCESSING + "estimator.kind": "maximum_likelihood"}
@@ -42,7 +48,7 @@ def slope(table_4_1, angle, *, ratio, **changes):
         PROCESSING + "window": "hann", PROCESSING + "tnr": 10.0,
     }  # fmt: skip
     return with_signal_over_threshold(
-        DEFAULTS | table_4_1() | LANDER_PARAMETERS | own | changes, ratio
+        PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | own | changes, ratio
     )
 
 
@@ -55,19 +61,21 @@ def flown(p, method, draws):
     seen = observe_shots(
         straight_flight(position=tuple(-distance * along), velocity=tuple(velocity)),
         beams=along[None],
-        angles=lambda far: beam.angles(p, np.where(np.isfinite(far), far, 1.0)),
+        footprint_angles=lambda far: beam.footprint_angles(p, np.where(np.isfinite(far), far, 1.0)),
     )
     instrument = {path: value for path, value in p.items() if not path.startswith("target.")}
     sun = "target.solar_irradiance"
-    return cloud(
+    return simulate_cloud(
         seen,
-        parameters=DEFAULTS | instrument | {sun: p[sun], "footprint.speckle": "developed"},
-        surfaces=[Surface("ground", p["target.reflectance"], p["target.reflectance_law"])],
+        parameters=PARAMETER_DEFAULTS
+        | instrument
+        | {sun: p[sun], "footprint.speckle": "developed"},
+        surfaces=[SurfaceMaterial("ground", p["target.reflectance"], p["target.reflectance_law"])],
         keys=make_point_keys(1),
         draws=draws,
         method=method,
         effects=COMPARED_EFFECTS,
-        returns=1,
+        returns_max=1,
     )
 
 
@@ -86,14 +94,19 @@ def scatterers_reported(p, draws, seed):
         row = np.arange(draws)
         detected &= magnitude[row, best] >= float(shots.threshold[0])
         three = np.stack([magnitude[row, best + k] for k in (-1, 0, 1)], axis=1)
-        delta = np.array([sub_bin(below, middle, above, tables) for below, middle, above in three])
+        delta = np.array(
+            [
+                estimate_sub_bin_offset(below, middle, above, tables)
+                for below, middle, above in three
+            ]
+        )
         places[segment] = drawn.bins[segment][best] + delta
     width = float(np.ravel(shots.sample_rate)[0]) / shots.fft_size
     up, down = (places[segment] * width for segment in ("up", "down"))
-    beats = reading(FAR, up, down, 200e6)
+    beats = read_beats(FAR_READING, up, down, 200e6)
     carrier = 299792458.0 / p["instrument.laser.wavelength"]
     chirp = (p["instrument.chirp.bandwidth"], p["instrument.chirp.duration"])
-    distance, velocity = measured(*beats, carrier, *chirp)
+    distance, velocity = range_velocity_of_beats(*beats, carrier, *chirp)
     return detected, distance[detected], velocity[detected]
 
 
@@ -103,12 +116,12 @@ def scatterers_reported(p, draws, seed):
 def fan_of(spread, turn, shape="hann"):
     """Lines of one footprint, and the window, of records as long as their FFT."""
     size = 1024
-    transform = speckle_lines.transform_table(window(shape, size))[1]
-    node, weight = speckle_lines._rules()
+    transform = speckle_lines.transform_table(get_window(shape, size))[1]
+    node, weight = speckle_lines._gaussian_rules()
     rule = np.array([[3, 3]])  # of 15 lines along either coordinate
-    return speckle_lines.LineFan(
+    return speckle_lines.SpeckleLineGrid(
         np.array([spread]), np.array([turn]), rule, np.ones(1, np.int64), node, weight,
-        speckle_lines.NODES, transform, float(speckle_lines.OVERSAMPLING), 6.0, 0,
+        speckle_lines.RULE_SIZES, transform, float(speckle_lines.TRANSFORM_SAMPLES_PER_BIN), 6.0, 0,
     )  # fmt: skip
 
 
@@ -125,18 +138,18 @@ def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(s
         middle = np.full(3, np.nan)
         middle[segment] = -off
         drawn.append(
-            speckle_lines.drawn_speckle(
+            speckle_lines.draw_segment_amplitudes(
                 fan, 0, middle, (0, 1), key=make_point_keys(1)[0], draws=np.arange(number)
             )[:, 0]
         )
     one, other = drawn
     for amplitude in drawn:
         assert np.mean(np.abs(amplitude) ** 2) == pytest.approx(1.0, abs=5 / np.sqrt(number))
-    lines = LineSpread(
+    lines = LinePairGradients(
         tuple(np.array([d]) for d in distance), tuple(np.array([s]) for s in spread),
         np.array([turn]), np.zeros(1),
     )  # fmt: skip
-    expected = bin_correlation(window(shape, 1024), lines)[0]
+    expected = peak_bin_correlation(get_window(shape, 1024), lines)[0]
     assert abs(np.mean(one * other.conj()).conj() - expected) < 5 / np.sqrt(number)
 
 
@@ -146,25 +159,25 @@ def test_correlations_of_bins_are_the_sums_of_a_fine_grid_of_scatterers(shape):
 
     One by one they are the same bits, whatever the interval of the one before.
     """
-    rng, w = np.random.default_rng(3), window(shape, 1024)
+    rng, w = np.random.default_rng(3), get_window(shape, 1024)
     n = 60
     distance, spread = rng.uniform(-0.6, 0.6, (2, n)), rng.uniform(-3, 3, (2, n))
     spread[:, ::2] *= 0.05
-    lines = LineSpread(
+    lines = LinePairGradients(
         tuple(distance), tuple(spread), rng.uniform(-2, 2, n), rng.uniform(0, 0.1, n)
     )
-    reach = np.minimum(5, REACH / lines.widest)  # no scatterer beyond counts
+    reach = np.minimum(5, TRANSFORM_REACH_BINS / lines.line_shift_max)  # no scatterer beyond counts
     y = reach[:, None] * np.linspace(-1, 1, 20_001)
     first, second = (
         window_transform(w, d[:, None] - s[:, None] * y)
         for d, s in zip(distance, spread, strict=True)
     )
-    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.lean[:, None] * y, 0.0)
-    shared = (power * first * second * np.exp(1j * lines.turn[:, None] * y)).sum(axis=1)
+    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.power_slope[:, None] * y, 0.0)
+    shared = (power * first * second * np.exp(1j * lines.phase_difference[:, None] * y)).sum(axis=1)
     strength = (power * first**2).sum(axis=1) * (power * second**2).sum(axis=1)
-    together = bin_correlation(w, lines)
+    together = peak_bin_correlation(w, lines)
     np.testing.assert_allclose(together, shared / np.sqrt(strength), rtol=0, atol=2e-4)
-    alone = [bin_correlation(w, lines.at(np.array([i])))[0] for i in range(n)]
+    alone = [peak_bin_correlation(w, lines.select(np.array([i])))[0] for i in range(n)]
     np.testing.assert_array_equal(together, alone)
 
 
@@ -188,7 +201,7 @@ def test_places_of_two_segments_wander_together_as_their_closed_form_says(turn, 
     power = np.abs(total) ** 2
     there = (power > level).all(axis=1)
     wander = (b * (moment / total).real)[there]
-    footprints = speckle_lines.SpeckleLines(
+    footprints = speckle_lines.LineGradients(
         np.tile([[b[0], 0.0], [0.0, 0.0], [b[1], 0.0]], (there.sum(), 1, 1)),
         np.tile([[0.0, 0.0], [0.0, 0.0], [turn, 0.0]], (there.sum(), 1, 1)),
     )
@@ -279,9 +292,9 @@ def test_three_segments_of_a_shot_are_detected_together(table_4_1):
     for method in ("probabilities", "noise"):
         got = flown(p, method, draws)
         flags = got["flags"][0, :, 0]
-        confirmed = (flags > 0) & (flags & UNCONFIRMED == 0)
+        confirmed = (flags > 0) & (flags & UNCONFIRMED_FLAG == 0)
         assert abs(confirmed.mean() - detected.mean()) < 4 * np.sqrt(2) * error
-        unconfirmed = (flags > 0) & (flags & UNCONFIRMED > 0)
+        unconfirmed = (flags > 0) & (flags & UNCONFIRMED_FLAG > 0)
         pair = float(got["pd_shot"][0])
         assert abs((confirmed | unconfirmed).mean() - pair) < 4 * np.sqrt(pair * (1 - pair) / draws)
         assert unconfirmed.mean() < 0.3 * (pair * (1 - float(got["pd_doppler"][0])))
@@ -320,7 +333,7 @@ def test_methods_agree_on_how_often_what_is_detected(number, table_4_1):
         got = flown(p, method, draws if method != "spectra" else 400)
         flags = got["flags"][0, :, 0]
         there = flags > 0
-        confirmed = there & (flags & UNCONFIRMED == 0)
+        confirmed = there & (flags & UNCONFIRMED_FLAG == 0)
         shares[method] = np.array([there.mean(), confirmed.mean(), (flags == 1).mean()])
         pair, count = float(got["pd_shot"][0]), there.size
         # any_bin has no closed form of both chirps; spectra find a neighbour of the peak as well.

@@ -6,8 +6,8 @@ from test_drawn_speckle import PROCESSING, flown, scatterers_reported
 from test_speckle_at_dc import BIN_WIDTH, HOVER, RANGE_BEAT, at_doppler
 from test_speckle_on_slopes import with_signal_over_threshold
 
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.pairing import UNCONFIRMED
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 
 DRAWS = 8000
 METHODS = ("probabilities", "noise", "spectra")
@@ -16,14 +16,14 @@ METHODS = ("probabilities", "noise", "spectra")
 def hover(table_4_1, bins, *, ratio=1.6, **changes):
     """Parameters of a lidar above level ground whose Doppler frequency is so many bins."""
     high = {PROCESSING + "tnr": 10.0}  # no false alarms, of which methods list different numbers
-    p = at_doppler(DEFAULTS | table_4_1() | HOVER | high | changes, bins * BIN_WIDTH)
+    p = at_doppler(PARAMETER_DEFAULTS | table_4_1() | HOVER | high | changes, bins * BIN_WIDTH)
     return with_signal_over_threshold(p, ratio)
 
 
 def shares(p, method, draws):
     """Shares of draws with a confirmed point, and with any point."""
     flags = flown(p, method, draws)["flags"][0, :, 0]
-    return ((flags > 0) & (flags & UNCONFIRMED == 0)).mean(), (flags > 0).mean()
+    return ((flags > 0) & (flags & UNCONFIRMED_FLAG == 0)).mean(), (flags > 0).mean()
 
 
 @pytest.mark.parametrize("window", ["hamming", "hann"])

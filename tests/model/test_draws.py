@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from shot_helpers import make_point_keys
 
-from sweep.model.effects.catalogue import CORE
-from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.realisations import realise
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate, statistics
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import evaluate, shot_statistics
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS, GRID_OUTPUTS, STANDARD_ERROR_OUTPUTS
+from sweep.model.sampling.realisations import iter_realisations
+from sweep.model.sampling.samplers import simulate_draws
 
 DRAWS = 40_000
 """5 sigma of a proportion is at most 5 * sqrt(1/4 / 40,000) = 0.0125: a 2 % error shows."""
@@ -36,7 +36,9 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
     parameters = _points(table_4_1, tnr=7.0)
     outputs = evaluate(parameters)
     assert ((outputs["pd_up"] > 0.02) & (outputs["pd_up"] < 0.98)).sum() >= 2
-    counts = simulate(parameters, CORE, keys=make_point_keys(6), batch_sizes=[DRAWS], method=method)
+    counts = simulate_draws(
+        parameters, DEFAULT_EFFECTS, keys=make_point_keys(6), batch_sizes=[DRAWS], method=method
+    )
     for segment in ("up", "down", "doppler", "shot"):
         found = counts[f"n_detected_{segment}"][:, 0]
         assert _within_5_sigma(found, outputs[f"pd_{segment}"]).all(), segment
@@ -51,8 +53,8 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         "target.range": np.array([20.0]),
     }
     for method in ("probabilities", "noise"):
-        counts = simulate(
-            parameters, CORE, keys=make_point_keys(1), batch_sizes=[50], method=method
+        counts = simulate_draws(
+            parameters, DEFAULT_EFFECTS, keys=make_point_keys(1), batch_sizes=[50], method=method
         )
         assert counts["n_detected_doppler"].sum() == 0
         assert counts["n_detected_up"].sum() == 50
@@ -85,14 +87,16 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         "footprint.phases": "incoherent",
         "footprint.beamlets": 7,
     }
-    chosen, draws = (*CORE, *effects), 1500
-    found = simulate(
+    chosen, draws = (*DEFAULT_EFFECTS, *effects), 1500
+    found = simulate_draws(
         parameters, chosen, keys=make_point_keys(6), batch_sizes=[1000, 500], method=method
     )
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
     table = {name: np.empty((6, draws)) for name in names}
-    for point, number, shots in realise(parameters, chosen, keys=make_point_keys(6), draws=draws):
-        outputs = statistics(shots)
+    for point, number, shots in iter_realisations(
+        parameters, chosen, keys=make_point_keys(6), draws=draws
+    ):
+        outputs = shot_statistics(shots)
         quiet = (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
         for name, values in (outputs | {"alarm": 1 - quiet}).items():
             if name in table:
@@ -103,7 +107,7 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         sigma = np.sqrt((p * (1 - p)).sum(axis=1))
         assert (abs(found[count].sum(axis=1) - p.sum(axis=1)) <= 5 * sigma + 3).all(), name
         assert ((p.mean(axis=1) > 0.02) & (p.mean(axis=1) < 0.98)).sum() >= 2, name
-        if name in OUTPUTS:
+        if name in GRID_OUTPUTS:
             np.testing.assert_allclose(found[name], p.mean(axis=1), rtol=1e-10)
 
 
@@ -114,12 +118,12 @@ def test_batches_split_the_same_draws(method, random, table_4_1):
     parameters |= {"instrument.processing.fft_size": 4096, "instrument.laser.power": 1.5}
     parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
     arguments = {"keys": make_point_keys(6), "method": method}
-    effects = (*CORE, *random)
-    whole = simulate(parameters, effects, batch_sizes=[300], **arguments)
-    parts = simulate(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
-    later = simulate(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)
-    for name in DRAW_OUTPUTS:
+    effects = (*DEFAULT_EFFECTS, *random)
+    whole = simulate_draws(parameters, effects, batch_sizes=[300], **arguments)
+    parts = simulate_draws(parameters, effects, batch_sizes=[100, 150, 50], **arguments)
+    later = simulate_draws(parameters, effects, first_draw=100, batch_sizes=[150], **arguments)
+    for name in DRAW_COUNT_OUTPUTS:
         np.testing.assert_array_equal(parts[name].sum(axis=1), whole[name][:, 0])
         np.testing.assert_array_equal(parts[name][:, 1], later[name][:, 0])
-    for name in (*OUTPUTS, *ERROR_OUTPUTS):
+    for name in (*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS):
         np.testing.assert_array_equal(parts[name], whole[name])

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from small_scenes import observe_shots, straight_flight
 
 import sweep
-from sweep.model import philox
-from sweep.model.error_floor import ErrorFloor, stray
 from sweep.model.geometry.scanner import BeamCycle
-from sweep.model.navigation import solve
-from sweep.model.pairing import TRUE
+from sweep.model.pointcloud.error_floor import ErrorFloor, apply_error_floor
+from sweep.model.pointcloud.navigation import solve_navigation
+from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.sampling import philox
 from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 from sweep.spec import SceneSpec
 
@@ -75,7 +75,10 @@ def _flown(cycles=2):
 def _points(seen, draws, noise=0.0):
     """Points that state the truth but for noise of a share of its standard errors."""
     shape, random = (len(seen.time), draws, 1), np.random.default_rng(3)
-    points = {"flags": np.full(shape, TRUE, np.uint8), "position": np.full((*shape, 3), np.nan)}
+    points = {
+        "flags": np.full(shape, TRUE_FLAG, np.uint8),
+        "position": np.full((*shape, 3), np.nan),
+    }
     for name, error in NOISE.items():
         points[f"{name}_per_slip"] = np.zeros(shape)
         truth = getattr(seen, name)[:, None, None] + np.zeros(shape)
@@ -89,7 +92,9 @@ def _points(seen, draws, noise=0.0):
 def _strayed(seen, points, floor, first_draw=0, some=slice(None)):
     index = np.arange(len(seen.time))[some]
     keys = philox.point_keys(index[:, None].astype(float), domain="shots", seed=5)
-    return stray(points, seen.some(some), floor, keys=keys, seed=5, first_draw=first_draw)
+    return apply_error_floor(
+        points, seen.select(some), floor, keys=keys, seed=5, first_draw=first_draw
+    )
 
 
 @ALONE
@@ -142,7 +147,9 @@ def test_velocity_and_altitude_stray_by_their_covariances(floor):
     """And residuals show the pointing and the vibration alone."""
     seen = _flown(1)
     found = _strayed(seen, _points(seen, DRAWS, noise=1.0), floor)
-    got = solve(eyepoints_to_arrays(seen), found, shots_a_cycle=4, ground_slope=0.0, floor=floor)
+    got = solve_navigation(
+        eyepoints_to_arrays(seen), found, shots_per_cycle=4, ground_slope=0.0, error_floor=floor
+    )
     off, stated = got["velocity"][0] - MOVING, got["velocity_covariance"][0].mean(axis=0)
     variance = np.diag(stated)
     spread = np.sqrt((np.outer(variance, variance) + stated**2) / DRAWS)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from shot_helpers import parametrize_product
 
-from sweep.model import estimators
-from sweep.model.detectors import Setting, taper
-from sweep.model.estimators import ESTIMATORS, jacobsen_form
-from sweep.model.window import window
+from sweep.model.detection import estimators
+from sweep.model.detection.detectors import SpectrumSettings, cached_window_samples
+from sweep.model.detection.estimators import ESTIMATORS, jacobsen_coefficients
+from sweep.model.window import get_window
 
 SIZE, BIN, DRAWS = 512, 120, 1500
 """5 standard errors of a root mean square of 1500 normal numbers are 5 / sqrt(3000) = 9 %."""
@@ -15,16 +15,16 @@ SIZE, BIN, DRAWS = 512, 120, 1500
 
 def spectra(name, length, delta, cnr=np.inf, seed=2):
     """Spectra of tones `delta` bins above BIN, phases at random; what is told of them."""
-    rng, w = np.random.default_rng(seed), window(name, length)
+    rng, w = np.random.default_rng(seed), get_window(name, length)
     turns = np.outer(BIN + np.asarray(delta), np.arange(length)) / SIZE
     record = np.cos(2 * np.pi * turns + rng.uniform(0, 2 * np.pi, (len(delta), 1)))
     variance = 0.5 / cnr
     record += rng.normal(0, np.sqrt(variance), record.shape)
-    setting = Setting(
+    setting = SpectrumSettings(
         fft_size=SIZE, sample_rate=float(SIZE), window=w, noise_power=w.energy * variance,
         threshold=1.0, training=32, guard=4, rank=24, pfa=1e-3,
     )  # fmt: skip
-    spectrum = np.fft.rfft(record * taper(w), SIZE)
+    spectrum = np.fft.rfft(record * cached_window_samples(w), SIZE)
     peak = BIN - 8 + np.argmax(np.abs(spectrum[:, BIN - 8 : BIN + 9]), axis=1)
     return spectrum, peak, setting
 
@@ -53,13 +53,13 @@ def test_a_tone_without_noise_is_placed_within_the_estimators_bias(name, shape, 
 def test_a_complex_spectrum_has_no_ends(name, shift):
     """A record turned by whole bins has its spectrum rolled, and its tone so many bins on."""
     size, rng = 1024, np.random.default_rng(8)
-    setting = Setting(
-        fft_size=size, sample_rate=600e6, window=window("hann", size), noise_power=1.0,
+    setting = SpectrumSettings(
+        fft_size=size, sample_rate=600e6, window=get_window("hann", size), noise_power=1.0,
         threshold=1.0, training=32, guard=8, rank=24, pfa=1e-4, complex_record=True,
     )  # fmt: skip
     noise = 0.1 * (rng.normal(size=size) + 1j * rng.normal(size=size))
     record = np.exp(2j * np.pi * (size - 1 + 0.3) * np.arange(size) / size) + noise
-    spectrum = np.fft.fft(taper(setting.window) * record)[None]
+    spectrum = np.fft.fft(cached_window_samples(setting.window) * record)[None]
     (whole,) = ESTIMATORS[name](np.roll(spectrum, 512, 1), np.array([511]), setting)
     (found,) = ESTIMATORS[name](
         np.roll(spectrum, shift, 1), np.array([(shift - 1) % size]), setting
@@ -75,19 +75,22 @@ def test_jacobsens_factors_are_those_of_his_table():
     """Q of Jacobsen and Kootsookos [2007], which they fitted by eye to two digits."""
     table = {"hamming": 0.60, "hann": 0.55, "blackman": 0.55, "blackmanharris": 0.56}
     for name, factor in table.items():
-        assert jacobsen_form(window(name, SIZE), SIZE) == (-1, pytest.approx(factor, abs=0.025))
-    assert jacobsen_form(window("rectangular", SIZE), SIZE) == (1, 1.0)
+        assert jacobsen_coefficients(get_window(name, SIZE), SIZE) == (
+            -1,
+            pytest.approx(factor, abs=0.025),
+        )
+    assert jacobsen_coefficients(get_window("rectangular", SIZE), SIZE) == (1, 1.0)
 
 
 def errors(name, shape, length, decibel):
     """Errors [bins] of tones anywhere between bins, the Cramer-Rao bound, the windowed one."""
-    w = window(shape, length)
+    w = get_window(shape, length)
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (decibel / 10), window=w)
     delta = np.random.default_rng(9).uniform(-0.5, 0.5, DRAWS)
     spectrum, peak, setting = spectra(shape, length, delta, cnr)
     error = ESTIMATORS[name](spectrum, peak, setting) - BIN - delta
-    bound = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=float(SIZE))
-    return error, bound, estimators.windowed_deviation(
+    bound = estimators.beat_frequency_bound(cnr=cnr, n_samples=length, sample_rate=float(SIZE))
+    return error, bound, estimators.windowed_peak_deviation(
         cnr=cnr, window=w, sample_rate=float(SIZE)
     )  # fmt: skip
 

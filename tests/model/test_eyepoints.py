@@ -5,15 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_scenes import level_plate, observe_shots, straight_flight
 
-from sweep.model.eyepoints import observe, prepare_eyepoints
-from sweep.model.footprint import beamlets
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.platform import ConstantAcceleration, Flight, Spin
-from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import LineScan, cone, corners, fixed
-from sweep.model.shot import evaluate, statistics
+from sweep.model.beamlets import place_beamlets
+from sweep.model.evaluation import evaluate, shot_statistics
+from sweep.model.geometry.body_motion import ConstantAcceleration, MovingBody, SpinningAttitude
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.geometry.scanner import LineScan, cone_directions, corner_directions, fixed_beams
+from sweep.model.pointcloud.eyepoints import observe_eyepoints, prepare_eyepoint_shots
 
-GROUND = Surface("ground", 0.1, "lambert")
+GROUND = SurfaceMaterial("ground", 0.1, "lambert")
 
 
 def square(half):
@@ -24,13 +24,13 @@ def square(half):
 @pytest.mark.parametrize("phases", ["incoherent", "coherent"])
 def test_level_ground_gives_what_the_flat_plane_gives(table_4_1, tilt, phases):
     """The footprint of a tilted beam on level ground is the plane's, along another azimuth."""
-    beams = cone(1, half_angle=np.radians(tilt), azimuth=np.pi / 2)
+    beams = cone_directions(1, half_angle=np.radians(tilt), azimuth=np.pi / 2)
     pattern = "sunflower" if phases == "coherent" else "hexagonal"
     along = 45.0 * beams[0]  # no velocity across the beam: no Doppler spread, as on the plane
     seen = observe_shots(straight_flight(velocity=along), beams=beams, number=109, pattern=pattern)
     parameters = table_4_1(phases=phases, reflectance_law="lambert")
-    shots = prepare_eyepoints(seen, parameters, [GROUND])
-    got = statistics(shots)
+    shots = prepare_eyepoint_shots(seen, parameters, [GROUND])
+    got = shot_statistics(shots)
     expected = evaluate(
         parameters
         | {
@@ -53,7 +53,7 @@ def test_level_ground_gives_what_the_flat_plane_gives(table_4_1, tilt, phases):
 
 def _beamlet_vectors(turn, beam, divergence, number):
     """Unit vectors of a beam's beamlets in the world, of a beam in the body's x-z plane."""
-    (across, along), _ = beamlets(number)
+    (across, along), _ = place_beamlets(number)
     # transverse: the first axis lies in the plane of the beam and x, the second across it
     first, second = np.array([-beam[2], 0.0, beam[0]]), np.array([0.0, -1.0, 0.0])
     body = beam + divergence / 4 * (np.outer(across, first) + np.outer(along, second))
@@ -66,9 +66,13 @@ def test_velocity_across_the_footprint_of_a_spinning_target_is_that_of_its_point
     omega, place, own = np.array([0.05, 0.3, 0.1]), np.array([8.0, -3.0, 300.0]), (2.0, 1.0, -9.0)
     path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
     seen = observe_shots(
-        straight_flight(position=place, velocity=own), bodies=[square(400.0)],
-        body_motion=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
-    )  # fmt: skip
+        straight_flight(position=place, velocity=own),
+        bodies=[square(400.0)],
+        body_motion=[MovingBody(path, SpinningAttitude(omega))],
+        index=[when],
+        number=37,
+        beam_divergence=0.02,
+    )
     here = place + when * np.array(own)
     u = _beamlet_vectors(Rotation.identity(), np.array([0.0, 0.0, -1.0]), 0.02, 37)
     normal = Rotation.from_rotvec(omega * when).apply([0.0, 0.0, 1.0])
@@ -95,9 +99,14 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
     own, place = np.array([20.0, -5.0, -30.0]), np.array([0.0, 0.0, 900.0])
     beam = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
     seen = observe_shots(
-        straight_flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
-        beams=beam[None], index=[when], number=37, beam_divergence=0.02,
-    )  # fmt: skip
+        straight_flight(
+            position=place, velocity=own, attitude=SpinningAttitude(omega), lever_arm=arm
+        ),
+        beams=beam[None],
+        index=[when],
+        number=37,
+        beam_divergence=0.02,
+    )
     turn = Rotation.from_rotvec(omega * when)
     u = _beamlet_vectors(turn, beam, 0.02, 37)
     moving = own + np.cross(omega, turn.apply(arm))
@@ -121,28 +130,38 @@ def test_beamlets_that_miss_send_nothing_back(table_4_1):
     )
     hit = seen.surface[0] >= 0
     assert 0 < hit.sum() < hit.size
-    shots = prepare_eyepoints(seen, table_4_1(), [GROUND])
-    assert (shots.amplitude[0][~hit] == 0).all() and (shots.amplitude[0][hit] > 0).all()
-    assert not observe_shots(straight_flight(position=(50.0, 0.0, 100.0)), bodies=edge).seen.any()
+    shots = prepare_eyepoint_shots(seen, table_4_1(), [GROUND])
+    assert (shots.relative_amplitude[0][~hit] == 0).all() and (
+        shots.relative_amplitude[0][hit] > 0
+    ).all()
+    assert not observe_shots(
+        straight_flight(position=(50.0, 0.0, 100.0)), bodies=edge
+    ).has_target.any()
 
 
 def _turning(rate, arm=(0.0, 0.0, 0.0)):
     """A falling instrument on an arm of a body that turns."""
     path = ConstantAcceleration((0.0, 0.0, 900.0), (35.0, -10.0, -60.0), (1.0, 2.0, 11.4), 10.0)
-    return Flight(path, Spin(rate), arm)
+    return MovingBody(path, SpinningAttitude(rate), arm)
 
 
 def _body(rate):
     path = ConstantAcceleration((0.0, 0.0, 0.0), (3.0, -4.0, 5.0), (0.5, 0.2, -2.0), 10.0)
-    return Flight(path, Spin(rate))
+    return MovingBody(path, SpinningAttitude(rate))
 
 
-SLANTED = corners(0.2)[:1]
+SLANTED = corner_directions(0.2)[:1]
 MOTIONS = {
-    "falling straight down": (_turning((0.0, 0.0, 0.0)), fixed(np.array([[0, 0, -1.0]]), rate=1e4)),
-    "slanting beam": (_turning((0.0, 0.0, 0.0)), fixed(SLANTED, rate=1e4)),
-    "turning": (_turning((0.3, -0.2, 0.4)), fixed(SLANTED, rate=1e4)),
-    "on a lever arm": (_turning((0.3, -0.2, 0.4), (2.0, -1.0, 3.0)), fixed(SLANTED, rate=1e4)),
+    "falling straight down": (
+        _turning((0.0, 0.0, 0.0)),
+        fixed_beams(np.array([[0, 0, -1.0]]), rate=1e4),
+    ),
+    "slanting beam": (_turning((0.0, 0.0, 0.0)), fixed_beams(SLANTED, rate=1e4)),
+    "turning": (_turning((0.3, -0.2, 0.4)), fixed_beams(SLANTED, rate=1e4)),
+    "on a lever arm": (
+        _turning((0.3, -0.2, 0.4), (2.0, -1.0, 3.0)),
+        fixed_beams(SLANTED, rate=1e4),
+    ),
     "resonant mirror": (_turning((0.0, 0.0, 0.0)), LineScan(0.3, 5.0, 1e4, wave="sine")),
     "triangular sweep": (_turning((0.1, 0.0, 0.0)), LineScan(0.3, 5.0, 1e4, along=(0.2,))),
 }
@@ -153,14 +172,14 @@ MOTIONS = {
 def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
     """Central differences over 0.1 ms to either side, on level ground or on moving."""
     flight, scanner = MOTIONS[name]
-    seen = observe(
-        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster([level_plate()]),
-        beam_divergence=50e-6, number=7, bodies=None if body is None else [_body(body)],
+    seen = observe_eyepoints(
+        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=RayCaster([level_plate()]),
+        beam_divergence=50e-6, n_beamlets=7, body_motions=None if body is None else [_body(body)],
     )  # fmt: skip
     grows = (seen.radial_velocity[2] - seen.radial_velocity[0]) / 2e-4
     falls = (seen.range[0] - seen.range[2]) / 2e-4
     assert seen.acceleration[1] == pytest.approx(grows, rel=1e-5, abs=1e-6)
-    assert seen.approach[1] == pytest.approx(falls, rel=1e-5)
+    assert seen.approach_speed[1] == pytest.approx(falls, rel=1e-5)
     turned = np.linalg.norm(seen.direction[2] - seen.direction[0]) / 2e-4
     assert seen.turn_rate[1] == pytest.approx(turned, rel=1e-5, abs=1e-9)
 
@@ -169,4 +188,8 @@ def test_a_shot_that_sees_nothing_has_no_acceleration():
     seen = observe_shots(
         straight_flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1)
     )
-    assert np.isnan(seen.acceleration).tolist() == np.isnan(seen.approach).tolist() == [True, False]
+    assert (
+        np.isnan(seen.acceleration).tolist()
+        == np.isnan(seen.approach_speed).tolist()
+        == [True, False]
+    )

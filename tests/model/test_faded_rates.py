@@ -3,34 +3,40 @@
 import numpy as np
 import pytest
 
-from sweep.model import detection, leakage
-from sweep.model.crossings import MOST_TERMS, any_crossing, crossing_series, leave_out_joined
-from sweep.model.faded_rates import (
-    FINER_POWERS,
-    LOUDEST,
-    OCTAVES,
-    POWERS,
-    SPECKLE_POWERS,
-    add_rates,
-    faded_rates,
+from sweep.model.detection import echo_detection
+from sweep.model.detection.added_crossings import (
+    SERIES_TERMS_MAX,
+    any_crossing_probability,
+    exclude_bins_joining_echo,
+    fill_crossing_series,
 )
-from sweep.model.marcum import excess_crossing, marcum_q1
-from sweep.model.spectrum import OUT, ROOM
+from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
+from sweep.model.detection.speckle_crossing_rates import (
+    N_SPECKLE_OCTAVES,
+    N_SPECKLE_POWERS,
+    POWERS_PER_OCTAVE_MAX,
+    SPECKLE_POWER_MAX,
+    TABULATED_SPECKLE_POWERS,
+    add_rates_by_power,
+    tabulate_crossing_rates,
+)
+from sweep.model.spectrum import leakage
+from sweep.model.spectrum.bin_spectrum import N_SCRATCH_ROWS, OUT
 
 CERTAIN = 25.0
 """Rate from which on only it matters that bins cross."""
 
 
 def table_of(level):
-    series = np.empty(MOST_TERMS)
-    crossing_series(level, series)
-    return faded_rates(level, series)
+    series = np.empty(SERIES_TERMS_MAX)
+    fill_crossing_series(level, series)
+    return tabulate_crossing_rates(level, series)
 
 
 def direct_rates(amplitude, level):
     """Rates -ln(1 - c) of amplitudes, with the digits of the smaller of c and 1 - c."""
     quiet = -np.expm1(-(level**2) / 2)
-    c = np.array([excess_crossing(a, level) for a in amplitude]) / quiet
+    c = np.array([marcum_q1_excess(a, level) for a in amplitude]) / quiet
     stays = np.maximum(marcum_q1(amplitude, np.array(level)).p / quiet, 1e-300)
     return np.where(c < 0.5, -np.log1p(-np.minimum(c, 0.9)), -np.log(stays))
 
@@ -39,10 +45,10 @@ def direct_rates(amplitude, level):
 def test_tabulated_rates_are_those_of_a_bin_at_each_speckle_power(level):
     table = table_of(level)
     for amplitude in np.exp(np.linspace(np.log(1e-4), np.log(level + 20), 300)):
-        sums = np.zeros(POWERS)
-        add_rates(amplitude**2, 1.0, table, sums)
-        told = sums * SPECKLE_POWERS
-        faded = amplitude * np.sqrt(SPECKLE_POWERS)
+        sums = np.zeros(N_SPECKLE_POWERS)
+        add_rates_by_power(amplitude**2, 1.0, table, sums)
+        told = sums * TABULATED_SPECKLE_POWERS
+        faded = amplitude * np.sqrt(TABULATED_SPECKLE_POWERS)
         expected = direct_rates(faded, level)
         sound = expected < CERTAIN
         np.testing.assert_allclose(told[sound], expected[sound], rtol=2e-5, atol=1e-14)
@@ -69,29 +75,31 @@ def run_at_random(seed, level):
 def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
     level, correlation = float([4.5, 6.55, 9.0][seed % 3]), [-0.5, 0.0, 0.6][seed % 2]
     magnitude, exempt = run_at_random(seed, level)
-    room = np.zeros((ROOM, magnitude.size + 8))
+    room = np.zeros((N_SCRATCH_ROWS, magnitude.size + 8))
     room[OUT, : magnitude.size] = magnitude
-    told = leakage.of_fading_bins(
+    told = leakage.leakage_of_bins_in_speckle(
         np.int64(magnitude.size), (1.0, level, 0.0, correlation), 0.0, room, exempt, table_of(level)
     )
 
     def log_rates(per_octave):
         found = []
-        for k in range(per_octave * OCTAVES + 1):
-            root = np.sqrt(LOUDEST * 2.0 ** (-k / per_octave))
+        for k in range(per_octave * N_SPECKLE_OCTAVES + 1):
+            root = np.sqrt(SPECKLE_POWER_MAX * 2.0 ** (-k / per_octave))
             chances = np.where(exempt, 0.0, -np.expm1(-direct_rates(root * magnitude, level)))
-            brightest = any_crossing(chances, 0, chances.size)
+            brightest = any_crossing_probability(chances, 0, chances.size)
             noise = 1.0 / root, level / root
-            leave_out_joined(chances, 0, chances.size, magnitude, exempt, noise, correlation)
-            rate = -np.log1p(-min(any_crossing(chances, 0, chances.size), 1 - 1e-15))
-            found.append((np.log(max(rate, leakage.FAINTEST_RATE)), brightest))
+            exclude_bins_joining_echo(
+                chances, 0, chances.size, magnitude, exempt, noise, correlation
+            )
+            rate = -np.log1p(-min(any_crossing_probability(chances, 0, chances.size), 1 - 1e-15))
+            found.append((np.log(max(rate, leakage.RATE_MIN)), brightest))
         return np.array([f[0] for f in found]), found[0][1]
 
     of_octaves, brightest = log_rates(1)
     per_octave = 1
-    if brightest > leakage.BRIGHTEST_MAX:
-        per_octave, (of_octaves, _) = FINER_POWERS, log_rates(FINER_POWERS)
-    expected = leakage.fading_mean(of_octaves, per_octave)
+    if brightest > leakage.OCTAVE_STEP_LEAKAGE_MAX:
+        per_octave, (of_octaves, _) = POWERS_PER_OCTAVE_MAX, log_rates(POWERS_PER_OCTAVE_MAX)
+    expected = leakage.mean_leakage_in_speckle(of_octaves, per_octave)
     assert told == pytest.approx(expected, rel=5e-5, abs=1e-13)
 
 
@@ -105,17 +113,22 @@ def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
     steady[0] = peak * np.exp(-(((np.arange(bins) - rng.uniform(3, 5)) / rng.uniform(0.7, 3)) ** 2))
     steady[1] = rng.uniform(3.0, 9.0) * rng.uniform(0.7, 1.0, bins)
     steady[2, 1:] = rng.uniform(-0.6, 0.6, bins - 1)
-    told = detection._mean_over_mode(steady, echo, 100, 0)
+    told = echo_detection._mean_over_mode_power(steady, echo, 100, 0)
 
     ratio = steady[1] / steady[0]
-    first = np.min(np.maximum(steady[1] - detection._REACH, 0.0) / steady[0])
-    last = min(np.min((steady[1] + detection._REACH) / steady[0]), detection._Z_MAX)
-    first, last = (min(v, detection._Z_MAX) for v in (first, last))
-    last = min(last, np.sqrt(min(ratio.min(), detection._Z_MAX) ** 2 + 10.0))
-    z = first + (last - first) * 0.5 * (detection._NODE + 1)
-    weight = 0.5 * (last - first) * detection._WEIGHT * 2 * z * np.exp(-z * z)
+    first = np.min(np.maximum(steady[1] - echo_detection._THRESHOLD_REACH_SIGMA, 0.0) / steady[0])
+    last = min(
+        np.min((steady[1] + echo_detection._THRESHOLD_REACH_SIGMA) / steady[0]),
+        echo_detection._MODE_MAGNITUDE_MAX,
+    )
+    first, last = (min(v, echo_detection._MODE_MAGNITUDE_MAX) for v in (first, last))
+    last = min(last, np.sqrt(min(ratio.min(), echo_detection._MODE_MAGNITUDE_MAX) ** 2 + 10.0))
+    z = first + (last - first) * 0.5 * (echo_detection._GAUSS_NODES + 1)
+    weight = 0.5 * (last - first) * echo_detection._GAUSS_WEIGHTS * 2 * z * np.exp(-z * z)
     z, weight = np.append(0.6 * first, z), np.append(-np.expm1(-first * first), weight)
-    of_nodes = [detection._any_steady(steady, one, echo, 100, 0, np.inf, 0.0) for one in z]
+    of_nodes = [
+        echo_detection._pd_and_miss_given_mode(steady, one, echo, 100, 0, np.inf, 0.0) for one in z
+    ]
     found, missed = (weight * np.array(of_nodes).T).sum(axis=1)
     found += np.exp(-last * last)
     whole = found + missed

@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 from drawn_leakage import drawn_leakage
 
-from sweep.model import leakage
-from sweep.model.crossings import any_crossing, leave_out_joined
-from sweep.model.detection import mark
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.interpolation import sidelobe_correlation
-from sweep.model.marcum import marcum_q1
-from sweep.model.segments import spectrum
-from sweep.model.shot import evaluate, prepare
+from sweep.model.detection.added_crossings import (
+    any_crossing_probability,
+    exclude_bins_joining_echo,
+)
+from sweep.model.detection.echo_detection import mark_exempt_bins
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate, prepare_shots
+from sweep.model.spectrum import leakage
+from sweep.model.spectrum.segment_spectra import segment_spectrum
 
 POWERS = (np.arange(40_000) + 0.5) * (20.0 / 40_000)
 
@@ -31,13 +34,15 @@ def test_the_mean_of_few_powers_is_that_of_all(signals, level, per_octave):
         added = np.maximum(crossing.q - quiet, 0.0) / -np.expm1(-(level**2) / 2)
         return -np.expm1(np.log1p(-np.minimum(added, 1 - 1e-16)).sum(axis=1))
 
-    number = per_octave * leakage.OCTAVES + 1
-    few = chance(leakage.LOUDEST * 2.0 ** (-np.arange(number) / per_octave))
+    number = per_octave * leakage.N_SPECKLE_OCTAVES + 1
+    few = chance(leakage.SPECKLE_POWER_MAX * 2.0 ** (-np.arange(number) / per_octave))
     few = np.minimum(few, 1 - 1e-15)
-    rates = np.log(np.maximum(-np.log1p(-few), leakage.FAINTEST_RATE))
+    rates = np.log(np.maximum(-np.log1p(-few), leakage.RATE_MIN))
     expected = mean_over_power(chance)
     if expected > 1e-5:
-        assert leakage.fading_mean(rates, per_octave) == pytest.approx(expected, rel=0.02)
+        assert leakage.mean_leakage_in_speckle(rates, per_octave) == pytest.approx(
+            expected, rel=0.02
+        )
 
 
 @pytest.mark.parametrize("window", ["hamming", "rectangular", "hann"])
@@ -47,8 +52,10 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
 
     Runs that join the echo are none of them (drawn spectra hold that).
     """
-    effects = (*CORE, "fading")
-    p = DEFAULTS | table_4_1(window=window, beamlets=1, fft_size=4096, radial_velocity=0.0)
+    effects = (*DEFAULT_EFFECTS, "fading")
+    p = PARAMETER_DEFAULTS | table_4_1(
+        window=window, beamlets=1, fft_size=4096, radial_velocity=0.0
+    )
     p |= {
         "target.range": np.array([150.3, 900.7, 2500.0]), "footprint.phases": "incoherent",
         "instrument.laser.power": 1.0, "accuracy.leakage_floor": 0.0 if every_bin else -1.0,
@@ -57,13 +64,15 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
         p["instrument.processing.fft_size"] = 2**19
         p["target.range"] = np.array([150.3])
     told = evaluate(p, effects)["p_leakage_up"]
-    ((_, shots),) = prepare(p, effects)
+    ((_, shots),) = prepare_shots(p, effects)
     for i in range(shots.size):
-        bins, magnitude = spectrum(shots, i, 0)
-        sigma, level = float(shots.bin_deviation[i]), float(shots.threshold[i])
+        bins, magnitude = segment_spectrum(shots, i, 0)
+        sigma, level = float(shots.bin_noise_sigma[i]), float(shots.threshold[i])
 
         exempt = np.zeros(magnitude.size, bool)
-        mark(magnitude, magnitude.size, level, exempt, shots.echo_rule.beside)
+        mark_exempt_bins(
+            magnitude, magnitude.size, level, exempt, shots.detection_rule.lobe_half_width
+        )
         counts = ~exempt & (bins > 0)
         quiet = -np.expm1(-((level / sigma) ** 2) / 2)
         powers, raised = np.linspace(0, 16, 321)[1:], []
@@ -72,8 +81,8 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
             stays = marcum_q1(np.sqrt(u) * magnitude / sigma, np.array(level / sigma)).p / quiet
             chances = np.where(counts, np.maximum(1.0 - stays, 0.0), 0.0)
             noise = sigma / np.sqrt(u), level / np.sqrt(u)
-            leave_out_joined(chances, 0, chances.size, magnitude, exempt, noise, near)
-            raised.append(any_crossing(chances, 0, chances.size))
+            exclude_bins_joining_echo(chances, 0, chances.size, magnitude, exempt, noise, near)
+            raised.append(any_crossing_probability(chances, 0, chances.size))
         expected = np.trapezoid(np.array(raised) * np.exp(-powers), powers)
         if expected > 1e-7:
             assert told[i] == pytest.approx(expected, rel=0.05)
@@ -84,15 +93,17 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
     ("window", "power"), [("rectangular", 1.0), ("hann", 60.0), ("hamming", 60.0)]
 )
 def test_leakage_is_that_of_further_groups_in_drawn_spectra(table_4_1, window, power, fades):
-    p = DEFAULTS | table_4_1(window=window, beamlets=1, fft_size=1024, radial_velocity=0.0, tnr=6.5)
+    p = PARAMETER_DEFAULTS | table_4_1(
+        window=window, beamlets=1, fft_size=1024, radial_velocity=0.0, tnr=6.5
+    )
     p |= {
         "target.range": np.array([300.0, 700.0]), "footprint.phases": "incoherent",
         "instrument.laser.power": power, "accuracy.leakage_floor": 0.0,
         "instrument.receiver.noise_shape": "white",
     }  # fmt: skip
-    effects = (*CORE, "fading") if fades else CORE
+    effects = (*DEFAULT_EFFECTS, "fading") if fades else DEFAULT_EFFECTS
     told = evaluate(p, effects)["p_leakage_up"]
-    ((_, shots),) = prepare(p, effects)
+    ((_, shots),) = prepare_shots(p, effects)
     for i in range(shots.size):
         drawn, deviation = drawn_leakage(shots, i, draws=4000, fades=fades)
         assert told[i] == pytest.approx(drawn, abs=4 * deviation + 0.1 * drawn)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from sweep.model.footprint import beamlets, plane_footprint
+from sweep.model.beamlets import place_beamlets, plane_footprint
 
 
 @pytest.mark.parametrize("pattern", ["hexagonal", "sunflower"])
 def test_any_number_of_beamlets_keeps_power_and_pointing_and_size(pattern):
     """Mean 0, covariance the identity (from three on), weights that sum to 1."""
     for number in range(1, 401):
-        offsets, weights = beamlets(number, pattern)
+        offsets, weights = place_beamlets(number, pattern)
         assert offsets.shape == (2, number) and weights.shape == (number,)
         assert (weights > 0).all()
         assert weights.sum() == pytest.approx(1.0, abs=4e-16 * number)
@@ -21,9 +21,9 @@ def test_any_number_of_beamlets_keeps_power_and_pointing_and_size(pattern):
 
 
 def test_one_beamlet_is_the_beams_axis_and_two_lie_along_the_slope():
-    offsets, weights = beamlets(1)
+    offsets, weights = place_beamlets(1)
     assert np.array_equal(offsets, [[0.0], [0.0]]) and np.array_equal(weights, [1.0])
-    offsets, weights = beamlets(2)
+    offsets, weights = place_beamlets(2)
     assert (offsets[1] ** 2 @ weights, offsets[0] ** 2 @ weights) == (1.0, 0.0)
 
 
@@ -35,7 +35,7 @@ def test_a_sunflower_has_no_rows_for_the_phases_of_a_smooth_plane_to_step_along(
     steepness = np.linspace(20.0, 400.0, 4000)[:, None]
     median = {}
     for pattern in ("hexagonal", "sunflower"):
-        offsets, weights = beamlets(109, pattern)
+        offsets, weights = place_beamlets(109, pattern)
         power = np.abs(np.exp(1j * steepness * offsets[1]) @ np.sqrt(weights)) ** 2
         median[pattern] = np.median(power)
     # An exponential's median is ln 2 = 0.69 of its mean.
@@ -45,7 +45,7 @@ def test_a_sunflower_has_no_rows_for_the_phases_of_a_smooth_plane_to_step_along(
 
 def test_a_full_lattice_of_109_is_the_thesiss_hexagon_about_its_centre():
     """[T 3.3.1]: its 109 points are whole shells, hence the pattern equals its own mirror image."""
-    offsets, weights = beamlets(109)
+    offsets, weights = place_beamlets(109)
     points = {(round(x, 9) + 0.0, round(y, 9) + 0.0) for x, y in offsets.T}
     assert points == {(-x + 0.0, -y + 0.0) for x, y in points}
     assert weights.argmax() == np.hypot(*offsets).argmin()
@@ -62,7 +62,7 @@ def test_many_beamlets_have_the_beams_gaussian_profile(pattern):
     """
     cut = {"hexagonal": np.sqrt(9 + 2.9 * np.log(4001 / 19)), "sunflower": 3.0}[pattern]
     lost = cut**2 / 2 / np.expm1(cut**2 / 2)
-    offsets, weights = beamlets(4001, pattern)
+    offsets, weights = place_beamlets(4001, pattern)
     radius = np.hypot(*offsets)
     slope = np.polyfit(radius**2, np.log(weights), 1)[0]
     assert slope == pytest.approx(-0.5 * (1 - lost), rel=0.003)
@@ -73,7 +73,7 @@ def test_many_beamlets_have_the_beams_gaussian_profile(pattern):
 def footprint(grazing_angle, divergence, number):
     offset, cos_incidence, weights, _ = plane_footprint(
         grazing_angle=np.atleast_1d(grazing_angle), beam_divergence=np.atleast_1d(divergence),
-        number=number,
+        n_beamlets=number,
     )  # fmt: skip
     return offset[0], cos_incidence[0], weights[0]
 

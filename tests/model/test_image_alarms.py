@@ -3,31 +3,36 @@
 import numpy as np
 import pytest
 
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.groups import groups
-from sweep.model.segments import spectrum
-from sweep.model.shot import CORE, find, prepare, statistics
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.evaluation import (
+    DEFAULT_EFFECTS,
+    evaluate_segments,
+    prepare_shots,
+    shot_statistics,
+)
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.spectrum.segment_spectra import segment_spectrum
 
-EFFECTS = (*CORE, "iq_imbalance", "leakage")
+EFFECTS = (*DEFAULT_EFFECTS, "iq_imbalance", "leakage")
 DRAWS = 40_000
 
 
 def shots_with_image(parameters, ratio):
     """Shots whose image in the up-chirp's spectrum is ``ratio`` times the threshold."""
     for _ in range(2):
-        ((_, shots),) = prepare(parameters, EFFECTS)
-        image = float(find(shots)[0, 2, 0] * shots.image_gain)
+        ((_, shots),) = prepare_shots(parameters, EFFECTS)
+        image = float(evaluate_segments(shots)[0, 2, 0] * shots.image_gain)
         factor = (ratio * float(shots.threshold[0]) / image) ** 2
         parameters = parameters | {
             "instrument.laser.power": parameters["instrument.laser.power"] * factor
         }
-    ((_, shots),) = prepare(parameters, EFFECTS)
+    ((_, shots),) = prepare_shots(parameters, EFFECTS)
     return shots
 
 
 def drawn_alarms(shots, seed):
     """Share of draws in which a bin about the image crosses, over what noise alone makes of it."""
-    bins, magnitude = spectrum(shots, 0, 0)
+    bins, magnitude = segment_spectrum(shots, 0, 0)
     peak = int(magnitude.argmax())
     size, length = shots.fft_size, shots.window.length
     image = int(np.flatnonzero((bins + bins[peak]) % size == 0)[0])
@@ -52,10 +57,10 @@ def drawn_alarms(shots, seed):
     fits = np.abs(shapes) / np.abs(shapes).max(axis=1)[:, None]
     shape = shapes[np.argmin(((fits - around) ** 2).sum(axis=1))]
     phase = np.exp(-1j * np.pi * bins[places] * length / size)
-    signal = np.sign(shape) * phase * magnitude[places] / float(shots.bin_deviation[0])
+    signal = np.sign(shape) * phase * magnitude[places] / float(shots.bin_noise_sigma[0])
     values, vectors = np.linalg.eigh(noise)
     factor = vectors * np.sqrt(np.maximum(values, 0))
-    rng, level = np.random.default_rng(seed), float(shots.threshold[0] / shots.bin_deviation[0])
+    rng, level = np.random.default_rng(seed), float(shots.threshold[0] / shots.bin_noise_sigma[0])
     numbers = rng.normal(size=(DRAWS, places.size, 2)) @ [1, 1j] @ factor.T
     alone, crosses = ((abs(numbers + s) >= level).any(axis=1).mean() for s in (0 * signal, signal))
     return (crosses - alone) / (1 - alone)
@@ -64,14 +69,14 @@ def drawn_alarms(shots, seed):
 @pytest.mark.parametrize("ratio", [0.5, 0.8, 0.95, 1.02, 1.2])
 @pytest.mark.parametrize("rule", ["peak_bin", "any_bin"])
 def test_an_image_is_the_alarm_that_it_is(ratio, rule, table_4_1):
-    p = DEFAULTS | table_4_1() | {
+    p = PARAMETER_DEFAULTS | table_4_1() | {
         "instrument.receiver.record": "complex", "instrument.receiver.iq_gain_imbalance": 10**0.05,
         "instrument.processing.detection": rule, "instrument.processing.noise_bins": "correlated",
         "instrument.receiver.noise_shape": "white", "instrument.processing.fft_size": 8192,
         "target.range": 1500.0, "target.radial_velocity": 3.0, "footprint.beamlets": 1,
     }  # fmt: skip
     shots = shots_with_image(p, ratio)
-    drawn, outputs = drawn_alarms(shots, seed=2), statistics(shots)
+    drawn, outputs = drawn_alarms(shots, seed=2), shot_statistics(shots)
     error = np.sqrt(drawn * (1 - drawn) / DRAWS)
     assert abs(outputs["p_leakage_up"][0] - drawn) < 0.01 + 3 * error
-    assert groups(shots).bin[0, 0, 1] == -1  # nor is it an echo
+    assert list_bin_groups(shots).strongest_bin[0, 0, 1] == -1  # nor is it an echo

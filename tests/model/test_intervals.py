@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.model.accuracy import COUNTED, bounded_mean, clopper_pearson, half_width, wilson
-from sweep.model.marcum import marcum_q1
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.error_budget import (
+    COUNT_INTERVALS,
+    bounded_mean_interval,
+    clopper_pearson_interval,
+    interval_half_width,
+    wilson_interval,
+)
 
 CONFIDENCE = 0.95
 Z = stats.norm.ppf(0.975)
@@ -23,7 +29,7 @@ NUMBERS = (1, 2, 5, 10, 100, 1000, 10_000)
 def test_beyond_clopper_and_pearsons_ends_the_counts_have_half_the_rest_each(n, confidence):
     k = np.unique([0, 1, 2, n // 3, n - 1, n])
     k = k[k <= n]
-    low, high = clopper_pearson(successes=k, trials=n, confidence=confidence)
+    low, high = clopper_pearson_interval(successes=k, trials=n, confidence=confidence)
     below = (1 - confidence) / 2
     inner = k > 0
     np.testing.assert_allclose(stats.binom.sf(k[inner] - 1, n, low[inner]), below, rtol=1e-6)
@@ -36,7 +42,7 @@ def test_no_success_and_nothing_but_success_in_very_many_trials():
     n = np.array([1.0, 1e6, 1e12])
     unseen = -np.expm1(np.log(0.025) / n)
     for k, ends in ((0 * n, (0, unseen)), (n, (1 - unseen, 1))):
-        found = clopper_pearson(successes=k, trials=n, confidence=CONFIDENCE)
+        found = clopper_pearson_interval(successes=k, trials=n, confidence=CONFIDENCE)
         for end, expected in zip(found, ends, strict=True):
             np.testing.assert_allclose(end, expected + 0 * n, rtol=1e-12)
 
@@ -44,7 +50,7 @@ def test_no_success_and_nothing_but_success_in_very_many_trials():
 @pytest.mark.parametrize("n", [1, 7, 1000, 10**6])
 def test_wilsons_ends_are_as_likely_as_their_own_variance_says(n):
     k = np.unique([0, 1, n // 3, n - 1, n])
-    low, high = wilson(successes=k, trials=n, confidence=CONFIDENCE)
+    low, high = wilson_interval(successes=k, trials=n, confidence=CONFIDENCE)
     for end in (low, high):
         apart = (k / n - end) ** 2 - Z**2 * end * (1 - end) / n
         np.testing.assert_allclose(apart, 0, atol=1e-14)
@@ -54,17 +60,17 @@ def test_wilsons_ends_are_as_likely_as_their_own_variance_says(n):
 
 def coverage(estimate, interval, weight, truth):
     """Probability that estimate +- half-width holds the truth; the largest step near its ends."""
-    within = abs(estimate - truth) <= half_width(estimate, interval) + 1e-15
+    within = abs(estimate - truth) <= interval_half_width(estimate, interval) + 1e-15
     edges = np.flatnonzero(np.diff(within.astype(int), prepend=0, append=0))
     near = np.unique(np.clip(np.concatenate([edges - 1, edges]), 0, weight.size - 1))
     return weight[within].sum(), weight[near].max()
 
 
 @pytest.mark.parametrize("n", NUMBERS)
-@pytest.mark.parametrize("name", COUNTED)
+@pytest.mark.parametrize("name", COUNT_INTERVALS)
 def test_counts_are_as_sure_as_promised(name, n):
     k = np.arange(n + 1)
-    interval = COUNTED[name](successes=k, trials=n, confidence=CONFIDENCE)
+    interval = COUNT_INTERVALS[name](successes=k, trials=n, confidence=CONFIDENCE)
     for p in CHANCES:
         found, step = coverage(k / n, interval, stats.binom.pmf(k, n, p), p)
         assert found >= CONFIDENCE - (step if name == "wilson" else 1e-12), p
@@ -75,7 +81,7 @@ def test_on_the_average_wilsons_own_interval_is_right_and_clopper_and_pearsons_w
     p = (np.arange(2000) + 0.5) / 2000
     weight = stats.binom.pmf(k, n, p[:, None])
     means = {}
-    for name, interval in COUNTED.items():
+    for name, interval in COUNT_INTERVALS.items():
         low, high = interval(successes=k, trials=n, confidence=CONFIDENCE)
         means[name] = (weight * ((low <= p[:, None]) & (p[:, None] <= high))).sum(axis=1).mean()
     assert means["wilson"] == pytest.approx(CONFIDENCE, abs=0.004)
@@ -89,7 +95,9 @@ def test_means_of_two_values_are_as_sure_as_promised(pair, n):
     (u, v), k = pair, np.arange(n + 1)
     mean = u + (v - u) * k / n
     variance = (v - u) ** 2 * k * (1 - k / n) / (n - 1)
-    interval = bounded_mean(mean=mean, variance=variance, number=n, confidence=CONFIDENCE)
+    interval = bounded_mean_interval(
+        mean=mean, variance=variance, n_values=n, confidence=CONFIDENCE
+    )
     for p in CHANCES:
         found, step = coverage(mean, interval, stats.binom.pmf(k, n, p), u + (v - u) * p)
         assert found >= CONFIDENCE - step, p
@@ -118,10 +126,10 @@ def test_means_of_skewed_values_are_as_sure_as_promised(values, n):
     for pd in CHANCES[(CHANCES > 0) & (CHANCES < 1)]:
         drawn = values(pd, (trials, n), random)
         mean = drawn.mean(axis=1)
-        interval = bounded_mean(
-            mean=mean, variance=drawn.var(axis=1, ddof=1), number=n, confidence=CONFIDENCE
+        interval = bounded_mean_interval(
+            mean=mean, variance=drawn.var(axis=1, ddof=1), n_values=n, confidence=CONFIDENCE
         )
-        found = (abs(mean - pd) <= half_width(mean, interval)).mean()
+        found = (abs(mean - pd) <= interval_half_width(mean, interval)).mean()
         sigma = np.sqrt(CONFIDENCE * (1 - CONFIDENCE) / trials)
         assert found >= CONFIDENCE - 5 * sigma, pd
 
@@ -129,14 +137,16 @@ def test_means_of_skewed_values_are_as_sure_as_promised(values, n):
 def test_draws_all_alike_promise_no_more_than_so_many_draws_can():
     n = np.array([1, 100, 10_000])
     for mean, room in ((0.0, 1.0), (1.0, 1.0), (0.3, 0.7)):
-        interval = bounded_mean(mean=mean, variance=0.0, number=n, confidence=CONFIDENCE)
-        width = half_width(mean, interval)
+        interval = bounded_mean_interval(mean=mean, variance=0.0, n_values=n, confidence=CONFIDENCE)
+        width = interval_half_width(mean, interval)
         np.testing.assert_allclose(width, np.minimum(Z**2 / n, 1) * room, rtol=1e-12)
         # What 19 of 20 samples of so many miss has a probability of 3 / n, and adds as much.
         assert (width >= room * -np.expm1(np.log(0.05) / n)).all()
 
 
 def test_with_many_draws_only_their_variance_counts():
-    interval = bounded_mean(mean=0.4, variance=0.09, number=10**10, confidence=CONFIDENCE)
-    assert half_width(0.4, interval) == pytest.approx(Z * 0.3 / 1e5, rel=1e-4)
-    assert half_width(0.4, interval) > Z * 0.3 / 1e5
+    interval = bounded_mean_interval(
+        mean=0.4, variance=0.09, n_values=10**10, confidence=CONFIDENCE
+    )
+    assert interval_half_width(0.4, interval) == pytest.approx(Z * 0.3 / 1e5, rel=1e-4)
+    assert interval_half_width(0.4, interval) > Z * 0.3 / 1e5

@@ -6,8 +6,13 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from small_scenes import DOWNWARD_BEAM, observe_shots, straight_flight
 
-from sweep.model.geometry.platform import Nadir
-from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners
+from sweep.model.geometry.body_motion import NadirAttitude
+from sweep.model.geometry.scanner import (
+    BeamCycle,
+    PointingJitter,
+    cone_directions,
+    corner_directions,
+)
 
 SHOTS = 20_000
 """A standard deviation is known to 1/sqrt(2 SHOTS) = 0.5 %: at 5 sigma an error of 2.5 % shows.
@@ -37,7 +42,7 @@ def _alike(values, deviation):
 
 def test_a_slanting_beam_is_off_by_a_normal_angle_in_its_plane():
     """cos(angle from nadir) = height / range; each of four beams shows another component."""
-    seen = _seen(cone(4, half_angle=np.pi / 4, azimuth=0.4))
+    seen = _seen(cone_directions(4, half_angle=np.pi / 4, azimuth=0.4))
     off = (np.arccos(1000.0 / seen.range) - np.pi / 4).reshape(-1, 4)
     assert _alike(off.ravel(), SIGMA)
     correlation = np.corrcoef(off.T)[np.triu_indices(4, 1)]
@@ -45,7 +50,9 @@ def test_a_slanting_beam_is_off_by_a_normal_angle_in_its_plane():
 
 
 def test_the_instrument_knows_nothing_of_it():
-    plain, jittered = (_seen(cone(3, half_angle=0.4), jitter) for jitter in (None, JITTER))
+    plain, jittered = (
+        _seen(cone_directions(3, half_angle=0.4), jitter) for jitter in (None, JITTER)
+    )
     for name in ("time", "beam", "cycle", "position", "velocity", "direction"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(jittered, name))
     assert (plain.range != jittered.range).mean() > 0.99
@@ -54,7 +61,7 @@ def test_the_instrument_knows_nothing_of_it():
 def test_the_turn_has_three_independent_normal_angles_about_the_bodys_axes():
     attitude = Rotation.random(random_state=1)
     start = np.tile(attitude.as_quat(scalar_first=True), (SHOTS, 1))
-    turned = Rotation.from_quat(JITTER.turned(start, np.arange(SHOTS)), scalar_first=True)
+    turned = Rotation.from_quat(JITTER.perturb_attitude(start, np.arange(SHOTS)), scalar_first=True)
     angles = (attitude.inv() * turned).as_rotvec()
     assert all(_alike(angle, SIGMA) for angle in angles.T)
     correlation = np.corrcoef(angles.T)[np.triu_indices(3, 1)]
@@ -84,8 +91,8 @@ def test_the_seed_decides_on_the_angles():
 
 @pytest.mark.parametrize("some", [[33, 7, 20], [5]])
 def test_any_stretch_of_a_flight_is_the_same_bit_for_bit(some):
-    path = straight_flight(velocity=(1.0, 2.0, -50.0), attitude=Nadir(0.3))
-    scanner = BeamCycle(corners(np.radians(22.5)), [[0, 1, 2, 3]], 4.0)
+    path = straight_flight(velocity=(1.0, 2.0, -50.0), attitude=NadirAttitude(0.3))
+    scanner = BeamCycle(corner_directions(np.radians(22.5)), [[0, 1, 2, 3]], 4.0)
     whole, part = (
         observe_shots(path, scanner=scanner, index=index, jitter=JITTER)
         for index in (np.arange(36), np.array(some))

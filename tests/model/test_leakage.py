@@ -7,21 +7,26 @@ import numpy as np
 import pytest
 from shot_helpers import detected_window, line_shape_of_window, magnitude_error, parametrize_product
 
-from sweep.model import truth
-from sweep.model.crossings import (
-    MOST_TERMS,
-    added_crossings,
-    any_crossing,
-    crossing_series,
-    silence,
+from sweep.model import time_domain_truth
+from sweep.model.detection.added_crossings import (
+    SERIES_TERMS_MAX,
+    any_crossing_probability,
+    crossing_rate,
+    fill_added_crossings,
+    fill_crossing_series,
 )
-from sweep.model.ground import Cast, Footprints
-from sweep.model.groups import groups
-from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.segments import spectrum
-from sweep.model.shot import find, prepare, prepare_cast
-from sweep.model.spectrum import ROOM, SOURCE_DIGITS, take_sources, weight_afar
-from sweep.model.window import COSINE_SUMS, transform, window
+from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots, prepare_shots
+from sweep.model.ground import BeamletTable, RayTracedGround
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.spectrum.bin_spectrum import (
+    N_SCRATCH_ROWS,
+    SOURCE_LOG_ACCURACY,
+    compute_sources,
+    far_line_weight,
+)
+from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
+from sweep.model.spectrum.segment_spectra import segment_spectrum
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, direct_transform, get_window
 
 PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED, LEAKAGE = range(6)
 
@@ -29,12 +34,12 @@ ACCURACY = 1e-6
 """What the module states, relative to the leakage."""
 
 CLOSED_FORMS = ("hamming", "hann", "rectangular", "flattop")
-EVERY_FORM = tuple(COSINE_SUMS)
+EVERY_FORM = tuple(COSINE_SUM_COEFFICIENTS)
 
 
 def compare(shots):
     """Largest relative differences of what is found, fast against bin by bin."""
-    fast, slow = find(shots), find(shots, every_bin=True)
+    fast, slow = evaluate_segments(shots), evaluate_segments(shots, bin_by_bin=True)
     exists = np.isfinite(slow)
     np.testing.assert_array_equal(np.isfinite(fast), exists)
     scale = np.abs(slow)
@@ -43,7 +48,9 @@ def compare(shots):
     scale = np.maximum(scale, 1e-290)
     error = np.nanmax(np.abs(fast - slow) / scale, axis=(0, 2))
     # Of the Doppler segment only draws need to know what leaks.
-    listed, every = (groups(shots, most=1, every_bin=k).leakage[:, 1] for k in (False, True))
+    listed, every = (
+        list_bin_groups(shots, groups_max=1, every_bin=k).leakage[:, 1] for k in (False, True)
+    )
     apart = np.nanmax(np.abs(listed - every) / np.maximum(every, 1e-20), initial=0.0)
     error[LEAKAGE] = max(error[LEAKAGE], apart)
     return error, slow
@@ -70,19 +77,19 @@ def strengths_without_moments(places, degree, generator):
 )
 def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(name, half):
     """Against the transforms of all of them, from the table's end to the record's other end."""
-    generator, shape = np.random.default_rng(5), window(name, 4096)
+    generator, shape = np.random.default_rng(5), get_window(name, 4096)
     _, form, sizes, _, _ = line_shape_of_window(shape, 4096)
-    room, gained = np.zeros((ROOM, LEAST_WIDTH)), []
+    room, gained = np.zeros((N_SCRATCH_ROWS, SCRATCH_WIDTH_MIN)), []
     for degree in (0, 1, 2, 4, 6):
         places = np.append(generator.uniform(-half, half, 10), [-half, half])
         s = strengths_without_moments(places / half, degree, generator)
         n, total = places.size, abs(s).sum()
         room[PLACE, :n], room[RE, :n], room[IM, :n] = places, s.real, s.imag
-        sources = take_sources(n, -half, half, float(sizes[6]), SOURCE_DIGITS, sizes, room)
-        bound = weight_afar(total, sources, sizes, room)
+        sources = compute_sources(n, -half, half, float(sizes[6]), SOURCE_LOG_ACCURACY, sizes, room)
+        bound = far_line_weight(total, sources, sizes, room)
         away = np.geomspace(sizes[6] + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + away[:, None] - places
-        kernel = transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
+        kernel = direct_transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
         envelope = form[1, np.searchsorted(form[0], away - 1.5, "right") - 1]
         assert (abs(kernel @ s) <= bound * envelope * (1 + 1e-9) + 1e-12 * total).all()
         assert bound <= total
@@ -106,10 +113,10 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     )  # fmt: skip
     # Up to Nyquist and beyond: images are as near as the lines at some points, far at others.
     parameters["target.radial_velocity"] = generator.uniform(-470.0, 470.0, 300)
-    ((_, shots),) = prepare(parameters)
-    assert shots.image
-    whole = find(shots)
-    some = find(replace(shots, leakage_tolerance=np.asarray(allowed)))
+    ((_, shots),) = prepare_shots(parameters)
+    assert shots.sums_images
+    whole = evaluate_segments(shots)
+    some = evaluate_segments(replace(shots, leakage_tolerance=np.asarray(allowed)))
     missed = whole[:, LEAKAGE] - some[:, LEAKAGE]
     assert (missed <= allowed).all() and (missed >= -1e-6 * whole[:, LEAKAGE]).all()
     others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
@@ -128,7 +135,7 @@ def test_leakage_over_ranges_and_angles_for_every_window(table_4_1, window, phas
         "target.grazing_angle": np.radians(generator.uniform(1.0, 90.0, 150)),
         "target.radial_velocity": generator.uniform(-400.0, 400.0, 150),
     }
-    ((_, shots),) = prepare(parameters)
+    ((_, shots),) = prepare_shots(parameters)
     leakage = held(shots)
     assert np.nanmax(leakage) > 1e-2 and np.nanmin(leakage) < 1e-3  # of many sizes
 
@@ -139,7 +146,7 @@ def test_leakage_of_near_targets_at_normal_incidence(table_4_1, phases):
     parameters = table_4_1(phases=phases, leakage_floor=1e-12, beamlets=109) | {
         "target.range": np.array([0.01, 0.3, 2.0, 10.0, 35.0, 80.0])
     }
-    ((_, shots),) = prepare(parameters)
+    ((_, shots),) = prepare_shots(parameters)
     held(shots)
 
 
@@ -153,7 +160,7 @@ def test_leakage_of_beats_at_dc_at_nyquist_and_where_they_cancel(table_4_1, phas
         "target.radial_velocity": velocity,
         "target.range": np.array([0.02, 1.0, meets + 0.1, meets + 3.0, 22473.0, 22484.4]),
     }
-    ((_, shots),) = prepare(parameters)
+    ((_, shots),) = prepare_shots(parameters)
     held(shots)
 
 
@@ -186,7 +193,9 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
     echo = rng.exponential(size=bins.shape) / beamlets / 6
     offset = bins * RANGE_BIN / fft_size / ranges[:, None]
     shift = doppler * DOPPLER_BIN / fft_size
-    return prepare_cast(parameters, Cast(Footprints(np.arange(shots), offset, shift, echo)))
+    return prepare_ray_traced_shots(
+        parameters, RayTracedGround(BeamletTable(np.arange(shots), offset, shift, echo))
+    )
 
 
 @pytest.mark.parametrize(
@@ -197,16 +206,18 @@ def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_s
     """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
-        held(replace(shots, image=image))
+        held(replace(shots, sums_images=image))
 
 
 @pytest.mark.parametrize("fft_size", [64, 255, 1023, 5000])
 def test_lines_further_apart_than_there_are_bins_fold_into_the_spectrum(table_4_1, fft_size):
     for seed in range(6):
         shots = drawn_bundles(table_4_1, 1000 + seed, fft_size, 2.0 * fft_size)
-        for segment in np.flatnonzero(shots.segments):
-            _, found = spectrum(shots, seed, int(segment))
-            exact = truth.spectrum(shots, seed, int(segment), range_walk=False)
+        for segment in np.flatnonzero(shots.has_segment):
+            _, found = segment_spectrum(shots, seed, int(segment))
+            exact = time_domain_truth.time_domain_spectrum(
+                shots, seed, int(segment), with_range_walk=False
+            )
             assert np.abs(found - exact).max() < 1e-8 * exact.max()
 
 
@@ -219,12 +230,12 @@ def test_leakage_where_all_lines_lie_past_dc_or_nyquist(table_4_1, place, past):
         parameters = table_4_1(window=name, fft_size=fft_size, leakage_floor=1e-12, tnr=5.0)
         velocity = (place + np.array([-1e5, 0.0, 1e4])) * 1550e-9 / 2
         bins = past + 0.1 * np.arange(beamlets) - 0.3
-        footprints = Footprints(
+        footprints = BeamletTable(
             np.zeros(3, int), np.zeros((1, beamlets)), bins[None] * DOPPLER_BIN / fft_size,
             np.full((1, beamlets), 0.01),
         )  # fmt: skip
         moving = parameters | {"target.radial_velocity": velocity, "target.range": 300.0}
-        shots = prepare_cast(moving, Cast(footprints))
+        shots = prepare_ray_traced_shots(moving, RayTracedGround(footprints))
         held(shots)
 
 
@@ -234,16 +245,16 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
     """Of the time-domain truth, near the lines and beside them."""
     scene = table_4_1(window=window, phases=phases, fft_size=8192, beamlets=19, power=20.0)
     for r, grazing, v in ((30.0, 1.5, 150.0), (700.0, 0.7, 0.3), (4000.0, 0.1, -90.0)):
-        ((_, shots),) = prepare(
+        ((_, shots),) = prepare_shots(
             scene
             | {"target.range": r, "target.grazing_angle": grazing, "target.radial_velocity": v}
         )
         for segment in range(3):
             low, found = detected_window(shots, segment)
-            exact = truth.spectrum(shots, 0, segment, range_walk=False)
+            exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
             assert 5 < found.size < 4097
             error = magnitude_error(shots, found, exact[low : low + found.size], exact.max())
-            assert error < (1e-9 if shots.incoherent else 1e-10)
+            assert error < (1e-9 if shots.adds_powers else 1e-10)
 
 
 @pytest.mark.parametrize("apart", [0.5, 50.0])
@@ -252,11 +263,14 @@ def test_groups_are_those_of_every_bin(table_4_1, apart):
     found = 0
     for seed in range(5):
         shots = drawn_bundles(table_4_1, 900 + seed, 16384, apart)
-        fast, slow = groups(shots, most=6), groups(shots, most=6, every_bin=True)
-        for name in ("bin", "first", "last", "exempted"):
+        fast, slow = (
+            list_bin_groups(shots, groups_max=6),
+            list_bin_groups(shots, groups_max=6, every_bin=True),
+        )
+        for name in ("strongest_bin", "first_bin", "last_bin", "n_exempt"):
             np.testing.assert_array_equal(getattr(fast, name), getattr(slow, name))
-        np.testing.assert_allclose(fast.neighbours, slow.neighbours, rtol=1e-7)
-        found += (slow.bin >= 0).sum(axis=-1).max()
+        np.testing.assert_allclose(fast.neighbour_magnitudes, slow.neighbour_magnitudes, rtol=1e-7)
+        found += (slow.strongest_bin >= 0).sum(axis=-1).max()
     assert found >= 5 * (2 if apart > 1 else 1)
 
 
@@ -265,11 +279,11 @@ def test_added_crossings_have_their_digits(beta):
     """(Q_1(a, b) - Q_1(0, b)) / (1 - Q_1(0, b)) against 40 digits, up to the threshold."""
     y = beta**2 / 2
     x = y * np.array([1e-30, 1e-12, 1e-6, 1e-3, 0.03, 0.1, 0.2, 0.35, 0.45])
-    series, out = np.zeros(MOST_TERMS), np.empty(32)
-    crossing_series(beta, series)
+    series, out = np.zeros(SERIES_TERMS_MAX), np.empty(32)
+    fill_crossing_series(beta, series)
     room = np.zeros(32)
     room[: x.size] = x
-    added_crossings(room, x.size, beta, series, out)
+    fill_added_crossings(room, x.size, beta, series, out)
     with mpmath.workdps(40):
         for value, got in zip(x, out, strict=False):
             xm, ym = mpmath.mpf(value), mpmath.mpf(y)
@@ -292,8 +306,12 @@ def test_many_small_chances_keep_their_digits():
     chances = np.array([1e-300, 1e-20, 3e-17, 1e-9, 0.2, 0.0, 1e-16, 1e-12, 0.5])
     with mpmath.workdps(60):
         exact = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances)
-        assert any_crossing(chances, 0, chances.size) == pytest.approx(float(exact), rel=1e-15)
+        assert any_crossing_probability(chances, 0, chances.size) == pytest.approx(
+            float(exact), rel=1e-15
+        )
         few = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances[:4])
-        assert any_crossing(chances, 0, 4) == pytest.approx(float(few), rel=1e-15)
+        assert any_crossing_probability(chances, 0, 4) == pytest.approx(float(few), rel=1e-15)
         for c in [*chances, 9.9e-5, 1.01e-4]:
-            assert silence(c) == pytest.approx(float(-mpmath.log1p(-mpmath.mpf(c))), rel=1e-15)
+            assert crossing_rate(c) == pytest.approx(
+                float(-mpmath.log1p(-mpmath.mpf(c))), rel=1e-15
+            )

@@ -12,18 +12,18 @@ import pytest
 from shot_helpers import make_point_keys, prepare_single_category
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model import leaked_peaks as leaked
 from sweep.model import outputs
-from sweep.model.clouds import cloud
+from sweep.model.detection.looks import SINGLE_LOOK
+from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
+from sweep.model.detection.sub_bin_interpolation import interpolator
 from sweep.model.effects import circulator_leak
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.geometry.mesh import Surface
-from sweep.model.groups import groups
-from sweep.model.interpolation import interpolator
-from sweep.model.looks import ONE
-from sweep.model.marcum import excess_crossing, marcum_q1_pair
-from sweep.model.pairing import FALSE_ALARM
-from sweep.model.window import window
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.pointcloud import leaked_peaks as leaked
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.window import get_window
 
 NUMBER = {"probabilities": 8000, "noise": 8000, "spectra": 1500}
 """Draws of a method in a scene.
@@ -46,20 +46,21 @@ RECORD = "instrument.receiver.record"
 SKIRTS = {"instrument.chirp.sinusoidal_error": 2.5e5, "instrument.chirp.error_periods": 1500.0}
 SCENES = {
     "strong ground and a dim roof": ({**HAMMING, "power": 200.0}, {}),
-    "the same in speckle": ({**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {}),
+    "the same in "
+    "speckle": ({**HAMMING, "power": 150.0, "effects": (*DEFAULT_EFFECTS, "fading")}, {}),
     "near ground": ({**HAMMING, "power": 0.8, "height": 60.0, "roof": False}, {}),
     "rectangular window and near ground": (
         {"window": "rectangular", "power": 0.4, "height": 30.0, "roof": False}, {},
     ),
     "rectangular window and near ground in speckle": (
         {"window": "rectangular", "power": 0.002, "height": 6.8, "roof": False,
-         "effects": (*CORE, "fading")}, {},
+         "effects": (*DEFAULT_EFFECTS, "fading")}, {},
     ),
     "complex record": (
-        {**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {RECORD: "complex"},
+        {**HAMMING, "power": 150.0, "effects": (*DEFAULT_EFFECTS, "fading")}, {RECORD: "complex"},
     ),
     "skirts of an uneven chirp": (
-        {**HAMMING, "power": 3.0, "effects": (*CORE, "chirp_nonlinearity")}, SKIRTS,
+        {**HAMMING, "power": 3.0, "effects": (*DEFAULT_EFFECTS, "chirp_nonlinearity")}, SKIRTS,
     ),
 }  # fmt: skip
 
@@ -72,7 +73,7 @@ def _flown(table_4_1, method, scene, *, draws=0, first=0):
     """Points of a shot on the edge of a dim roof over bright ground, or on the ground alone."""
     changes, further = SCENES[scene]
     changes = dict(changes)
-    height, effects = changes.pop("height", HEIGHT), changes.pop("effects", CORE)
+    height, effects = changes.pop("height", HEIGHT), changes.pop("effects", DEFAULT_EFFECTS)
     roof = level_plate(x=(0.0, 30.0), surface=1, height=ROOF)
     bodies = [level_plate(x=(-1e3, 30.0)), *[roof] * changes.pop("roof", True)]
     path = straight_flight(position=(0.0, 0.0, height), velocity=(0.0, 0.0, -20.0))
@@ -80,10 +81,10 @@ def _flown(table_4_1, method, scene, *, draws=0, first=0):
     table = scene_parameters(table_4_1, **law, **changes)
     speckle = "developed" if "fading" in effects else "none"
     starts = {"probabilities": 0, "noise": 10**6, "spectra": 2 * 10**6}
-    got = cloud(
+    got = simulate_cloud(
         observe_shots(path, bodies=bodies, number=7),
-        parameters=DEFAULTS | table | further | {"footprint.speckle": speckle},
-        surfaces=[Surface("ground", 0.5), Surface("roof", 0.005)],
+        parameters=PARAMETER_DEFAULTS | table | further | {"footprint.speckle": speckle},
+        surfaces=[SurfaceMaterial("ground", 0.5), SurfaceMaterial("roof", 0.005)],
         keys=make_point_keys(1),
         effects=effects,
         method=method,
@@ -109,7 +110,7 @@ def _distances(table_4_1, method, scene):
     found, there = got["range"][0], got["flags"][0] > 0
     apart = np.minimum(np.abs(found - height), np.abs(found - height + ROOF)) / RANGE_BIN
     apart = np.where(there & (apart > NEAR), np.rint(2 * apart) / 2, 0.0)
-    return apart.max(axis=1), (got["flags"][0] & FALSE_ALARM > 0).any(axis=1)
+    return apart.max(axis=1), (got["flags"][0] & FALSE_ALARM_FLAG > 0).any(axis=1)
 
 
 def _difference(one, other):
@@ -131,10 +132,10 @@ def test_points_are_as_far_from_the_echoes_as_in_drawn_noise(scene, method, draw
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 def test_any_split_of_draws_has_the_same_false_peaks(method, table_4_1):
     whole, _ = _flown(table_4_1, method, "the same in speckle", draws=60)
-    assert (whole["flags"] & FALSE_ALARM > 0).any()
+    assert (whole["flags"] & FALSE_ALARM_FLAG > 0).any()
     for first, number in ((0, 7), (7, 53)):
         part, _ = _flown(table_4_1, method, "the same in speckle", draws=number, first=first)
-        for name in outputs.POINTS:
+        for name in outputs.POINT_VARIABLES:
             assert part[name].tobytes() == whole[name][:, first : first + number].tobytes(), name
 
 
@@ -145,8 +146,8 @@ def _rate(amplitude, level):
     """-ln(1 - c) of a bin by Marcum's Q, without the tables of the module."""
     stays = -math.expm1(-0.5 * level * level)
     if amplitude < level:
-        return -math.log1p(-excess_crossing(amplitude, level) / stays)
-    return -math.log(max(marcum_q1_pair(amplitude, level)[1], 1e-300) / stays)
+        return -math.log1p(-marcum_q1_excess(amplitude, level) / stays)
+    return -math.log(max(marcum_q1_tails(amplitude, level)[1], 1e-300) / stays)
 
 
 def _leakage_by_quadrature(amplitudes, level):
@@ -180,22 +181,28 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
     places = {"half": level / 2, "level": level, "beyond": level + 11.9, "far": 1e4 * level}
     signal = {places.get(a, a): n for a, n in amplitudes.items()}
     bins = np.repeat(list(signal), list(signal.values()))
-    levels, law = leaked._laws(np.full(2, level))
-    rates, scale = leaked._rates(ONE, levels)
+    levels, law = leaked._distinct_thresholds(np.full(2, level))
+    rates, scale = leaked._log_rates(SINGLE_LOOK, levels)
     stretch = np.zeros((2, 3, 2), np.int64)
     stretch[1, 2] = 0, bins.size  # the other point and segments have none
-    leaks = leaked.LeakedPeaks.nothing(2)._replace(
-        stretch=stretch, bin=np.arange(bins.size), amplitude=np.log(bins),
-        echo=np.zeros(bins.size, np.int64), edge=np.zeros(bins.size), law=law, rates=rates,
-        scale=scale, level=levels,
-        total=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
-    )  # fmt: skip
+    leaks = leaked.LeakageBins.empty(2)._replace(
+        bin_slice=stretch,
+        bins=np.arange(bins.size),
+        log_amplitude=np.log(bins),
+        group=np.zeros(bins.size, np.int64),
+        exempt_neighbour=np.zeros(bins.size),
+        threshold_index=law,
+        log_rates=rates,
+        log_amplitude_grid=scale,
+        threshold_ratio=levels,
+        rate_sum=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
+    )
     means = leaks.mean_leakage()
-    within = {"rel": 1e-6, "abs": 1e-6 * leaked.SELDOM}
+    within = {"rel": 1e-6, "abs": 1e-6 * leaked.LEAKAGE_MIN}
     assert means[1, 2] == pytest.approx(_leakage_by_quadrature(signal, level), **within)
     assert np.count_nonzero(means) == 1
     # Echoes fade each for itself.
-    apart = leaks._replace(echo=np.arange(bins.size) % 2).mean_leakage()[1, 2]
+    apart = leaks._replace(group=np.arange(bins.size) % 2).mean_leakage()[1, 2]
     halves = [dict(zip(*np.unique(half, return_counts=True), strict=True))
               for half in (bins[::2], bins[1::2])]  # fmt: skip
     stays = [1 - _leakage_by_quadrature(half, level) for half in halves]
@@ -206,11 +213,11 @@ def _raised(leaks, level, draws, *, fading=None, room=3):
     """Bins and sizes of the peaks raised in the up-chirp, a list for each draw."""
     found = []
     bins, ratios = np.empty(room, np.int64), np.empty(room)
-    (key,), tables = make_point_keys(1), interpolator(window("hamming", SIZE), SIZE)
+    (key,), tables = make_point_keys(1), interpolator(get_window("hamming", SIZE), SIZE)
     for d in range(draws):
         ratios[:] = 0.0
         factors = np.ones((1, 3)) if fading is None else np.full((1, 3), fading[d])
-        number = leaked.draw_leaked(
+        number = leaked.draw_leaked_peaks(
             (key[0], key[1], d), (0, 0), leaks, factors, level, 1, tables, bins, ratios
         )
         found.append((bins[:number].copy(), ratios[:number].copy()))
@@ -224,9 +231,9 @@ def _largest(bins, magnitudes, level):
     return np.where(size >= level, bins[best], -1), np.where(size >= level, size, 0.0)
 
 
-def _one_shot(table_4_1, effects=CORE, further=(), **changes):
+def _one_shot(table_4_1, effects=DEFAULT_EFFECTS, further=(), **changes):
     law = {"fft_size": SIZE, "beamlets": 1, "radial_velocity": 20.0, "window": "hamming"}
-    parameters = DEFAULTS | table_4_1(**law | {"range": 400.0} | changes) | dict(further)
+    parameters = PARAMETER_DEFAULTS | table_4_1(**law | {"range": 400.0} | changes) | dict(further)
     return prepare_single_category(parameters, effects)
 
 
@@ -234,14 +241,14 @@ def _one_shot(table_4_1, effects=CORE, further=(), **changes):
 def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1):
     """Rice's law by simulation, with the speckle of an echo common to its bins."""
     draws, random = 6000, np.random.default_rng(8)
-    effects = (*CORE, "fading") if fades else CORE
+    effects = (*DEFAULT_EFFECTS, "fading") if fades else DEFAULT_EFFECTS
     speckle = {"footprint.speckle": "developed" if fades else "none"}
     shots = _one_shot(table_4_1, effects, speckle, phases="incoherent", power=420.0)
-    found = groups(shots)
-    ((_, leaks),) = leaked.leaked_peaks(shots, found, np.zeros(1, np.int64))
-    level = float(shots.threshold[0] / shots.bin_deviation[0])
-    stretch = slice(*leaks.stretch[0, 0])
-    bins, signal = leaks.bin[stretch], np.exp(leaks.amplitude[stretch])
+    found = list_bin_groups(shots)
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
+    level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
+    stretch = slice(*leaks.bin_slice[0, 0])
+    bins, signal = leaks.bins[stretch], np.exp(leaks.log_amplitude[stretch])
     loud = signal > 0.5  # the rest crosses once in 1e15
     bins, signal = bins[loud], signal[loud]
     power = random.exponential(size=draws) if fades else np.ones(draws)
@@ -262,16 +269,18 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
 
 def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypatch):
     """Records of the line at a uniform phase, in noise; the echo itself leaks nothing."""
-    monkeypatch.setattr(circulator_leak, "MASKED_FROM", 0.8)  # for many alarms
+    monkeypatch.setattr(circulator_leak, "MASK_THRESHOLD_FRACTION", 0.8)  # for many alarms
     draws, random = 4000, np.random.default_rng(4)
-    further = {circulator_leak.PATH: 40.0, circulator_leak.ISOLATION: 1e5}
-    shots = _one_shot(table_4_1, (*CORE, "circulator_leak"), further, range=1500.0, power=1.0)
-    found = groups(shots)
-    ((_, leaks),) = leaked.leaked_peaks(shots, found, np.zeros(1, np.int64))
-    level = float(shots.threshold[0] / shots.bin_deviation[0])
-    scale, line = circulator_leak.line_of(shots, 0, 0)
-    bins = leaks.line_bin[slice(*leaks.line_stretch[0, 0])]
-    one, other = scale / shots.bin_deviation[0] * line.terms[:, bins]
+    further = {circulator_leak.LEAK_LENGTH_PATH: 40.0, circulator_leak.ISOLATION_PATH: 1e5}
+    shots = _one_shot(
+        table_4_1, (*DEFAULT_EFFECTS, "circulator_leak"), further, range=1500.0, power=1.0
+    )
+    found = list_bin_groups(shots)
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
+    level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
+    scale, line = circulator_leak.leak_line_of_point(shots, 0, 0)
+    bins = leaks.line_bins[slice(*leaks.line_slice[0, 0])]
+    one, other = scale / shots.bin_noise_sigma[0] * line.transforms[:, bins]
     turn = np.exp(2j * np.pi * random.random(draws))[:, None]
     noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
     places, _ = _largest(bins, np.abs(one * turn + other * turn.conj() + noise), level)
@@ -280,8 +289,8 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     assert (places >= 0).mean() > 0.1
     assert _difference(places, own) < _allowed(draws, draws)
     # Noise alone raises nothing where the line is masked.
-    hidden = leaks.barred_bin[slice(*leaks.barred_stretch[0, 0])]
-    assert (scale * line.most[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
+    hidden = leaks.excluded_bins[slice(*leaks.excluded_slice[0, 0])]
+    assert (scale * line.magnitude_max[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
     assert not set(hidden) & set(bins)
 
 
@@ -292,48 +301,55 @@ def _faint_shots(table_4_1, power, record="real"):
         phases="incoherent", range=np.linspace(300.0, 500.0, 7),
     )  # fmt: skip
     further = {"footprint.speckle": "developed", RECORD: record}
-    return prepare_single_category(DEFAULTS | law | further, (*CORE, "fading"))
+    return prepare_single_category(PARAMETER_DEFAULTS | law | further, (*DEFAULT_EFFECTS, "fading"))
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, table_4_1):
     shots = _faint_shots(table_4_1, 200.0, record)
-    found, listed = leaked.groups_with_leaks(shots, 4)
-    apart = groups(shots, leakage=False)
+    found, listed = leaked.find_groups_and_leakage_bins(shots, 4)
+    apart = list_bin_groups(shots, with_leakage=False)
     for name, values in found._asdict().items():
         if name != "leakage":
             np.testing.assert_allclose(values, getattr(apart, name), rtol=1e-12, err_msg=name)
     number = 0
     for (part, leaks), (same, others) in zip(
-        listed, leaked.leaked_peaks(shots, apart, np.arange(shots.size)), strict=True
+        listed, leaked.iter_leakage_bins(shots, apart, np.arange(shots.size)), strict=True
     ):
         assert (part == same).all()
-        assert (leaks.stretch == others.stretch).all() and (leaks.bin == others.bin).all()
-        assert (leaks.echo == others.echo).all() and (leaks.side == others.side).all()
-        np.testing.assert_allclose(leaks.amplitude, others.amplitude, rtol=1e-9)
+        assert (leaks.bin_slice == others.bin_slice).all() and (leaks.bins == others.bins).all()
+        assert (leaks.group == others.group).all() and (
+            leaks.exempt_neighbour_side == others.exempt_neighbour_side
+        ).all()
+        np.testing.assert_allclose(leaks.log_amplitude, others.log_amplitude, rtol=1e-9)
         np.testing.assert_allclose(found.leakage[part], others.mean_leakage(), rtol=1e-9)
-        number += leaks.bin.size
+        number += leaks.bins.size
     assert number > 50
 
 
 def test_faint_leakage_is_what_the_average_over_all_bins_together_gives(table_4_1):
     shots = _faint_shots(table_4_1, 1.0)
-    ((_, leaks),) = leaked.leaked_peaks(shots, groups(shots), np.arange(shots.size))
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
     means = leaks.mean_leakage()
-    together = leaks._replace(faint=leaks.faint * np.nan).mean_leakage()
-    faint = (together > leaked.SELDOM) & (together < 0.9 * leaked.FAINT_LEAKAGE)
+    together = leaks._replace(
+        mean_probability_sum=leaks.mean_probability_sum * np.nan
+    ).mean_leakage()
+    faint = (together > leaked.LEAKAGE_MIN) & (together < 0.9 * leaked.FAINT_LEAKAGE_MAX)
     assert faint.sum() > 3
-    np.testing.assert_array_equal(means[faint], leaks.faint[faint])
+    np.testing.assert_array_equal(means[faint], leaks.mean_probability_sum[faint])
     np.testing.assert_allclose(means[faint], together[faint], rtol=5e-3)
 
 
 def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
     shots = _faint_shots(table_4_1, 20.0)
-    ((_, leaks),) = leaked.leaked_peaks(shots, groups(shots), np.arange(shots.size))
-    for octave in range(leaked.OCTAVES):
-        for j, s in np.ndindex(leaks.total.shape):
-            bins = slice(*leaks.stretch[j, s])
-            amplitudes = leaks.amplitude[bins] + 0.5 * octave * math.log(2.0)
-            law = leaks.law[j]
-            whole = sum(leaked._rate(a, leaks.rates[law], leaks.scale[law]) for a in amplitudes)
-            assert whole <= leaks.bound[j, s, octave] <= 1.3 * whole
+    ((_, leaks),) = leaked.iter_leakage_bins(shots, list_bin_groups(shots), np.arange(shots.size))
+    for octave in range(leaked.N_BOUND_POWERS):
+        for j, s in np.ndindex(leaks.rate_sum.shape):
+            bins = slice(*leaks.bin_slice[j, s])
+            amplitudes = leaks.log_amplitude[bins] + 0.5 * octave * math.log(2.0)
+            law = leaks.threshold_index[j]
+            whole = sum(
+                leaked._crossing_rate(a, leaks.log_rates[law], leaks.log_amplitude_grid[law])
+                for a in amplitudes
+            )
+            assert whole <= leaks.rate_sum_bounds[j, s, octave] <= 1.3 * whole

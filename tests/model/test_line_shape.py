@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from shot_helpers import line_shape_of_window, parametrize_product
 
-from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.segments import tangents
-from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field, reach_of
-from sweep.model.window import COSINE_SUMS, samples, window
+from sweep.model.spectrum.bin_spectrum import (
+    F_IM,
+    F_RE,
+    LINE_BATCH_CELLS_MAX,
+    N_SCRATCH_ROWS,
+    compute_field,
+    distance_below_level,
+)
+from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
+from sweep.model.spectrum.segment_spectra import bin_tangents
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
-WINDOWS = (*COSINE_SUMS, "kaiser(8)")
+WINDOWS = (*COSINE_SUM_COEFFICIENTS, "kaiser(8)")
 
 SIZES = (4096, 4096), (4099, 4099), (8195, 4097), (8192, 5003), (512, 500), (301, 77)
 """FFT and record: even and odd, with padding and without; the last two have no modes."""
@@ -29,7 +36,7 @@ def transform(name, sizes, phase, y):
     """Direct sums over the record, its middle the phase's origin, (n,)."""
     fft_size, length = sizes
     x = 2 * np.arange(length) / length - 1
-    record = samples(name, length) * np.exp(2j * np.pi * phase(x))
+    record = window_samples(name, length) * np.exp(2j * np.pi * phase(x))
     return np.exp(-1j * np.pi * length / fft_size * np.outer(y, x)) @ record
 
 
@@ -37,10 +44,10 @@ def seen(sizes, power, places, weights, first, count, shape):
     """F of some bins as the model has it, (count,)."""
     table, form, numbers, shift, _ = shape
     n, places = places.size, places + shift
-    room = np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16))
+    room = np.empty((N_SCRATCH_ROWS, max(count, SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
     room[PLACE, :n], room[RE, :n], room[IM, :n] = places, weights.real, weights.imag
     lines = n, places.min(), places.max(), 0.0
-    field(first, count, lines, table, form, numbers, tangents(sizes[0]), room)
+    compute_field(first, count, lines, table, form, numbers, bin_tangents(sizes[0]), room)
     return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
 
 
@@ -54,7 +61,7 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
     bins = np.unique([*range(-28, 29, 3), *rng.integers(-fft_size // 2, fft_size // 2, 9)])
     for drift in (0.0, 0.7, 4.0, 30.0):
         phase = partial(wandering, drift)
-        shape = line_shape_of_window(window(name, sizes[1]), fft_size, power=power, phase=phase)
+        shape = line_shape_of_window(get_window(name, sizes[1]), fft_size, power=power, phase=phase)
         places = rng.uniform(-3, 3, 2)
         weights = rng.normal(size=2) + 1j * rng.normal(size=2)
         weights = abs(weights) + 0j if power else weights
@@ -76,15 +83,15 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
 def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
     size = 4096
     phase = partial(wandering, drift)
-    _, form, _, shift, _ = line_shape_of_window(window(name, size), size, phase=phase)
+    _, form, _, shift, _ = line_shape_of_window(get_window(name, size), size, phase=phase)
     y = np.linspace(-2048, 2048, 2 * 4096 + 1)
     exact = abs(
         np.fft.fft(
-            samples(name, size) * np.exp(2j * np.pi * phase(2 * np.arange(size) / size - 1)),
+            window_samples(name, size) * np.exp(2j * np.pi * phase(2 * np.arange(size) / size - 1)),
             2 * size,
         )
     )
     magnitude = exact[np.rint(2 * y).astype(int) % (2 * size)]
     for level in 10.0 ** np.arange(-1, -8, -0.5) * magnitude.max():
-        reach = reach_of(level, 1.0, form)
+        reach = distance_below_level(level, 1.0, form)
         assert magnitude[abs(y - shift) >= reach].max(initial=0.0) <= level

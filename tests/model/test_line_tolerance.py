@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.shot import find, prepare
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate_segments, prepare_shots
 
 POINTS = 200
 PD, MAGNITUDE = 0, 2
@@ -15,27 +15,29 @@ PD, MAGNITUDE = 0, 2
 def some_shots(table_4_1, phases, effects, seed):
     """From the target on the doorstep to the far one, where phases cancel and where they do not."""
     rng = np.random.default_rng((81, seed))
-    parameters = DEFAULTS | table_4_1(
+    parameters = PARAMETER_DEFAULTS | table_4_1(
         phases=phases, fft_size=2**13, window=str(rng.choice(["hamming", "flattop"])),
         range=10 ** rng.uniform(0.5, 4, POINTS), power=10 ** rng.uniform(-3, 1, POINTS),
         grazing_angle=np.radians(rng.uniform(2, 90, POINTS)),
         radial_velocity=rng.choice([5.0, 150.0], POINTS), beam_divergence=1e-4,
     )  # fmt: skip
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
-@pytest.mark.parametrize("effects", [CORE, (*CORE, "range_walk")], ids=["plain", "range walk"])
+@pytest.mark.parametrize(
+    "effects", [DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "range_walk")], ids=["plain", "range walk"]
+)
 def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, phases, effects):
     changed = 0
     for seed in range(3):
         shots = some_shots(table_4_1, phases, effects, seed)
-        exact = find(shots)
+        exact = evaluate_segments(shots)
         for tolerance in (1e-1, 1e-3, 1e-6):
-            found = find(replace(shots, line_tolerance=np.asarray(tolerance)))
-            apart = abs(found[:, MAGNITUDE] - exact[:, MAGNITUDE]) / shots.bin_deviation
-            rounding = 1e-11 * exact[:, MAGNITUDE] / shots.bin_deviation
+            found = evaluate_segments(replace(shots, line_error_tolerance=np.asarray(tolerance)))
+            apart = abs(found[:, MAGNITUDE] - exact[:, MAGNITUDE]) / shots.bin_noise_sigma
+            rounding = 1e-11 * exact[:, MAGNITUDE] / shots.bin_noise_sigma
             assert (apart <= tolerance + rounding).all()
             assert abs(found[:, PD] - exact[:, PD]).max() <= 0.5 * tolerance + 1e-9
             changed += (apart > 10 * rounding).sum()
@@ -43,10 +45,10 @@ def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, pha
 
 
 def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
-    parameters = DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
+    parameters = PARAMETER_DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
     given = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}
-    ((_, by_hand),) = prepare(parameters | given | {"accuracy.tolerance": 0.1})
-    assert (by_hand.line_tolerance, by_hand.leakage_tolerance) == (1e-4, 2e-5)
-    ((_, auto),) = prepare(parameters | {"accuracy.tolerance": 0.1})
-    assert auto.line_tolerance == pytest.approx(0.1)
+    ((_, by_hand),) = prepare_shots(parameters | given | {"accuracy.tolerance": 0.1})
+    assert (by_hand.line_error_tolerance, by_hand.leakage_tolerance) == (1e-4, 2e-5)
+    ((_, auto),) = prepare_shots(parameters | {"accuracy.tolerance": 0.1})
+    assert auto.line_error_tolerance == pytest.approx(0.1)
     assert auto.leakage_tolerance == pytest.approx(0.05)

@@ -7,10 +7,10 @@ from scipy import integrate
 from scipy.constants import c as speed_of_light
 from shot_helpers import prepare_single_category
 
-from sweep.model import constants, link, shot
-from sweep.model.footprint import beamlets
+from sweep.model import constants, evaluation, receiver_chain
+from sweep.model.beamlets import place_beamlets
 from sweep.model.ground import backscatter
-from sweep.model.link import bin_deviation, electrical_bandwidth, transfer
+from sweep.model.receiver_chain import bin_noise_sigma, electrical_bandwidth, receiver_transfer
 
 ELECTRON, BOLTZMANN = 1.602176634e-19, 1.380649e-23
 GAIN = 7e3
@@ -36,7 +36,7 @@ def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_
         reflectance_law=law, grazing_angle=0.03, beam_divergence=20e-3, beamlets=37,
         fft_size=1024, phases="incoherent", range=100.0,
     )  # fmt: skip
-    (across, along), share = beamlets(37)
+    (across, along), share = place_beamlets(37)
     x, y = 5e-3 * across, 5e-3 * along
     ray = np.array([np.cos(0.03) - y * np.sin(0.03), x, -np.sin(0.03) - y * np.cos(0.03)])
     down = -ray[2] / np.sqrt((ray**2).sum(axis=0))
@@ -44,7 +44,9 @@ def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_
     lit = down > 0
     assert far[lit].max() / far[lit].min() > 2
     shots = prepare_single_category(scene)
-    power = (shots.beat_scale * shots.amplitude[0] / (2 * 1.1 * GAIN)) ** 2 / 1e-3
+    power = (
+        shots.beat_amplitude_scale * shots.relative_amplitude[0] / (2 * 1.1 * GAIN)
+    ) ** 2 / 1e-3
     scattered = down / np.pi if law == "lambert" else 1 / (2 * np.pi)
     expected = 0.1 * np.pi * 0.0125**2 * share * scattered / (100.0 * far) ** 2
     assert power[lit] == pytest.approx(expected[lit], rel=1e-10)
@@ -60,7 +62,7 @@ def carrier_to_noise(parameters, bins=1000):
     n = int(parameters["instrument.processing.fft_size"])
     beat = bins * 600e6 / n
     velocity = beat * 1550e-9 / 2
-    results = shot.evaluate(parameters | {"target.radial_velocity": velocity})
+    results = evaluation.evaluate(parameters | {"target.radial_velocity": velocity})
     poles = 1 + (beat / parameters["instrument.receiver.detector_bandwidth"]) ** 2
     poles *= 1 + (beat / parameters["instrument.receiver.amplifier_bandwidth"]) ** 2
     hamming = 0.54**2 + 0.46**2 / 2
@@ -121,7 +123,7 @@ def direct_snr(parameters):
     beat = 2e12 * 2 * scene["target.range"] / speed_of_light
     bins = round(beat / (600e6 / n))
     scene["target.range"] *= bins * 600e6 / n / beat
-    snr = shot.evaluate(scene)["snr_up"][0]
+    snr = evaluation.evaluate(scene)["snr_up"][0]
     poles = (1 + (bins * 600e6 / n / 400e6) ** 2) ** 2
     return snr * poles * 2 / n, 1.953125e-12 * (2000.0 / scene["target.range"]) ** 2
 
@@ -155,7 +157,7 @@ def test_direct_detection_ignores_the_local_oscillator_and_has_no_shot_noise_of_
 ):
     scene = thermally_limited | {"instrument.receiver.local_oscillator_power": 5.0}
     assert direct_snr(scene) == direct_snr(thermally_limited)
-    assert "local_oscillator_shot" not in prepare_single_category(scene).noise_sources
+    assert "local_oscillator_shot" not in prepare_single_category(scene).noise_variances
 
 
 # Noise
@@ -166,19 +168,21 @@ def test_the_noise_of_table_4_1_by_hand(table_4_1):
     shots = prepare_single_category(table_4_1(fft_size=1024))
     by_hand = {"local_oscillator_shot": 1.40992e-13, "detector": 1.21e-14, "amplifier": 6.25e-16}
     for source, current in by_hand.items():
-        assert shots.noise_sources[source] == pytest.approx(current * 4.9e7, rel=1e-5)
+        assert shots.noise_variances[source] == pytest.approx(current * 4.9e7, rel=1e-5)
     assert shots.noise_variance == pytest.approx(7.53211e-6, rel=1e-5)
-    assert set(shots.noise_sources) == {*by_hand, "signal_shot", "solar_shot"}
-    assert shots.noise_sources["solar_shot"] == 0.0
+    assert set(shots.noise_variances) == {*by_hand, "signal_shot", "solar_shot"}
+    assert shots.noise_variances["solar_shot"] == 0.0
     # 2 q Re P B of the echo, 1.953e-12 W.
-    assert shots.noise_sources["signal_shot"] == pytest.approx(2.7537e-22 * 4.9e7, rel=1e-3)
+    assert shots.noise_variances["signal_shot"] == pytest.approx(2.7537e-22 * 4.9e7, rel=1e-3)
 
 
 def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_amplifiers(table_4_1):
-    plain = prepare_single_category(table_4_1(fft_size=1024, solar_irradiance=2.6e8)).noise_sources
+    plain = prepare_single_category(
+        table_4_1(fft_size=1024, solar_irradiance=2.6e8)
+    ).noise_variances
     gained = prepare_single_category(
         table_4_1(fft_size=1024, solar_irradiance=2.6e8, apd_gain=10.0, excess_noise_factor=4.0)
-    ).noise_sources
+    ).noise_variances
     factors = {
         "local_oscillator_shot": 400.0, "signal_shot": 400.0, "solar_shot": 400.0,
         "detector": 100.0, "amplifier": 1.0,
@@ -192,7 +196,7 @@ def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
         stages = {"detector_bandwidth": detector, "amplifier_bandwidth": amplifier}
         assert electrical_bandwidth(stages) == 100e6
         scene = table_4_1(detector_bandwidth=detector, amplifier_bandwidth=amplifier, fft_size=1024)
-        shot_noise = prepare_single_category(scene).noise_sources["local_oscillator_shot"]
+        shot_noise = prepare_single_category(scene).noise_variances["local_oscillator_shot"]
         assert shot_noise == pytest.approx(1.40992e-13 / 4 * 4.9e7, rel=1e-5)
 
 
@@ -200,7 +204,7 @@ def test_noise_of_a_bin_is_half_the_windowed_records_in_each_quadrature():
     """White noise of variance 3 through a Hann window: its covariance, summed sample by sample."""
     n = np.arange(128)
     w = 0.5 - 0.5 * np.cos(2 * np.pi * n / 128)
-    sigma = bin_deviation(noise_variance=3.0, window_energy=(w**2).sum())
+    sigma = bin_noise_sigma(noise_variance=3.0, window_energy=(w**2).sum())
     for k in (5, 31, 60):
         turn = 2 * np.pi * k * n / 128
         assert 3.0 * ((w * np.cos(turn)) ** 2).sum() == pytest.approx(sigma**2, rel=1e-12)
@@ -212,7 +216,9 @@ def test_noise_of_a_bin_is_half_the_windowed_records_in_each_quadrature():
 
 
 def response(frequency, detector=400e6, amplifier=200e6):
-    return 7e3 * transfer(frequency, detector_bandwidth=detector, amplifier_bandwidth=amplifier)
+    return 7e3 * receiver_transfer(
+        frequency, detector_bandwidth=detector, amplifier_bandwidth=amplifier
+    )
 
 
 def test_each_pole_takes_three_decibels_and_an_eighth_of_a_turn():
@@ -241,7 +247,7 @@ def test_the_receiver_sees_lines_where_they_are_before_they_fold(table_4_1):
     scene = table_4_1(beamlets=1, fft_size=4096, window="rectangular")
     beat = 2731 * 600e6 / 4096  # the bin nearest to 400 MHz
     results = [
-        shot.evaluate(scene | {"target.radial_velocity": f * 1550e-9 / 2})["snr_doppler"][0]
+        evaluation.evaluate(scene | {"target.radial_velocity": f * 1550e-9 / 2})["snr_doppler"][0]
         for f in (600e6 - beat, beat)
     ]
     losses = [(1 + (f / 400e6) ** 2) ** 2 for f in (600e6 - beat, beat)]
@@ -254,7 +260,7 @@ def test_the_noises_density_is_the_sum_of_its_aliases(other):
     aliases = frequency[:, None] + 600e6 * np.arange(-4000, 4001)
     poles = (1 + (aliases / 400e6) ** 2) * (1 + (aliases / other) ** 2)
     summed = (1 / poles).sum(axis=1) * 600e6 / (2 * min(400e6, other))
-    found = link.noise_density(
+    found = receiver_chain.relative_noise_density(
         frequency, detector_bandwidth=400e6, amplifier_bandwidth=other, sample_rate=600e6
     )
     assert found == pytest.approx(summed, rel=2e-8)
@@ -267,7 +273,9 @@ def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
     """
     rng, over, n = np.random.default_rng(4), 16, 64
     high = np.fft.rfftfreq(over * n, 1 / (over * 600e6))
-    gain = link.transfer(high, detector_bandwidth=400e6, amplifier_bandwidth=400e6)
+    gain = receiver_chain.receiver_transfer(
+        high, detector_bandwidth=400e6, amplifier_bandwidth=400e6
+    )
     power = np.zeros(n // 2 + 1)
     for _ in range(40):
         white = np.fft.rfft(rng.normal(size=(1000, over * n)), axis=1)
@@ -275,7 +283,7 @@ def test_drawn_noise_that_passes_the_receiver_has_its_density(table_4_1):
         power += (np.abs(np.fft.rfft(record, axis=1)) ** 2).mean(axis=0) / (40 * n)
     # of a density of one sample's variance over the half of the high rate, within 400 MHz
     expected = power / (400e6 / (over * 300e6))
-    found = link.noise_density(
+    found = receiver_chain.relative_noise_density(
         np.fft.rfftfreq(n, 1 / 600e6), detector_bandwidth=400e6, amplifier_bandwidth=400e6,
         sample_rate=600e6,
     )  # fmt: skip

@@ -12,10 +12,16 @@ from scatterer_shots import (
     with_signal_over_threshold,
 )
 
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.look_speckle import LookSpeckle
-from sweep.model.looks import COMBINE, NUMBER, SPECKLE, VOTES, Looks
-from sweep.model.shot import find, statistics
+from sweep.model.detection.look_speckle import LookSpeckle
+from sweep.model.detection.looks import (
+    LOOKS_COMBINE_PATH,
+    LOOKS_NUMBER_PATH,
+    LOOKS_SPECKLE_PATH,
+    LOOKS_VOTES_PATH,
+    Looks,
+)
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate_segments, shot_statistics
 
 TOLERANCE = 0.02
 DRAWS = 8000
@@ -32,38 +38,60 @@ ANY_TWO = {
     "instrument.chirp.segments": "up doppler down",
 }  # fmt: skip
 CASES = {
-    "four powers": {NUMBER: 4},
-    "eight powers, slowly": {NUMBER: 8, "target.transverse_velocity": 4.0},
+    "four powers": {LOOKS_NUMBER_PATH: 4},
+    "eight powers, slowly": {LOOKS_NUMBER_PATH: 8, "target.transverse_velocity": 4.0},
     "eight powers, fast and down": {
-        NUMBER: 8, "target.transverse_velocity": -20.0, "target.radial_velocity": 20.0,
+        LOOKS_NUMBER_PATH: 8,
+        "target.transverse_velocity": -20.0,
+        "target.radial_velocity": 20.0,
     },
     "two thirds of a bin": {
-        NUMBER: 4, "target.range": 600.0, "target.grazing_angle": np.radians(10),
+        LOOKS_NUMBER_PATH: 4,
+        "target.range": 600.0,
+        "target.grazing_angle": np.radians(10),
     },
     "one and a half bins of hann": {
-        NUMBER: 4, "target.range": 407.0, "target.grazing_angle": np.radians(3),
-        "instrument.processing.window": "hann", "target.transverse_velocity": 6.0,
+        LOOKS_NUMBER_PATH: 4,
+        "target.range": 407.0,
+        "target.grazing_angle": np.radians(3),
+        "instrument.processing.window": "hann",
+        "target.transverse_velocity": 6.0,
     },
     "looks that drift by a bin": {
-        NUMBER: 24, "target.radial_velocity": 25.0, "target.transverse_velocity": 8.0,
+        LOOKS_NUMBER_PATH: 24,
+        "target.radial_velocity": 25.0,
+        "target.transverse_velocity": 8.0,
     },
-    "three votes of eight": {NUMBER: 8, COMBINE: "binary", VOTES: 3},
-    "one vote of four": {NUMBER: 4, COMBINE: "binary", VOTES: 1},
+    "three votes of eight": {
+        LOOKS_NUMBER_PATH: 8,
+        LOOKS_COMBINE_PATH: "binary",
+        LOOKS_VOTES_PATH: 3,
+    },
+    "one vote of four": {LOOKS_NUMBER_PATH: 4, LOOKS_COMBINE_PATH: "binary", LOOKS_VOTES_PATH: 1},
     "six votes of eight, slowly": {
-        NUMBER: 8, COMBINE: "binary", VOTES: 6, "target.transverse_velocity": 4.0,
+        LOOKS_NUMBER_PATH: 8,
+        LOOKS_COMBINE_PATH: "binary",
+        LOOKS_VOTES_PATH: 6,
+        "target.transverse_velocity": 4.0,
     },
-    "any two of powers": {NUMBER: 4, **ANY_TWO},
+    "any two of powers": {LOOKS_NUMBER_PATH: 4, **ANY_TWO},
     "any two of powers, slowly": {
-        NUMBER: 8, **ANY_TWO,
+        LOOKS_NUMBER_PATH: 8,
+        **ANY_TWO,
         "target.transverse_velocity": 4.0,
     },
     "any two of votes": {
-        NUMBER: 4, COMBINE: "binary", VOTES: 2, **ANY_TWO,
+        LOOKS_NUMBER_PATH: 4,
+        LOOKS_COMBINE_PATH: "binary",
+        LOOKS_VOTES_PATH: 2,
+        **ANY_TWO,
     },
     "any two in one speckle": {
-        NUMBER: 4, **ANY_TWO, "target.transverse_velocity": 0.0,
+        LOOKS_NUMBER_PATH: 4,
+        **ANY_TWO,
+        "target.transverse_velocity": 0.0,
     },
-}  # fmt: skip
+}
 
 
 FAST = ("eight powers, fast and down", "three votes of eight", "any two of powers")
@@ -73,12 +101,12 @@ FAST = ("eight powers, fast and down", "three votes of eight", "any two of power
     "case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in FAST)) for case in CASES]
 )
 def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
-    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | CASES[case]
-    p = with_signal_over_threshold(p | {NUMBER: 1}, 1.3 if COMBINE not in p else 1.0) | {
-        NUMBER: p[NUMBER]
-    }
+    p = PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | CASES[case]
+    p = with_signal_over_threshold(
+        p | {LOOKS_NUMBER_PATH: 1}, 1.3 if LOOKS_COMBINE_PATH not in p else 1.0
+    ) | {LOOKS_NUMBER_PATH: p[LOOKS_NUMBER_PATH]}
     shots = prepare_single_category(p)
-    outputs = statistics(shots)
+    outputs = shot_statistics(shots)
     found = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
     shot = found["up"] & found["down"]
     if shots.any_two:
@@ -114,7 +142,9 @@ def speckle_of(number, turn, apart):
         np.sqrt((weight * np.exp(-((distance * apart + turn * lags) ** 2))).sum() / alone)
         for distance in (1, 2, 1)
     ]
-    return LookSpeckle.of(by_lag, np.ones((3, 1, number)), np.array(between)[:, None])
+    return LookSpeckle.from_correlations(
+        by_lag, np.ones((3, 1, number)), np.array(between)[:, None]
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,16 +154,21 @@ def speckle_of(number, turn, apart):
 @pytest.mark.parametrize("turn", [0.03, 0.3, 1.0])
 def test_looks_detect_as_often_as_drawn_amplitudes(number, combine, votes, turn):
     rng, draws, snr = np.random.default_rng(number), 20_000 if number < 20 else 4000, (3, 8, 5)
-    looks, speckle = Looks(number, combine, votes, moving=True), speckle_of(number, turn, turn / 3)
+    looks, speckle = (
+        Looks(number, combine, votes, has_moving_speckle=True),
+        speckle_of(number, turn, turn / 3),
+    )
     power = drawn_amplitudes(number, turn, turn / 3, snr, draws, rng)
     shown = power.mean(axis=2) if combine == "power" else np.sort(power, axis=2)[:, :, -votes]
     least = np.quantile(shown[:, 0], 0.5)
     detected = shown >= least
     signals, level = np.sqrt(2 * np.array(snr, float))[:, None], np.sqrt(2 * np.array([least]))
-    pd, miss = looks.faded(signals, level, speckle)
+    pd, miss = looks.pd_and_miss_in_speckle(signals, level, speckle)
     np.testing.assert_allclose(pd + miss, 1.0, atol=1e-12)
-    both = looks.faded_together(signals[0], signals[2], level, speckle.between[1], speckle)
-    two = looks.faded_any_two(signals, level, speckle.between, pd, speckle)[0]
+    both = looks.joint_pd_in_speckle(
+        signals[0], signals[2], level, speckle.segment_correlation[1], speckle
+    )
+    two = looks.pd_and_miss_any_two(signals, level, speckle.segment_correlation, pd, speckle)[0]
     told = [*pd[:, 0], both[0], two[0]]
     drawn = [
         *detected.mean(axis=0), (detected[:, 0] & detected[:, 2]).mean(),
@@ -145,9 +180,11 @@ def test_looks_detect_as_often_as_drawn_amplitudes(number, combine, votes, turn)
 def test_looks_of_one_speckle_and_of_independent_ones_are_swerlings_cases():
     signal = np.array([[0.5, 2.0, 6.0, 20.0]] * 3)
     level = np.full(4, 2.5)
-    for turn, law in ((1e-9, Looks(8)), (50.0, Looks(8, independent=True))):
-        found, missed = Looks(8, moving=True).faded(signal, level, speckle_of(8, turn, 0.0))
-        expected, lost = law.faded(signal, level)
+    for turn, law in ((1e-9, Looks(8)), (50.0, Looks(8, has_independent_speckle=True))):
+        found, missed = Looks(8, has_moving_speckle=True).pd_and_miss_in_speckle(
+            signal, level, speckle_of(8, turn, 0.0)
+        )
+        expected, lost = law.pd_and_miss_in_speckle(signal, level)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
         np.testing.assert_allclose(missed, lost, rtol=1e-6)
 
@@ -158,9 +195,9 @@ def test_tails_keep_their_digits():
     speckle = speckle_of(4, 0.8, 0.0)
     for signal, level in ((1.0, 6.0), (30.0, 2.0)):
         a, b = np.full((3, 1), signal), np.full((3, 1), level)
-        found, missed = Looks(4, moving=True).faded(a, b, speckle)
+        found, missed = Looks(4, has_moving_speckle=True).pd_and_miss_in_speckle(a, b, speckle)
         with mpmath.workdps(60):
-            mean = [1 + mpmath.mpf(float(c)) * signal**2 / 2 for c in speckle.strength[0, 0]]
+            mean = [1 + mpmath.mpf(float(c)) * signal**2 / 2 for c in speckle.eigenvalue[0, 0]]
             exact = sum(
                 mpmath.exp(-2 * mpmath.mpf(level) ** 2 / own)
                 * mpmath.fprod(own / (own - other) for other in mean if other != own)
@@ -173,21 +210,32 @@ def test_tails_keep_their_digits():
 
 
 def test_a_target_at_rest_has_one_speckle_in_all_looks(table_4_1):
-    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {NUMBER: 8}
+    p = PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {LOOKS_NUMBER_PATH: 8}
     p |= {"target.radial_velocity": 0.0, "target.transverse_velocity": 0.0}
     shots = prepare_single_category(p)
     assert shots.look_speckle is None
-    common = statistics(prepare_single_category(p | {SPECKLE: "common"}))
-    np.testing.assert_array_equal(statistics(shots)["pd_shot"], common["pd_shot"])
+    common = shot_statistics(prepare_single_category(p | {LOOKS_SPECKLE_PATH: "common"}))
+    np.testing.assert_array_equal(shot_statistics(shots)["pd_shot"], common["pd_shot"])
 
 
 def test_added_amplitudes_of_looks_lose_what_their_speckle_does_not_share(table_4_1):
     """The mean amplitude of N looks: sum of mu over all pairs of looks, over N^2, of the power."""
-    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {NUMBER: 6, COMBINE: "coherent"}
-    moving, common = prepare_single_category(p), prepare_single_category(p | {SPECKLE: "common"})
-    powers = prepare_single_category(p | {COMBINE: "power"}).look_speckle.by_lag[0, 0]
+    p = (
+        PARAMETER_DEFAULTS
+        | table_4_1()
+        | LANDER_PARAMETERS
+        | SLOPE
+        | {LOOKS_NUMBER_PATH: 6, LOOKS_COMBINE_PATH: "coherent"}
+    )
+    moving, common = (
+        prepare_single_category(p),
+        prepare_single_category(p | {LOOKS_SPECKLE_PATH: "common"}),
+    )
+    powers = prepare_single_category(
+        p | {LOOKS_COMBINE_PATH: "power"}
+    ).look_speckle.correlation_by_lag[0, 0]
     lag = np.arange(6) - np.arange(6)[:, None]
     shared = np.abs(powers)[np.abs(lag)].sum() / 36
     assert 0.05 < shared < 0.9
-    ratio = (find(moving)[0, 2, 0] / find(common)[0, 2, 0]) ** 2
+    ratio = (evaluate_segments(moving)[0, 2, 0] / evaluate_segments(common)[0, 2, 0]) ** 2
     assert ratio == pytest.approx(shared, rel=1e-3)

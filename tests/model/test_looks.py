@@ -9,20 +9,28 @@ from scipy import special, stats
 from shot_helpers import make_point_keys, parametrize_product
 
 from sweep.analysis.shot_spectra import simulate_shot
-from sweep.model import alarms, truth, window
+from sweep.model import time_domain_truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.crossings import leave_out_joined
-from sweep.model.detection import RAYLEIGH_DEVIATION
-from sweep.model.effects.line_width import coherent_share, seen_line
-from sweep.model.effects.segment_motion import looks_of
-from sweep.model.estimators import ESTIMATOR
-from sweep.model.looks import COMBINE, NUMBER, SPECKLE, VOTES, Looks, coherent_gain
-from sweep.model.marcum import at_least_one, marcum_q1
-from sweep.model.sampling import simulate
-from sweep.model.segments import spectrum
-from sweep.model.shot import evaluate, find, prepare
-from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, tnr_of
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.detection import bin_noise
+from sweep.model.detection.added_crossings import exclude_bins_joining_echo
+from sweep.model.detection.echo_detection import RAYLEIGH_DEVIATION
+from sweep.model.detection.estimators import ESTIMATOR_PREFIX
+from sweep.model.detection.looks import (
+    LOOKS_COMBINE_PATH,
+    LOOKS_NUMBER_PATH,
+    LOOKS_SPECKLE_PATH,
+    LOOKS_VOTES_PATH,
+    Looks,
+    coherent_gain,
+)
+from sweep.model.detection.marcum import at_least_one_probability, marcum_q1
+from sweep.model.effects.line_width import apparent_line_and_pedestal, coherent_power_fraction
+from sweep.model.effects.segment_motion import split_looks
+from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.spectrum.segment_spectra import segment_spectrum
+from sweep.model.threshold import DESIGN_PFA_BIN_PATH, DESIGN_PFA_SEGMENT_PATH, tnr_from_parameters
+from sweep.model.unsupported_shot import UnsupportedShotError
 
 DRAWS, PIECE = 200_000, 50_000
 BIN = 0.5e6
@@ -38,7 +46,7 @@ def amplitudes(rng, *size):
 def drawn(looks, speckle, signals, level, alike=1.0):
     """Share of draws in which each of two segments is detected, and both are."""
     rng, found = np.random.default_rng([looks.number, len(looks.combine), len(speckle)]), []
-    apart = looks.number if looks.independent else 1
+    apart = looks.number if looks.has_independent_speckle else 1
     for _ in range(DRAWS // PIECE):
         first = amplitudes(rng, PIECE, apart)
         second = alike * first + np.sqrt(1 - alike**2) * amplitudes(rng, PIECE, apart)
@@ -66,11 +74,11 @@ def test_closed_forms_are_the_mean_over_draws(number, combine, votes, speckle):
     looks = Looks(number, combine, votes, speckle == "independent")
     one, other = signals = (1.6, 1.3)
     level = np.array(2.0)
-    law = looks.steady if speckle == "steady" else looks.faded
+    law = looks.pd_and_miss_steady if speckle == "steady" else looks.pd_and_miss_in_speckle
     told = [float(law(np.array(a), level)[0]) for a in signals]
     together = told[0] * told[1]
     if speckle != "steady":
-        together = float(looks.faded_together(one, other, level, np.array(1.0)))
+        together = float(looks.joint_pd_in_speckle(one, other, level, np.array(1.0)))
     for share, chance in zip(drawn(looks, speckle, signals, level), [*told, together], strict=True):
         assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / DRAWS)
     for a in signals:
@@ -81,23 +89,25 @@ def test_closed_forms_are_the_mean_over_draws(number, combine, votes, speckle):
 @pytest.mark.parametrize("apart", [True, False])
 def test_segments_that_share_part_of_their_speckle(apart):
     """Exact where looks fade apart; else within 0.01, between what is shared wholly and not."""
-    looks, level, signals = Looks(8, independent=apart), np.array(2.6), (2.0, 1.6)
-    told = float(looks.faded_together(*signals, level, np.array(0.8)))
+    looks, level, signals = Looks(8, has_independent_speckle=apart), np.array(2.6), (2.0, 1.6)
+    told = float(looks.joint_pd_in_speckle(*signals, level, np.array(0.8)))
     share = drawn(looks, "part", signals, level, alike=0.8)[2]
     assert abs(share - told) < 5 * np.sqrt(told / DRAWS) + (0.0 if apart else 0.01)
-    up, down = (looks.faded(np.array(a), level)[0] for a in signals)
-    alone = looks.faded_together(*signals, level, np.array(0.0))
+    up, down = (looks.pd_and_miss_in_speckle(np.array(a), level)[0] for a in signals)
+    alone = looks.joint_pd_in_speckle(*signals, level, np.array(0.0))
     assert float(alone) == pytest.approx(float(up * down), rel=1e-6)
 
 
 def test_one_look_is_marcums_q_and_swerlings_first_case():
     signal, level = np.linspace(0, 8, 9), np.full(9, 4.0)
     for looks in (Looks(), Looks(9, "coherent")):
-        np.testing.assert_array_equal(looks.steady(signal, level), marcum_q1(signal, level))
         np.testing.assert_array_equal(
-            looks.faded(signal, level)[0], np.exp(-(level**2) / (2 + signal**2))
+            looks.pd_and_miss_steady(signal, level), marcum_q1(signal, level)
         )
-        np.testing.assert_array_equal(looks.log_alarm(level), -(level**2) / 2)
+        np.testing.assert_array_equal(
+            looks.pd_and_miss_in_speckle(signal, level)[0], np.exp(-(level**2) / (2 + signal**2))
+        )
+        np.testing.assert_array_equal(looks.log_pfa(level), -(level**2) / 2)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +123,7 @@ def test_deep_tails_keep_their_digits(number, signal, level):
             * mpmath.gammainc(number + j, y, mpmath.inf, regularized=True)
             for j in range(900)
         )  # fmt: skip
-    found, missed = Looks(number).steady(np.array(signal), np.array(level))
+    found, missed = Looks(number).pd_and_miss_steady(np.array(signal), np.array(level))
     if exact < 0.5:
         assert float(found) == pytest.approx(float(exact), rel=1e-10)
     else:
@@ -123,28 +133,34 @@ def test_deep_tails_keep_their_digits(number, signal, level):
 def test_alarms_and_thresholds_are_those_of_gamma_and_binomial_laws():
     level = np.array([0.3, 1.2, 1.5, 3.0, 5.0])
     power = special.gammaincc(8, 4 * level**2)
-    np.testing.assert_allclose(np.exp(Looks(8).log_alarm(level)), power, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(Looks(8).log_pfa(level)), power, rtol=1e-12)
     votes = stats.binom.sf(2, 8, np.exp(-(level**2) / 2))
     binary = Looks(8, "binary", 3)
-    np.testing.assert_allclose(np.exp(binary.log_alarm(level)), votes, rtol=1e-12)
-    far = Looks(32).log_alarm(np.array(20.0))  # ln (6400^31 / 31! (1 + 31 / 6400 + ..)) - 6400
+    np.testing.assert_allclose(np.exp(binary.log_pfa(level)), votes, rtol=1e-12)
+    far = Looks(32).log_pfa(np.array(20.0))  # ln (6400^31 / 31! (1 + 31 / 6400 + ..)) - 6400
     terms = np.cumsum([0.0, *(np.log((32 - k) / 6400) for k in range(1, 32))])
     expected = 31 * np.log(6400) - special.gammaln(32) + np.log(np.exp(terms).sum()) - 6400
     assert float(far) == pytest.approx(expected, rel=1e-13)
     for chance in (0.3, 1e-6, 1e-200):
         for looks in (Looks(8), Looks(200)):
-            y = looks.level(np.log(chance)) ** 2 / 2 * looks.number
+            y = looks.threshold_ratio_from_log_pfa(np.log(chance)) ** 2 / 2 * looks.number
             assert float(y) == pytest.approx(special.gammainccinv(looks.number, chance), rel=1e-12)
     for chance in (0.3, 1e-6, 1e-100):
         p = special.betaincinv(3, 6, chance)
-        assert float(binary.level(np.log(chance))) == pytest.approx(np.sqrt(-2 * np.log(p)))
+        assert float(binary.threshold_ratio_from_log_pfa(np.log(chance))) == pytest.approx(
+            np.sqrt(-2 * np.log(p))
+        )
 
 
 @pytest.mark.parametrize("looks", [Looks(8), Looks(8, "binary", 3)], ids=lambda it: it.combine)
 def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
     """Hamming, 1024 bins, twice padded: 5 sigma of 4000 segments, and the 3 % of one look."""
-    rng, length, level = np.random.default_rng(7), 512, looks.level(np.log(2e-3))
-    taper = window.samples("hamming", length)
+    rng, length, level = (
+        np.random.default_rng(7),
+        512,
+        looks.threshold_ratio_from_log_pfa(np.log(2e-3)),
+    )
+    taper = window.window_samples("hamming", length)
     sigma = np.sqrt((taper**2).sum() / 2)
     found, number = 0, 4000
     for _ in range(number):
@@ -154,9 +170,11 @@ def test_alarms_of_correlated_bins_are_those_of_drawn_records(looks):
             found += ((power >= (level * sigma) ** 2).sum(axis=0) >= looks.votes).any()
         else:
             found += (power.mean(axis=0) >= (level * sigma) ** 2).any()
-    correlation = alarms.neighbour_correlation(window.window("hamming", length), 1024)
-    bins = alarms.independent_bins(480, level=level, correlation=correlation, looks=looks)
-    told = float(at_least_one(2e-3, bins))
+    correlation = bin_noise.neighbour_noise_correlation(window.get_window("hamming", length), 1024)
+    bins = bin_noise.alarm_equivalent_bins(
+        480, threshold_ratio=level, correlation=correlation, looks=looks
+    )
+    told = float(at_least_one_probability(2e-3, bins))
     assert bins < 400
     error = 5 * np.sqrt(told * (1 - told) / number)
     assert found / number == pytest.approx(told, abs=error + 0.03 * told)
@@ -170,7 +188,7 @@ def instrument(**changes):
         "instrument.processing.window": "rectangular",
         "instrument.processing.noise_bins": "correlated",
         "target.range": np.array([ON_A_BIN]), "target.radial_velocity": 0.0,
-        "footprint.beamlets": 1, "footprint.phases": "incoherent", PFA_BIN: 1e-5,
+        "footprint.beamlets": 1, "footprint.phases": "incoherent", DESIGN_PFA_BIN_PATH: 1e-5,
     } | changes  # fmt: skip
 
 
@@ -189,17 +207,28 @@ def dimmed(parameters, effects, pd):
 
 
 LOOKS = {
-    "steady powers": ({NUMBER: 4}, ()),
-    "common speckle": ({NUMBER: 4}, ("fading",)),
-    "speckle apart": ({NUMBER: 4, SPECKLE: "independent"}, ("fading",)),
+    "steady powers": ({LOOKS_NUMBER_PATH: 4}, ()),
+    "common speckle": ({LOOKS_NUMBER_PATH: 4}, ("fading",)),
+    "speckle apart": ({LOOKS_NUMBER_PATH: 4, LOOKS_SPECKLE_PATH: "independent"}, ("fading",)),
     "speckle in part": (
-        {NUMBER: 4, "target.transverse_velocity": 300.0},
+        {LOOKS_NUMBER_PATH: 4, "target.transverse_velocity": 300.0},
         ("doppler_spread", "fading"),
     ),
-    "votes": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ()),
-    "votes apart": ({NUMBER: 5, COMBINE: "binary", VOTES: 2, SPECKLE: "independent"}, ("fading",)),
-    "votes together": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ("fading",)),
-    "amplitudes": ({NUMBER: 8, COMBINE: "coherent"}, ("fading",)),
+    "votes": ({LOOKS_NUMBER_PATH: 5, LOOKS_COMBINE_PATH: "binary", LOOKS_VOTES_PATH: 2}, ()),
+    "votes apart": (
+        {
+            LOOKS_NUMBER_PATH: 5,
+            LOOKS_COMBINE_PATH: "binary",
+            LOOKS_VOTES_PATH: 2,
+            LOOKS_SPECKLE_PATH: "independent",
+        },
+        ("fading",),
+    ),
+    "votes together": (
+        {LOOKS_NUMBER_PATH: 5, LOOKS_COMBINE_PATH: "binary", LOOKS_VOTES_PATH: 2},
+        ("fading",),
+    ),
+    "amplitudes": ({LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: "coherent"}, ("fading",)),
 }
 
 
@@ -208,7 +237,7 @@ def test_whole_spectra_are_detected_as_often_as_the_closed_form_says(scene, name
     changes, effects = LOOKS[name]
     given = dimmed(scene(**changes), ("image", *effects), 0.6)
     told, number = evaluate(given, ("image", *effects)), 600
-    found = simulate(
+    found = simulate_draws(
         given, ("image", *effects), keys=make_point_keys(1), batch_sizes=[number], method="spectra"
     )
     for which in ("pd_up", "pd_down", "pd_shot"):
@@ -221,21 +250,30 @@ def test_whole_spectra_are_detected_as_often_as_the_closed_form_says(scene, name
 
 
 def test_the_threshold_of_a_segment_holds_its_alarms(scene):
-    base = {path: v for path, v in scene().items() if path != PFA_BIN}
-    for changes in ({NUMBER: 8}, {NUMBER: 8, COMBINE: "binary", VOTES: 4}):
-        given = base | changes | {PFA_SEGMENT: 0.2, "instrument.processing.window": "hamming"}
+    base = {path: v for path, v in scene().items() if path != DESIGN_PFA_BIN_PATH}
+    for changes in (
+        {LOOKS_NUMBER_PATH: 8},
+        {LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: "binary", LOOKS_VOTES_PATH: 4},
+    ):
+        given = (
+            base
+            | changes
+            | {DESIGN_PFA_SEGMENT_PATH: 0.2, "instrument.processing.window": "hamming"}
+        )
         given |= {"target.reflectance": 1e-12}
-        found = simulate(given, (), keys=make_point_keys(1), batch_sizes=[600], method="spectra")
+        found = simulate_draws(
+            given, (), keys=make_point_keys(1), batch_sizes=[600], method="spectra"
+        )
         share = found["n_false_alarm_up"].sum() / 600
         assert share == pytest.approx(0.2, abs=5 * np.sqrt(0.16 / 600) + 0.03 * 0.2)
 
 
 def test_estimates_err_by_the_root_of_the_number_of_looks_less(scene):
-    quiet = scene(**{ESTIMATOR + "kind": "chirp_z", "instrument.laser.power": 1e-3})
+    quiet = scene(**{ESTIMATOR_PREFIX + "kind": "chirp_z", "instrument.laser.power": 1e-3})
     found = {}
     for number in (1, 16):
-        given = quiet | {NUMBER: number}
-        found[number] = simulate(
+        given = quiet | {LOOKS_NUMBER_PATH: number}
+        found[number] = simulate_draws(
             given, ("image",), keys=make_point_keys(1), batch_sizes=[250], method="spectra"
         )
     one, many = (found[number] for number in (1, 16))
@@ -247,23 +285,27 @@ def test_estimates_err_by_the_root_of_the_number_of_looks_less(scene):
 
 def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
     """Records by the exact delay, look by look, their phases' best straight line taken off."""
-    given = scene(**{NUMBER: 8, COMBINE: "coherent", "target.acceleration": 80.0})
-    ((_, shots),) = prepare(given, ("segment_motion", "image"))
+    given = scene(
+        **{LOOKS_NUMBER_PATH: 8, LOOKS_COMBINE_PATH: "coherent", "target.acceleration": 80.0}
+    )
+    ((_, shots),) = prepare_shots(given, ("segment_motion", "image"))
     bins = np.exp(-2j * np.pi * 100 * np.arange(1024) / 1024)
-    record = partial(truth.analytic_record, i=0, segment=0, beamlet=0, acceleration=True)
-    sums = np.array([(record(look) * bins).sum() for look in looks_of(shots)])
+    record = partial(
+        time_domain_truth.analytic_record, point=0, segment=0, beamlet=0, with_acceleration=True
+    )
+    sums = np.array([(record(look) * bins).sum() for look in split_looks(shots)])
     place = np.arange(8) - 3.5
     phase = np.unwrap(np.angle(sums))
     turned = sums * np.exp(-1j * np.polyfit(place, phase, 1)[0] * place)
     lost = np.abs(turned.mean()) / np.abs(sums).mean()
     told = coherent_gain(
         Looks(8, "coherent"), acceleration=np.array(80.0),
-        carrier=np.asarray(shots.carriers[0]), period=np.array(20e-6),
+        carrier=np.asarray(shots.carriers[0]), look_period=np.array(20e-6),
     )  # fmt: skip
     assert 0.5 < told < 0.9
     assert float(told) == pytest.approx(lost, rel=2e-3)
     magnitude = {
-        effects: find(next(prepare(given, effects))[1])[0, 2, 0]
+        effects: evaluate_segments(next(prepare_shots(given, effects))[1])[0, 2, 0]
         for effects in (("image",), ("image", "acceleration"))
     }
     ratio = magnitude["image", "acceleration"] / magnitude[("image",)]
@@ -274,16 +316,16 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     """exp(-2 pi dnu tau) of the power adds up; what walks is noise, and new in each record."""
     laser = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
     effects = ("image", "line_width")
-    given = scene(**{NUMBER: 4, COMBINE: "coherent"}, **laser)
-    ((_, pure),) = prepare(given, ("image",))
-    ((_, shots),) = prepare(given, effects)
+    given = scene(**{LOOKS_NUMBER_PATH: 4, LOOKS_COMBINE_PATH: "coherent"}, **laser)
+    ((_, pure),) = prepare_shots(given, ("image",))
+    ((_, shots),) = prepare_shots(given, effects)
     delay = 2 * ON_A_BIN / SPEED_OF_LIGHT
     share = np.exp(-2 * np.pi * 1e5 * delay)
-    left = (find(shots)[0, 2, 0] / find(pure)[0, 2, 0]) ** 2
+    left = (evaluate_segments(shots)[0, 2, 0] / evaluate_segments(pure)[0, 2, 0]) ** 2
     assert left == pytest.approx(share, rel=1e-9)
     given = dimmed(given, effects, 0.6)
     told, number = evaluate(given, effects)["pd_up"][0], 800
-    found = simulate(
+    found = simulate_draws(
         given, effects, keys=make_point_keys(1), batch_sizes=[number], method="spectra"
     )
     error = 5 * np.sqrt(told * (1 - told) / number)
@@ -292,38 +334,42 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     assert without > told + 0.1
     timing = {"line_width": np.array([1e5]), "delay": np.array([delay])}
     own = {"duration": np.array([2e-6]), "window": shots.window}
-    assert seen_line(**timing, **own)[0] > coherent_share(**timing, duration=own["duration"])
+    assert apparent_line_and_pedestal(**timing, **own)[0] > coherent_power_fraction(
+        **timing, duration=own["duration"]
+    )
 
 
 @pytest.mark.parametrize("combine", ["power", "binary"])
 def test_a_target_that_moves_smears_the_mean_power_of_its_looks(scene, combine):
     """0.9 bins from first to last: the mean of each look's own spectrum, by any route."""
-    moving = scene(**{NUMBER: 32, COMBINE: combine, "target.radial_velocity": 1000.0})
+    moving = scene(
+        **{LOOKS_NUMBER_PATH: 32, LOOKS_COMBINE_PATH: combine, "target.radial_velocity": 1000.0}
+    )
     effects = ("segment_motion", "image")
     if combine == "binary":
-        with pytest.raises(UnsupportedShot, match=r"instrument\.looks\.number takes 32 looks"):
-            next(prepare(moving, effects))
+        with pytest.raises(UnsupportedShotError, match=r"instrument\.looks\.number takes 32 looks"):
+            next(prepare_shots(moving, effects))
         return
-    ((_, shots),) = prepare(moving, effects)
-    bins, magnitude = spectrum(shots, 0, 0)
-    each = [dict(zip(*spectrum(look, 0, 0), strict=True)) for look in looks_of(shots)]
+    ((_, shots),) = prepare_shots(moving, effects)
+    bins, magnitude = segment_spectrum(shots, 0, 0)
+    each = [dict(zip(*segment_spectrum(look, 0, 0), strict=True)) for look in split_looks(shots)]
     for k in range(95, 105):
         expected = np.sqrt(np.mean([look[k] ** 2 for look in each]))
         # The receiver's poles are those of the middle look's line.
         assert magnitude[list(bins).index(k)] == pytest.approx(expected, rel=1e-4)
-    in_time = truth.find(shots, range_walk=False)
-    np.testing.assert_allclose(find(shots)[::2, 2], in_time[::2, 2], rtol=1e-4)
+    in_time = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
+    np.testing.assert_allclose(evaluate_segments(shots)[::2, 2], in_time[::2, 2], rtol=1e-4)
     seen = [look[100] for look in each]
     assert max(seen) > 1.2 * min(seen)
 
 
 def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
-    given = scene(**{NUMBER: 4, "accuracy.leakage_floor": -1.0})
+    given = scene(**{LOOKS_NUMBER_PATH: 4, "accuracy.leakage_floor": -1.0})
     given |= {"target.range": np.array([ON_A_BIN + 0.3]), "instrument.laser.power": 4e-3}
     told = evaluate(given, ("image", "leakage"))
-    ((_, shots),) = prepare(given, ("image",))
-    bins, magnitude = spectrum(shots, 0, 0)
-    sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
+    ((_, shots),) = prepare_shots(given, ("image",))
+    bins, magnitude = segment_spectrum(shots, 0, 0)
+    sigma, level = float(shots.bin_noise_sigma[0]), float(shots.threshold[0])
     own = magnitude >= level
     own |= np.convolve(own, np.ones(3), "same") > 0
     counts = ~own & (bins > 0) & (bins < 512)
@@ -332,9 +378,9 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
     chances = np.where(counts, (crosses - quiet) / (1 - quiet), 0.0)
     # By one record that detects as often: groups that join the echo are no further ones.
     scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
-    near = shots.echo_rule.sidelobe_correlation
+    near = shots.detection_rule.sidelobe_correlation
     alone = 1 - np.prod(1 - chances)
-    leave_out_joined(chances, 0, chances.size, magnitude, own, (sigma / 2, scaled), near)
+    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, own, (sigma / 2, scaled), near)
     expected = 1 - np.prod(1 - chances)
     assert 1e-3 < expected < alone < 0.9
     assert told["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)
@@ -343,13 +389,15 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
 @pytest.mark.parametrize("speckle", ["common", "independent"])
 def test_leakage_of_fading_looks_is_that_of_drawn_spectra(scene, speckle):
     """The mean over the fade of further groups in averaged spectra."""
-    given = scene(**{NUMBER: 4, SPECKLE: speckle, "accuracy.leakage_floor": -1.0})
+    given = scene(
+        **{LOOKS_NUMBER_PATH: 4, LOOKS_SPECKLE_PATH: speckle, "accuracy.leakage_floor": -1.0}
+    )
     given |= {
         "target.range": np.array([ON_A_BIN + 0.5]), "instrument.laser.power": 16e-3,
         "footprint.speckle": "developed", "footprint.phases": "incoherent",
     }  # fmt: skip
     told = evaluate(given, ("image", "leakage", "fading"))["p_leakage_up"][0]
-    ((_, shots),) = prepare(given, ("image", "fading"))
+    ((_, shots),) = prepare_shots(given, ("image", "fading"))
     drawn, deviation = drawn_leakage(shots, 0, draws=12000, looks=4, own=speckle == "independent")
     steady = evaluate(given, ("image", "leakage"))["p_leakage_up"][0]
     assert told > 1.3 * steady
@@ -359,26 +407,26 @@ def test_leakage_of_fading_looks_is_that_of_drawn_spectra(scene, speckle):
 def test_votes_of_one_and_of_all_are_any_and_every_record():
     level, signal = np.array(2.0), np.array(1.5)
     each = marcum_q1(signal, level)
-    assert Looks(6, "binary", 1).steady(signal, level)[1] == pytest.approx(each.p**6)
-    assert Looks(6, "binary", 6).steady(signal, level)[0] == pytest.approx(each.q**6)
+    assert Looks(6, "binary", 1).pd_and_miss_steady(signal, level)[1] == pytest.approx(each.p**6)
+    assert Looks(6, "binary", 6).pd_and_miss_steady(signal, level)[0] == pytest.approx(each.q**6)
 
 
 def test_a_threshold_over_the_noise_is_that_of_one_record(scene):
-    given = {path: v for path, v in scene().items() if path != PFA_BIN}
-    given |= {NUMBER: 4, "instrument.processing.tnr": 6.0}
+    given = {path: v for path, v in scene().items() if path != DESIGN_PFA_BIN_PATH}
+    given |= {LOOKS_NUMBER_PATH: 4, "instrument.processing.tnr": 6.0}
     level = 6.0 * RAYLEIGH_DEVIATION
-    assert float(tnr_of(given)) == 6.0
+    assert float(tnr_from_parameters(given)) == 6.0
     found = evaluate(given, ())["log10_pfa_bin"][0]
     assert found == pytest.approx(np.log10(special.gammaincc(4, 2 * level**2)), rel=1e-9)
 
 
 def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
     """Speckle of beamlets, drawn once a shot for all its looks: 5 sigma of 6000 draws."""
-    rough = scene(**{NUMBER: 8, "footprint.beamlets": 19, "target.roughness": 1e-3})
+    rough = scene(**{LOOKS_NUMBER_PATH: 8, "footprint.beamlets": 19, "target.roughness": 1e-3})
     smooth = {path: v for path, v in rough.items() if path != "target.roughness"}
     light = dimmed(smooth, ("image", "fading"), 0.6)["instrument.laser.power"]
     told = evaluate(smooth | {"instrument.laser.power": light}, ("image", "fading"))
-    found = simulate(
+    found = simulate_draws(
         rough | {"instrument.laser.power": light}, ("image", "speckle"), keys=make_point_keys(1),
         batch_sizes=[6000], method="probabilities",
     )  # fmt: skip
@@ -391,16 +439,23 @@ def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
 @pytest.mark.parametrize("combine", ["power", "binary", "coherent"])
 def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
     """Noise: mean power within 5 sigma, a spread less by the root of 16; or any bin's votes."""
-    given = scene(**{NUMBER: 16, COMBINE: combine, VOTES: 4, "target.reflectance": 1e-12})
+    given = scene(
+        **{
+            LOOKS_NUMBER_PATH: 16,
+            LOOKS_COMBINE_PATH: combine,
+            LOOKS_VOTES_PATH: 4,
+            "target.reflectance": 1e-12,
+        }
+    )
     shot = simulate_shot(given, ("image",), seed=3)
     power = (shot.segments[0].magnitude[8:-8] / shot.bin_deviation) ** 2 / 2
     looks = shot.prepared_shot.looks
     if combine == "binary":  # the fourth largest of 16
         levels = np.array([0.8, 1.4, 2.0])
-        told = looks.steady(np.zeros(3), np.sqrt(2 * levels))[0]
+        told = looks.pd_and_miss_steady(np.zeros(3), np.sqrt(2 * levels))[0]
         shares = (power[:, None] >= levels).mean(axis=0)
         assert np.abs(shares - told).max() < 5 * 0.5 / np.sqrt(power.size)
         return
-    spread = 1 / np.sqrt(looks.averaged)
+    spread = 1 / np.sqrt(looks.n_power_averaged)
     assert power.mean() == pytest.approx(1.0, abs=5 * spread / np.sqrt(power.size))
     assert power.std() == pytest.approx(spread, rel=5 * np.sqrt(8 / 4 / power.size))

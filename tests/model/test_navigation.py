@@ -8,14 +8,20 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 from shot_helpers import DRAWS, is_within_5_sigma
 
-from sweep.model import navigation
-from sweep.model.geometry.scanner import cone, corners, squares
-from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, velocity
+from sweep.model.geometry.scanner import cone_directions, corner_directions, square_patterns
+from sweep.model.pointcloud import navigation
+from sweep.model.pointcloud.navigation import (
+    STATUS_EXCLUDED,
+    STATUS_SOLVED,
+    STATUS_UNDETERMINED,
+    STATUS_WITHHELD,
+    solve_velocity,
+)
 
-THREE = cone(3, half_angle=radians(22.5))
-FOUR = corners(radians(22.5))
-NARROW = corners(radians(7.5))
-SIXTEEN = squares([radians(15.0), radians(7.5)])[0].reshape(-1, 3)
+THREE = cone_directions(3, half_angle=radians(22.5))
+FOUR = corner_directions(radians(22.5))
+NARROW = corner_directions(radians(7.5))
+SIXTEEN = square_patterns([radians(15.0), radians(7.5)])[0].reshape(-1, 3)
 PATTERNS = pytest.mark.parametrize("beams", [THREE, FOUR, NARROW, SIXTEEN], ids=len)
 
 MOVING = np.array([12.0, -7.0, -85.0])
@@ -28,7 +34,7 @@ FREE = 1e7
 
 def altitude(**given):
     """Altitudes over ground of any slope unless said otherwise."""
-    return navigation.altitude(**({"slope": FREE} | given))
+    return navigation.solve_altitude(**({"slope": FREE} | given))
 
 
 def _ranges(beams, height, *, normal=(0.0, 0.0, 1.0), offset=0.0):
@@ -44,8 +50,8 @@ def _ranges(beams, height, *, normal=(0.0, 0.0, 1.0), offset=0.0):
 @pytest.mark.parametrize("half_angle", np.radians([2.0, 22.5, 45.0, 70.0]))
 @pytest.mark.parametrize("number", [3, 4, 7])
 def test_standard_errors_go_as_1_over_sine_across_and_1_over_cosine_along(number, half_angle):
-    beams = cone(number, half_angle=half_angle, azimuth=0.3)
-    found = velocity(direction=beams, radial_velocity=np.zeros(number), standard_error=0.02)
+    beams = cone_directions(number, half_angle=half_angle, azimuth=0.3)
+    found = solve_velocity(direction=beams, radial_velocity=np.zeros(number), standard_error=0.02)
     across = 0.02**2 * 2 / (number * np.sin(half_angle) ** 2)
     along = 0.02**2 / (number * np.cos(half_angle) ** 2)
     expected = np.diag([across, across, along])
@@ -56,7 +62,9 @@ def test_standard_errors_go_as_1_over_sine_across_and_1_over_cosine_along(number
 def test_mean_and_covariance_of_drawn_velocities_are_those_propagated(beams):
     error = 0.01 * (1 + np.arange(len(beams)) % 3)  # unequal: the weights matter
     noise = np.random.default_rng(1).standard_normal((DRAWS, len(beams))) * error
-    found = velocity(direction=beams, radial_velocity=beams @ MOVING + noise, standard_error=error)
+    found = solve_velocity(
+        direction=beams, radial_velocity=beams @ MOVING + noise, standard_error=error
+    )
     off, stated = found.value - MOVING, found.covariance[0]
     variance = np.diag(stated)
     assert (np.abs(off.mean(axis=0)) <= 5 * np.sqrt(variance / DRAWS)).all()
@@ -71,9 +79,9 @@ def test_a_turned_frame_turns_the_solution():
     noise = np.random.default_rng(2).standard_normal(16) * 0.05
     error = np.linspace(0.01, 0.1, 16)
     measured = SIXTEEN @ MOVING + noise
-    plain = velocity(direction=SIXTEEN, radial_velocity=measured, standard_error=error)
+    plain = solve_velocity(direction=SIXTEEN, radial_velocity=measured, standard_error=error)
     for turn in Rotation.random(5, random_state=3).as_matrix():
-        turned = velocity(
+        turned = solve_velocity(
             direction=SIXTEEN @ turn.T, radial_velocity=measured, standard_error=error
         )
         np.testing.assert_allclose(turned.value, turn @ plain.value, atol=1e-11)
@@ -84,15 +92,17 @@ def test_a_turned_frame_turns_the_solution():
 
 
 def test_four_beams_can_spare_any_one_and_three_can_not():
-    for beams, status in ((FOUR, SOLVED), (THREE, UNDETERMINED)):
+    for beams, status in ((FOUR, STATUS_SOLVED), (THREE, STATUS_UNDETERMINED)):
         valid = ~np.eye(len(beams), dtype=bool)
         measured = np.where(valid, beams @ MOVING, np.nan)
-        found = velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
+        found = solve_velocity(direction=beams, radial_velocity=measured, standard_error=0.01)
         assert (found.status == status).all()
-        assert (found.used == valid).all() and (found.degrees == 0).all()
-        if status == SOLVED:
+        assert (found.is_used == valid).all() and (found.degrees_of_freedom == 0).all()
+        if status == STATUS_SOLVED:
             np.testing.assert_allclose(found.value, np.tile(MOVING, (4, 1)), atol=1e-12)
-            full = velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
+            full = solve_velocity(
+                direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01
+            )
             lost = np.linalg.eigvalsh(found.covariance - full.covariance)
             assert (lost > -1e-15).all()  # a beam less never makes anything better known
         else:
@@ -101,25 +111,27 @@ def test_four_beams_can_spare_any_one_and_three_can_not():
 
 def test_no_cycles_make_no_solutions():
     nothing = np.empty((0, 5, 4))
-    found = velocity(direction=FOUR, radial_velocity=nothing, standard_error=0.01, level=0.01)
-    assert found.value.shape == (0, 5, 3) and found.available.shape == (0, 5)
+    found = solve_velocity(
+        direction=FOUR, radial_velocity=nothing, standard_error=0.01, test_level=0.01
+    )
+    assert found.value.shape == (0, 5, 3) and found.is_available.shape == (0, 5)
 
 
 @pytest.mark.parametrize("half_angle", [1e-1, 1e-3, 1e-5, 1e-7])
 def test_a_cone_so_narrow_that_rounding_spoils_it_is_refused(half_angle):
     """Singular values sqrt(3/2) sin and sqrt(3) cos: a condition number of 1e6 at 1.4e-6 rad."""
-    beams = cone(3, half_angle=half_angle)
-    found = velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
-    assert found.available == (np.sqrt(2) / np.tan(half_angle) < 1e6)
-    assert np.isfinite(found.value).all() == found.available
+    beams = cone_directions(3, half_angle=half_angle)
+    found = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
+    assert found.is_available == (np.sqrt(2) / np.tan(half_angle) < 1e6)
+    assert np.isfinite(found.value).all() == found.is_available
 
 
 def test_beams_in_a_plane_leave_the_velocity_across_undetermined():
     angle = np.radians([-20.0, -5.0, 5.0, 30.0])
     beams = np.column_stack([np.sin(angle), 0 * angle, -np.cos(angle)])
     beams = beams @ Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix().T
-    found = velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
-    assert found.status == UNDETERMINED and np.isnan(found.value).all()
+    found = solve_velocity(direction=beams, radial_velocity=beams @ MOVING, standard_error=0.01)
+    assert found.status == STATUS_UNDETERMINED and np.isnan(found.value).all()
 
 
 # ---- one false beam ----
@@ -130,13 +142,15 @@ LEVEL = 0.02
 def _drawn_with_alarm(beams, *, alarm, beam, seed):
     measured = beams @ MOVING + np.random.default_rng(seed).normal(0, 0.01, (DRAWS, len(beams)))
     measured[:, beam] += alarm
-    return velocity(direction=beams, radial_velocity=measured, standard_error=0.01, level=LEVEL)
+    return solve_velocity(
+        direction=beams, radial_velocity=measured, standard_error=0.01, test_level=LEVEL
+    )
 
 
 @PATTERNS
 def test_true_beams_are_suspect_at_the_stated_level(beams):
     found = _drawn_with_alarm(beams, alarm=0.0, beam=0, seed=6)
-    suspect = (found.status != SOLVED).sum()
+    suspect = (found.status != STATUS_SOLVED).sum()
     assert suspect == 0 if len(beams) == 3 else is_within_5_sigma(suspect, LEVEL)
 
 
@@ -144,10 +158,12 @@ def test_true_beams_are_suspect_at_the_stated_level(beams):
 def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
     found = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
-    right = (found.status == EXCLUDED) & ~found.used[:, beam]
+    right = (found.status == STATUS_EXCLUDED) & ~found.is_used[:, beam]
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
-    assert (found.status[~right] == WITHHELD).all() and np.isnan(found.value[~right]).all()
-    assert (found.used[right].sum(axis=1) == 15).all() and (found.degrees[right] == 12).all()
+    assert (found.status[~right] == STATUS_WITHHELD).all() and np.isnan(found.value[~right]).all()
+    assert (found.is_used[right].sum(axis=1) == 15).all() and (
+        found.degrees_of_freedom[right] == 12
+    ).all()
     left = np.delete(SIXTEEN, beam, axis=0)
     stated = 0.01**2 * np.linalg.inv(left.T @ left)
     np.testing.assert_allclose(found.covariance[right][0], stated, rtol=1e-9, atol=1e-16)
@@ -161,27 +177,35 @@ def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
     power = ncx2.sf(chi2.isf(LEVEL, 13), 13, (alarm / 0.01) ** 2 * (1 - leverage))
     assert 0.3 < power < 0.95
     found = _drawn_with_alarm(SIXTEEN, alarm=alarm, beam=beam, seed=8)
-    assert is_within_5_sigma((found.status != SOLVED).sum(), power)
-    excluded = found.status == EXCLUDED
-    assert (~found.used[excluded, beam]).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
+    assert is_within_5_sigma((found.status != STATUS_SOLVED).sum(), power)
+    excluded = found.status == STATUS_EXCLUDED
+    assert (
+        ~found.is_used[excluded, beam]
+    ).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
 
 
 def test_two_false_alarms_are_withheld():
     measured = SIXTEEN @ MOVING
     measured[[2, 9]] += [40.0, -25.0]
-    found = velocity(direction=SIXTEEN, radial_velocity=measured, standard_error=0.01, level=LEVEL)
-    assert found.status == WITHHELD
+    found = solve_velocity(
+        direction=SIXTEEN, radial_velocity=measured, standard_error=0.01, test_level=LEVEL
+    )
+    assert found.status == STATUS_WITHHELD
 
 
 def test_level_ground_tells_which_of_four_ranges_is_false():
     rng = np.random.default_rng(10)
     ranges = _ranges(FOUR, 400.0) + rng.normal(0, 0.1, (DRAWS, 4))
     ranges[np.arange(DRAWS), np.arange(DRAWS) % 4] = rng.uniform(0, 300, DRAWS)
-    known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "level": LEVEL}
+    known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "test_level": LEVEL}
     found = altitude(**known, slope=0.0)
-    right = (found.status == EXCLUDED) & (found.used.argmin(axis=1) == np.arange(DRAWS) % 4)
+    right = (found.status == STATUS_EXCLUDED) & (
+        found.is_used.argmin(axis=1) == np.arange(DRAWS) % 4
+    )
     assert is_within_5_sigma(right.sum(), 1 - LEVEL)
-    assert (altitude(**known).status == WITHHELD).all()  # a free plane has one degree of freedom
+    assert (
+        altitude(**known).status == STATUS_WITHHELD
+    ).all()  # a free plane has one degree of freedom
 
 
 # ---- altitude ----
@@ -265,12 +289,12 @@ def test_two_beams_see_the_slope_along_their_line():
     found = altitude(
         direction=beams, range=_ranges(beams, height, normal=NORMAL), standard_error=0.1
     )
-    assert found.value == pytest.approx(height, rel=1e-12) and found.degrees == 1
+    assert found.value == pytest.approx(height, rel=1e-12) and found.degrees_of_freedom == 1
 
 
 def test_no_beam_gives_no_altitude():
-    found = altitude(direction=FOUR, range=np.full(4, np.nan), standard_error=0.1, level=0.01)
-    assert found.status == UNDETERMINED and not found.available
+    found = altitude(direction=FOUR, range=np.full(4, np.nan), standard_error=0.1, test_level=0.01)
+    assert found.status == STATUS_UNDETERMINED and not found.is_available
     assert np.isnan(found.value) and np.isnan(found.covariance)
 
 
@@ -294,7 +318,7 @@ def test_ground_of_random_slope_is_off_by_the_stated_variance():
     ratio = np.mean((found.value - 200.0) ** 2) / found.covariance.mean()
     assert abs(ratio - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
     assert found.covariance.mean() > 100 * 0.1**2  # by far the slope's doing
-    assert (found.degrees == 1).all()  # two heights and two slopes known, three sought
+    assert (found.degrees_of_freedom == 1).all()  # two heights and two slopes known, three sought
     assert abs(found.chi_square.mean() - 1) <= 5 * np.sqrt(2 / DRAWS) + 0.01
 
 
@@ -302,6 +326,6 @@ def test_a_beam_that_grazes_the_fitted_plane_does_not_run_off_with_the_weight():
     """A false range tilts the plane until another beam runs along it or past it."""
     ranges = _ranges(SIXTEEN, 100.0)
     ranges[0] = 9000.0
-    found = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, level=1e-3)
-    assert found.status == EXCLUDED and not found.used[0]
+    found = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, test_level=1e-3)
+    assert found.status == STATUS_EXCLUDED and not found.is_used[0]
     assert found.value == pytest.approx(100.0, rel=1e-12)

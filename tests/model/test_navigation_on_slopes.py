@@ -10,20 +10,23 @@ import numpy as np
 import pytest
 from small_scenes import observe_shots, scene_parameters, straight_flight
 
-from sweep.model import philox
-from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import CORE
-from sweep.model.error_floor import ErrorFloor, stray
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.platform import Spin
-from sweep.model.geometry.scanner import cone, corners, fixed
-from sweep.model.navigation import solve
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.geometry.body_motion import SpinningAttitude
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.scanner import cone_directions, corner_directions, fixed_beams
+from sweep.model.pointcloud.error_floor import ErrorFloor, apply_error_floor
+from sweep.model.pointcloud.navigation import solve_navigation
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling import philox
 from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 from sweep.scenes.meshes import clean_mesh
 
-MOVING = {*CORE, "range_walk", "acceleration", "segment_motion"}
+MOVING = {*DEFAULT_EFFECTS, "range_walk", "acceleration", "segment_motion"}
 CYCLES, DRAWS = 8, 150
-FOUR, THREE = corners(math.radians(22.5)), cone(3, half_angle=math.radians(22.5))
+FOUR, THREE = (
+    corner_directions(math.radians(22.5)),
+    cone_directions(3, half_angle=math.radians(22.5)),
+)
 DESCENTS = {
     "constant": {"velocity": (0.0, 0.0, -60.0)},
     "oblique": {"velocity": (40.0, 10.0, -50.0)},
@@ -31,7 +34,7 @@ DESCENTS = {
     "braking hard": {"velocity": (30.0, 0.0, -60.0), "acceleration": (-5.0, 2.0, 12.0)},
     "turning": {
         "velocity": (20.0, 0.0, -60.0),
-        "attitude": Spin((math.radians(3), 0.0, math.radians(60))),
+        "attitude": SpinningAttitude((math.radians(3), 0.0, math.radians(60))),
     },
 }
 
@@ -47,20 +50,24 @@ def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, state
     """Mean NEES / 3 of velocity, rms of altitude's z, and mean errors of each cycle's altitude."""
     seen = observe_shots(
         straight_flight(**({"position": (0.0, 0.0, 800.0)} | descent)), bodies=[slanting(slope)],
-        scanner=fixed(beams, rate=2.0, interval=interval), index=range(CYCLES * len(beams)),
+        scanner=fixed_beams(beams, rate=2.0, interval=interval), index=range(CYCLES * len(beams)),
         beam_divergence=1e-7,
     )  # fmt: skip
     keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="o", seed=1)
-    points = cloud(
-        seen, parameters=parameters, surfaces=[Surface("ground", 0.2)], keys=keys, draws=DRAWS,
+    points = simulate_cloud(
+        seen,
+        parameters=parameters,
+        surfaces=[SurfaceMaterial("ground", 0.2)],
+        keys=keys,
+        draws=DRAWS,
         effects=MOVING,
-    )  # fmt: skip
+    )
     if floor is not None:
-        points = stray(points, seen, floor, keys=keys, seed=1)
-    stated = {} if floor is None and stated is None else {"floor": stated or floor}
+        points = apply_error_floor(points, seen, floor, keys=keys, seed=1)
+    stated = {} if floor is None and stated is None else {"error_floor": stated or floor}
     shots = eyepoints_to_arrays(seen)
-    found = solve(
-        shots, points, shots_a_cycle=len(beams), **({"ground_slope": 10.0} | ground), **stated
+    found = solve_navigation(
+        shots, points, shots_per_cycle=len(beams), **({"ground_slope": 10.0} | ground), **stated
     )
     position, velocity = (
         shots[f"platform_{name}"].reshape(CYCLES, -1, 3) for name in ("position", "velocity")

@@ -2,12 +2,12 @@ import mpmath
 import numpy as np
 import pytest
 
-from sweep.model import noise_only
+from sweep.model.detection import noise_false_alarms
 
 
 def shot_probability(tnr, bins):
-    in_a_bin = np.asarray(noise_only.bin_probability(tnr))
-    return float(noise_only.segment_probability(in_a_bin, bins)) ** 2
+    in_a_bin = np.asarray(noise_false_alarms.bin_pfa(tnr))
+    return float(noise_false_alarms.segment_pfa(in_a_bin, bins)) ** 2
 
 
 @pytest.mark.parametrize("tnr", [1.0, 5.0, 10.0, 15.0])
@@ -17,7 +17,7 @@ def test_a_bin_of_noise_crosses_as_often_as_a_rayleigh_magnitude_exceeds_its_dev
         deviation = mpmath.sqrt(2 - mpmath.pi / 2)
         ends = [tnr * deviation + step for step in (0, 1, 2, 4, 8, 16)]  # nothing beyond
         tail = mpmath.quad(lambda r: r * mpmath.exp(-r * r / 2), ends)
-    assert noise_only.bin_probability(tnr) == pytest.approx(float(tail), rel=1e-13)
+    assert noise_false_alarms.bin_pfa(tnr) == pytest.approx(float(tail), rel=1e-13)
 
 
 @pytest.mark.parametrize("bins", [2**16, 2**17, 2**18])
@@ -44,13 +44,15 @@ def test_the_implied_excess_is_the_one_that_made_the_figure(excess, tnr):
         of_bin, of_shot = float(p), float((1 - (1 - p) ** 131072) ** 2)
     # a relative error of 1e-16 in the figure moves e by (1 + e)^2 / x / 2 of that; where all
     # but certain (TNR 5), the figure itself holds no more digits
-    assert noise_only.variance_excess_of_bin(of_bin, tnr) == pytest.approx(excess, abs=1e-14)
+    assert noise_false_alarms.variance_excess_from_bin_pfa(of_bin, tnr) == pytest.approx(
+        excess, abs=1e-14
+    )
     if of_shot < 0.5:
-        found = noise_only.variance_excess_of_shot(of_shot, tnr, 131072)
+        found = noise_false_alarms.variance_excess_from_shot_pfa(of_shot, tnr, 131072)
         assert found == pytest.approx(excess, abs=1e-14)
 
 
 @pytest.mark.parametrize("figure", [0.0, 1.0, float("nan")])
 def test_no_excess_makes_a_figure_of_nothing_or_of_certainty(figure):
-    assert np.isnan(noise_only.variance_excess_of_shot(figure, 10.0, 131072))
-    assert np.isnan(noise_only.variance_excess_of_bin(figure, 10.0))
+    assert np.isnan(noise_false_alarms.variance_excess_from_shot_pfa(figure, 10.0, 131072))
+    assert np.isnan(noise_false_alarms.variance_excess_from_bin_pfa(figure, 10.0))

@@ -12,14 +12,14 @@ from small_scenes import (
     straight_flight,
 )
 
-from sweep.model.eyepoints import LEAST_RANGE, prepare_eyepoints
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.rays import Caster
-from sweep.model.groups import _list_groups
-from sweep.model.looks import Looks
+from sweep.model.detection.looks import Looks
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.pointcloud.bin_groups import _list_groups
+from sweep.model.pointcloud.eyepoints import RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
-from sweep.model.search import _keep_echoes
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.spectrum.search_restriction import _mark_searched_echoes
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.meshes import clean_mesh
 
 NOT_FINITE = [np.nan, np.inf, -np.inf]
@@ -35,26 +35,30 @@ def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
         peak = int(np.nanargmax(magnitude))
         exempt = np.zeros(6, np.bool_)
         assert _list_groups(magnitude, exempt, peak, level, bins) <= 4
-        _keep_echoes(magnitude, exempt, 0, level, 0, (np.array([0, 6]), 0), np.array([2.0]))
+        _mark_searched_echoes(
+            magnitude, exempt, 0, level, 0, (np.array([0, 6]), 0), np.array([2.0])
+        )
 
 
 def test_probabilities_of_several_records_end_for_levels_that_are_not_finite():
     several = Looks(4)
     for level in (np.nan, np.inf):
         with np.errstate(all="ignore"):
-            several.fresh(np.array([level, 3.0]), 0.4)
+            several.p_stay_given_neighbour_crosses(np.array([level, 3.0]), 0.4)
 
 
 def shots(table_4_1):
     eyes = observe_shots(straight_flight(), index=range(3))
-    return prepare_eyepoints(eyes, scene_parameters(table_4_1), [Surface("plate", 0.1)])
+    return prepare_eyepoint_shots(
+        eyes, scene_parameters(table_4_1), [SurfaceMaterial("plate", 0.1)]
+    )
 
 
 @pytest.mark.parametrize("value", NOT_FINITE)
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("range", "the range"), ("amplitude", "beamlets' echoes"),
-     ("offset", "beamlets' ranges"), ("echo_scale", "echo's power")],
+    [("range", "the range"), ("relative_amplitude", "beamlets' echoes"),
+     ("relative_range_offset", "beamlets' ranges"), ("echo_power_scale", "echo's power")],
 )  # fmt: skip
 def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words, value):
     prepared = shots(table_4_1)
@@ -64,16 +68,18 @@ def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words
         values[1 if values.shape[0] > 1 else 0] = value
     else:
         values = np.asarray(value)
-    with pytest.raises(UnsupportedShot, match=words) as refused:
+    with pytest.raises(UnsupportedShotError, match=words) as refused:
         require_finite(replace(prepared, **{name: values}))
-    assert refused.value.point in (0, 1)
+    assert refused.value.point_index in (0, 1)
 
 
 def test_a_path_that_leaves_the_numbers_is_refused_with_the_shot_and_its_time():
     away = straight_flight(velocity=(1e308, 0.0, 0.0), duration=1e3)
     with (
         np.errstate(all="ignore"),
-        pytest.raises(UnsupportedShot, match=r"shot 4, at time 4 s, has a position that is not"),
+        pytest.raises(
+            UnsupportedShotError, match=r"shot 4, at time 4 s, has a position that is not"
+        ),
     ):
         observe_shots(away, index=(0, 1, 4))
 
@@ -86,26 +92,24 @@ WALL = clean_mesh(
 FORWARD = np.array([[1.0, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * LEAST_RANGE])
+@pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * RANGE_MIN])
 def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, x):
     far = replace(WALL, origin=WALL.origin + np.array([200.0, 0.0, 0.0]))
     eyes = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
     np.testing.assert_allclose(eyes.range, 200.0, rtol=1e-4)
-    prepare_eyepoints(eyes, scene_parameters(table_4_1), [Surface("wall", 0.1)])
+    prepare_eyepoint_shots(eyes, scene_parameters(table_4_1), [SurfaceMaterial("wall", 0.1)])
     alone = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
-    assert not alone.seen.any()
+    assert not alone.has_target.any()
 
 
 def test_a_surface_farther_than_the_least_range_is_hit():
-    eyes = observe_shots(
-        straight_flight((-2 * LEAST_RANGE, 0.0, 0.0)), bodies=[WALL], beams=FORWARD
-    )
-    np.testing.assert_allclose(eyes.range, 2 * LEAST_RANGE)
+    eyes = observe_shots(straight_flight((-2 * RANGE_MIN, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    np.testing.assert_allclose(eyes.range, 2 * RANGE_MIN)
     low = observe_shots(straight_flight((0.0, 0.0, 0.1)), beams=DOWNWARD_BEAM)
     np.testing.assert_allclose(low.range, 0.1)
 
 
 def test_the_least_range_is_the_callers():
-    caster, origin = Caster(level_plate()), np.array([[0.0, 0.0, 0.5]])
+    caster, origin = RayCaster(level_plate()), np.array([[0.0, 0.0, 0.5]])
     for least, range_ in ((0.0, 0.5), (0.4, 0.5), (0.6, np.inf)):
-        assert caster.bundle(origin, DOWNWARD_BEAM[:, None], least_range=least).range == range_
+        assert caster.cast_bundles(origin, DOWNWARD_BEAM[:, None], range_min=least).range == range_

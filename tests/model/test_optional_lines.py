@@ -9,15 +9,18 @@ from shot_helpers import magnitude_error, parametrize_product, segment_lines
 from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD
 from test_leakage import drawn_bundles as bundles
 
-from sweep.model import philox, returns, segments, truth
-from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.line_width import DEVIATION_OF_FWHM
-from sweep.model.groups import groups
-from sweep.model.sampling import simulate
-from sweep.model.segments import POINTS
-from sweep.model.shot import evaluate, find, prepare
-from sweep.model.waveform import SIGNS
-from sweep.model.window import samples, transform
+from sweep.model import time_domain_truth
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.effects.line_width import DEVIATION_PER_FWHM
+from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
+from sweep.model.pointcloud import returns
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.sampling import philox
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.spectrum import segment_spectra
+from sweep.model.spectrum.segment_spectra import POINTS_PER_BATCH
+from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.window import direct_transform, window_samples
 
 AGREEMENT = 1e-9
 """Largest difference of |X| from the truth, relative to the peak of lines without the effect."""
@@ -35,8 +38,8 @@ DRIFTS = {
 
 
 def prepared(parameters, *further, without=()):
-    effects = [name for name in (*CORE, *further) if name not in without]
-    ((_, shots),) = prepare(parameters | (DRIFTS if further else {}), effects)
+    effects = [name for name in (*DEFAULT_EFFECTS, *further) if name not in without]
+    ((_, shots),) = prepare_shots(parameters | (DRIFTS if further else {}), effects)
     return shots
 
 
@@ -60,9 +63,9 @@ def plain_sum(shots, i, segment, bins):
     for place, c in zip(delta, weight, strict=True):
         y = (way * bins - origin - place) * shots.window.length / shots.fft_size
         # C_b counts its phase from the middle of the record, the transform from its beginning
-        line = transform(shots.window, y) * c * np.exp(1j * np.pi * y)
-        total += abs(line) ** 2 if shots.incoherent else line
-    return np.sqrt(total.real) if shots.incoherent else abs(total)
+        line = direct_transform(shots.window, y) * c * np.exp(1j * np.pi * y)
+        total += abs(line) ** 2 if shots.adds_powers else line
+    return np.sqrt(total.real) if shots.adds_powers else abs(total)
 
 
 @pytest.mark.parametrize(
@@ -78,12 +81,12 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
             without=("image",),
         )  # fmt: skip
         for segment in range(3):
-            bins, fast = segments.spectrum(shots, 0, segment)
+            bins, fast = segment_spectra.segment_spectrum(shots, 0, segment)
             slow = plain_sum(shots, 0, segment, bins)
-            assert magnitude_error(shots, fast, slow) < (AGREEMENT if shots.incoherent else 1e-11)
+            assert magnitude_error(shots, fast, slow) < (AGREEMENT if shots.adds_powers else 1e-11)
         if distance < 1:  # beats next to DC: images are there, and were left out
-            both = find(replace(shots, image=True))[1, MAGNITUDE]
-            assert abs(both / find(shots)[1, MAGNITUDE] - 1) > 1e-3
+            both = evaluate_segments(replace(shots, sums_images=True))[1, MAGNITUDE]
+            assert abs(both / evaluate_segments(shots)[1, MAGNITUDE] - 1) > 1e-3
 
 
 # Leakage
@@ -91,10 +94,10 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
 
 def same_detections(shots):
     """Largest relative change of a magnitude, and change of a pd, by leaving leakage out."""
-    whole = find(shots)
+    whole = evaluate_segments(shots)
     worst = np.zeros(2)
     for every_bin in (False, True):
-        found = find(replace(shots, leakage=False), every_bin=every_bin)
+        found = evaluate_segments(replace(shots, includes_leakage=False), bin_by_bin=every_bin)
         assert not np.nan_to_num(found[:, LEAKAGE]).any()
         for field in (FREQUENCY, EXEMPTED):
             np.testing.assert_array_equal(found[:, field], whole[:, field])
@@ -111,7 +114,7 @@ def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, imag
     """Bundles wide and narrow, weak and strong, on DC and Nyquist and beyond."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
-        magnitude, pd = same_detections(replace(shots, image=image))
+        magnitude, pd = same_detections(replace(shots, sums_images=image))
         assert magnitude < 1e-11 and pd < 1e-12
 
 
@@ -141,9 +144,12 @@ def test_without_leakage_only_noise_raises_false_peaks(table_4_1):
     parameters = scene(table_4_1, range=20.0, tnr=7.0, fft_size=8192, power=30.0)
     keys = philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
     shares = {}
-    for name, effects in (("with", CORE), ("without", set(CORE) - {"leakage"})):
+    for name, effects in (
+        ("with", DEFAULT_EFFECTS),
+        ("without", set(DEFAULT_EFFECTS) - {"leakage"}),
+    ):
         outputs = evaluate(parameters, effects)
-        counts = simulate(parameters, effects, keys=keys, batch_sizes=[4000], method="noise")
+        counts = simulate_draws(parameters, effects, keys=keys, batch_sizes=[4000], method="noise")
         shares[name] = counts["n_false_alarm_up"][0, 0] / 4000, outputs["pfa_segment"][0]
     assert shares["with"][0] > 0.5
     found, expected = shares["without"]
@@ -159,34 +165,36 @@ def exact(shots, i, segment, shifts):
     Records of beamlets add, or the powers of their spectra, lines' and images' apart: what is
     left of random phases in the mean.
     """
-    window, length = samples(shots.window.name, shots.window.length), shots.window.length
+    window, length = window_samples(shots.window.name, shots.window.length), shots.window.length
     x, half = 2 * np.arange(length) / length - 1, shots.fft_size // 2 + 1
     cycles = np.zeros(length)
     for error in shots.phase_errors:
-        values = error.chosen(segment, np.array([i]))
-        cycles = cycles + error.phase(x, sign=SIGNS[segment], **values)[0]
+        values = error.select_arguments(segment, np.array([i]))
+        cycles = cycles + error.phase(x, sign=DEFAULT_CHIRP_SLOPES[segment], **values)[0]
     records = [
-        truth.analytic_record(shots, i, segment, b, range_walk=False)
-        for b in range(shots.offset.shape[1])
+        time_domain_truth.analytic_record(shots, i, segment, b, with_range_walk=False)
+        for b in range(shots.relative_range_offset.shape[1])
     ]
     total = np.zeros(half)
     for shift, weight in zip(*shifts, strict=True):
         turn = window * np.exp(2j * np.pi * (cycles + shift * x / 2))
-        for record in records if shots.incoherent else [sum(records)]:
+        for record in records if shots.adds_powers else [sum(records)]:
             spectrum = np.fft.fft(turn * record, shots.fft_size) / 2
-            line, image = spectrum[:half], spectrum[-np.arange(half)].conj() * shots.image
-            power = abs(line) ** 2 + abs(image) ** 2 if shots.incoherent else abs(line + image) ** 2
+            line, image = spectrum[:half], spectrum[-np.arange(half)].conj() * shots.sums_images
+            power = (
+                abs(line) ** 2 + abs(image) ** 2 if shots.adds_powers else abs(line + image) ** 2
+            )
             total += weight * power
     return np.sqrt(total)
 
 
 def width_by_hermite(shots, i):
     """Shifts [bins of fs/L] of a Gaussian line, by a rule of its own: Gauss and Hermite's."""
-    if shots.gaussian_width is None:
+    if shots.gaussian_line_width is None:
         return np.zeros(1), np.ones(1)
     place, weight = np.polynomial.hermite_e.hermegauss(61)
-    bins = shots.gaussian_width[i] * np.broadcast_to(shots.record_duration, shots.size)[i]
-    return DEVIATION_OF_FWHM * bins * place, weight / weight.sum()
+    bins = shots.gaussian_line_width[i] * np.broadcast_to(shots.record_duration, shots.size)[i]
+    return DEVIATION_PER_FWHM * bins * place, weight / weight.sum()
 
 
 CASES = {
@@ -215,9 +223,9 @@ def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, 
     parameters = scene(table_4_1, window=window, phases=phases, **CASES[case])
     shots, plain = prepared(parameters, *effects), prepared(parameters)
     for segment in range(3):
-        bins, fast = segments.spectrum(shots, 0, segment)
+        bins, fast = segment_spectra.segment_spectrum(shots, 0, segment)
         slow = exact(shots, 0, segment, width_by_hermite(shots, 0))
-        peak = segments.spectrum(plain, 0, segment)[1].max()
+        peak = segment_spectra.segment_spectrum(plain, 0, segment)[1].max()
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
         assert magnitude_error(shots, fast, slow, peak) < AGREEMENT
 
@@ -237,22 +245,24 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
         "accuracy.leakage_floor": 1e-12,
     }
     shots = prepared(parameters, *effects, without=() if leakage else ("leakage",))
-    found, listed = find(shots), groups(shots)
-    slow = find(shots, every_bin=True)
+    found, listed = evaluate_segments(shots), list_bin_groups(shots)
+    slow = evaluate_segments(shots, bin_by_bin=True)
     np.testing.assert_allclose(found[:, LEAKAGE], slow[:, LEAKAGE], rtol=1e-6, atol=1e-20)
     above = 0
     for i in range(40):
         for segment in range(3):
-            bins, magnitude = segments.spectrum(shots, i, segment)
+            bins, magnitude = segment_spectra.segment_spectrum(shots, i, segment)
             level = shots.threshold[i]
             best = magnitude.argmax()
             assert found[segment, MAGNITUDE, i] == pytest.approx(magnitude[best], rel=1e-9)
             assert found[segment, FREQUENCY, i] == best * shots.sample_rate[i] / 4096
-            assert listed.bin[i, segment, 0] == best
+            assert listed.strongest_bin[i, segment, 0] == best
             neighbours = magnitude[np.clip([best - 1, best, best + 1], 0, bins[-1])]
             inside = 0 < best < bins[-1]
             if inside:
-                np.testing.assert_allclose(listed.neighbours[i, segment, 0], neighbours, rtol=1e-7)
+                np.testing.assert_allclose(
+                    listed.neighbour_magnitudes[i, segment, 0], neighbours, rtol=1e-7
+                )
             crossing = magnitude >= level
             crossing[best] = True
             wide = np.convolve(crossing, np.ones(3), "same") > 0
@@ -265,22 +275,22 @@ def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, 
 def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
     """Detections in noise have the pd of the smeared line, not that of a pure one; 5 sigma."""
     number = 20_000
-    effects = [*(name for name in CORE if name != "leakage"), *effects]
+    effects = [*(name for name in DEFAULT_EFFECTS if name != "leakage"), *effects]
     parameters = scene(
         table_4_1, radial_velocity=-3e3, tnr=4.0, power=12.0, duration=70e-6,
         phases="incoherent", grazing_angle=np.pi / 2,
     ) | {"instrument.laser.line_width": 3e4, "target.range": np.array([300.0, 400.0])}  # fmt: skip
     outputs = evaluate(parameters, effects)
     keys = philox.point_keys(np.arange(2.0)[:, None], domain="tests", seed=2)
-    counts = simulate(parameters, effects, keys=keys, batch_sizes=[number], method="noise")
+    counts = simulate_draws(parameters, effects, keys=keys, batch_sizes=[number], method="noise")
     pd = outputs["pd_up"]
     sigma = np.sqrt(pd * (1 - pd) / number)
     assert (abs(counts["n_detected_up"][:, 0] / number - pd) < 5 * sigma).all()
     assert (abs(evaluate(parameters)["pd_up"] - pd) > 10 * sigma).any()
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     for method in ("probabilities", "noise"):
         drawn = returns.draw_returns(
-            shots, groups(shots), keys=keys, draws=4000, method=method
+            shots, list_bin_groups(shots), keys=keys, draws=4000, method=method
         ).group[..., 0]  # fmt: skip
         seen = (drawn == 0).any(axis=-1).mean(axis=1)
         # An up peak makes a return where there is a down peak, or a false one, to go with it.
@@ -295,7 +305,7 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
 )
 def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
     """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
-    number = 2 * POINTS + 40
+    number = 2 * POINTS_PER_BATCH + 40
     rng = np.random.default_rng(7)
     parameters = scene(table_4_1, phases=phases, fft_size=512) | {
         "target.range": 10 ** rng.uniform(0, 4, number),
@@ -305,12 +315,12 @@ def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
         "instrument.chirp.sinusoidal_error": rng.choice([0.0, 1e5], number),
         "instrument.laser.line_width": rng.choice([0.0, 1e3, 3e5], number),
     }
-    chosen = [n for n in (*CORE, *DRIFTING, "line_width") if n not in left_out]
+    chosen = [n for n in (*DEFAULT_EFFECTS, *DRIFTING, "line_width") if n not in left_out]
 
     def found(index):
         part = {k: v[index] if np.ndim(v) else v for k, v in parameters.items()}
-        ((_, shots),) = prepare(part, chosen)
-        return find(shots)
+        ((_, shots),) = prepare_shots(part, chosen)
+        return evaluate_segments(shots)
 
     whole = found(np.arange(number))
     some = rng.permutation(number)[: number // 2]

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model import philox
-from sweep.model.clouds import cloud
-from sweep.model.effects.catalogue import CORE
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.platform import Spin
-from sweep.model.geometry.scanner import cone, fixed
-from sweep.model.own_motion import MotionPriors, own_motion
-from sweep.model.pairing import TRUE
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.geometry.body_motion import SpinningAttitude
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.scanner import cone_directions, fixed_beams
+from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion
+from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling import philox
 from sweep.scenes.meshes import clean_mesh
 
-MOVING = {*CORE, "range_walk", "acceleration", "segment_motion"}
-BEAMS = cone(4, half_angle=math.radians(15))
+MOVING = {*DEFAULT_EFFECTS, "range_walk", "acceleration", "segment_motion"}
+BEAMS = cone_directions(4, half_angle=math.radians(15))
 FALL = {"position": (0.0, 0.0, 2800.0), "velocity": (30.0, 0.0, -100.0)}
-WOBBLE = Spin((0.0, math.radians(20), 0.0))
-TURN = Spin((math.radians(3), 0.0, math.radians(60)))
+WOBBLE = SpinningAttitude((0.0, math.radians(20), 0.0))
+TURN = SpinningAttitude((math.radians(3), 0.0, math.radians(60)))
 
 MOTIONS = {
     "wobbling": {"attitude": WOBBLE},
@@ -45,11 +45,11 @@ def tilted(slope, across=None):
 def errors_of_points(seen, parameters, effects=MOVING, **how):
     """Errors of range and velocity over their standard errors, of true points, and the errors."""
     keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="o", seed=1)
-    got = cloud(
-        seen, parameters=parameters, surfaces=[Surface("ground", 0.2)], keys=keys, draws=30,
+    got = simulate_cloud(
+        seen, parameters=parameters, surfaces=[SurfaceMaterial("ground", 0.2)], keys=keys, draws=30,
         effects=effects, **how,
     )  # fmt: skip
-    true = got["flags"] & TRUE > 0
+    true = got["flags"] & TRUE_FLAG > 0
     assert true.any(axis=(1, 2)).all()
     found = {}
     for name in ("range", "radial_velocity"):
@@ -60,7 +60,7 @@ def errors_of_points(seen, parameters, effects=MOVING, **how):
 
 def shots(motion, slope=0.0, across=None, **keywords):
     """Shots of four beams at three times of a flight, 109 beamlets each."""
-    scanner = fixed(BEAMS, rate=2.0)
+    scanner = fixed_beams(BEAMS, rate=2.0)
     path = straight_flight(**(FALL | motion))
     bodies = [tilted(slope, across)]
     return observe_shots(
@@ -81,7 +81,9 @@ def is_near_one(scores, most=1.5):
 def test_points_of_a_moving_instrument_are_as_good_as_they_say(table_4_1, name, slope, method):
     parameters = scene_parameters(table_4_1, beamlets=109)
     priors = MotionPriors() if slope else LEVEL_GROUND
-    found = errors_of_points(shots(MOTIONS[name], slope), parameters, method=method, priors=priors)
+    found = errors_of_points(
+        shots(MOTIONS[name], slope), parameters, method=method, motion_priors=priors
+    )
     for _, scores in found.values():
         is_near_one(scores)
 
@@ -98,7 +100,7 @@ def test_standard_errors_are_right_over_ground_of_the_stated_slopes_and_do_not_k
             straight_flight(**(FALL | MOTIONS["turning"])),
             bodies=[tilted(along, across)],
             number=19,
-            scanner=fixed(BEAMS, rate=2.0),
+            scanner=fixed_beams(BEAMS, rate=2.0),
             index=range(4),
             beam_divergence=1e-7,
         )
@@ -115,7 +117,7 @@ def test_a_wobble_of_20_deg_a_second_moves_level_ground_by_no_more_than_millimet
     seen = shots(MOTIONS["wobbling"])
     assert np.abs(seen.acceleration).max() > 25
     parameters = scene_parameters(table_4_1, beamlets=109)
-    (error, _), (speed, _) = errors_of_points(seen, parameters, priors=LEVEL_GROUND).values()
+    (error, _), (speed, _) = errors_of_points(seen, parameters, motion_priors=LEVEL_GROUND).values()
     assert np.abs(error).max() < 0.08 and np.median(np.abs(error)) < 0.02
     assert np.abs(speed).max() < 2e-3
 
@@ -150,15 +152,15 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
         straight_flight(**FALL),
         bodies=[level_plate()],
         body_motion=[lift],
-        scanner=fixed(BEAMS, rate=2.0),
+        scanner=fixed_beams(BEAMS, rate=2.0),
         index=range(4),
         number=109,
     )
-    np.testing.assert_allclose(own_motion(seen).acceleration, 0, atol=1e-9)
+    np.testing.assert_allclose(ego_motion(seen).acceleration, 0, atol=1e-9)
     parameters = scene_parameters(table_4_1, beamlets=109)
     for acceleration, low, high in ((0.0, 50, 1000), (30.0, 0.9, 1.1), (300.0, 0.09, 0.11)):
         priors = MotionPriors(terrain_slope=0.0, target_acceleration=acceleration)
-        (error, scores), _ = errors_of_points(seen, parameters, priors=priors).values()
+        (error, scores), _ = errors_of_points(seen, parameters, motion_priors=priors).values()
         assert np.abs(error).min() > 0.5
         assert low < np.median(np.abs(scores)) < high
 
@@ -170,7 +172,7 @@ def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
         straight_flight(**FALL),
         bodies=[level_plate()],
         body_motion=[slide],
-        scanner=fixed(BEAMS[:1], rate=2.0),
+        scanner=fixed_beams(BEAMS[:1], rate=2.0),
         index=range(3),
         number=19,
         beam_divergence=1e-7,
@@ -179,7 +181,7 @@ def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
     scores = {}
     for speed in (0.0, 100.0):
         priors = MotionPriors(terrain_slope=0.0, target_speed=speed)
-        (_, scores[speed]), _ = errors_of_points(seen, parameters, priors=priors).values()
+        (_, scores[speed]), _ = errors_of_points(seen, parameters, motion_priors=priors).values()
     assert np.median(np.abs(scores[0.0])) > 3
     assert np.median(np.abs(scores[100.0])) == pytest.approx(1, abs=0.2)
 
@@ -187,13 +189,13 @@ def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
 def test_known_motion_is_the_true_one_over_level_ground():
     for motion in MOTIONS.values():
         seen = shots(motion)
-        known = own_motion(seen)
+        known = ego_motion(seen)
         np.testing.assert_allclose(known.acceleration, seen.acceleration, rtol=1e-9, atol=1e-9)
         slip = known.slip_at(seen.range)
-        np.testing.assert_allclose(slip, seen.radial_velocity - seen.approach, atol=1e-6)
+        np.testing.assert_allclose(slip, seen.radial_velocity - seen.approach_speed, atol=1e-6)
 
 
 def test_a_beam_that_looks_ahead_is_taken_to_meet_a_wall_that_faces_it():
     seen = observe_shots(straight_flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
-    known = own_motion(seen)
+    known = ego_motion(seen)
     assert known.slip_at(np.array([1e3])).tolist() == [0.0]

@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from shot_helpers import prepare_single_category
 
 from sweep.model import waveform
-from sweep.model.pairing import TOLERANCE, confirm, pair_peaks
-from sweep.model.returns import How, _third
+from sweep.model.pointcloud.pairing import (
+    CONFIRMATION_TOLERANCE_BINS,
+    find_confirming_peak,
+    pair_peaks,
+)
+from sweep.model.pointcloud.returns import DrawConfig, _doppler_prediction
 
 N, FS = 2**17, 600e6
 WIDTH = FS / N
@@ -32,10 +36,10 @@ def _beats(target_range, radial_velocity):
         )
         for sign, carrier in zip((1, 0, -1), carriers, strict=True)
     ]
-    return [waveform.fold(np.array(f), np.array(FS)) / WIDTH for f in signed]
+    return [waveform.fold_frequency(np.array(f), np.array(FS)) / WIDTH for f in signed]
 
 
-def _pair(up, doppler, down, tolerance=TOLERANCE, assumed=waveform.FAR):
+def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=waveform.FAR_READING):
     """(confirmed, [(up, doppler, down, code)])."""
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
@@ -45,13 +49,15 @@ def _pair(up, doppler, down, tolerance=TOLERANCE, assumed=waveform.FAR):
 
 
 def _reported(up, down, code):
-    beats = waveform.reading(code, up * WIDTH, down * WIDTH, FS)
-    return waveform.measured(*beats, *OPTICS.values())
+    beats = waveform.read_beats(code, up * WIDTH, down * WIDTH, FS)
+    return waveform.range_velocity_of_beats(*beats, *OPTICS.values())
 
 
 def _confirmed(up, doppler, down, tolerance):
     """(reading, cost) of one triple [bins]."""
-    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), 0.0, tolerance)
+    cost, _, code = find_confirming_peak(
+        up, np.array([doppler]), down, AT_START, float(N), 0.0, tolerance
+    )
     return code, cost
 
 
@@ -76,13 +82,18 @@ def test_signed_beats_of_any_slope_confirm_each_other_at_any_range(table_4_1, do
         "instrument.receiver.record": "complex", "instrument.chirp.down_slope": down_slope,
     }  # fmt: skip
     shots = prepare_single_category(scene)
-    signed, third = How.of(shots, 0, False).signed, np.array(_third(shots), float)
+    signed, third = (
+        DrawConfig.from_shots(shots, 0, False).down_beat_sign,
+        np.array(_doppler_prediction(shots), float),
+    )
     f_r, f_d, size = far * 4096.0, 700.0, 4096.0
     # carriers differ by 5e-6, and Doppler shifts with them by less than a hundredth of a bin
     up, doppler, down = (
         (beat + size / 2) % size - size / 2 for beat in (f_d - f_r, f_d, f_d - down_slope * f_r)
     )
-    cost, peak, _ = confirm(up, np.array([doppler]), down, third, size, signed, TOLERANCE)
+    cost, peak, _ = find_confirming_peak(
+        up, np.array([doppler]), down, third, size, signed, CONFIRMATION_TOLERANCE_BINS
+    )
     assert peak == 0 and cost < 0.05
 
 
@@ -91,7 +102,7 @@ def test_a_tolerance_takes_the_cheapest_reading_among_those_within_it():
     up, doppler, down = float(up), float(doppler), float(down)
     code, cost = _confirmed(up, doppler, down, 3.0)
     assert code & 0b1110 == 0b0010
-    assert waveform.FOLD_PENALTY <= cost < waveform.FOLD_PENALTY + 0.5
+    assert waveform.FOLD_PENALTY_BINS <= cost < waveform.FOLD_PENALTY_BINS + 0.5
     assert _confirmed(up, doppler + 4000.0, down, 3.0) == (-1, np.inf)
     assert _confirmed(up, doppler + 4000.0, down, np.inf)[0] >= 0
 
@@ -100,8 +111,8 @@ def test_a_peak_confirms_others_by_chance_as_rarely_as_stated():
     """1.5e-3 at most for peaks anywhere: below it by 5 sigma of 40,000 triples, and not nothing."""
     generator = np.random.default_rng(2)
     triples = generator.uniform(0, N / 2, (40_000, 3))
-    hits = sum(_confirmed(*t, TOLERANCE)[0] >= 0 for t in triples)
-    stated = 16 * 2 * TOLERANCE / (N / 2)
+    hits = sum(_confirmed(*t, CONFIRMATION_TOLERANCE_BINS)[0] >= 0 for t in triples)
+    stated = 16 * 2 * CONFIRMATION_TOLERANCE_BINS / (N / 2)
     assert stated == pytest.approx(1.5e-3, rel=0.03)
     assert 0.1 * stated < hits / 40_000 <= stated + 5 * np.sqrt(stated / 40_000)
 
@@ -149,7 +160,7 @@ def test_a_false_peak_alone_leaves_the_true_pair_as_it_was():
     assert [p[:3] for p in pairs] == [(1, 0, 0)]
 
 
-@pytest.mark.parametrize("assumed", [waveform.FAR, waveform.FAST])
+@pytest.mark.parametrize("assumed", [waveform.FAR_READING, waveform.FAST_READING])
 @pytest.mark.parametrize(
     ("doppler", "target"),
     [
@@ -165,7 +176,7 @@ def test_without_a_doppler_peak_of_its_own_a_pair_is_read_as_assumed(assumed, do
     confirmed, pairs = _pair(up, doppler, down, assumed=assumed)
     assert confirmed == 0
     assert pairs == [(0, -1, 0, assumed)]
-    right = (target[1] == 60.0) == (assumed == waveform.FAST)
+    right = (target[1] == 60.0) == (assumed == waveform.FAST_READING)
     assert _agrees(_reported(up[0], down[0], assumed), target) == right
     f_r = 2e12 * 2 * target[0] / 299792458.0
     f_d = 2 * target[1] / 1550e-9

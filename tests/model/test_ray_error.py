@@ -7,23 +7,23 @@ import pytest
 from shot_helpers import parametrize_product
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model import philox
-from sweep.model.accuracy import Accuracy
-from sweep.model.clouds import cloud
-from sweep.model.footprint import beamlets
-from sweep.model.geometry.mesh import Surface
-from sweep.model.ray_error import _roughness, folded
-from sweep.model.resolution import more_rays, rays_needed
+from sweep.model.beamlet_counts import initial_ray_count, next_ray_counts
+from sweep.model.beamlets import place_beamlets
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.pointcloud.ray_error import _fill_power_errors, fold_lattice
+from sweep.model.sampling import philox
 from sweep.scenes.meshes import clean_mesh
 
-RAYS = Accuracy.rays
+RAYS = ErrorBudget.ray_counts
 
 INCOHERENT = {
     "footprint.phases": "incoherent",
     "footprint.pattern": "auto",
     "instrument.receiver.architecture": "homodyne",
 }
-SURFACES = [Surface("ground", 0.1), Surface("table", 0.2)]
+SURFACES = [SurfaceMaterial("ground", 0.1), SurfaceMaterial("table", 0.2)]
 SHOTS, HEIGHT, MANY = 400, 1000.0, 4009
 DETECTED = "pd_up", "pd_doppler", "pd_down"
 
@@ -66,8 +66,8 @@ def _parameters(table_4_1, power=0.006):
 
 def _cloud(seen, parameters, **keywords):
     keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="rays", seed=1)
-    return cloud(
-        seen, parameters=parameters, surfaces=SURFACES, keys=keys, **{"returns": 1} | keywords
+    return simulate_cloud(
+        seen, parameters=parameters, surfaces=SURFACES, keys=keys, **{"returns_max": 1} | keywords
     )
 
 
@@ -75,7 +75,10 @@ def _cloud(seen, parameters, **keywords):
 
 
 def test_the_fewest_follow_from_the_tolerance_alone():
-    numbers = [rays_needed(INCOHERENT, Accuracy(t)) for t in (1.0, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)]
+    numbers = [
+        initial_ray_count(INCOHERENT, ErrorBudget(t))
+        for t in (1.0, 1e-2, 9.9e-3, 1e-5, 9.9e-6, 0.0)
+    ]
     assert numbers == [19, 19, 37, 37, 109, 109] and set(numbers) < set(RAYS)
 
 
@@ -84,7 +87,7 @@ def test_shots_get_more_rays_as_theirs_tell(rays):
     """About as many as the error, which falls with their number, asks for; and no more at a time
     than an error from so few can be trusted with."""
     tolerance, over = 1e-3, np.array([0.0, 0.5, 1.0, 1.01, 3.0, 8.0, 1e3, np.nan])
-    more = more_rays(rays, tolerance * over, Accuracy(tolerance))
+    more = next_ray_counts(rays, tolerance * over, ErrorBudget(tolerance))
     assert (more[[0, 1, 2, -1]] == 0).all()
     if rays == RAYS[-1]:
         assert (more == 0).all(), "there are no more to be had"
@@ -105,19 +108,23 @@ def test_shots_get_more_rays_as_theirs_tell(rays):
     ],
 )
 def test_where_no_number_is_enough_it_is_the_thesis_s(change):
-    assert {rays_needed(INCOHERENT | change, Accuracy(t)) for t in (1.0, 1e-3, 0.0)} == {109}
+    assert {initial_ray_count(INCOHERENT | change, ErrorBudget(t)) for t in (1.0, 1e-3, 0.0)} == {
+        109
+    }
 
 
 @pytest.mark.parametrize("number", RAYS)
 def test_numbers_are_whole_shells(number):
     """Each beamlet has one opposite, and the fold tells them all."""
-    rule = folded(number)
-    offsets, weight = beamlets(number)
-    np.testing.assert_allclose(offsets[:, rule.second], -offsets[:, rule.first], atol=1e-12)
-    assert sorted({*rule.first, *rule.second}) == list(range(number))
-    assert rule.first.size == (number + 1) // 2
-    np.testing.assert_allclose(weight[rule.second], weight[rule.first], rtol=1e-12)
-    identity = rule.weighted @ rule.smooth.T
+    rule = fold_lattice(number)
+    offsets, weight = place_beamlets(number)
+    np.testing.assert_allclose(
+        offsets[:, rule.opposite_beamlet], -offsets[:, rule.beamlet], atol=1e-12
+    )
+    assert sorted({*rule.beamlet, *rule.opposite_beamlet}) == list(range(number))
+    assert rule.beamlet.size == (number + 1) // 2
+    np.testing.assert_allclose(weight[rule.opposite_beamlet], weight[rule.beamlet], rtol=1e-12)
+    identity = rule.weighted_polynomials @ rule.polynomials.T
     np.testing.assert_allclose(identity, np.eye(len(identity)), atol=1e-12)
 
 
@@ -132,7 +139,7 @@ def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, number):
     """
     parameters, seen = _parameters(table_4_1), _seen(scene, number)
     many = _cloud(_seen(scene, MANY), parameters)
-    few = _cloud(seen, parameters, estimates_rays=True)
+    few = _cloud(seen, parameters, estimates_ray_error=True)
     detected = sum(abs(few[name] - many[name]) for name in DETECTED)
     one, other = (np.sqrt(2 * each["snr_up"]) for each in (few, many))
     real = np.maximum(detected, abs(one - other) / np.maximum(np.maximum(one, other), 1))
@@ -147,7 +154,7 @@ def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, number):
 def test_of_even_ground_there_is_next_to_nothing_to_tell(table_4_1):
     parameters = _parameters(table_4_1)
     found = [
-        _cloud(_seen("the edge of a table", number), parameters, estimates_rays=True)
+        _cloud(_seen("the edge of a table", number), parameters, estimates_ray_error=True)
         for number in (19, 109)
     ]
     far = np.arange(SHOTS) < 5  # 49 mm and more, 3.9 deviations, from the edge
@@ -162,7 +169,9 @@ def test_it_is_told_only_where_it_is_asked_for(table_4_1):
     for values in (seen.offset, seen.velocity_offset, seen.cos_incidence):
         values[3] = np.nan
     parameters = _parameters(table_4_1)
-    asked, not_asked = (_cloud(seen, parameters, estimates_rays=each) for each in (True, False))
+    asked, not_asked = (
+        _cloud(seen, parameters, estimates_ray_error=each) for each in (True, False)
+    )
     for name in asked.keys() - {"beamlets_error"}:
         np.testing.assert_array_equal(asked[name], not_asked[name])
     assert np.isnan([each["beamlets_error"][3] for each in (asked, not_asked)]).all()
@@ -170,10 +179,14 @@ def test_it_is_told_only_where_it_is_asked_for(table_4_1):
     assert np.isnan(not_asked["beamlets_error"][others]).all()
     assert (asked["beamlets_error"][others] > 0).any()
     part = np.arange(100, 130)
-    alone = cloud(
-        seen.some(part), parameters=parameters, surfaces=SURFACES, returns=1, estimates_rays=True,
+    alone = simulate_cloud(
+        seen.select(part),
+        parameters=parameters,
+        surfaces=SURFACES,
+        returns_max=1,
+        estimates_ray_error=True,
         keys=np.zeros((part.size, 2), np.uint64),
-    )  # fmt: skip
+    )
     np.testing.assert_array_equal(alone["beamlets_error"], asked["beamlets_error"][part])
 
 
@@ -183,7 +196,7 @@ def _ridge_errors(number, width):
     The ridge exp(-(u - u_0)^2 / (2 width^2)) lies across the direction u. Over a Gaussian beam its
     mean is width / sqrt(1 + width^2) exp(-u_0^2 / (2 (1 + width^2))).
     """
-    offsets, weight = beamlets(number)
+    offsets, weight = place_beamlets(number)
     angle, place = np.meshgrid(np.linspace(0, np.pi, 13), [0.0, 0.3, 1.0])
     direction = np.stack([np.cos(angle.ravel()), np.sin(angle.ravel())], axis=1)
     away = direction @ offsets - place.ravel()[:, None]
@@ -191,7 +204,7 @@ def _ridge_errors(number, width):
     squared = 1 + width**2
     true = width / np.sqrt(squared) * np.exp(-0.5 * place.ravel() ** 2 / squared)
     told = np.empty(len(power))
-    _roughness(power, folded(number), told)
+    _fill_power_errors(power, fold_lattice(number), told)
     return abs(power.sum(axis=1) / true - 1), told
 
 

@@ -6,15 +6,15 @@ from mean_over_draws import mean_statistics
 from scipy import special
 from shot_helpers import intersect_level_plane, make_point_keys, parametrize_product
 
-from sweep.model import realisations
+from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects import pointing_jitter, scintillation
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.marcum import marcum_q1
-from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
-from sweep.model.realisations import realise
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate as evaluate_without
-from sweep.model.shot import statistics
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate as evaluate_without
+from sweep.model.evaluation import shot_statistics
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS, GRID_OUTPUTS, STANDARD_ERROR_OUTPUTS
+from sweep.model.sampling import realisations
+from sweep.model.sampling.realisations import iter_realisations
+from sweep.model.sampling.samplers import simulate_draws
 
 DRAWS = 20_000
 RANDOM = ("pointing_jitter", "speckle", "scintillation")
@@ -23,12 +23,12 @@ AIR = {
     "atmosphere.structure_constant": 1e-14,
     "atmosphere.scintillation_law": "log_normal",
 }
-ALL = (*CORE, *RANDOM)
+ALL = (*DEFAULT_EFFECTS, *RANDOM)
 
 
 def index(legs):
     """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
-    return np.expm1(sum(each.large + each.small for each in legs))
+    return np.expm1(sum(each.large_eddies + each.small_eddies for each in legs))
 
 
 def scene(table_4_1, **changes):
@@ -46,12 +46,12 @@ def scene(table_4_1, **changes):
 
 def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
     """Outputs of every draw by name, (n, draws)."""
-    names = {name: np.full((n, draws), np.nan) for name in OUTPUTS}
+    names = {name: np.full((n, draws), np.nan) for name in GRID_OUTPUTS}
     chosen = make_point_keys(n) if seeded is None else seeded
-    for point, draw, shots in realise(
+    for point, draw, shots in iter_realisations(
         parameters, effects, keys=chosen, first_draw=first_draw, draws=draws
     ):
-        for name, values in statistics(shots).items():
+        for name, values in shot_statistics(shots).items():
             names[name][point, draw - first_draw] = values
     return names
 
@@ -63,10 +63,10 @@ def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch
     late = per_draw(scene(table_4_1), ALL, 4, 20, first_draw=30)
     alone = scene(table_4_1, range=np.array([5000.0]), fft_size=4096)
     single = per_draw(alone, ALL, 1, 60, seeded=make_point_keys(4)[3:])
-    monkeypatch.setattr(realisations, "ROWS", 7)
+    monkeypatch.setattr(realisations, "DRAWS_PER_BATCH", 7)
     pieces = per_draw(scene(table_4_1), ALL, 4, 60)
     summed = mean_statistics(scene(table_4_1), ALL, keys=make_point_keys(4), draws=60)
-    for name in OUTPUTS:
+    for name in GRID_OUTPUTS:
         np.testing.assert_array_equal(whole[name][:, 30:50], late[name], err_msg=name)
         np.testing.assert_array_equal(whole[name][3:], single[name], err_msg=name)
         np.testing.assert_array_equal(whole[name], pieces[name], err_msg=name)
@@ -75,19 +75,22 @@ def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch
 
 
 def test_wide_footprints_are_cut_into_shorter_stretches(table_4_1, monkeypatch):
-    monkeypatch.setattr(realisations, "BEAMLETS", 70)
+    monkeypatch.setattr(realisations, "BEAMLETS_PER_BATCH", 70)
     sizes = [
-        s.point.size for s in realise(scene(table_4_1), ALL, keys=make_point_keys(4), draws=25)
+        s.point_indices.size
+        for s in iter_realisations(scene(table_4_1), ALL, keys=make_point_keys(4), draws=25)
     ]
     assert max(sizes) == 10 and sum(sizes) == 100
 
 
-STILL = [effect for effect in CORE if effect != "doppler_spread"]
+STILL = [effect for effect in DEFAULT_EFFECTS if effect != "doppler_spread"]
 """Beamlets with one velocity: their own turn speckles as jitter moves them."""
 
 
 def drawn_shots(parameters, effects):
-    (stretch,) = realise(parameters, [*STILL, *effects], keys=make_point_keys(2), draws=50)
+    (stretch,) = iter_realisations(
+        parameters, [*STILL, *effects], keys=make_point_keys(2), draws=50
+    )
     return stretch.shots
 
 
@@ -95,19 +98,19 @@ def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1
     parameters = scene(table_4_1, range=np.array([2000.0, 5000.0]), fft_size=4096)
     both = drawn_shots(parameters, ["speckle", "scintillation"])
     speckled, twinkling = (drawn_shots(parameters, [e]) for e in ("speckle", "scintillation"))
-    np.testing.assert_array_equal(both.amplitude, speckled.amplitude)
-    np.testing.assert_array_equal(both.phase, speckled.phase)
-    np.testing.assert_array_equal(both.beat_scale, twinkling.beat_scale)
+    np.testing.assert_array_equal(both.relative_amplitude, speckled.relative_amplitude)
+    np.testing.assert_array_equal(both.beamlet_phase_cycles, speckled.beamlet_phase_cycles)
+    np.testing.assert_array_equal(both.beat_amplitude_scale, twinkling.beat_amplitude_scale)
     shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
     np.testing.assert_array_equal(every.range, shaken.range)
     # Beamlets are elsewhere, and the factors on them are what they were.
     plain = drawn_shots(parameters, [])
     np.testing.assert_allclose(
-        every.amplitude / shaken.amplitude[shaken.row],
-        speckled.amplitude / plain.amplitude[plain.row],
+        every.relative_amplitude / shaken.relative_amplitude[shaken.footprint_row],
+        speckled.relative_amplitude / plain.relative_amplitude[plain.footprint_row],
         rtol=1e-12,
     )
-    np.testing.assert_array_equal(every.phase, speckled.phase)
+    np.testing.assert_array_equal(every.beamlet_phase_cycles, speckled.beamlet_phase_cycles)
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
@@ -116,14 +119,14 @@ def test_a_random_effect_that_does_nothing_leaves_every_count_as_it_is(method, t
     parameters = scene(table_4_1) | {"atmosphere.structure_constant": 0.0}
     parameters["instrument.processing.tnr"] = 5.0
     chosen = {"keys": make_point_keys(4), "batch_sizes": [40, 70], "method": method}
-    still = simulate(parameters, CORE, **chosen)
-    drawn = simulate(parameters, [*CORE, "scintillation"], **chosen)
-    for name in DRAW_OUTPUTS:
+    still = simulate_draws(parameters, DEFAULT_EFFECTS, **chosen)
+    drawn = simulate_draws(parameters, [*DEFAULT_EFFECTS, "scintillation"], **chosen)
+    for name in DRAW_COUNT_OUTPUTS:
         np.testing.assert_array_equal(still[name], drawn[name], err_msg=name)
-    for name in OUTPUTS:
+    for name in GRID_OUTPUTS:
         np.testing.assert_allclose(still[name], drawn[name], rtol=1e-12, err_msg=name)
     assert still["n_detected_up"].sum() > 0 and still["n_false_alarm_up"].sum() > 0
-    for name in ERROR_OUTPUTS:
+    for name in STANDARD_ERROR_OUTPUTS:
         assert (still[name] == 0).all()
 
 
@@ -131,7 +134,7 @@ def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
     parameters = scene(table_4_1)
     drawn = per_draw(parameters, ALL, 4, 300)
     means = mean_statistics(parameters, ALL, keys=make_point_keys(4), draws=300)
-    assert list(means) == [*OUTPUTS, *ERROR_OUTPUTS]
+    assert list(means) == [*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS]
     for name, values in drawn.items():
         if not name.startswith("log10"):
             np.testing.assert_allclose(means[name], values.mean(axis=1), rtol=1e-11, err_msg=name)
@@ -148,7 +151,7 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
     """Close to a loud target, whose own shot noise twinkles with it."""
     parameters = table_4_1(range=np.array([1.0, 2.0]), tnr=tnr, fft_size=4096, beamlets=7) | AIR
     parameters |= {"atmosphere.structure_constant": 1e-8, "target.radial_velocity": 20.0}
-    effects = (*CORE, "scintillation")
+    effects = (*DEFAULT_EFFECTS, "scintillation")
     drawn = per_draw(parameters, effects, 2, 200)
     means = mean_statistics(parameters, effects, keys=make_point_keys(2), draws=200)
     assert (np.ptp(drawn["log10_pfa_bin"], axis=1) > 1e-3).all()
@@ -171,24 +174,26 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
         "atmosphere.scintillation_law": law,
         "instrument.receiver.architecture": architecture,
     }
-    effects = (*CORE, "scintillation")
-    stretches = list(realise(parameters, effects, keys=make_point_keys(4), draws=DRAWS))
-    (plain,) = realise(parameters, CORE, keys=make_point_keys(4), draws=1)
+    effects = (*DEFAULT_EFFECTS, "scintillation")
+    stretches = list(iter_realisations(parameters, effects, keys=make_point_keys(4), draws=DRAWS))
+    (plain,) = iter_realisations(parameters, DEFAULT_EFFECTS, keys=make_point_keys(4), draws=1)
     power = np.concatenate([s.shots.echo_power for s in stretches]) / plain.shots.echo_power[0]
-    even = scintillation.Turbulence(uniform=1e-14)
-    legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(3000.0))
+    even = scintillation.TurbulenceProfile(uniform=1e-14)
+    legs = scintillation.two_way_log_variances(
+        even, PARAMETER_DEFAULTS | parameters, np.array(3000.0)
+    )
     root = np.sqrt(power.size)
     assert power.mean() == pytest.approx(1, abs=5 * power.std() / root)
     square = (power - 1) ** 2
     assert square.mean() == pytest.approx(index(legs), abs=5 * square.std() / root)
     for stretch in stretches[:2]:
-        shots, outputs = stretch.shots, statistics(stretch.shots)
+        shots, outputs = stretch.shots, shot_statistics(stretch.shots)
         share = shots.echo_power / plain.shots.echo_power[0]
-        quiet = plain.shots.noise_sources["signal_shot"][0]
-        np.testing.assert_allclose(shots.noise_sources["signal_shot"], share * quiet, rtol=1e-12)
+        quiet = plain.shots.noise_variances["signal_shot"][0]
+        np.testing.assert_allclose(shots.noise_variances["signal_shot"], share * quiet, rtol=1e-12)
         by_light = 2 if architecture == "direct" else 1
         signal = outputs["snr_up"] * shots.noise_variance
-        alone = evaluate_without(parameters, CORE)
+        alone = evaluate_without(parameters, DEFAULT_EFFECTS)
         np.testing.assert_allclose(
             signal, share**by_light * alone["snr_up"][0] * alone["noise_variance"][0], rtol=1e-9
         )
@@ -197,10 +202,12 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
 def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     parameters = table_4_1(range=4000.0, beamlets=1, tnr=8.0, power=0.1) | AIR
     means = mean_statistics(
-        parameters, (*CORE, "scintillation"), keys=make_point_keys(1), draws=50_000
+        parameters, (*DEFAULT_EFFECTS, "scintillation"), keys=make_point_keys(1), draws=50_000
     )
-    even = scintillation.Turbulence(uniform=1e-14)
-    legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(4000.0))
+    even = scintillation.TurbulenceProfile(uniform=1e-14)
+    legs = scintillation.two_way_log_variances(
+        even, PARAMETER_DEFAULTS | parameters, np.array(4000.0)
+    )
     variance = np.log1p(index(legs))
     x, weight = np.polynomial.hermite_e.hermegauss(100)
     root = np.exp(0.5 * (np.sqrt(variance) * x - variance / 2))
@@ -243,7 +250,7 @@ def test_the_mean_over_jitter_is_a_quadrature_over_both_angles(changes, sigma, t
         | {"target.radial_velocity": 150.0 * along}
     )
     means = mean_statistics(
-        parameters | {"target.pointing_jitter": sigma}, (*CORE, "pointing_jitter"),
+        parameters | {"target.pointing_jitter": sigma}, (*DEFAULT_EFFECTS, "pointing_jitter"),
         keys=make_point_keys(1), draws=DRAWS,
     )  # fmt: skip
     for name in ("pd_up", "pd_down", "pd_shot"):
@@ -258,8 +265,8 @@ def test_a_moving_instrument_sees_what_its_jitter_turns_into_the_beam(table_4_1)
     """Towards the near side, tilting up by a takes a of the speed away: v_r' = v_r - a v."""
     parameters = table_4_1(beamlets=1, radial_velocity=50.0, grazing_angle=0.5)
     parameters |= {"target.pointing_jitter": 1e-4, "target.transverse_velocity": 80.0}
-    (stretch,) = realise(
-        parameters, (*CORE, "pointing_jitter"), keys=make_point_keys(1), draws=2000
+    (stretch,) = iter_realisations(
+        parameters, (*DEFAULT_EFFECTS, "pointing_jitter"), keys=make_point_keys(1), draws=2000
     )
     upwards = np.arcsin(2000.0 * np.sin(0.5) / stretch.shots.range) - 0.5  # -a
     found = stretch.shots.radial_velocity - 50.0
@@ -271,7 +278,7 @@ def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
     """a > 0.02, of deviation 0.02: 15.9 % of draws; noise alone may still cross the threshold."""
     parameters = table_4_1(grazing_angle=0.02, beamlets=1, range=50.0, tnr=3.0)
     parameters |= {"target.pointing_jitter": 0.02}
-    effects = (*CORE, "pointing_jitter")
+    effects = (*DEFAULT_EFFECTS, "pointing_jitter")
     drawn = per_draw(parameters, effects, 1, 2000)
     missed = drawn["snr_up"][0] == 0
     assert missed.mean() == pytest.approx(0.1587, abs=5 * np.sqrt(0.1587 * 0.8413 / 2000))
@@ -285,12 +292,13 @@ def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
 
 def test_a_steady_beam_is_the_shot_as_it_is(table_4_1):
     parameters = table_4_1(range=np.array([2000.0, 4000.0]), grazing_angle=0.5, beamlets=7)
-    angles = pointing_jitter.angles(
-        pointing_jitter.Realisation(make_point_keys(2), np.zeros(2, np.int64)), np.array([0.0, 1.0])
+    angles = pointing_jitter.draw_jitter_angles(
+        pointing_jitter.DrawAddresses(make_point_keys(2), np.zeros(2, np.int64)),
+        np.array([0.0, 1.0]),
     )
     assert (angles[0] == 0).all() and (angles[1] != 0).all()
     still = mean_statistics(
-        parameters, (*CORE, "pointing_jitter"), keys=make_point_keys(2), draws=3
+        parameters, (*DEFAULT_EFFECTS, "pointing_jitter"), keys=make_point_keys(2), draws=3
     )
     plain = evaluate_without(parameters)
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_down"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from shot_helpers import parametrize_product
 
-from sweep.model import shot
+from sweep.model import evaluation
 
 PER_BIN = {1.0: 0.807, 5.0: 4.68e-3, 10.0: 4.79e-10, 15.0: 1.07e-21}
 """Table 4.2 as PHYSICS section 6 reads it, to three digits (the thesis prints the first as 0.8)."""
@@ -12,7 +12,7 @@ PER_BIN = {1.0: 0.807, 5.0: 4.68e-3, 10.0: 4.79e-10, 15.0: 1.07e-21}
 
 def dark(table_4_1, **changes):
     """Outputs for a target that reflects nothing: noise alone."""
-    return shot.evaluate(table_4_1(reflectance=0.0, beamlets=1, **changes))
+    return evaluation.evaluate(table_4_1(reflectance=0.0, beamlets=1, **changes))
 
 
 # Tables 4.2 to 4.5: false alarms of noise
@@ -87,7 +87,7 @@ def test_the_printed_false_alarm_rates_lie_8_to_36_percent_above_noise_alone(
     )
     for where, figure in zip(slices, printed, strict=True):
         scene = table_4_1(**where, bins_counted="all", beamlets=7, **dict([changed]))
-        ratio = figure / shot.evaluate(scene)["pfa_both_chirps"].mean()
+        ratio = figure / evaluation.evaluate(scene)["pfa_both_chirps"].mean()
         assert 1.07 < ratio < 1.37
 
 
@@ -99,7 +99,7 @@ SLICE = np.arange(5.0, 10_001.0)
 def slice_at(table_4_1, degrees, **changes):
     """pd of a shot over range, in steps of 1 m, at a grazing angle."""
     scene = table_4_1(range=SLICE, grazing_angle=np.radians(degrees), **changes)
-    return shot.evaluate(scene)["pd_shot"]
+    return evaluation.evaluate(scene)["pd_shot"]
 
 
 def dips(pd):
@@ -134,7 +134,7 @@ def test_the_region_without_detection_grows_with_the_threshold(phases, table_4_1
         scene = table_4_1(
             range=ranges.ravel(), grazing_angle=np.radians(degrees.ravel()), tnr=tnr, phases=phases
         )
-        pd = shot.evaluate(scene)["pd_shot"].reshape(ranges.shape)
+        pd = evaluation.evaluate(scene)["pd_shot"].reshape(ranges.shape)
         cells[tnr] = np.mean(pd[:5] < 0.05), np.mean(pd < 0.05)
     low, all_angles = zip(*cells.values(), strict=True)
     assert low[0] == all_angles[0] == 0.0
@@ -153,7 +153,7 @@ def test_the_region_without_detection_is_a_triangle_of_low_angles_and_long_range
             scene = table_4_1(
                 range=target_range, grazing_angle=np.radians(degrees), tnr=tnr, phases="incoherent"
             )
-            pd = shot.evaluate(scene)["pd_shot"]
+            pd = evaluation.evaluate(scene)["pd_shot"]
             assert pd[-1] > 0.9
             lowest[tnr, target_range] = degrees[pd > 0.5].min()
             assert (pd[degrees >= lowest[tnr, target_range]] > 0.5).all()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from shot_helpers import parametrize_product
 
-from sweep.model import shot
-from sweep.model.accuracy import Accuracy
+from sweep.model import evaluation
+from sweep.model.beamlets import place_beamlets
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.footprint import beamlets
-from sweep.model.shot import prepare
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.evaluation import prepare_shots
 
 NUMBER = 200
 FINE = {"footprint.beamlets": 8192, "footprint.pattern": "line", "accuracy.line_error": 1e-9}
@@ -31,7 +31,7 @@ def scenes(table_4_1, seed, **fixed):
     }
     across = rng.normal(0, 50, NUMBER) * (rng.random(NUMBER) < 0.5)
     table = table_4_1(**values | fixed)
-    return DEFAULTS | table | {"target.transverse_velocity": across}
+    return PARAMETER_DEFAULTS | table | {"target.transverse_velocity": across}
 
 
 @pytest.mark.parametrize(
@@ -50,15 +50,17 @@ def scenes(table_4_1, seed, **fixed):
 def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, case):
     window, law = case
     parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)
-    exact = shot.evaluate(parameters | FINE)
+    exact = evaluation.evaluate(parameters | FINE)
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
-        found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
+        found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         for name in PDS:
-            assert abs(found[name] - exact[name]).max() <= Accuracy.beamlets_share * tolerance, name
+            assert (
+                abs(found[name] - exact[name]).max() <= ErrorBudget.beamlets_fraction * tolerance
+            ), name
         for name in SNRS:
             bins, true = np.sqrt(2 * found[name]), np.sqrt(2 * exact[name])  # over sigma
             assert (abs(bins - true) / np.maximum(true, 1)).max() <= tolerance, name
-        assert (found["beamlets_error"] <= Accuracy.beamlets_share * tolerance).all()
+        assert (found["beamlets_error"] <= ErrorBudget.beamlets_fraction * tolerance).all()
         assert found["beamlets"].min() == 2 and np.median(found["beamlets"]) <= 9
 
 
@@ -69,10 +71,10 @@ def test_wide_beams_at_normal_incidence_take_several_lines(table_4_1):
         reflectance_law="lambert",
     ) | {"target.transverse_velocity": 0.0}  # fmt: skip
     side = 61
-    exact = shot.evaluate(
+    exact = evaluation.evaluate(
         parameters | {"footprint.beamlets": side * side, "footprint.pattern": "square"}
     )
-    found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": 1e-3})
+    found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": 1e-3})
     far = parameters["target.range"] > 1000
     assert (found["beamlets_error"][far] > 0).all() and found["beamlets"][far].min() > 20
     for name in PDS:
@@ -81,7 +83,7 @@ def test_wide_beams_at_normal_incidence_take_several_lines(table_4_1):
 
 def steep(table_4_1, **changes):
     """Wide beams that a line shows best, though what it misses across the slope is told too."""
-    return DEFAULTS | table_4_1(**{"phases": "incoherent"} | changes)
+    return PARAMETER_DEFAULTS | table_4_1(**{"phases": "incoherent"} | changes)
 
 
 @pytest.mark.parametrize(
@@ -97,12 +99,14 @@ def steep(table_4_1, **changes):
 def test_a_tighter_tolerance_never_gives_a_worse_answer(table_4_1, changes):
     parameters = steep(table_4_1, **changes)
     line = {"footprint.beamlets": 4001, "footprint.pattern": "line"}
-    exact = shot.evaluate(parameters | line)
+    exact = evaluation.evaluate(parameters | line)
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-5, 1e-7, 0.0):
-        found = shot.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
+        found = evaluation.evaluate(parameters | AUTO | {"accuracy.tolerance": tolerance})
         assert found["snr_up"] == pytest.approx(exact["snr_up"], rel=max(tolerance, 1e-6))
         assert abs(found["pd_up"] - exact["pd_up"]).max() <= max(tolerance, 1e-6)
-        assert (found["beamlets_error"] <= max(Accuracy.beamlets_share * tolerance, 1e-6)).all()
+        assert (
+            found["beamlets_error"] <= max(ErrorBudget.beamlets_fraction * tolerance, 1e-6)
+        ).all()
 
 
 def test_tighter_tolerances_of_random_scenes_come_nearer(table_4_1):
@@ -117,15 +121,15 @@ def test_tighter_tolerances_of_random_scenes_come_nearer(table_4_1):
         ) | {"target.transverse_velocity": rng.choice([0.0, rng.normal(0, 30)])}  # fmt: skip
         many = {"footprint.beamlets": 32 * 2000, "footprint.pattern": "32 lines"}
         fine = {"accuracy.line_error": 1e-9}
-        power = rng.uniform(15, 30) / shot.evaluate(parameters | many)["snr_up"]
+        power = rng.uniform(15, 30) / evaluation.evaluate(parameters | many)["snr_up"]
         fine["instrument.laser.power"] = power  # so that its pd is neither 0 nor 1
-        exact, errors = shot.evaluate(parameters | many | fine), []
+        exact, errors = evaluation.evaluate(parameters | many | fine), []
         for tolerance in (1e-1, 1e-3, 1e-5, 1e-7):
             wanted = AUTO | fine | {"accuracy.tolerance": tolerance}
-            found = shot.evaluate(parameters | wanted)
+            found = evaluation.evaluate(parameters | wanted)
             errors.append(max(abs(found[name][0] - exact[name][0]) for name in PDS))
             assert errors[-1] <= found["beamlets_error"][0] + 2e-9
-            assert errors[-1] <= max(Accuracy.beamlets_share * tolerance, 1e-6)
+            assert errors[-1] <= max(ErrorBudget.beamlets_fraction * tolerance, 1e-6)
         worst = max(worst, errors[0])
     assert worst > 1e-5
 
@@ -136,26 +140,28 @@ def test_a_velocity_along_a_wide_beam_spreads_its_lines_alone(table_4_1, transve
     scene = steep(table_4_1, range=300.0, grazing_angle=np.pi / 2, beam_divergence=0.02)
     moving = scene | {"target.transverse_velocity": transverse}
     square = {"footprint.beamlets": 61 * 61, "footprint.pattern": "square"}
-    exact = shot.evaluate(scene | square | {"target.transverse_velocity": 1e-9})
+    exact = evaluation.evaluate(scene | square | {"target.transverse_velocity": 1e-9})
     for some in (square, AUTO | {"accuracy.tolerance": 1e-5}):
-        found = shot.evaluate(moving | some)
+        found = evaluation.evaluate(moving | some)
         for name in SNRS:
             assert found[name] == pytest.approx(exact[name], rel=2e-4)
-    still = shot.evaluate(scene | square | {"target.radial_velocity": 0.0})
+    still = evaluation.evaluate(scene | square | {"target.radial_velocity": 0.0})
     assert found["snr_doppler"] < 0.6 * still["snr_doppler"]
-    ((_, shots),) = prepare(moving | square)
-    (x, y), _ = beamlets(61 * 61, "square")
+    ((_, shots),) = prepare_shots(moving | square)
+    (x, y), _ = place_beamlets(61 * 61, "square")
     cosine = 1 / np.sqrt(1 + (x**2 + y**2) * 0.005**2)
     speeds = moving["target.radial_velocity"] * (cosine - 1)
-    assert shots.doppler[0] * SPEED_OF_LIGHT / 2 == pytest.approx(speeds, abs=2e-10)
+    assert shots.doppler_ratio_offset[0] * SPEED_OF_LIGHT / 2 == pytest.approx(speeds, abs=2e-10)
 
 
 def test_a_lattice_of_many_beamlets_agrees_with_the_line(table_4_1):
     """An arrangement of its own: two-dimensional, of 20,000 beamlets, for narrow spreads."""
     parameters = scenes(table_4_1, 3, beam_divergence=5e-5)
     some = {path: v[:40] if np.ndim(v) else v for path, v in parameters.items()}
-    lattice = shot.evaluate(some | {"footprint.beamlets": 20_000, "footprint.pattern": "hexagonal"})
-    found = shot.evaluate(some | AUTO | {"accuracy.tolerance": 1e-6})
+    lattice = evaluation.evaluate(
+        some | {"footprint.beamlets": 20_000, "footprint.pattern": "hexagonal"}
+    )
+    found = evaluation.evaluate(some | AUTO | {"accuracy.tolerance": 1e-6})
     for name in PDS:
         # the lattice ends at three deviations of the beam: its fourth moment is 5 % short
         assert abs(found[name] - lattice[name]).max() <= 2e-3
@@ -163,10 +169,10 @@ def test_a_lattice_of_many_beamlets_agrees_with_the_line(table_4_1):
 
 def test_points_stay_what_they_are_whatever_points_are_beside_them(table_4_1):
     parameters = scenes(table_4_1, 4) | AUTO | {"accuracy.tolerance": 1e-3}
-    whole = shot.evaluate(parameters)
+    whole = evaluation.evaluate(parameters)
     for chosen in (slice(0, 7), slice(7, None)):
         part = {path: v[chosen] if np.ndim(v) else v for path, v in parameters.items()}
-        for name, values in shot.evaluate(part).items():
+        for name, values in evaluation.evaluate(part).items():
             assert np.array_equal(values, whole[name][chosen], equal_nan=True), name
 
 
@@ -177,21 +183,23 @@ def test_where_no_number_is_enough_it_is_the_thesiss(table_4_1, changes):
     """Amplitudes over a smooth plane, and patterns chosen by hand."""
     parameters = table_4_1(**{"phases": "incoherent"} | changes) | AUTO
     by_hand = {} if changes else {"footprint.pattern": "hexagonal"}
-    ((_, shots),) = prepare(parameters | {"accuracy.tolerance": 1e-3} | by_hand)
-    assert shots.offset.shape[1] == 109
+    ((_, shots),) = prepare_shots(parameters | {"accuracy.tolerance": 1e-3} | by_hand)
+    assert shots.relative_range_offset.shape[1] == 109
 
 
 def test_without_a_footprint_there_is_one_beamlet(table_4_1):
     parameters = table_4_1(phases="incoherent") | AUTO | {"accuracy.tolerance": 1e-3}
-    ((_, shots),) = prepare(parameters, [name for name in CORE if name != "footprint"])
-    assert shots.offset.shape[1] == 1
+    ((_, shots),) = prepare_shots(
+        parameters, [name for name in DEFAULT_EFFECTS if name != "footprint"]
+    )
+    assert shots.relative_range_offset.shape[1] == 1
 
 
 def test_numbers_given_by_hand_are_kept(table_4_1):
     for pattern, number in (("line", 5), ("square", 9), ("sunflower", 33), ("hexagonal", 7)):
         parameters = table_4_1(beamlets=number, phases="incoherent")
-        ((_, shots),) = prepare(parameters | {"footprint.pattern": pattern})
-        assert shots.offset.shape[1] == number
+        ((_, shots),) = prepare_shots(parameters | {"footprint.pattern": pattern})
+        assert shots.relative_range_offset.shape[1] == number
 
 
 def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):
@@ -200,7 +208,9 @@ def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):
         phases="incoherent", range=1e4, grazing_angle=np.radians([0.5, 80.0]), fft_size=2**12,
         beam_divergence=np.array([0.05, 1e-4]), bandwidth=1e9,
     ) | AUTO  # fmt: skip
-    found = shot.evaluate(parameters | {"accuracy.tolerance": 1e-3})
+    found = evaluation.evaluate(parameters | {"accuracy.tolerance": 1e-3})
     assert found["beamlets_error"][0] > 1e-3 >= found["beamlets_error"][1]
-    by_hand = shot.evaluate(parameters | {"footprint.beamlets": 7, "accuracy.tolerance": 1e-3})
+    by_hand = evaluation.evaluate(
+        parameters | {"footprint.beamlets": 7, "accuracy.tolerance": 1e-3}
+    )
     assert np.isnan(by_hand["beamlets_error"]).all()

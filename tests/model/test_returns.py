@@ -7,31 +7,43 @@ import pytest
 from scipy import ndimage, stats
 from shot_helpers import DRAWS, is_within_5_sigma, make_point_keys, prepare_single_category
 
-from sweep.model import truth, waveform
-from sweep.model.draws import Seen
-from sweep.model.effects.catalogue import CORE
-from sweep.model.groups import groups
-from sweep.model.interpolation import interpolator
-from sweep.model.leaked_peaks import LeakedPeaks
-from sweep.model.pairing import FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, TRUE, UNCONFIRMED
-from sweep.model.returns import (
-    RATIO,
-    WHOLE,
-    How,
-    Known,
-    Workspace,
-    beamlet_lines,
-    draw_peaks,
-    draw_returns,
-    free_bin,
-    judge,
-    largest_of,
-    no_speckle,
+from sweep.model import time_domain_truth, waveform
+from sweep.model.detection.sub_bin_interpolation import interpolator
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import (
+    evaluate,
+    evaluate_segments,
+    measure_range_velocity,
+    prepare_shots,
 )
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate, find, prepare, report
-from sweep.model.speckle_lines import LineFan
-from sweep.model.window import samples, window
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.leaked_peaks import LeakageBins
+from sweep.model.pointcloud.pairing import (
+    FALSE_ALARM_FLAG,
+    MISPAIRED_FLAG,
+    MISREAD_FLAG,
+    SIDELOBE_FLAG,
+    TRUE_FLAG,
+    UNCONFIRMED_FLAG,
+)
+from sweep.model.pointcloud.returns import (
+    BIN_COLUMN,
+    RATIO_COLUMN,
+    DrawConfig,
+    DrawInputs,
+    DrawWorkspace,
+    beamlet_line_positions,
+    draw_free_bin,
+    draw_returns,
+    draw_segment_peaks,
+    empty_group_speckle,
+    judge_return,
+    largest_noise_magnitude,
+)
+from sweep.model.sampling.draws import NoiselessSpectra
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.sampling.speckle_lines import SpeckleLineGrid
+from sweep.model.window import get_window, window_samples
 
 METHODS = ["probabilities", "noise"]
 LIGHT = 299792458.0
@@ -54,9 +66,9 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     share = np.ones(len(ranges)) if shares is None else np.array(shares)
     return dataclasses.replace(
         shots,
-        offset=offset[None],
-        doppler=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
-        amplitude=shots.amplitude[:1] * np.sqrt(share[which])[None],
+        relative_range_offset=offset[None],
+        doppler_ratio_offset=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
+        relative_amplitude=shots.relative_amplitude[:1] * np.sqrt(share[which])[None],
     )
 
 
@@ -65,7 +77,7 @@ def _certain(found, sure=1.0):
 
 
 def _drawn(shots, found=None, **keywords):
-    found = groups(shots) if found is None else found
+    found = list_bin_groups(shots) if found is None else found
     return draw_returns(shots, found, keys=make_point_keys(shots.range.size), **keywords)
 
 
@@ -78,51 +90,55 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
         table_4_1, [300.0, 420.0, 330.0], [20.0, 20.0, 21.0], shares=[1.0, 0.3, 0.1],
         fft_size=4096, beamlets=6, tnr=4.0,
     )  # fmt: skip
-    found = groups(shots, most=8)
+    found = list_bin_groups(shots, groups_max=8)
     for segment in range(3):
-        spectrum = truth.spectrum(shots, 0, segment, range_walk=False)
+        spectrum = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
         label, number = ndimage.label(spectrum >= shots.threshold[0])
         assert number >= (1 if segment == 1 else 2)
         order = np.argsort(-ndimage.maximum(spectrum, label, range(1, number + 1)), kind="stable")
         slices = ndimage.find_objects(label)
-        listed = found.bin[0, segment] >= 0
+        listed = found.strongest_bin[0, segment] >= 0
         assert listed.sum() == min(number, 8)
         for g, which in enumerate(order[:8]):
             run = slices[which][0]
-            assert found.first[0, segment, g] == run.start
-            assert found.last[0, segment, g] == run.stop - 1
+            assert found.first_bin[0, segment, g] == run.start
+            assert found.last_bin[0, segment, g] == run.stop - 1
             peak = run.start + spectrum[run].argmax()
-            assert found.bin[0, segment, g] == peak
+            assert found.strongest_bin[0, segment, g] == peak
             np.testing.assert_allclose(
-                found.neighbours[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
+                found.neighbour_magnitudes[0, segment, g], spectrum[peak - 1 : peak + 2], rtol=1e-5
             )
 
 
 def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
     shots = prepare_single_category(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
-    found, expected = groups(shots), np.moveaxis(find(shots), 1, 0)
+    found, expected = list_bin_groups(shots), np.moveaxis(evaluate_segments(shots), 1, 0)
     np.testing.assert_array_equal(found.pd[:, :, 0].T, expected[0])
     np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected[2])
-    np.testing.assert_array_equal(found.bin[:, :, 0].T, np.rint(expected[3] * 2**17 / 600e6))
-    np.testing.assert_array_equal(found.exempted.T, expected[4])
+    np.testing.assert_array_equal(
+        found.strongest_bin[:, :, 0].T, np.rint(expected[3] * 2**17 / 600e6)
+    )
+    np.testing.assert_array_equal(found.n_exempt.T, expected[4])
     np.testing.assert_array_equal(found.leakage.T[[0, 2]], expected[5][[0, 2]])
     assert not expected[5][1].any()  # of the Doppler segment only draws need to know
 
 
 def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
     shots = _surfaces(table_4_1, [300.0, 330.0, 345.0, 360.0], [20.0] * 4, shares=[0.1, 1, 0.3, 2])
-    few, many = groups(shots, most=2), groups(shots, most=12)
-    np.testing.assert_array_equal(few.bin, many.bin[..., :2])
-    strength = many.magnitude[0, 0][many.bin[0, 0] >= 0]
+    few, many = list_bin_groups(shots, groups_max=2), list_bin_groups(shots, groups_max=12)
+    np.testing.assert_array_equal(few.strongest_bin, many.strongest_bin[..., :2])
+    strength = many.magnitude[0, 0][many.strongest_bin[0, 0] >= 0]
     assert (np.diff(strength) <= 0).all()
 
 
 def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
-    found = groups(prepare_single_category(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
-    assert (found.bin[0, :, 0] >= 0).all()
-    assert (found.bin[0, :, 1:] == -1).all()
+    found = list_bin_groups(
+        prepare_single_category(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3))
+    )
+    assert (found.strongest_bin[0, :, 0] >= 0).all()
+    assert (found.strongest_bin[0, :, 1:] == -1).all()
     assert (found.pd[0, :, 0] < 0.1).all()
-    np.testing.assert_array_equal(found.first[..., 0], found.last[..., 0])
+    np.testing.assert_array_equal(found.first_bin[..., 0], found.last_bin[..., 0])
 
 
 # Without chance
@@ -130,11 +146,11 @@ def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
 
 def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
     shots = prepare_single_category(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
-    found = _certain(groups(shots))
-    got, expected = _drawn(shots, found), report(shots, find(shots))
+    found = _certain(list_bin_groups(shots))
+    got, expected = _drawn(shots, found), measure_range_velocity(shots, evaluate_segments(shots))
     np.testing.assert_array_equal(got.range[:, 0, 0], expected.range)
     np.testing.assert_array_equal(got.radial_velocity[:, 0, 0], expected.radial_velocity)
-    assert (got.flags[:, 0, 0] == TRUE).all()
+    assert (got.flags[:, 0, 0] == TRUE_FLAG).all()
 
 
 def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
@@ -142,7 +158,7 @@ def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
         table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
     )
     got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE, 0, 0, 0]
+    assert got.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
     assert got.range_interpolated[0, 0, 0] == pytest.approx(200.0, abs=0.5 * RANGE_BIN)
     assert got.group[0, 0, 0].tolist() == [0, -1, 0]
 
@@ -151,9 +167,9 @@ def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
 def test_a_triangle_loses_no_return_for_want_of_a_third_segment(order, table_4_1):
     """Two surfaces: the stronger up peak with the stronger down peak, and none unconfirmed."""
     shots = _surfaces(table_4_1, (300.0, 320.0), (1.0, 1.0), shares=(0.8, 0.2), power=0.5)
-    shots = dataclasses.replace(shots, order=tuple(order.split()))
+    shots = dataclasses.replace(shots, segment_order=tuple(order.split()))
     got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE, TRUE, 0, 0]
+    assert got.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
     np.testing.assert_allclose(got.range[0, 0, :2], [300.0, 320.0], atol=2 * RANGE_BIN)
     np.testing.assert_allclose(got.radial_velocity[0, 0, :2], 1.0, atol=2 * VELOCITY_BIN)
 
@@ -171,14 +187,19 @@ def _weak(table_4_1, n=4, **changes):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1, method):
-    """The same random numbers as sweep.model.draws, and so the same counts exactly.
+    """The same random numbers as sweep.model.sampling.draws, and so the same counts exactly.
 
     A true pair, both peaks found, is lost only where a false peak takes one of them: rarely.
     """
     parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
     shots = prepare_single_category(parameters)
-    counts = simulate(
-        parameters, CORE, keys=make_point_keys(4), first_draw=3, batch_sizes=[2000], method=method
+    counts = simulate_draws(
+        parameters,
+        DEFAULT_EFFECTS,
+        keys=make_point_keys(4),
+        first_draw=3,
+        batch_sizes=[2000],
+        method=method,
     )
     got = _drawn(shots, first_draw=3, draws=2000, method=method)
     both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
@@ -222,10 +243,10 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     expected = DRAWS * out["pd_up"] * out["pd_down"]
     spread = np.sqrt(expected * (1 - expected / DRAWS))
     assert (np.abs(both.sum(1) - expected) < 5 * spread + slack).all()
-    confirmed = (got.flags == TRUE).any(2).sum(1)
+    confirmed = (got.flags == TRUE_FLAG).any(2).sum(1)
     expected = expected * out["pd_doppler"]
     assert (np.abs(confirmed - expected) < 5 * np.sqrt(expected) + slack).all()
-    false = (got.flags & FALSE_ALARM > 0).any(2).sum(1)
+    false = (got.flags & FALSE_ALARM_FLAG > 0).any(2).sum(1)
     expected = DRAWS * ((1 - none[0]) * (1 - none[1]) - out["pd_up"] * out["pd_down"])
     expected = expected + DRAWS * two[0] * two[1]
     assert (np.abs(false - expected) < 5 * np.sqrt(expected) + slack).all()
@@ -245,7 +266,7 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         free = sorted(set(range(1, half + 1)) - taken - set(BARRED.tolist()))
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
         places, counts = np.unique(
-            [free_bin(u, bins, BARRED, (1, half), 2 * half, False) for u in chances],
+            [draw_free_bin(u, bins, BARRED, (1, half), 2 * half, False) for u in chances],
             return_counts=True,
         )
         assert places.tolist() == free
@@ -256,13 +277,13 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
     """P(max > x) = 1 - (1 - exp(-x^2/2))^n, by scipy's Rayleigh distribution; Gamma's in looks."""
     for chance in (1e-9, 0.01, 0.7):
         for n in (1.0, 100.0, 65000.0):
-            x = largest_of(n, chance, 1)
+            x = largest_noise_magnitude(n, chance, 1)
             assert -np.expm1(n * stats.rayleigh.logcdf(x)) == pytest.approx(chance, rel=1e-9)
-            below = stats.gamma.logcdf(4 * largest_of(n, chance, 8) ** 2, 8)
+            below = stats.gamma.logcdf(4 * largest_noise_magnitude(n, chance, 8) ** 2, 8)
             assert -np.expm1(n * below) == pytest.approx(chance, rel=1e-9)
 
 
-NO_LINES = LineFan(
+NO_LINES = SpeckleLineGrid(
     *np.zeros((2, 0, 3, 2)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.ones((1, 1)),
     np.ones((1, 1)), np.ones(1, np.int64), np.ones(2), 1.0, 1.0, 0,
 )  # fmt: skip
@@ -272,7 +293,7 @@ NO_LINES = LineFan(
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
     rule = np.empty((0, 17)), np.empty(0, np.int64), 0
-    how = How(
+    how = DrawConfig(
         0,
         True,
         True,
@@ -290,23 +311,36 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         False,
         0,
     )
-    known = Known(
+    known = DrawInputs(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
         np.zeros((1, 7)), np.full((1, 3), alarm), np.ones((1, 2)), np.ones((1, 2, 1)),
         np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)), np.ones((1, 3, 1)),
         np.zeros((1, 6)), np.zeros((1, 3, 1, 0), complex),
     )  # fmt: skip
-    seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
+    seen = NoiselessSpectra.empty(1)._replace(
+        first_bin=np.full((1, 3), low), n_noise_bins=np.full((1, 3), others)
+    )
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
     (key,) = make_point_keys(1)
 
     def drawn(number):
         address = key[0], key[1], number
-        count = draw_peaks(
-            address, (0, 0), how, known, seen, LeakedPeaks.nothing(1), np.ones((1, 3)),
-            no_speckle(1), tables, Workspace.of(3, 1), peaks, which, np.zeros(1, bool),
-        )  # fmt: skip
+        count = draw_segment_peaks(
+            address,
+            (0, 0),
+            how,
+            known,
+            seen,
+            LeakageBins.empty(1),
+            np.ones((1, 3)),
+            empty_group_speckle(1),
+            tables,
+            DrawWorkspace.allocate(3, 1),
+            peaks,
+            which,
+            np.zeros(1, bool),
+        )
         return peaks[0].copy() if count else None
 
     return drawn
@@ -320,9 +354,14 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
     beta, half, n = 3.0, 2000, 1900.0
     one = np.exp(-(beta**2) / 2)
     noise = _up_in_noise(
-        -1, np.full(3, np.nan), (1.0, beta, 1.0), interpolator(window("hann", 4000), 4000), half,
-        others=n, alarm=-np.expm1(n * np.log1p(-one)),
-    )  # fmt: skip
+        -1,
+        np.full(3, np.nan),
+        (1.0, beta, 1.0),
+        interpolator(get_window("hann", 4000), 4000),
+        half,
+        others=n,
+        alarm=-np.expm1(n * np.log1p(-one)),
+    )
     drawn = np.array([peak for peak in map(noise, range(4000)) if peak is not None])
     quiet = stats.rayleigh.cdf(beta) ** n
     assert abs(len(drawn) - 4000 * (1 - quiet)) < 5 * np.sqrt(4000 * quiet) + 1
@@ -330,16 +369,18 @@ def test_noise_alone_has_its_largest_peak_where_and_as_large_as_it_should():
     def largest(x):
         return (stats.rayleigh.cdf(x) ** n - quiet) / (1 - quiet)
 
-    assert stats.kstest(drawn[:, RATIO], largest).pvalue > 1e-6
-    assert stats.kstest(drawn[:, WHOLE], stats.uniform(0.5, half).cdf).pvalue > 1e-6
+    assert stats.kstest(drawn[:, RATIO_COLUMN], largest).pvalue > 1e-6
+    assert stats.kstest(drawn[:, BIN_COLUMN], stats.uniform(0.5, half).cdf).pvalue > 1e-6
 
 
 def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
     """A tone 0.47 bins past its bin, in white noise of a twentieth, Hann window of 64 samples."""
     length, delta, ratio = 64, 0.47, 20.0
-    shape = window("hann", length)
+    shape = get_window("hann", length)
     n = np.arange(length)
-    basis = (samples("hann", length) * np.exp(-2j * np.pi * np.outer([15, 16, 17], n) / length)).T
+    basis = (
+        window_samples("hann", length) * np.exp(-2j * np.pi * np.outer([15, 16, 17], n) / length)
+    ).T
     tone = np.exp(2j * np.pi * (16 + delta) * n / length)
     sigma = shape.sum / ratio
     noise = np.random.default_rng(4).standard_normal((DRAWS, 2 * length)).view(complex)
@@ -348,7 +389,7 @@ def test_noise_moves_the_largest_bin_as_often_as_in_the_time_domain():
     noise = _up_in_noise(
         16, np.abs(tone @ basis), (sigma, 5.0, 1.0), interpolator(shape, length), 32, low=14
     )
-    moved = sum(noise(d)[WHOLE] == 17 for d in range(DRAWS))
+    moved = sum(noise(d)[BIN_COLUMN] == 17 for d in range(DRAWS))
     assert 0.1 < expected < 0.4
     assert abs(moved / DRAWS - expected) < 5 * np.sqrt(2 * expected * (1 - expected) / DRAWS)
 
@@ -367,7 +408,7 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
         )
     )  # fmt: skip
     got = _drawn(shots, draws=1000, method=method)
-    assert (got.flags[..., 0] == TRUE).all()
+    assert (got.flags[..., 0] == TRUE_FLAG).all()
     assert 2 * got.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
     for quantity, expected in (("range", shots.range), ("radial_velocity", shots.radial_velocity)):
         found = getattr(got, f"{quantity}_interpolated")[..., 0]
@@ -392,11 +433,11 @@ def test_interpolated_ranges_of_moving_ground_are_those_at_the_beginning(
         radial_velocity=velocity, beamlets=1, power=5.0, phases="incoherent",
         acquisition_delay=delay,
     )  # fmt: skip
-    walking, still = (*CORE, "range_walk"), CORE
+    walking, still = (*DEFAULT_EFFECTS, "range_walk"), DEFAULT_EFFECTS
     for effects in (walking, still):
-        ((_, shots),) = prepare(parameters, effects)
+        ((_, shots),) = prepare_shots(parameters, effects)
         got = _drawn(shots, draws=200, method="noise")
-        assert (got.flags[..., 0] == TRUE).all()
+        assert (got.flags[..., 0] == TRUE_FLAG).all()
         off = got.range_interpolated[..., 0] - shots.range[:, None]
         stated = got.range_interpolated_standard_error[..., 0]
         assert abs(off.mean()) < 5 * stated.mean() / np.sqrt(off.size) + 5e-5
@@ -420,7 +461,7 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
         )
     )  # fmt: skip
     got = _drawn(shots, draws=1)
-    good = got.flags[..., 0] == TRUE
+    good = got.flags[..., 0] == TRUE_FLAG
     error = (got.range_interpolated[..., 0] - shots.range[:, None])[good]
     stated = got.range_interpolated_standard_error[..., 0][good]
     assert good.mean() > 0.9
@@ -434,15 +475,18 @@ def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
     shots = prepare_single_category(
         table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
     )
-    shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
-    velocity = -170.0 + shots.doppler[0] * LIGHT / 2
-    lines = beamlet_lines(shots)[0]
+    shots = dataclasses.replace(shots, doppler_ratio_offset=np.linspace(-1e-9, 1e-9, 7)[None])
+    velocity = -170.0 + shots.doppler_ratio_offset[0] * LIGHT / 2
+    lines = beamlet_line_positions(shots)[0]
     for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.carriers, strict=True)):
         beats = waveform.beat_frequency(
-            sign, carrier=carrier, chirp_rate=2e12, range=8000.0 * (1 + shots.offset[0]),
+            sign,
+            carrier=carrier,
+            chirp_rate=2e12,
+            range=8000.0 * (1 + shots.relative_range_offset[0]),
             radial_velocity=velocity,
-        )  # fmt: skip
-        expected = waveform.fold(beats, np.array(600e6)) / 600e6 * 2**17
+        )
+        expected = waveform.fold_frequency(beats, np.array(600e6)) / 600e6 * 2**17
         np.testing.assert_allclose(lines[s], expected, atol=1e-6)
     assert np.ptp(lines[0]) > 0.1
 
@@ -458,14 +502,14 @@ def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
     nowhere = bins + np.array([0, 0, 20])[:, None, None]
     centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
     lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
-    assert judge(all_three, centres, bins, lines, lit) == (TRUE, 1)
-    assert judge(all_three, centres, bins, lines, dim) == (TRUE, 0)
+    assert judge_return(all_three, centres, bins, lines, lit) == (TRUE_FLAG, 1)
+    assert judge_return(all_three, centres, bins, lines, dim) == (TRUE_FLAG, 0)
     apart = np.array([0, 0, 1], np.int8)
-    assert judge(apart, centres, bins, lines, lit) == (MISPAIRED, -1)
-    assert judge(all_three, centres, nowhere, lines, lit) == (SIDELOBE, -1)
+    assert judge_return(apart, centres, bins, lines, lit) == (MISPAIRED_FLAG, -1)
+    assert judge_return(all_three, centres, nowhere, lines, lit) == (SIDELOBE_FLAG, -1)
     no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
-    assert judge(no_doppler, centres, bins, lines, lit) == (TRUE, 1)
-    assert judge(noise, centres, bins, lines, lit) == (FALSE_ALARM, -1)
+    assert judge_return(no_doppler, centres, bins, lines, lit) == (TRUE_FLAG, 1)
+    assert judge_return(noise, centres, bins, lines, lit) == (FALSE_ALARM_FLAG, -1)
 
 
 def _only(found, present):
@@ -478,9 +522,9 @@ def _only(found, present):
 
 def test_peaks_of_two_surfaces_make_a_mispaired_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 412.0], [12.0, 12.0], shares=[1.0, 0.6])
-    found = _only(_certain(groups(shots)), {(0, 1): 0.0, (2, 0): 0.0})
+    found = _only(_certain(list_bin_groups(shots)), {(0, 1): 0.0, (2, 0): 0.0})
     got = _drawn(shots, found)
-    assert got.flags[0, 0].tolist() == [MISPAIRED | UNCONFIRMED, 0, 0, 0]
+    assert got.flags[0, 0].tolist() == [MISPAIRED_FLAG | UNCONFIRMED_FLAG, 0, 0, 0]
     assert got.group[0, 0, 0].tolist() == [0, -1, 1]
     assert got.beamlet[0, 0, 0] == -1
 
@@ -490,11 +534,11 @@ def test_a_pair_without_its_doppler_peak_is_read_as_two_beats_are(table_4_1, two
     """Range and velocity of the other target are exchanged, and flagged."""
     for velocity, kind in ((2.0, waveform.FAR_TARGET), (60.0, waveform.FAST_TARGET)):
         shots = _surfaces(table_4_1, [400.0], [velocity])
-        shots = dataclasses.replace(shots, two_beats=two_beats)
-        kind = TRUE if kind == two_beats else MISREAD
-        found = _only(_certain(groups(shots)), {(1, g): 0.0 for g in range(4)})
+        shots = dataclasses.replace(shots, two_beat_assumption=two_beats)
+        kind = TRUE_FLAG if kind == two_beats else MISREAD_FLAG
+        found = _only(_certain(list_bin_groups(shots)), {(1, g): 0.0 for g in range(4)})
         got = _drawn(shots, found)
-        assert got.flags[0, 0, 0] == kind | UNCONFIRMED
+        assert got.flags[0, 0, 0] == kind | UNCONFIRMED_FLAG
         assert got.beamlet[0, 0, 0] >= 0
 
 
@@ -508,14 +552,16 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
         detector_bandwidth=4e8,
     )  # fmt: skip
     assert shots.window.length < shots.fft_size
-    shots = dataclasses.replace(shots, leakage=False)  # false peaks may pair with the true ones
-    got = _drawn(shots, _certain(groups(shots)))
-    assert got.flags[0, 0, 0] == TRUE
-    assert (got.flags[0, 0, 1:] & SIDELOBE > 0).all()
+    shots = dataclasses.replace(
+        shots, includes_leakage=False
+    )  # false peaks may pair with the true ones
+    got = _drawn(shots, _certain(list_bin_groups(shots)))
+    assert got.flags[0, 0, 0] == TRUE_FLAG
+    assert (got.flags[0, 0, 1:] & SIDELOBE_FLAG > 0).all()
 
 
 def test_surfaces_merged_in_one_group_are_one_true_return(table_4_1):
     shots = _surfaces(table_4_1, [400.0, 400.3], [12.0, 12.0])
     got = _drawn(shots)
-    assert got.flags[0, 0].tolist() == [TRUE, 0, 0, 0]
+    assert got.flags[0, 0].tolist() == [TRUE_FLAG, 0, 0, 0]
     assert 399.8 < got.range[0, 0, 0] < 400.5

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.model import philox, realisations, sampling
-from sweep.model.accuracy import COUNTED, Accuracy, half_width
-from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.error_budget import COUNT_INTERVALS, ErrorBudget, interval_half_width
+from sweep.model.evaluation import evaluate
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
-    PROMISED,
-    RUNNING,
+    DRAW_COUNT_OUTPUTS,
+    GRID_OUTPUTS,
+    PD_OUTPUTS,
+    RUNNING_SUMS,
+    STANDARD_ERROR_OUTPUTS,
 )
-from sweep.model.sampling import looks, settle, simulate
-from sweep.model.shot import evaluate
+from sweep.model.sampling import philox, realisations, samplers
+from sweep.model.sampling.samplers import draw_until_accurate, simulate_draws, stopping_checks
 
-SPECKLED = (*CORE, "speckle")
+SPECKLED = (*DEFAULT_EFFECTS, "speckle")
 METHODS = ("probabilities", "noise")
-COUNTS = {name: name.replace("pd_", "n_detected_") for name in PROMISED}
+COUNTS = {name: name.replace("pd_", "n_detected_") for name in PD_OUTPUTS}
 
 
 def keys(n, seed=11):
@@ -42,7 +42,7 @@ def some(parameters, index):
 
 @pytest.mark.parametrize(("batch", "limit"), [(100, 10**6), (7, 1000), (50, 20), (1, 1), (3, 9)])
 def test_looks_come_after_whole_batches_ever_further_apart(batch, limit):
-    ends = list(looks(batch, limit))
+    ends = list(stopping_checks(batch, limit))
     assert ends[-1] == limit and ends[0] == min(batch, limit)
     assert all(end % batch == 0 for end in ends[:-1])
     for first, second in pairwise(ends):
@@ -51,103 +51,110 @@ def test_looks_come_after_whole_batches_ever_further_apart(batch, limit):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("effects", [CORE, SPECKLED], ids=["noise alone", "speckle"])
+@pytest.mark.parametrize("effects", [DEFAULT_EFFECTS, SPECKLED], ids=["noise alone", "speckle"])
 def test_what_is_drawn_until_a_promise_is_kept_is_what_so_many_draws_yield(
     effects, method, table_4_1
 ):
     """Each point against a fixed number of draws, the one at which it stopped, to the last bit."""
-    parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
-    chosen = {"keys": keys(4), "method": method, "accuracy": accuracy}
-    found = simulate(parameters, effects, batch=20, limit=400, **chosen)
-    drawn = {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
-    assert set(found) == (drawn | {RUNNING} if effects is SPECKLED else drawn)
+    parameters, accuracy = scene(table_4_1), ErrorBudget(0.06, 0.9)
+    chosen = {"keys": keys(4), "method": method, "error_budget": accuracy}
+    found = simulate_draws(parameters, effects, batch=20, limit=400, **chosen)
+    drawn = {*GRID_OUTPUTS, *STANDARD_ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS}
+    assert set(found) == (drawn | {RUNNING_SUMS} if effects is SPECKLED else drawn)
     numbers = found["n_draws"]
-    assert np.isin(numbers, list(looks(20, 400))).all()
-    assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", CORE)
+    assert np.isin(numbers, list(stopping_checks(20, 400))).all()
+    assert np.unique(numbers).size > 1 or (method, effects) == ("probabilities", DEFAULT_EFFECTS)
     for point, number in enumerate(numbers.tolist()):
-        fixed = simulate(parameters, effects, batch_sizes=[number], **chosen)
+        fixed = simulate_draws(parameters, effects, batch_sizes=[number], **chosen)
         for name, values in found.items():
             np.testing.assert_array_equal(values[point], np.ravel(fixed[name][point]), err_msg=name)
 
 
 def test_points_stop_at_the_first_look_at_which_every_pd_is_sure_enough(table_4_1):
-    parameters, accuracy = scene(table_4_1), Accuracy(0.06, 0.9)
-    chosen = {"keys": keys(4), "method": "probabilities", "accuracy": accuracy}
-    found = simulate(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
+    parameters, accuracy = scene(table_4_1), ErrorBudget(0.06, 0.9)
+    chosen = {"keys": keys(4), "method": "probabilities", "error_budget": accuracy}
+    found = simulate_draws(parameters, SPECKLED, batch=20, limit=10_000, **chosen)
     assert (found["accuracy_missed"] == 0).all()
-    for name in PROMISED:
+    for name in PD_OUTPUTS:
         assert (found[f"{name}_half_width"] <= 0.06).all()
     for point, number in enumerate(found["n_draws"].tolist()):
-        for before in [n for n in looks(20, 10_000) if n < number]:
-            fixed = simulate(parameters, SPECKLED, batch_sizes=[before], **chosen)
-            widths = [fixed[f"{name}_half_width"][point] for name in PROMISED]
+        for before in [n for n in stopping_checks(20, 10_000) if n < number]:
+            fixed = simulate_draws(parameters, SPECKLED, batch_sizes=[before], **chosen)
+            widths = [fixed[f"{name}_half_width"][point] for name in PD_OUTPUTS]
             assert max(widths) > 0.06
             assert fixed["accuracy_missed"][point] == max(widths) - 0.06
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("effects", [CORE, SPECKLED], ids=["noise alone", "speckle"])
+@pytest.mark.parametrize("effects", [DEFAULT_EFFECTS, SPECKLED], ids=["noise alone", "speckle"])
 def test_neighbours_and_the_cutting_of_work_change_no_bit(effects, method, table_4_1, monkeypatch):
     parameters = scene(table_4_1)
-    chosen = {"batch": 20, "limit": 300, "method": method, "accuracy": Accuracy(0.06, 0.9)}
-    together = simulate(parameters, effects, keys=keys(4), **chosen)
-    monkeypatch.setattr(sampling, "PIECE", 13)
-    monkeypatch.setattr(realisations, "ROWS", 7)
+    chosen = {"batch": 20, "limit": 300, "method": method, "error_budget": ErrorBudget(0.06, 0.9)}
+    together = simulate_draws(parameters, effects, keys=keys(4), **chosen)
+    monkeypatch.setattr(samplers, "NOISE_DRAWS_PER_STEP", 13)
+    monkeypatch.setattr(realisations, "DRAWS_PER_BATCH", 7)
     for point in range(4):
         index = slice(point, point + 1)
-        alone = simulate(some(parameters, index), effects, keys=keys(4)[index], **chosen)
+        alone = simulate_draws(some(parameters, index), effects, keys=keys(4)[index], **chosen)
         for name, values in alone.items():
             np.testing.assert_array_equal(values[0], together[name][point], err_msg=name)
 
 
 def test_where_the_limit_comes_first_the_excess_is_told(table_4_1):
     tolerance = np.array([0.5, 0.01, 0.2, 0.01])
-    found = simulate(
+    found = simulate_draws(
         scene(table_4_1), SPECKLED, keys=keys(4), batch=30, limit=100, method="probabilities",
-        accuracy=Accuracy(tolerance, 0.95),
+        error_budget=ErrorBudget(tolerance, 0.95),
     )  # fmt: skip
-    widths = np.max([found[f"{name}_half_width"] for name in PROMISED], axis=0)
+    widths = np.max([found[f"{name}_half_width"] for name in PD_OUTPUTS], axis=0)
     np.testing.assert_array_equal(found["accuracy_missed"], np.maximum(widths - tolerance, 0))
     missed = found["accuracy_missed"] > 0
     assert missed.tolist() == [False, True, False, True]
     assert (found["n_draws"][missed] == 100).all() and (found["n_draws"][~missed] < 100).all()
 
 
-@pytest.mark.parametrize("interval", COUNTED)
+@pytest.mark.parametrize("interval", COUNT_INTERVALS)
 def test_the_share_of_draws_in_noise_has_the_interval_asked_for(interval, table_4_1):
     chosen = {
         "keys": keys(4),
         "method": "noise",
-        "accuracy": Accuracy(0.01, 0.9, interval=interval),
+        "error_budget": ErrorBudget(0.01, 0.9, interval=interval),
     }
-    found = simulate(scene(table_4_1), CORE, batch_sizes=[150, 50], **chosen)
+    found = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch_sizes=[150, 50], **chosen)
     for name, count in COUNTS.items():
         k = found[count].sum(axis=1)
-        expected = COUNTED[interval](successes=k, trials=200, confidence=0.9)
-        np.testing.assert_array_equal(found[f"{name}_half_width"], half_width(k / 200, expected))
+        expected = COUNT_INTERVALS[interval](successes=k, trials=200, confidence=0.9)
+        np.testing.assert_array_equal(
+            found[f"{name}_half_width"], interval_half_width(k / 200, expected)
+        )
     assert 20 < found["n_detected_up"][1].sum() < 180
-    until = simulate(scene(table_4_1), CORE, batch=50, limit=1000, **chosen)
+    until = simulate_draws(scene(table_4_1), DEFAULT_EFFECTS, batch=50, limit=1000, **chosen)
     assert (until["n_draws"] > 150).all()
 
 
 def test_probabilities_that_are_known_need_no_draws(table_4_1):
-    found = simulate(
-        scene(table_4_1), CORE, keys=keys(4), batch=50, limit=10**6, method="probabilities",
-        accuracy=Accuracy(0.0),
-    )  # fmt: skip
+    found = simulate_draws(
+        scene(table_4_1),
+        DEFAULT_EFFECTS,
+        keys=keys(4),
+        batch=50,
+        limit=10**6,
+        method="probabilities",
+        error_budget=ErrorBudget(0.0),
+    )
     assert (found["n_draws"] == 50).all() and (found["accuracy_missed"] == 0).all()
-    for name in PROMISED:
+    for name in PD_OUTPUTS:
         assert (found[f"{name}_half_width"] == 0).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("effects", [CORE, (*CORE, "pointing_jitter")])
+@pytest.mark.parametrize("effects", [DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "pointing_jitter")])
 def test_a_segment_that_is_not_there_keeps_no_point_open(effects, method, table_4_1):
     parameters = table_4_1(range=np.array([20.0]), architecture="direct")
     parameters |= {"target.pointing_jitter": 1e-6}
-    found = simulate(
+    found = simulate_draws(
         parameters, effects, keys=keys(1), batch=40, limit=10_000, method=method,
-        accuracy=Accuracy(0.05),
+        error_budget=ErrorBudget(0.05),
     )  # fmt: skip
     assert np.isnan(found["pd_doppler_half_width"]) and found["accuracy_missed"] == 0
     assert found["n_draws"] < 10_000
@@ -159,9 +166,9 @@ def test_a_speckled_targets_pd_is_within_the_tolerance_as_often_as_promised(tabl
     single = evaluate(scene(table_4_1, ranges=[500.0]))
     beta = 8.0 * np.sqrt(2 - np.pi / 2)
     exact = {s: np.exp(-(beta**2) / (2 + 2 * single[f"snr_{s}"])) for s in ("up", "down")}
-    found = simulate(
+    found = simulate_draws(
         scene(table_4_1, ranges=np.full(number, 500.0)), SPECKLED, keys=keys(number), batch=4,
-        limit=10_000, method="probabilities", accuracy=Accuracy(tolerance, 0.9),
+        limit=10_000, method="probabilities", error_budget=ErrorBudget(tolerance, 0.9),
     )  # fmt: skip
     assert np.unique(found["n_draws"]).size > 3 and (found["accuracy_missed"] == 0).all()
     sigma = np.sqrt(0.9 * 0.1 / number)
@@ -177,28 +184,28 @@ class Coins:
 
     def __init__(self, pd, number, method):
         self.pd, self.method, self.random = pd, method, np.random.default_rng(2)
-        self.hits, self.number = np.zeros((2, number), np.int64)
+        self.hits, self.n_draws = np.zeros((2, number), np.int64)
 
-    def at_once(self, points):
-        return sampling.PIECE
+    def draws_per_step(self, n_points):
+        return samplers.NOISE_DRAWS_PER_STEP
 
-    def take(self, points, number):
-        assert np.unique(self.number[points]).size == 1
+    def draw(self, points, number):
+        assert np.unique(self.n_draws[points]).size == 1
         self.hits[points] += self.random.binomial(number, self.pd, points.size)
-        self.number[points] += number
+        self.n_draws[points] += number
 
     def widths(self, points):
-        pairs = np.stack([self.hits[points], self.number[points]])
+        pairs = np.stack([self.hits[points], self.n_draws[points]])
         (k, n), place = np.unique(pairs, axis=1, return_inverse=True)
-        interval = COUNTED[self.method](successes=k, trials=n, confidence=0.95)
-        return half_width(k / n, interval)[place]
+        interval = COUNT_INTERVALS[self.method](successes=k, trials=n, confidence=0.95)
+        return interval_half_width(k / n, interval)[place]
 
-    def missed(self, points, accuracy):
-        return np.maximum(self.widths(points) - accuracy.tolerance, 0.0)
+    def half_width_excess(self, points, error_budget):
+        return np.maximum(self.widths(points) - error_budget.tolerance, 0.0)
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
-@pytest.mark.parametrize("method", COUNTED)
+@pytest.mark.parametrize("method", COUNT_INTERVALS)
 def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     """5 sigma of 4000 trials are 1.7 %; Wilson's may lack a step at either end of its counts.
 
@@ -208,10 +215,10 @@ def test_stopping_costs_little_coverage_and_bias(method, tolerance):
     trials = 4000
     for pd in (0.0, 1e-4, 0.3 * tolerance, tolerance, 1.3 * tolerance, 0.2, 0.5, 0.8, 0.9999, 1.0):
         coins, points = Coins(pd, trials, method), np.arange(trials)
-        settle(coins, points, looks(10, 10**6), Accuracy(tolerance))
-        found = coins.hits / coins.number
+        draw_until_accurate(coins, points, stopping_checks(10, 10**6), ErrorBudget(tolerance))
+        found = coins.hits / coins.n_draws
         within = (abs(found - pd) <= coins.widths(points) + 1e-15).mean()
-        most = coins.number.max()
+        most = coins.n_draws.max()
         step = stats.binom.pmf(round(most * pd), most, pd) if method == "wilson" else 0
         sigma = np.sqrt(0.95 * 0.05 / trials)
         assert within >= 0.95 - 5 * sigma - step, pd

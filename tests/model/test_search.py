@@ -12,17 +12,17 @@ from shot_helpers import (
     prepare_single_category,
 )
 
-from sweep.model import truth
-from sweep.model.band import band_of
-from sweep.model.effects.catalogue import CORE
-from sweep.model.groups import groups
-from sweep.model.pairing import UNCONFIRMED
-from sweep.model.returns import draw_returns, free_bin
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate
-from sweep.model.threshold import PFA_SEGMENT, PFA_SHOT, TNR
-from sweep.model.waveform import ENDS
-from sweep.model.window import samples
+from sweep.model import time_domain_truth
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import evaluate
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
+from sweep.model.pointcloud.returns import draw_free_bin, draw_returns
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.spectrum.search_band import search_band_bins
+from sweep.model.threshold import DESIGN_PFA_SEGMENT_PATH, DESIGN_PFA_SHOT_PATH, TNR_PATH
+from sweep.model.waveform import SEARCH_BAND_PATHS
+from sweep.model.window import window_samples
 
 RECORD = "instrument.receiver.record"
 SIZE = 1024
@@ -36,7 +36,7 @@ SMALL = {
 def scene_of(table_4_1, band=None, record="real", **changes):
     """A short record, whose bins are 0.98 m wide at 600 MHz, in which the echo is faint."""
     scene = table_4_1(**(SMALL | changes)) | {RECORD: record, "footprint.speckle": "none"}
-    return scene | ({} if band is None else dict(zip(ENDS, band, strict=True)))
+    return scene | ({} if band is None else dict(zip(SEARCH_BAND_PATHS, band, strict=True)))
 
 
 @given(
@@ -47,12 +47,12 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
     scene = table_4_1() | {
         RECORD: record, "instrument.processing.fft_size": SIZE,
         "instrument.chirp.duration": 20e-6,
-        **dict(zip(ENDS, (near, near + deep, slow, slow + spread), strict=True)),
+        **dict(zip(SEARCH_BAND_PATHS, (near, near + deep, slow, slow + spread), strict=True)),
     }  # fmt: skip
     # Twice as close as bins, in range and in velocity; from edge to edge.
     far, fast = np.linspace(near, near + deep, 6000), np.linspace(slow, slow + spread, 2000)
     beta = 2 * fast / 299792458
-    for band, sign, extra in zip(band_of(scene), (1, 0, -1), (0, 0, 1e9), strict=True):
+    for band, sign, extra in zip(search_band_bins(scene), (1, 0, -1), (0, 0, 1e9), strict=True):
         carrier = 299792458 / 1550e-9 + extra
         beats = [
             carrier * b - sign * 5e13 * 2 * r / 299792458 * (1 + b)
@@ -73,8 +73,8 @@ def test_bins_are_those_nearest_to_any_beat(table_4_1, near, deep, slow, spread,
 def noisy_spectra(shots, segment, rng):
     """|X| of DRAWS records: the echo's exact one, and white noise sampled with it."""
     length, shape = shots.window.length, (DRAWS, shots.window.length)
-    taper, sigma = samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
-    signal = truth.analytic_record(shots, 0, segment, 0, range_walk=False)
+    taper, sigma = window_samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
+    signal = time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=False)
     if shots.complex_record:
         noise = rng.normal(size=shape) + 1j * rng.normal(size=shape)
         whole = np.fft.fft(taper * (signal / 2 + sigma * np.sqrt(0.5) * noise), SIZE)
@@ -88,12 +88,14 @@ def noisy_spectra(shots, segment, rng):
 def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table_4_1):
     """The strongest bin of the up beat lies some bins within the band's far end, or beyond it."""
     whole = prepare_single_category(scene_of(table_4_1, record=record))
-    place = truth.find(whole)[0, 3, 0] / (600e6 / SIZE)  # of the echo [bins]
+    place = time_domain_truth.evaluate_segments_in_time_domain(whole)[0, 3, 0] / (
+        600e6 / SIZE
+    )  # of the echo [bins]
     metre = 299792458 * 600e6 / SIZE / (2 * 50e12)
     end = 220.0 + offset * metre
     scene = scene_of(table_4_1, (end - 60 * metre, end, 3.0, 3.0), record)
     shots, found = prepare_single_category(scene), evaluate(scene)
-    first, number = shots.band[0, :, 0]
+    first, number = shots.search_band[0, :, 0]
     inside = np.isin(place % SIZE, (first + np.arange(number)) % SIZE)
     assert inside == (offset >= 0) and abs(number - 61) <= 1
     magnitude = noisy_spectra(shots, 0, np.random.default_rng(50 + offset))
@@ -136,11 +138,13 @@ def test_thresholds_keep_the_rate_of_alarms_in_the_band(noise, record, table_4_1
     band = (np.array([10.0, 40.0]), 150.0, -2.0, 5.0)
     where = {"range": 500.0, "radial_velocity": -60.0}  # where no bins are taken away
     dark = scene_of(table_4_1, band, record, reflectance=0.0, noise_bins=noise, **where)
-    dark = {path: value for path, value in dark.items() if path != TNR}
-    found = evaluate(dark | {PFA_SEGMENT: 1e-5})
+    dark = {path: value for path, value in dark.items() if path != TNR_PATH}
+    found = evaluate(dark | {DESIGN_PFA_SEGMENT_PATH: 1e-5})
     assert found["pfa_segment"] == pytest.approx([1e-5, 1e-5], rel=1e-9)
     assert found["pfa_bin"][1] > found["pfa_bin"][0]  # in fewer bins
-    assert evaluate(dark | {PFA_SHOT: 1e-5})["pfa_shot"] == pytest.approx([1e-5, 1e-5], rel=1e-9)
+    assert evaluate(dark | {DESIGN_PFA_SHOT_PATH: 1e-5})["pfa_shot"] == pytest.approx(
+        [1e-5, 1e-5], rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
@@ -150,8 +154,13 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
     band = (np.array([150.0, 60.0]), np.array([260.0, 140.0]), 0.0, 5.0)
     scene = scene_of(table_4_1, band, record, range=np.full(2, 220.0), tnr=4.5)
     found, draws = evaluate(scene), 1000
-    counts = simulate(
-        scene, CORE, keys=make_point_keys(2), method=method, batch_sizes=[draws], first_draw=0
+    counts = simulate_draws(
+        scene,
+        DEFAULT_EFFECTS,
+        keys=make_point_keys(2),
+        method=method,
+        batch_sizes=[draws],
+        first_draw=0,
     )
     spread = 5 * np.sqrt(draws * 0.25)
     assert counts["n_detected_up"][:, 0] == pytest.approx(draws * found["pd_up"], abs=spread)
@@ -160,11 +169,13 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
         draws * (1 - (1 - found["pfa_segment"]) * (1 - found["p_leakage_up"])), abs=spread
     )
     shots = prepare_single_category(scene)
-    listed = groups(shots)
-    assert (listed.bin[:, 0, 0] >= 0).tolist() == [True, False] and listed.pd[1, 0, 0] == 0
+    listed = list_bin_groups(shots)
+    assert (listed.strongest_bin[:, 0, 0] >= 0).tolist() == [True, False] and listed.pd[
+        1, 0, 0
+    ] == 0
     points = draw_returns(shots, listed, keys=make_point_keys(2), draws=draws, method=method)
     assert (points.group[1][..., [0, 2]] < 0).all()
-    own = np.isfinite(points.range) & (points.flags & UNCONFIRMED == 0)
+    own = np.isfinite(points.range) & (points.flags & UNCONFIRMED_FLAG == 0)
     # In one band the echo, in the other noise: of signed beats Doppler's seldom confirms that.
     for i in range(1 if record == "complex" else 2):
         far = points.range[i][own[i]]
@@ -184,5 +195,5 @@ def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
     chances = (np.arange(100 * len(expected)) + 0.5) / (100 * len(expected))
     if signed:
         bins[:, 0] += 2 * 512  # runs of complex records count from further on
-    found = [free_bin(u, bins, NONE, (first, last), 512, signed) for u in chances]
+    found = [draw_free_bin(u, bins, NONE, (first, last), 512, signed) for u in chances]
     assert found == np.repeat(expected, 100).tolist()

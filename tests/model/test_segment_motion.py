@@ -9,23 +9,30 @@ from scipy.constants import speed_of_light
 from shot_helpers import magnitude_error
 from small_scenes import observe_shots, scene_parameters, straight_flight
 
-from sweep.model import segments, truth
-from sweep.model.effects.catalogue import CORE, DEFAULTS, names_of
-from sweep.model.eyepoints import prepare_eyepoints
-from sweep.model.geometry.mesh import Surface
-from sweep.model.geometry.scanner import cone, fixed
-from sweep.model.groups import groups
-from sweep.model.realisations import realise
-from sweep.model.returns import beamlet_lines, draw_returns
-from sweep.model.shot import prepare
-from sweep.model.waveform import GAP, ORDER, ORDERS, SEGMENTS, SIGNS
+from sweep.model import time_domain_truth
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS, unpack_effect_flags
+from sweep.model.evaluation import prepare_shots
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.scanner import cone_directions, fixed_beams
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.eyepoints import prepare_eyepoint_shots
+from sweep.model.pointcloud.returns import beamlet_line_positions, draw_returns
+from sweep.model.sampling.realisations import iter_realisations
+from sweep.model.spectrum import segment_spectra
+from sweep.model.waveform import (
+    DEFAULT_CHIRP_SLOPES,
+    SEGMENT_GAP_PATH,
+    SEGMENT_NAMES,
+    SEGMENT_ORDER_PATH,
+    SEGMENT_ORDERS,
+)
 from sweep.tasks.studies.flight_study import plan_shot_effects
 
-MOVING = (*CORE, "segment_motion")
+MOVING = (*DEFAULT_EFFECTS, "segment_motion")
 
 
 def prepared(parameters, effects=MOVING):
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
@@ -34,9 +41,11 @@ def test_a_target_at_150_metres_a_second_is_7_5_centimetres_nearer_after_500_mic
 ):
     """S 2/c 7.5 cm is 1.0007 kHz a segment: less by S 2/c times both the range and beta."""
     shots = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1))
-    assert [float(each.nearer) for each in shots.waveform] == pytest.approx([0, 0.075, 0.15])
-    still = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1), CORE)
-    bins = beamlet_lines(shots)[0, :, 0] - beamlet_lines(still)[0, :, 0]
+    assert [float(each.range_decrease) for each in shots.waveform_segments] == pytest.approx(
+        [0, 0.075, 0.15]
+    )
+    still = prepared(table_4_1(range=2000.0, radial_velocity=150.0, beamlets=1), DEFAULT_EFFECTS)
+    bins = beamlet_line_positions(shots)[0, :, 0] - beamlet_line_positions(still)[0, :, 0]
     moved = 2e12 * 2 * 0.15 / speed_of_light * (1 + 300 / speed_of_light) / (600e6 / 2**17)
     np.testing.assert_allclose(bins, [0, 0, -moved], atol=1e-9)
 
@@ -45,7 +54,8 @@ def test_acceleration_moves_the_doppler_shift_on_from_segment_to_segment(table_4
     """2 a t / lambda: 10 m/s^2 for 500 us is 6.45 kHz."""
     parameters = table_4_1(range=2000.0, radial_velocity=100.0, beamlets=1)
     moving, steady = (
-        beamlet_lines(prepared(parameters | {"target.acceleration": a}))[0, :, 0] for a in (10, 0)
+        beamlet_line_positions(prepared(parameters | {"target.acceleration": a}))[0, :, 0]
+        for a in (10, 0)
     )
     kilohertz = (moving - steady) * 600e3 / 2**17
     np.testing.assert_allclose(kilohertz, [0, 6.4516, 12.9032], rtol=1e-4)
@@ -63,26 +73,26 @@ def test_acceleration_moves_the_doppler_shift_on_from_segment_to_segment(table_4
 )
 def test_segments_follow_those_that_there_are(architecture, order, gap, starts, table_4_1):
     scene = table_4_1(architecture=architecture, radial_velocity=80.0)
-    shots = prepared(scene | {ORDER: order, GAP: gap})
-    np.testing.assert_allclose([float(start) for start in shots.starts], starts, rtol=1e-12)
-    assert shots.segments.tolist() == [True, architecture != "direct" and "dopp" in order, True]
+    shots = prepared(scene | {SEGMENT_ORDER_PATH: order, SEGMENT_GAP_PATH: gap})
+    np.testing.assert_allclose([float(start) for start in shots.segment_starts], starts, rtol=1e-12)
+    assert shots.has_segment.tolist() == [True, architecture != "direct" and "dopp" in order, True]
 
 
 @pytest.mark.parametrize("segment", [0, 1, 2])
 @pytest.mark.parametrize("a, order", [(0.0, 0), (-11.4, 3), (900.0, 4)])
 def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, order, table_4_1):
     """In 40 digits: R - v T - a T^2 / 2 from the shot's start, and each segment's own chirp."""
-    place = ORDERS[order].split().index(SEGMENTS[segment])
+    place = SEGMENT_ORDERS[order].split().index(SEGMENT_NAMES[segment])
     range_0, v, begun = 1400.0, -130.0, place * 500e-6
     shots = prepared(
         table_4_1(
             range=range_0, radial_velocity=v, beamlets=1, fft_size=512, sample_rate=1.2e6,
             acquisition_delay=20e-6, detector_bandwidth=1e30, amplifier_bandwidth=1e30,
         )
-        | {"target.acceleration": a, ORDER: ORDERS[order]}
+        | {"target.acceleration": a, SEGMENT_ORDER_PATH: SEGMENT_ORDERS[order]}
     )  # fmt: skip
-    record = truth.analytic_record(shots, 0, segment, 0, acceleration=True)
-    sign, carrier = SIGNS[segment], float(shots.carriers[segment])
+    record = time_domain_truth.analytic_record(shots, 0, segment, 0, with_acceleration=True)
+    sign, carrier = DEFAULT_CHIRP_SLOPES[segment], float(shots.carriers[segment])
     expected = []
     with mpmath.workdps(40):
         for n in range(0, 512, 73):
@@ -111,8 +121,8 @@ def drawn(number):
     further = {
         "target.acceleration": rng.choice([-1, 1]) * 10 ** rng.uniform(0, 5),
         "target.transverse_velocity": rng.uniform(-200, 200),
-        ORDER: ORDERS[number % len(ORDERS)],
-        GAP: float(rng.choice([0.0, 130e-6])),
+        SEGMENT_ORDER_PATH: SEGMENT_ORDERS[number % len(SEGMENT_ORDERS)],
+        SEGMENT_GAP_PATH: float(rng.choice([0.0, 130e-6])),
     }
     return scene, further
 
@@ -121,10 +131,10 @@ def disagreement(shots, **kept):
     return max(
         magnitude_error(
             shots,
-            segments.spectrum(shots, 0, int(segment))[1],
-            truth.spectrum(shots, 0, int(segment), **kept),
+            segment_spectra.segment_spectrum(shots, 0, int(segment))[1],
+            time_domain_truth.time_domain_spectrum(shots, 0, int(segment), **kept),
         )
-        for segment in np.flatnonzero(shots.segments)
+        for segment in np.flatnonzero(shots.has_segment)
     )
 
 
@@ -132,7 +142,7 @@ def disagreement(shots, **kept):
 def test_the_fast_path_is_the_truth_as_the_target_moves_on(number, table_4_1):
     scene, further = drawn(number)
     parameters = table_4_1(**scene) | further
-    assert disagreement(prepared(parameters), range_walk=False) < 1e-9, scene
+    assert disagreement(prepared(parameters), with_range_walk=False) < 1e-9, scene
 
 
 @pytest.mark.parametrize("number", range(0, 24, 5))
@@ -141,7 +151,7 @@ def test_the_drift_within_a_record_is_that_of_its_own_segment(number, table_4_1)
     scene, further = drawn(number)
     parameters = table_4_1(**scene | {"beamlets": 1}) | further
     shots = prepared(parameters, (*MOVING, "range_walk", "acceleration"))
-    assert disagreement(shots, acceleration=True) < 1e-8, scene
+    assert disagreement(shots, with_acceleration=True) < 1e-8, scene
 
 
 @pytest.mark.parametrize("frequency", [0.0, 300e6, -600e6])
@@ -151,7 +161,7 @@ def test_lines_meet_their_images_at_the_phase_of_where_they_have_come_to(frequen
     v = (frequency + rate * 2 * 1234.5 / speed_of_light) / carrier * speed_of_light / 2
     for a in (0.0, 3.0):
         shots = prepared(scene | {"target.radial_velocity": -v, "target.acceleration": a})
-        assert disagreement(shots, range_walk=False) < 1e-9
+        assert disagreement(shots, with_range_walk=False) < 1e-9
 
 
 def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
@@ -159,8 +169,10 @@ def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
     rng = np.random.default_rng(3)
     scene = table_4_1(fft_size=4096, phases="coherent", radial_velocity=20.0, range=900.0)
     shots = prepared(scene | {"footprint.beamlets": 19})
-    own = replace(shots, doppler=rng.uniform(-1e-8, 1e-8, shots.offset.shape))
-    assert disagreement(own, range_walk=False) < 1e-9
+    own = replace(
+        shots, doppler_ratio_offset=rng.uniform(-1e-8, 1e-8, shots.relative_range_offset.shape)
+    )
+    assert disagreement(own, with_range_walk=False) < 1e-9
 
 
 @pytest.mark.parametrize("velocity", [150.0, -90.0])
@@ -175,10 +187,10 @@ def test_what_is_reported_is_put_right_by_the_velocity_that_is_measured(
     scene = table_4_1(
         range=812.34, radial_velocity=velocity, power=100.0, beamlets=1, grazing_angle=1.1
     )
-    moving = {"target.transverse_velocity": across, ORDER: ORDERS[order]}
+    moving = {"target.transverse_velocity": across, SEGMENT_ORDER_PATH: SEGMENT_ORDERS[order]}
     shots = prepared(scene | moving, (*MOVING, "range_walk"))
     keys = np.ones((1, 2), np.uint64)
-    found = draw_returns(shots, groups(shots), keys=keys, draws=400)
+    found = draw_returns(shots, list_bin_groups(shots), keys=keys, draws=400)
     slid = across / np.tan(1.1)
     within = (up + down) / 2 * 500e-6 + 2**17 / 600e6 / 2
     off = np.median(found.range_interpolated[0, :, 0]) - 812.34
@@ -199,13 +211,13 @@ def of_flight(table_4_1, effects):
         straight_flight(
             (0.0, 0.0, 500.0), (0.0, 0.0, -100.0), acceleration=(0.0, 0.0, SLOWS), duration=6.0
         ),
-        scanner=fixed(cone(3, half_angle=TILT), rate=1.0),
+        scanner=fixed_beams(cone_directions(3, half_angle=TILT), rate=1.0),
         index=np.arange(3),
         number=1,
     )
-    ground = [Surface("ground", 0.1, "lambert")]
-    return prepare_eyepoints(
-        seen, DEFAULTS | scene_parameters(table_4_1, beamlets=1), ground, effects
+    ground = [SurfaceMaterial("ground", 0.1, "lambert")]
+    return prepare_eyepoint_shots(
+        seen, PARAMETER_DEFAULTS | scene_parameters(table_4_1, beamlets=1), ground, effects
     )
 
 
@@ -226,15 +238,15 @@ def test_morpheus_magnitudes_are_those_of_the_truth_that_decelerates(made, table
     within = (*MOVING, "range_walk")
     slowing, steady = (made(table_4_1, (*within, *also)) for also in (["acceleration"], []))
     assert float(np.ravel(slowing.acceleration)[0]) == pytest.approx(-10.509, abs=1e-3)
-    assert float(np.ravel(slowing.approach)[0]) == pytest.approx(100.0 / np.cos(TILT))
-    assert disagreement(slowing, acceleration=True) < 1e-8
-    lost = disagreement(steady, acceleration=True)
+    assert float(np.ravel(slowing.approach_speed)[0]) == pytest.approx(100.0 / np.cos(TILT))
+    assert disagreement(slowing, with_acceleration=True) < 1e-8
+    lost = disagreement(steady, with_acceleration=True)
     assert 0.05 < lost < 0.3
 
 
 def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
     """Deceleration by 11 m/s^2; a hovering lidar has neither."""
-    ground = [Surface("ground", 0.1, "lambert")]
+    ground = [SurfaceMaterial("ground", 0.1, "lambert")]
     called = []
     for slows in (SLOWS, 0.0):
         seen = observe_shots(
@@ -245,7 +257,7 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
             rotating=False,
         )  # fmt: skip
         flags = planned.selected_effects(1).effect_flags
-        called.append({"acceleration", "segment_motion"} & set(names_of(int(flags[0]))))
+        called.append({"acceleration", "segment_motion"} & set(unpack_effect_flags(int(flags[0]))))
     assert called == [{"acceleration", "segment_motion"}, set()]
 
 
@@ -257,11 +269,17 @@ def test_speckles_turn_once_between_segments(table_4_1):
     )  # fmt: skip
     rough = scene | {"target.roughness": 1e-3, "target.transverse_velocity": 3.0}
     (one,), (other,) = (
-        realise(rough, (*CORE, *also), keys=np.ones((1, 2), np.uint64), draws=1)
+        iter_realisations(
+            rough, (*DEFAULT_EFFECTS, *also), keys=np.ones((1, 2), np.uint64), draws=1
+        )
         for also in (["speckle"], ["speckle", "segment_motion"])
     )
     for segment in range(3):
-        first, second = (segments.spectrum(each.shots, 0, segment)[1] for each in (one, other))
+        first, second = (
+            segment_spectra.segment_spectrum(each.shots, 0, segment)[1] for each in (one, other)
+        )
         np.testing.assert_allclose(first, second, atol=1e-5 * first.max())
-    starts = [segments.spectrum(one.shots, 0, segment)[1].max() for segment in (0, 2)]
+    starts = [
+        segment_spectra.segment_spectrum(one.shots, 0, segment)[1].max() for segment in (0, 2)
+    ]
     assert abs(starts[0] / starts[1] - 1) > 0.05

@@ -23,9 +23,9 @@ from shot_helpers import make_point_keys, parametrize_product
 from test_drawn_speckle import flown
 from validate_speckle import random_mapping, spec_of_ratio, stated_error
 
-from sweep.model.pairing import FLAGS, UNCONFIRMED
-from sweep.model.sampling import simulate
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.pointcloud.pairing import FLAG_BITS, UNCONFIRMED_FLAG
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.spec import SpecError
 
 SCATTERER_DRAWS, DRAWS, SPECTRA = 16_000, 5_000, 800
@@ -79,7 +79,7 @@ def spec_at_random(number):
             continue
         try:
             found = spec_of_ratio(mapping, ratio)
-        except (SpecError, UnsupportedShot):
+        except (SpecError, UnsupportedShotError):
             continue
         chirps = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
         if min(chirps) > 0.1 and max(chirps) < 0.97:
@@ -89,7 +89,7 @@ def spec_at_random(number):
 def shares_of_grid(p, method, draws, seed):
     """Shares of a grid's draws by segment, and of the shot."""
     given = dict(p) | {"target.range": np.ravel(p["target.range"])[:1]}
-    counts = simulate(
+    counts = simulate_draws(
         given, COMPARED_EFFECTS, keys=make_point_keys(1, seed), batch_sizes=[draws], method=method
     )
     names = ("up", "doppler", "down", "shot")
@@ -100,9 +100,9 @@ def shares_of_flight(p, method, draws):
     """Shares of draws with a point, with a confirmed one, and with each flag."""
     place = {"instrument.processing.estimator.kind": "candan"} if method == "spectra" else {}
     flags = flown(dict(p) | place, method, draws)["flags"][0, :, 0]
-    confirmed = (flags > 0) & (flags & UNCONFIRMED == 0)
+    confirmed = (flags > 0) & (flags & UNCONFIRMED_FLAG == 0)
     shares = {"chirps": (flags > 0).mean(), "all segments": confirmed.mean()}
-    return shares | {name: (flags & bit > 0).mean() for name, bit in FLAGS.items()}
+    return shares | {name: (flags & bit > 0).mean() for name, bit in FLAG_BITS.items()}
 
 
 def compared(number):
@@ -131,7 +131,7 @@ def compared(number):
     stored = {name[3:]: share for name, share in found.stored_pd.items()}
     compare("closed form", {k: v for k, v in stored.items() if k != "shot"}, 1e9, law[:1] * 2)
     compare("closed form", {"shot": stored["shot"]}, 1e9, law)
-    several, flights = shots.looks.several, {}
+    several, flights = shots.looks.is_noncoherent, {}
     for method, draws in (("probabilities", DRAWS), ("noise", DRAWS), ("spectra", SPECTRA)):
         if method == "noise" and several:  # refused
             continue
@@ -144,7 +144,7 @@ def compared(number):
     one = flights["probabilities"]
     for method, shares in flights.items():
         draws = DRAWS if method == "noise" else 200 if several else SPECTRA
-        for name in FLAGS:
+        for name in FLAG_BITS:
             likely = np.clip(one[name], 1e-3, 1 - 1e-3)
             sigma = math.sqrt(likely * (1 - likely) * (1 / draws + 1 / DRAWS))
             if abs(shares[name] - one[name]) > SIGMAS * sigma + 0.02:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sweep.model import shot
-from sweep.model.outputs import OUTPUTS
+from sweep.model import evaluation
+from sweep.model.outputs import GRID_OUTPUTS
 
 CATEGORIES = {
     "architecture": ("homodyne", "heterodyne", "direct"),
@@ -47,17 +47,17 @@ def mixed_points(number, seed=0):
 
 def same_bits(one, other):
     """Names of the outputs whose bytes differ."""
-    return {name for name in OUTPUTS if one[name].tobytes() != other[name].tobytes()}
+    return {name for name in GRID_OUTPUTS if one[name].tobytes() != other[name].tobytes()}
 
 
 def test_points_together_are_the_same_bits_as_point_by_point(table_4_1):
     points = mixed_points(60)
-    together = shot.evaluate(table_4_1(**points))
+    together = evaluation.evaluate(table_4_1(**points))
     single = [
-        shot.evaluate(table_4_1(**{name: v[i].item() for name, v in points.items()}))
+        evaluation.evaluate(table_4_1(**{name: v[i].item() for name, v in points.items()}))
         for i in range(60)
     ]
-    apart = {name: np.concatenate([s[name] for s in single]) for name in OUTPUTS}
+    apart = {name: np.concatenate([s[name] for s in single]) for name in GRID_OUTPUTS}
     assert same_bits(together, apart) == set()
 
 
@@ -66,10 +66,10 @@ def test_it_does_not_matter_which_parameters_come_as_arrays(number, table_4_1):
     scenes = mixed_points(24, seed=1)
     for i in range(24):
         scene = table_4_1(**{name: v[i].item() for name, v in scenes.items()})
-        alone = shot.evaluate(scene)
+        alone = evaluation.evaluate(scene)
         chosen = np.random.default_rng((32, i)).choice(list(scene), 12, replace=False)
         arrays = scene | {path: np.array([scene[path]] * number) for path in chosen}
-        repeated = shot.evaluate(arrays)
+        repeated = evaluation.evaluate(arrays)
         for k in range(number):
             assert same_bits({n: v[k : k + 1] for n, v in repeated.items()}, alone) == set()
 
@@ -86,7 +86,7 @@ def test_reported_range_and_velocity_err_by_the_rounding_to_bins_and_by_no_bias(
     # Beats at DC or Nyquist apart: there the reading itself is at stake (test_waveform).
     clear = np.abs(np.abs(f_d) - f_r) > 5 * bin_width
     clear &= np.abs(np.abs(f_d) + f_r - 300e6) > 66 * bin_width
-    results = shot.evaluate(
+    results = evaluation.evaluate(
         table_4_1(
             range=ranges[clear], radial_velocity=velocities[clear], beamlets=1, fft_size=2**14
         )
@@ -104,7 +104,7 @@ def test_reported_range_and_velocity_err_by_the_rounding_to_bins_and_by_no_bias(
 
 
 def snr_of(table_4_1, **changes):
-    return shot.evaluate(table_4_1(range=50.0, **changes))["snr_doppler"][0]
+    return evaluation.evaluate(table_4_1(range=50.0, **changes))["snr_doppler"][0]
 
 
 def test_in_phase_coherent_beamlets_raise_the_snr_in_proportion_to_their_number(table_4_1):

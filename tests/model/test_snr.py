@@ -7,10 +7,14 @@ from hypothesis import strategies as st
 from scipy import stats
 from shot_helpers import make_point_keys, prepare_single_category
 
-from sweep.model import looks
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.noisy_spectra import drawn_of, index_of_zero, signal_of
-from sweep.model.shot import evaluate, statistics
+from sweep.model.detection import looks
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate, shot_statistics
+from sweep.model.sampling.noisy_spectra import (
+    draw_signal_spectra,
+    noiseless_signal,
+    zero_frequency_index,
+)
 
 WIDTH, SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
 NARROW, WIDE = {SHAPE: "lorentzian", WIDTH: 2e3}, {SHAPE: "lorentzian", WIDTH: 3e6}
@@ -24,10 +28,10 @@ CHANGES = {
     "a Lorentzian line that is all pedestal": WIDE,
     "a padded record": {"instrument.processing.sample_rate": 25e6},
     "a complex record": {"instrument.receiver.record": "complex"},
-    "averaged powers": {looks.NUMBER: 4, looks.COMBINE: "power"},
-    "added records": {looks.NUMBER: 4, looks.COMBINE: "coherent"},
+    "averaged powers": {looks.LOOKS_NUMBER_PATH: 4, looks.LOOKS_COMBINE_PATH: "power"},
+    "added records": {looks.LOOKS_NUMBER_PATH: 4, looks.LOOKS_COMBINE_PATH: "coherent"},
 }
-EFFECTS = (*CORE, "fading", "chirp_nonlinearity", "line_width")
+EFFECTS = (*DEFAULT_EFFECTS, "fading", "chirp_nonlinearity", "line_width")
 
 
 def _parameters(table_4_1, changes, speckle, power):
@@ -35,7 +39,7 @@ def _parameters(table_4_1, changes, speckle, power):
         fft_size=2**14, detection="peak_bin", beamlets=19, phases="incoherent", range=1000.0,
         radial_velocity=20.0, tnr=5.0, power=power,
     )  # fmt: skip
-    return DEFAULTS | given | {"footprint.speckle": speckle} | changes
+    return PARAMETER_DEFAULTS | given | {"footprint.speckle": speckle} | changes
 
 
 @given(
@@ -79,12 +83,14 @@ def test_the_power_of_a_lorentzian_line_is_that_of_records_whose_phase_walks(wid
     parameters = _parameters(table_4_1, {SHAPE: "lorentzian", WIDTH: width}, "none", 0.1)
     parameters |= {"instrument.processing.fft_size": 2**12}
     shots = prepare_single_category(parameters, EFFECTS)
-    out = statistics(shots)
-    signal = signal_of(shots, 0, 0)
-    spectra = drawn_of(shots, 0, 0, signal, key=make_point_keys(1)[0], draws=np.arange(600))
-    power = np.abs(spectra[:, signal.strongest]) ** 2 / (2 * shots.bin_deviation[0] ** 2)
+    out = shot_statistics(shots)
+    signal = noiseless_signal(shots, 0, 0)
+    spectra = draw_signal_spectra(
+        shots, 0, 0, signal, key=make_point_keys(1)[0], draws=np.arange(600)
+    )
+    power = np.abs(spectra[:, signal.strongest_bin]) ** 2 / (2 * shots.bin_noise_sigma[0] ** 2)
     error = 5 * power.std() / np.sqrt(600) + 0.03 * power.mean()
     assert out["snr_up"][0] == pytest.approx(power.mean(), abs=error)
-    assert signal.strongest - index_of_zero(shots) > 0
-    line = np.square(np.abs(signal.spectrum).max() / shots.bin_deviation[0]) / 2
+    assert signal.strongest_bin - zero_frequency_index(shots) > 0
+    line = np.square(np.abs(signal.spectrum).max() / shots.bin_noise_sigma[0]) / 2
     assert out["snr_up"][0] < 1.01 * line  # the walk adds no light

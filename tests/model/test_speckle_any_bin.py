@@ -9,11 +9,17 @@ import math
 import numpy as np
 import pytest
 
-from sweep.model.alarms import neighbour_correlation
-from sweep.model.detection import BinLevels, BinSpeckle, DetectionRule, found_pair, mark
-from sweep.model.detectors import main_lobe
-from sweep.model.speckle_modes import mode_table
-from sweep.model.window import samples, window
+from sweep.model.detection.bin_noise import neighbour_noise_correlation
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.detection.echo_detection import (
+    BinSpeckle,
+    BinThreshold,
+    DetectionRule,
+    mark_exempt_bins,
+    pd_and_miss,
+)
+from sweep.model.detection.speckle_modes import mode_table
+from sweep.model.window import get_window, window_samples
 
 LENGTH, DRAWS, LEVEL = 256, 20_000, 3.9
 
@@ -24,7 +30,7 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
     ``spread`` of the lines in bins of fs/L, ``place`` between bins of fs/N, ``snr`` of the
     strongest bin.
     """
-    rng, w, size = np.random.default_rng(seed), samples(name, LENGTH), LENGTH * padding
+    rng, w, size = np.random.default_rng(seed), window_samples(name, LENGTH), LENGTH * padding
     time = (np.arange(LENGTH) - LENGTH / 2) / LENGTH
     centre, half = 100 * padding, int((10 + 4 * spread) * padding)
     bins = np.arange(centre - half, centre + half + 1)
@@ -39,9 +45,9 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
     basis = w * np.exp(-2j * np.pi * np.outer(bins, time) / padding)
     noise = 2 * (basis @ basis.conj().T).real / (w**2).sum()
     magnitude, echo = np.sqrt(np.diag(signal)), np.zeros(bins.size, bool)
-    shape = window(name, LENGTH)
-    beside = math.ceil(main_lobe(shape) * padding)
-    mark(magnitude, bins.size, LEVEL, echo, beside)
+    shape = get_window(name, LENGTH)
+    beside = math.ceil(main_lobe_half_width(shape) * padding)
+    mark_exempt_bins(magnitude, bins.size, LEVEL, echo, beside)
     values, vectors = np.linalg.eigh((signal + noise)[np.ix_(echo, echo)])
     factor = vectors * np.sqrt(np.maximum(values, 0) / 2)
     detected = np.zeros(DRAWS, bool)
@@ -49,12 +55,12 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
         numbers = rng.normal(size=(5000, values.size, 2)) @ [1, 1j]
         detected[first : first + 5000] = (abs(numbers @ factor.T) >= LEVEL).any(axis=1)
     rule = DetectionRule(
-        0, beside, np.empty((3, 0)), neighbour_correlation(shape, size), 0, np.empty(0),
+        0, beside, np.empty((3, 0)), neighbour_noise_correlation(shape, size), 0, np.empty(0),
         mode_table(shape, size),
     )  # fmt: skip
-    levels = BinLevels(1.0, LEVEL, 1.0, 1.0)
+    levels = BinThreshold(1.0, LEVEL, 1.0, 1.0)
     speckle = BinSpeckle(spread * padding, np.empty(0))
-    pd, missed = found_pair(
+    pd, missed = pd_and_miss(
         magnitude, echo, int(magnitude.argmax()), int(bins[0]), rule, levels, speckle
     )
     assert pd + missed == pytest.approx(1, abs=1e-9)

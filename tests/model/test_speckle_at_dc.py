@@ -15,13 +15,13 @@ from scatterer_shots import (
 )
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.hoyt import hoyt_pair
-from sweep.model.look_speckle import turned_matrices
-from sweep.model.looks import Looks
-from sweep.model.quadratures import faded_looks
-from sweep.model.sampling import simulate
-from sweep.model.shot import find, statistics
+from sweep.model.detection.hoyt import hoyt_tails
+from sweep.model.detection.look_speckle import phase_rotated_look_covariances
+from sweep.model.detection.looks import Looks
+from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate_segments, shot_statistics
+from sweep.model.sampling.samplers import simulate_draws
 
 DRAWS = 20_000
 BIN_WIDTH = (
@@ -44,8 +44,8 @@ def at_doppler(parameters, frequency):
 def with_circular_pd(parameters, pd):
     """Parameters with the laser power for which a circular number in the Doppler segment has pd."""
     shots = prepare_single_category(parameters)
-    snr = 0.5 * float(shots.threshold[0] / shots.bin_deviation[0]) ** 2 / -np.log(pd) - 1
-    now = 0.5 * float(find(shots)[1, 2, 0] / shots.bin_deviation[0]) ** 2
+    snr = 0.5 * float(shots.threshold[0] / shots.bin_noise_sigma[0]) ** 2 / -np.log(pd) - 1
+    now = 0.5 * float(evaluate_segments(shots)[1, 2, 0] / shots.bin_noise_sigma[0]) ** 2
     factor = parameters["instrument.laser.power"] * snr / now
     return parameters | {"instrument.laser.power": factor}
 
@@ -61,9 +61,9 @@ def with_circular_pd(parameters, pd):
 )
 def test_a_hovering_lidar_detects_a_real_number(bins, circular, drawn, error, table_4_1):
     """Shares drawn by another simulation, with the probabilities of circular numbers there."""
-    p = at_doppler(DEFAULTS | table_4_1() | HOVER, bins * BIN_WIDTH)
+    p = at_doppler(PARAMETER_DEFAULTS | table_4_1() | HOVER, bins * BIN_WIDTH)
     p = with_circular_pd(p, circular)
-    outputs = statistics(prepare_single_category(p))
+    outputs = shot_statistics(prepare_single_category(p))
     assert abs(outputs["pd_doppler"][0] - drawn) < 3 * error
     assert outputs["pd_doppler"][0] + outputs["miss_doppler"][0] == pytest.approx(1, abs=1e-12)
 
@@ -81,24 +81,27 @@ def test_a_hovering_lidar_detects_a_real_number(bins, circular, drawn, error, ta
 def test_slow_echoes_are_detected_as_often_as_drawn_ones(
     window, rule, doppler, grazing, tolerance, table_4_1
 ):
-    p = DEFAULTS | table_4_1() | HOVER | {
+    p = PARAMETER_DEFAULTS | table_4_1() | HOVER | {
         "instrument.processing.window": window, "instrument.processing.detection": rule,
         "target.grazing_angle": grazing,
     }  # fmt: skip
     p = with_signal_over_threshold(at_doppler(p, doppler * BIN_WIDTH), 1.6)
     shots = prepare_single_category(p)
     drawn = draw_segment_detections(p, shots, draws=DRAWS, seed=7)["doppler"].mean()
-    expected = float(statistics(shots)["pd_doppler"][0])
+    expected = float(shot_statistics(shots)["pd_doppler"][0])
     assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / DRAWS) + tolerance
 
 
 @pytest.mark.parametrize(("rule", "tolerance"), [("peak_bin", 0.008), ("any_bin", 0.014)])
 def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
     """The Doppler frequency takes the range beat away; the down beat is at twice that."""
-    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
+    p = PARAMETER_DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
     p = with_signal_over_threshold(at_doppler(p, RANGE_BEAT + 0.3 * BIN_WIDTH), 1.6)
     shots = prepare_single_category(p)
-    detections, outputs = draw_segment_detections(p, shots, draws=DRAWS, seed=3), statistics(shots)
+    detections, outputs = (
+        draw_segment_detections(p, shots, draws=DRAWS, seed=3),
+        shot_statistics(shots),
+    )
     both = (detections["up"] & detections["down"]).mean()
     error = np.sqrt(0.25 / DRAWS)
     assert abs(detections["up"].mean() - outputs["pd_up"][0]) < 4 * error
@@ -107,12 +110,17 @@ def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
 
 
 def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
-    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.shot_detection": "any_two"}
+    p = (
+        PARAMETER_DEFAULTS
+        | table_4_1()
+        | HOVER
+        | {"instrument.processing.shot_detection": "any_two"}
+    )
     p = with_signal_over_threshold(at_doppler(p, 0.2 * BIN_WIDTH), 1.6)
     shots = prepare_single_category(p)
     detections = draw_segment_detections(p, shots, draws=DRAWS, seed=3)
     two = (np.sum([detections[name] for name in detections], axis=0) >= 2).mean()
-    outputs = statistics(shots)
+    outputs = shot_statistics(shots)
     assert abs(two - outputs["pd_shot"][0]) < 0.003 + 4 * np.sqrt(two * (1 - two) / DRAWS)
     assert outputs["pd_shot"][0] + outputs["miss_shot"][0] == pytest.approx(1, abs=1e-9)
 
@@ -122,7 +130,7 @@ def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
 @pytest.mark.parametrize("place", [0.0, 0.3, 1.06])
 def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, table_4_1):
     looks, draws, rng = 4, 20_000, np.random.default_rng(5)
-    p = DEFAULTS | table_4_1() | HOVER | {
+    p = PARAMETER_DEFAULTS | table_4_1() | HOVER | {
         "instrument.processing.tnr": 4.0, "instrument.looks.number": looks,
         "instrument.looks.combine": combine, "instrument.looks.votes": 2,
         "instrument.looks.speckle": speckle,
@@ -133,21 +141,21 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
     w = shots.window.samples()
     time, k = (np.arange(w.size) - w.size / 2) / w.size, round(place)
     line, image = ((w * np.cos(2 * np.pi * y * time)).sum() for y in (k - place, k + place))
-    power = float(find(shots)[1, 2, 0]) ** 2 / (line**2 + image**2)
+    power = float(evaluate_segments(shots)[1, 2, 0]) ** 2 / (line**2 + image**2)
     amplitude = rng.normal(size=(draws, looks, 2)) @ [1, 1j] * np.sqrt(power / 2)
     if speckle == "common":
         cycles = place * BIN_WIDTH * np.ravel(shots.look_period)[0] * np.arange(looks)
         amplitude = amplitude[:, :1] * np.exp(2j * np.pi * cycles)
     pseudo = (w**2 * np.cos(4 * np.pi * k * time)).sum() / (w**2).sum()
     noise = rng.normal(size=(draws, looks, 2)) * np.sqrt([1 + pseudo, 1 - pseudo])
-    noise = float(shots.bin_deviation[0]) * (noise @ [1, 1j])
+    noise = float(shots.bin_noise_sigma[0]) * (noise @ [1, 1j])
     magnitude = abs(amplitude * line + amplitude.conj() * image + noise)
     level = float(shots.threshold[0])
     if combine == "power":
         detected = (magnitude**2).mean(axis=1) >= level**2
     else:
         detected = (magnitude >= level).sum(axis=1) >= 2
-    drawn, expected = detected.mean(), float(statistics(shots)["pd_doppler"][0])
+    drawn, expected = detected.mean(), float(shot_statistics(shots)["pd_doppler"][0])
     assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / draws)
 
 
@@ -155,7 +163,7 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
 @pytest.mark.parametrize("level", [1e-3, 0.7, 2.0, 9.0])
 def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
     """Of |X|^2 = P (1 + q cos t) times an exponential variable, t uniform."""
-    found, missed = hoyt_pair(1.7, share, level)
+    found, missed = hoyt_tails(1.7, share, level)
     t = np.pi * (np.arange(20_000) + 0.5) / 20_000
     exponent = level**2 / (1.7 * (1 + share * np.cos(t)))
     assert found == pytest.approx(np.exp(-exponent).mean(), rel=1e-9, abs=1e-300)
@@ -165,13 +173,13 @@ def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
 @pytest.mark.parametrize("rule", ["peak_bin", "any_bin"])
 @pytest.mark.parametrize("place", [0.0, 0.42])
 def test_draws_in_noise_detect_slow_echoes_as_often(rule, place, table_4_1):
-    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
+    p = PARAMETER_DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
     p = with_signal_over_threshold(at_doppler(p, place * BIN_WIDTH), 1.6)
     p["target.range"] = np.array([300.0])
     keys, draws = np.array([[1, 2]], np.uint64), 20_000
-    counts = simulate(p, COMPARED_EFFECTS, keys=keys, batch_sizes=[draws], method="noise")
+    counts = simulate_draws(p, COMPARED_EFFECTS, keys=keys, batch_sizes=[draws], method="noise")
     drawn = counts["n_detected_doppler"][0, 0] / draws
-    expected = float(statistics(prepare_single_category(p))["pd_doppler"][0])
+    expected = float(shot_statistics(prepare_single_category(p))["pd_doppler"][0])
     assert abs(drawn - expected) < 0.004 + 4 * np.sqrt(expected * (1 - expected) / draws)
 
 
@@ -184,9 +192,9 @@ def test_looks_whose_phase_turns_are_detected_as_gaussian_numbers(combine, cycle
     signal, level, q = 5.0, 4.3, 0.8
     looks = Looks(number, combine, 2)
     by_lag = (memory ** np.arange(number)).astype(complex)[None]
-    covariance = turned_matrices(by_lag, np.ones((1, number)), np.array([cycles]))
+    covariance = phase_rotated_look_covariances(by_lag, np.ones((1, number)), np.array([cycles]))
     columns = (np.array([value]) for value in (signal, level, q, 0.0))
-    pd, miss = faded_looks(looks, *columns, covariance)
+    pd, miss = multilook_pd_and_miss_near_ends(looks, *columns, covariance)
     amplitude = np.empty((draws, number), complex)
     innovation = [complex_normal(rng, draws) for _ in range(number)]
     amplitude[:, 0] = innovation[0]

@@ -14,8 +14,8 @@ from scatterer_shots import (
 )
 
 from sweep.model import beam
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.shot import statistics
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.evaluation import shot_statistics
 
 DRAWS = 20_000
 
@@ -73,7 +73,7 @@ RATIOS = {"four bins": 0.6}
 @pytest.mark.parametrize("case", CASES)
 def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, tolerance, table_4_1):
     p = (
-        DEFAULTS
+        PARAMETER_DEFAULTS
         | table_4_1()
         | LANDER_PARAMETERS
         | CASES[case]
@@ -81,7 +81,7 @@ def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, toler
     )
     p = with_signal_over_threshold(p, RATIOS.get(case, 1.3))
     shots = prepare_single_category(p)
-    outputs = statistics(shots)
+    outputs = shot_statistics(shots)
     detections = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
     both = (detections["up"] & detections["down"]).mean()
     expected = float(outputs["pd_shot"][0])
@@ -91,12 +91,18 @@ def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, toler
 
 def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):
     """The correlation is exp(-t^2 / 2), t = 4 pi df sigma_R / c, where the footprint is narrow."""
-    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | CASES["steep chirp, short record"]
+    p = PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | CASES["steep chirp, short record"]
     shots = prepare_single_category(p)
     delay, length = 2 * 150.0 / 299792458.0, 8192 / 200e6
     frequencies_apart = 2 * (4e9 / 100e-6) * (5e-6 + length / 2 - delay - 50e-6)
-    deviation = float(beam.beams(p)[0].radius(150.0)) / np.sqrt(8) / np.tan(np.radians(30))
+    deviation = (
+        float(beam.sent_and_oscillator_beams(p)[0].radius(150.0))
+        / np.sqrt(8)
+        / np.tan(np.radians(30))
+    )
     turn = 4 * np.pi * frequencies_apart * deviation / 299792458.0
     assert abs(turn) > 0.5
     # The strongest bin sees a little less of the footprint, a tenth of a bin wide, than all of it.
-    assert abs(shots.fading.over[0]) == pytest.approx(np.exp(-0.5 * turn**2), rel=0.03)
+    assert abs(shots.segment_correlations.up_down[0]) == pytest.approx(
+        np.exp(-0.5 * turn**2), rel=0.03
+    )

@@ -5,14 +5,19 @@ import pytest
 from shot_helpers import make_point_keys, parametrize_product
 from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
-from sweep.model.clouds import cloud
-from sweep.model.estimators import DETECTOR, ESTIMATOR
-from sweep.model.geometry.mesh import Surface
-from sweep.model.noisy_spectra import Methods
-from sweep.model.pairing import FALSE_ALARM, MISREAD, TRUE, UNCONFIRMED
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate
-from sweep.model.waveform import PEAKS, STRONGEST
+from sweep.model.detection.estimators import DETECTOR_PREFIX, ESTIMATOR_PREFIX
+from sweep.model.evaluation import evaluate
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.pointcloud.pairing import (
+    FALSE_ALARM_FLAG,
+    MISREAD_FLAG,
+    TRUE_FLAG,
+    UNCONFIRMED_FLAG,
+)
+from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.sampling.noisy_spectra import SpectrumMethods
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.waveform import PEAKS_PATH, STRONGEST_PEAK
 
 EFFECTS = ("footprint", "doppler")
 RECORD = "instrument.receiver.record"
@@ -38,15 +43,21 @@ def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **given)
     given = {"effects": EFFECTS} | given
     path = straight_flight(position=(x, 0.0, HEIGHT), velocity=(0.0, 0.0, -CLOSING))
     seen = observe_shots(path, bodies=bodies, number=7)
-    return cloud(
-        seen, parameters=parameters, surfaces=[Surface("ground", 0.1), Surface("table", 0.1)],
-        keys=make_point_keys(1), first_draw=first, draws=draws, method="spectra", **given,
-    )  # fmt: skip
+    return simulate_cloud(
+        seen,
+        parameters=parameters,
+        surfaces=[SurfaceMaterial("ground", 0.1), SurfaceMaterial("table", 0.1)],
+        keys=make_point_keys(1),
+        first_draw=first,
+        draws=draws,
+        method="spectra",
+        **given,
+    )
 
 
 def _grid(parameters, methods=None):
     """A flat target of the same range, velocity and reflectance, with other draws."""
-    return simulate(
+    return simulate_draws(
         parameters | TARGET,
         EFFECTS,
         keys=make_point_keys(1),
@@ -66,13 +77,13 @@ def _grid(parameters, methods=None):
 def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
     """The same shot, seen in other draws: 5 sigma of means and of root mean squares."""
     kind, record = way
-    changes = {ESTIMATOR + "kind": kind, RECORD: record}
+    changes = {ESTIMATOR_PREFIX + "kind": kind, RECORD: record}
     parameters = _given(table_4_1, power=1.0, **changes)
     got, grid = _flown(parameters), _grid(parameters)
     assert got["snr_up"][0] == pytest.approx(grid["snr_up"][0], rel=1e-9)
     for name in ("range", "radial_velocity"):
         error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, :, 0]
-        assert np.isfinite(error).all() and (got["flags"][0, :, 0] == TRUE).all()
+        assert np.isfinite(error).all() and (got["flags"][0, :, 0] == TRUE_FLAG).all()
         bias, rmse = grid[f"{name}_bias"][0], grid[f"{name}_rmse"][0]
         scatter = np.sqrt(max(rmse**2 - bias**2, 0.0))
         apart = 5 * scatter * np.sqrt(2 / NUMBER)
@@ -89,10 +100,10 @@ def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
 )  # fmt: skip
 def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
     kind, record = way
-    chosen = {DETECTOR + "kind": kind, DETECTOR + "pfa": 1e-4, RECORD: record}
+    chosen = {DETECTOR_PREFIX + "kind": kind, DETECTOR_PREFIX + "pfa": 1e-4, RECORD: record}
     parameters = _given(table_4_1, tnr=6.0, power=1e-2, **chosen)
     got, grid = _flown(parameters), _grid(parameters)
-    found = np.isin(got["flags"], (TRUE, TRUE | UNCONFIRMED)).any(axis=2).mean()
+    found = np.isin(got["flags"], (TRUE_FLAG, TRUE_FLAG | UNCONFIRMED_FLAG)).any(axis=2).mean()
     pd = grid["pd_shot"][0]
     assert 0.1 < pd < 0.95
     assert found == pytest.approx(pd, abs=5 * np.sqrt(2 * pd * (1 - pd) / NUMBER))
@@ -105,13 +116,13 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
 @pytest.mark.parametrize("record", [pytest.param("real", marks=pytest.mark.slow), "complex"])
 def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(table_4_1, record):
     """A return of both right peaks may be misread for want of a Doppler peak."""
-    changes = {PEAKS: STRONGEST, RECORD: record}
+    changes = {PEAKS_PATH: STRONGEST_PEAK, RECORD: record}
     parameters = _given(table_4_1, tnr=3.0, power=1e-2, **changes)
     got = _flown(parameters, draws=2000)
     grid = evaluate(parameters | TARGET, EFFECTS)
     flags = got["flags"][0]
     assert not flags[:, 1:].any()  # a shot has one return
-    right = ((flags[:, 0] & (TRUE | MISREAD)) > 0).mean()
+    right = ((flags[:, 0] & (TRUE_FLAG | MISREAD_FLAG)) > 0).mean()
     pd, wrong = grid["pd_shot"][0], grid["p_wrong_range_shot"][0]
     assert 0.2 < pd < 0.8 and wrong > 0.05
     for found, told in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
@@ -129,10 +140,10 @@ def test_functions_of_ones_own_see_every_draw_alone(table_4_1):
         assert spectrum.shape == (1, setting.fft_size // 2 + 1) and (peak == 300).all()
         return peak + 0.25
 
-    own = Methods({"mine:here": here}, {"mine:there": there})
-    chosen = {DETECTOR + "kind": "mine:here", ESTIMATOR + "kind": "mine:there"}
+    own = SpectrumMethods({"mine:here": here}, {"mine:there": there})
+    chosen = {DETECTOR_PREFIX + "kind": "mine:here", ESTIMATOR_PREFIX + "kind": "mine:there"}
     got = _flown(_given(table_4_1, **chosen), draws=3, methods=own)
-    assert (got["flags"][0, :, 0] & FALSE_ALARM).all() and not got["flags"][0, :, 1:].any()
+    assert (got["flags"][0, :, 0] & FALSE_ALARM_FLAG).all() and not got["flags"][0, :, 1:].any()
     # Up and down beat alike: no range, and a velocity of 300.25 bins; or the reverse.
     bins = 299792458.0 * 600e6 / (4 * 2**11 * 2e12), 1550e-9 * 600e6 / 2**12
     far, closing = (np.abs(got[f"{n}_interpolated"][0, :, 0]) for n in ("range", "radial_velocity"))
@@ -143,7 +154,7 @@ def test_functions_of_ones_own_see_every_draw_alone(table_4_1):
 def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_1):
     """Both are seen as often as by chance, and their strengths are not correlated; 5 sigma."""
     bodies = [level_plate(x=(-1e3, 30.0)), level_plate(x=(0.0, 30.0), surface=1, height=120.0)]
-    changes = {ESTIMATOR + "kind": "candan", "footprint.speckle": "developed"}
+    changes = {ESTIMATOR_PREFIX + "kind": "candan", "footprint.speckle": "developed"}
     parameters = _given(table_4_1, power=0.3, **changes)
     effects = (*EFFECTS, "several_returns", "fading")
     got = _flown(parameters, bodies=bodies, x=1e-4, effects=effects, draws=2000)
@@ -155,13 +166,13 @@ def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_
     snr = [np.where(got["surface"][0] == k, got["snr"][0], 0.0).max(axis=1)[both] for k in (0, 1)]
     # One fading of both would have them rise and fall as one.
     assert abs(np.corrcoef(*snr)[0, 1]) < 5 / np.sqrt(both.sum()) < 0.2
-    true = got["flags"] == TRUE
+    true = got["flags"] == TRUE_FLAG
     off = np.abs(got["range_interpolated"] - got["true_range"])[true]
     assert np.median(off) < 0.5 * 299792458.0 * 600e6 / (4 * 2**11 * 2e12)
 
 
 def test_any_split_of_draws_gives_the_same_bytes(table_4_1):
-    parameters = _given(table_4_1, **{ESTIMATOR + "kind": "chirp_z"})
+    parameters = _given(table_4_1, **{ESTIMATOR_PREFIX + "kind": "chirp_z"})
     whole = _flown(parameters, draws=6)
     part = _flown(parameters, first=1002, draws=3)
     for name, values in part.items():

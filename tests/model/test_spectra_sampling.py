@@ -4,26 +4,26 @@ import numpy as np
 import pytest
 from shot_helpers import make_point_keys
 
-from sweep.model import philox, sampling
-from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.line_width import walk_steps, walked_phase
-from sweep.model.estimators import DEFAULTS
-from sweep.model.interpolation import noise_correlation
-from sweep.model.noisy_spectra import (
-    DETECTOR,
-    ESTIMATOR,
-    Methods,
-    drawn_of,
-    flagged,
-    noise_of,
-    signal_of,
-    view_of,
+from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
+from sweep.model.detection.sub_bin_interpolation import neighbour_noise_correlations
+from sweep.model.effects.line_width import n_phase_walk_steps, phase_walk
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.evaluation import evaluate, prepare_shots
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS, SPECTRA_OUTPUTS
+from sweep.model.sampling import philox, samplers
+from sweep.model.sampling.noisy_spectra import (
+    DETECTOR_PREFIX,
+    ESTIMATOR_PREFIX,
+    SpectrumMethods,
+    draw_noise_spectra,
+    draw_signal_spectra,
+    flag_bins,
+    make_spectrum_view,
+    noiseless_signal,
 )
-from sweep.model.outputs import DRAW_OUTPUTS, SPECTRA_OUTPUTS
-from sweep.model.sampling import Before, simulate
-from sweep.model.shot import evaluate, prepare
-from sweep.model.truth import spectrum
+from sweep.model.sampling.samplers import PriorDraws, simulate_draws
+from sweep.model.time_domain_truth import time_domain_spectrum
 
 EFFECTS = ("doppler",)
 WHOLE = {"method": "spectra"}
@@ -43,7 +43,7 @@ def _points(table_4_1, **changes):
 
 def _drawn(parameters, number=400, effects=EFFECTS, **place):
     size = np.size(parameters["target.range"])
-    return simulate(
+    return simulate_draws(
         parameters, effects, keys=make_point_keys(size), batch_sizes=[number], **place, **WHOLE
     )
 
@@ -56,15 +56,17 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
     """2.5 us are 1500 samples in 2048 points. 5 sigma of a mean over 300 spectra of 1000 bins."""
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
     changes[RECORD] = record
-    ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
-    noise = noise_of(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(300))[:, 8:-8]
-    power = 2 * float(shots.bin_deviation[0]) ** 2
+    ((_, shots),) = prepare_shots(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
+    noise = draw_noise_spectra(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(300))[
+        :, 8:-8
+    ]
+    power = 2 * float(shots.bin_noise_sigma[0]) ** 2
     independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
     turn = np.exp(1j * np.pi * shots.window.length / shots.fft_size)
     near = np.mean((noise[:, 1:] * noise[:, :-1].conj()).real * turn.real
                    - (noise[:, 1:] * noise[:, :-1].conj()).imag * turn.imag) / power  # fmt: skip
-    expected, _ = noise_correlation(shots.window, shots.fft_size)
+    expected, _ = neighbour_noise_correlations(shots.window, shots.fft_size)
     assert near == pytest.approx(expected, abs=5 / np.sqrt(independent))
 
 
@@ -73,12 +75,12 @@ def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     """A lone line: magnitudes of the record's own FFT; its place, but for its image."""
     parameters = _points(table_4_1) | {"target.range": 1000.0, "footprint.beamlets": 1}
     parameters[RECORD] = record
-    ((_, shots),) = prepare(parameters, (*EFFECTS, "image"))
-    expected = spectrum(shots, 0, 2, range_walk=False)
-    signal = signal_of(shots, 0, 2)
+    ((_, shots),) = prepare_shots(parameters, (*EFFECTS, "image"))
+    expected = time_domain_spectrum(shots, 0, 2, with_range_walk=False)
+    signal = noiseless_signal(shots, 0, 2)
     np.testing.assert_allclose(np.abs(signal.spectrum), expected, atol=1e-8 * expected.max())
-    assert signal.strongest == np.argmax(expected)
-    up, down = signal_of(shots, 0, 0).frequency, signal.frequency
+    assert signal.strongest_bin == np.argmax(expected)
+    up, down = noiseless_signal(shots, 0, 0).frequency, signal.frequency
     assert (up > 0) == (record == "real" or 2 * 150.0 / 1550e-9 > 1000.0 * 2e12 / 1.5e8)
     beat = 2 * 150.0 / 1550e-9 / 600e6 * 2048  # half sum of up and down [bins]
     assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
@@ -117,12 +119,12 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
 def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1, record):
     """Within 15 %, of a lone line; 5 standard errors of 600 draws are 14 %."""
     parameters = _points(table_4_1, **{"footprint.beamlets": 1, "target.range": np.array([600.0])})
-    parameters |= {ESTIMATOR + "kind": "maximum_likelihood", RECORD: record}
+    parameters |= {ESTIMATOR_PREFIX + "kind": "maximum_likelihood", RECORD: record}
     found = _drawn(parameters, 600)
     for name in ("range", "radial_velocity"):
         assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.15)
         assert np.abs(found[f"{name}_bias"]) < 5 * found[f"{name}_bias_error"]
-    coarse = _drawn(parameters | {ESTIMATOR + "kind": "peak_bin"}, 100)
+    coarse = _drawn(parameters | {ESTIMATOR_PREFIX + "kind": "peak_bin"}, 100)
     assert coarse["range_rmse"] > 2 * found["range_bound"]
 
 
@@ -134,7 +136,7 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
             "instrument.processing.fft_size": 8192, "instrument.laser.power": 30.0,
             "instrument.processing.sample_rate": 60e6, "instrument.laser.wavelength": 1e-4,
             "footprint.beamlets": 1, "target.range": np.array([100.0]),
-            "target.radial_velocity": 300.0, ESTIMATOR + "kind": "maximum_likelihood",
+            "target.radial_velocity": 300.0, ESTIMATOR_PREFIX + "kind": "maximum_likelihood",
         },
     )  # fmt: skip
     found = _drawn(parameters, 300, (*EFFECTS, "range_walk"))
@@ -148,28 +150,28 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
 def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
     parameters |= {RECORD: record}
-    parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
+    parameters |= {DETECTOR_PREFIX + "kind": "os_cfar", ESTIMATOR_PREFIX + "kind": "candan"}
     given = make_point_keys(3)
-    whole = simulate(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
+    whole = simulate_draws(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
     other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
-    parts = simulate(other, effects, keys=given[::-1], batch_sizes=[13, 7, 50], **WHOLE)
+    parts = simulate_draws(other, effects, keys=given[::-1], batch_sizes=[13, 7, 50], **WHOLE)
     for name, values in whole.items():
         if values.ndim == 2:
             np.testing.assert_array_equal(values.sum(axis=1), parts[name][::-1].sum(axis=1))
         else:
             np.testing.assert_array_equal(values, parts[name][::-1], err_msg=name)
     alone = {path: v[1:2] if np.ndim(v) else v for path, v in parameters.items()}
-    one = simulate(alone, effects, keys=given[1:2], batch_sizes=[70], **WHOLE)
+    one = simulate_draws(alone, effects, keys=given[1:2], batch_sizes=[70], **WHOLE)
     for name in SPECTRA_OUTPUTS:
         np.testing.assert_array_equal(one[name], whole[name][1:2], err_msg=name)
 
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
-    parameters, accuracy = _points(table_4_1), Accuracy(0.1, 0.95, interval="wilson")
-    given = {"keys": make_point_keys(3), "accuracy": accuracy} | WHOLE
-    found = simulate(parameters, EFFECTS, batch=20, limit=500, **given)
+    parameters, accuracy = _points(table_4_1), ErrorBudget(0.1, 0.95, interval="wilson")
+    given = {"keys": make_point_keys(3), "error_budget": accuracy} | WHOLE
+    found = simulate_draws(parameters, EFFECTS, batch=20, limit=500, **given)
     assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
-    again = simulate(
+    again = simulate_draws(
         parameters, EFFECTS, batch_sizes=[int(found["n_draws"][0])], **given
     )  # fmt: skip
     assert again["pd_shot"][0] == found["pd_shot"][0]
@@ -180,12 +182,14 @@ def _in_pieces(**given):
     """Results of draws that are stopped as soon as can be and gone on with, and how often."""
     before, number, pieces = None, -1, 0
     while True:
-        found = simulate(before=before, stop=lambda: True, **given)
+        found = simulate_draws(prior_draws=before, should_stop=lambda: True, **given)
         if found["n_draws"].sum() == number:
             return found, pieces
         number, pieces = found["n_draws"].sum(), pieces + 1
-        counts = np.stack([found[name].reshape(len(found["n_draws"]), -1) for name in DRAW_OUTPUTS])
-        before = Before(found["n_draws"], counts, found)
+        counts = np.stack(
+            [found[name].reshape(len(found["n_draws"]), -1) for name in DRAW_COUNT_OUTPUTS]
+        )
+        before = PriorDraws(found["n_draws"], counts, found)
 
 
 @pytest.mark.parametrize("kind", ["ca_cfar", "os_cfar", "goca_cfar"])
@@ -196,11 +200,14 @@ def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
     """
     changes = {"instrument.processing.window": "rectangular", "instrument.processing.fft_size": 64}
     parameters = _points(table_4_1, **changes) | COMPLEX | {"target.range": 1000.0}
-    parameters |= DEFAULTS | {DETECTOR + "kind": kind, DETECTOR + "pfa": 0.02}
-    ((_, shots),) = prepare(parameters, EFFECTS)
-    view = view_of(shots, 0, parameters, make_point_keys(1)[0], Methods())
-    noise = noise_of(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(10_000))
-    _, flags = flagged([noise], view, 0)
+    parameters |= SPECTRUM_METHOD_DEFAULTS | {
+        DETECTOR_PREFIX + "kind": kind,
+        DETECTOR_PREFIX + "pfa": 0.02,
+    }
+    ((_, shots),) = prepare_shots(parameters, EFFECTS)
+    view = make_spectrum_view(shots, 0, parameters, make_point_keys(1)[0], SpectrumMethods())
+    noise = draw_noise_spectra(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(10_000))
+    _, flags = flag_bins([noise], view, 0)
     assert flags.shape == (10_000, 64)
     np.testing.assert_allclose(flags.mean(axis=0), 0.02, atol=5 * np.sqrt(0.02 * 0.98 / 10_000))
 
@@ -215,7 +222,7 @@ def test_an_iq_echo_on_the_seam_or_at_zero_is_found_as_any_other(table_4_1, edge
     parameters = COMPLEX | {
         "instrument.processing.fft_size": 1024, "footprint.beamlets": 1,
         "target.radial_velocity": bins * (600e6 / 1024) * 1550e-9 / 2,
-        "target.range": np.full(3, 600.0), ESTIMATOR + "kind": "maximum_likelihood",
+        "target.range": np.full(3, 600.0), ESTIMATOR_PREFIX + "kind": "maximum_likelihood",
     }  # fmt: skip
     parameters = _points(table_4_1, **parameters) | {"instrument.laser.power": 0.06}
     snr = evaluate(parameters, EFFECTS)["snr_doppler"]  # of three bins that the receiver passes
@@ -233,13 +240,13 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
     much, table_4_1, monkeypatch
 ):
     """A threshold set by all that is seen at once: 5 draws at 2048 points, 10 at 1024."""
-    monkeypatch.setattr(sampling, "SAMPLES", 5 * 2048)
+    monkeypatch.setattr(samplers, "SPECTRUM_SAMPLES_PER_STEP", 5 * 2048)
 
     def over_the_median(power, setting):
         return power > 8 * np.median(power)
 
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
-    parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
+    parameters = _points(table_4_1, **sizes) | {DETECTOR_PREFIX + "kind": "m:f"}
     given = {
         "parameters": parameters,
         "effects": EFFECTS,
@@ -247,13 +254,16 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
         **much,
         **WHOLE,
     }
-    given |= {"accuracy": Accuracy(0.1), "methods": Methods({"m:f": over_the_median})}
-    whole, (found, pieces) = simulate(**given), _in_pieces(**given)
+    given |= {
+        "error_budget": ErrorBudget(0.1),
+        "methods": SpectrumMethods({"m:f": over_the_median}),
+    }
+    whole, (found, pieces) = simulate_draws(**given), _in_pieces(**given)
     assert pieces > 3
     for name, values in whole.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
-    monkeypatch.setattr(sampling, "SAMPLES", 3 * 2048)
-    assert (simulate(**given)["pfa_bin"] != whole["pfa_bin"]).all()
+    monkeypatch.setattr(samplers, "SPECTRUM_SAMPLES_PER_STEP", 3 * 2048)
+    assert (simulate_draws(**given)["pfa_bin"] != whole["pfa_bin"]).all()
 
 
 def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
@@ -287,8 +297,11 @@ def test_methods_may_be_ones_own(table_4_1):
         flags[:, [0, 1, 2, -2, -1]] = False
         return flags
 
-    methods = Methods({"m:f": all_but}, {"m:g": lambda spectrum, peak, setting: peak + 0.5})
-    parameters = _points(table_4_1) | {DETECTOR + "kind": "m:f", ESTIMATOR + "kind": "m:g"}
+    methods = SpectrumMethods({"m:f": all_but}, {"m:g": lambda spectrum, peak, setting: peak + 0.5})
+    parameters = _points(table_4_1) | {
+        DETECTOR_PREFIX + "kind": "m:f",
+        ESTIMATOR_PREFIX + "kind": "m:g",
+    }
     found = _drawn(parameters, 5, methods=methods)
     assert (found["pd_shot"] == 1).all()
     assert (found["false_alarms"] == 0).all()  # one group, and the signal within it
@@ -297,7 +310,7 @@ def test_methods_may_be_ones_own(table_4_1):
 CHIRP_2_US = {
     "instrument.processing.window": "rectangular", "instrument.processing.sample_rate": 500e6,
     "instrument.chirp.bandwidth": 500e6, "instrument.chirp.duration": 2e-6,
-    "target.radial_velocity": 0.0, ESTIMATOR + "kind": "chirp_z",
+    "target.radial_velocity": 0.0, ESTIMATOR_PREFIX + "kind": "chirp_z",
 }  # fmt: skip
 WANDERING = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
 
@@ -318,19 +331,21 @@ def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
     """As the time domain has it: the same phases in the record of the exact delay."""
     parameters = _points(table_4_1, **CHIRP_2_US) | WANDERING | {"target.range": 50.0}
     parameters |= {"footprint.beamlets": 1}
-    ((_, pure),) = prepare(parameters, ("doppler", "image"))
-    ((_, shots),) = prepare(parameters, ("doppler", "image", "line_width"))
+    ((_, pure),) = prepare_shots(parameters, ("doppler", "image"))
+    ((_, shots),) = prepare_shots(parameters, ("doppler", "image", "line_width"))
     key, draws, rate = make_point_keys(1)[0], np.arange(3), 500e6
     delay = 100.0 / SPEED_OF_LIGHT * rate
-    found = drawn_of(shots, 0, 2, signal_of(shots, 0, 2), key=key, draws=draws)
+    found = draw_signal_spectra(shots, 0, 2, noiseless_signal(shots, 0, 2), key=key, draws=draws)
     for draw, drawn in zip(draws, found, strict=True):
-        steps = walk_steps(delay=delay, length=shots.window.length)
+        steps = n_phase_walk_steps(delay=delay, length=shots.window.length)
         numbers = philox.uniforms(key[None], np.array([draw]), philox.STREAM_LASER_PHASE[2], steps)
-        phase = walked_phase(
-            philox.normals(numbers)[0], per_sample=2 * np.pi * 1e5 / rate, delay=delay
+        phase = phase_walk(
+            philox.to_normals_by_row(numbers)[0],
+            variance_per_sample=2 * np.pi * 1e5 / rate,
+            delay=delay,
         )
-        expected = spectrum(pure, 0, 2, range_walk=False, laser_phase=phase)
+        expected = time_domain_spectrum(pure, 0, 2, with_range_walk=False, laser_phase=phase)
         # Magnitudes have the phases of a lone tone at a place that is known to some 1e-4 of a bin.
         np.testing.assert_allclose(np.abs(drawn), expected, atol=0.01 * expected.max())
-    without = drawn_of(pure, 0, 2, signal_of(pure, 0, 2), key=key, draws=draws)
+    without = draw_signal_spectra(pure, 0, 2, noiseless_signal(pure, 0, 2), key=key, draws=draws)
     assert without.shape == (1, 1025)  # nothing is drawn of a pure tone

@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from shot_helpers import line_shape_of_window, parametrize_product
 
-from sweep.model.lines import (
+from sweep.model.evaluation import prepare_shots
+from sweep.model.spectrum.bin_spectrum import A_IM, A_RE, LINE_BATCH_CELLS_MAX, N_SCRATCH_ROWS, OUT
+from sweep.model.spectrum.bin_spectrum import compute_magnitudes as magnitudes_of
+from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
     IM,
-    LEAST_WIDTH,
-    MOST_NODES,
+    NODES_MAX,
     PLACE,
     RE,
+    SCRATCH_WIDTH_MIN,
     X,
-    node_limits,
-    nodes_for,
-    put_on_nodes,
+    count_nodes,
+    node_phase_limits,
+    replace_lines_by_nodes,
 )
-from sweep.model.segments import spectrum as segment_spectrum
-from sweep.model.segments import tangents
-from sweep.model.shot import prepare
-from sweep.model.spectrum import A_IM, A_RE, MOST_CELLS, OUT, ROOM
-from sweep.model.spectrum import magnitudes as magnitudes_of
-from sweep.model.window import COSINE_SUMS, samples, window
+from sweep.model.spectrum.segment_spectra import bin_tangents
+from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
 AT_THE_ENDS = 0.0, 1.0
 """Weights of a band that may be all at its ends: of windows of which nothing is known."""
@@ -37,13 +37,15 @@ def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=
     fft_size, length = sizes
     high = fft_size // 2 if high is None else high
     n, count, delta = len(delta), high - low + 1, np.asarray(delta, float)
-    table, form, numbers, _, _ = line_shape_of_window(window(name, length), fft_size, power=power)
-    room = np.empty((ROOM, max(count, n, LEAST_WIDTH, MOST_CELLS) + 16))
+    table, form, numbers, _, _ = line_shape_of_window(
+        get_window(name, length), fft_size, power=power
+    )
+    room = np.empty((N_SCRATCH_ROWS, max(count, n, SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
     room[PLACE, :n], room[IM, :n] = delta, 0.0 if power else np.imag(weights)
     room[RE, :n] = np.abs(weights) ** 2 if power else np.real(weights)
     magnitudes_of(
         low, count, origin, (n, delta.min(), delta.max(), 0.0), np.empty((2, 0)), table, form,
-        numbers, tangents(fft_size), room,
+        numbers, bin_tangents(fft_size), room,
     )  # fmt: skip
     return room[OUT, :count].copy()
 
@@ -71,13 +73,13 @@ SIZES = [(256, 256), (255, 255), (256, 200), (255, 201), (2000, 77), (4096, 4096
 
 
 @pytest.mark.parametrize(
-    ("name", "sizes"), parametrize_product(5, [*COSINE_SUMS, *TABULATED], SIZES)
+    ("name", "sizes"), parametrize_product(5, [*COSINE_SUM_COEFFICIENTS, *TABULATED], SIZES)
 )
 def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
     """Lines anywhere, near DC and Nyquist and beyond them, and their images."""
     fft_size, length = sizes
     rng = np.random.default_rng((40, fft_size, length))
-    w = samples(name, length)
+    w = window_samples(name, length)
     # A table's polynomial misses e^{i pi y}, the ends of the record, by some 1e-12 of their weight.
     accuracy = 1e-12 + 3e-12 * w[0]
     for spread in (1e-9, 0.7, 12.0, fft_size / 2):
@@ -103,10 +105,10 @@ def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
 def few_for(delta, weights, tolerance, limits):
     """Places and weights of as few lines as stand for many."""
     n, middle, half = delta.size, (delta.max() + delta.min()) / 2, np.ptp(delta) / 2
-    room = np.zeros((ROOM, LEAST_WIDTH))
+    room = np.zeros((N_SCRATCH_ROWS, SCRATCH_WIDTH_MIN))
     room[PLACE, :n], room[RE, :n], room[IM, :n] = delta, np.real(weights), np.imag(weights)
-    nodes = nodes_for(np.pi * half, tolerance, limits)
-    number = put_on_nodes(room, RE, IM, n, nodes, (middle, half), A_RE, A_IM)
+    nodes = count_nodes(np.pi * half, tolerance, limits)
+    number = replace_lines_by_nodes(room, RE, IM, n, nodes, (middle, half), A_RE, A_IM)
     return room[X, :number].copy(), room[A_RE, :number] + 1j * room[A_IM, :number]
 
 
@@ -115,7 +117,7 @@ def few_for(delta, weights, tolerance, limits):
 def test_few_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, tolerance):
     """Sum of C e^{i u delta} for |u| <= pi, to what is allowed of the summed amplitudes."""
     rng = np.random.default_rng(43)
-    limits, u = node_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.linspace(-np.pi, np.pi, 41)
+    limits, u = node_phase_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), np.linspace(-np.pi, np.pi, 41)
     allowed = max(tolerance, 1e-13) + 109 * 2.3e-16 + np.pi * np.spacing(abs(centre))
     for spread in 10 ** np.linspace(-16, 2, 60):
         delta, weights = bundle(rng, 109, spread)
@@ -128,7 +130,7 @@ def test_few_lines_have_the_same_spectrum_for_bundles_of_any_width(centre, toler
 
 
 def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
-    limits, counts = node_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), []
+    limits, counts = node_phase_limits(AT_THE_ENDS, AMPLITUDE_TOLERANCES), []
     for spread in (0.0, 0.1, 1.0, 5.0, 200.0):
         delta = np.linspace(-spread, spread, 109)
         few, _ = few_for(delta, np.ones(109), 0.0, limits)
@@ -137,15 +139,15 @@ def test_a_tight_bundle_takes_few_lines_and_a_wide_one_stays_as_it_is():
     assert counts[1] <= 10
     assert counts == sorted(counts)
     assert counts[-1] == 109 and np.array_equal(few, delta)
-    assert limits.shape == (len(AMPLITUDE_TOLERANCES), MOST_NODES + 1)
+    assert limits.shape == (len(AMPLITUDE_TOLERANCES), NODES_MAX + 1)
 
 
 @pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "flattop"])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-10])
 def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolerance):
     """Lines in phase at the ends of their bundle, the worst there are: by direct sums."""
-    limits = window(name, 256).node_limits(False)
-    record = samples(name, 256) * np.exp(
+    limits = get_window(name, 256).node_phase_limits(False)
+    record = window_samples(name, 256) * np.exp(
         2j * np.pi * np.outer(np.arange(-20, 21), np.arange(256)) / 256
     )
     t = np.arange(256) / 128 - 1
@@ -156,7 +158,7 @@ def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolera
         many = record @ np.exp(1j * np.pi * np.outer(t, delta)).sum(axis=1)
         found = record @ (np.exp(1j * np.pi * np.outer(t, few)) @ strength)
         # What nodes alias onto the terms that are there is as much again.
-        whole = 108 * np.abs(samples(name, 256)).sum()
+        whole = 108 * np.abs(window_samples(name, 256)).sum()
         assert np.abs(many - found).max() <= 2 * tolerance * whole + 1e-12 * whole
 
 
@@ -183,12 +185,12 @@ def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
             range=r, grazing_angle=np.radians(grazing), phases=phases, window=name,
             fft_size=fft_size, acquisition_delay=delay, beamlets=19 + number,
         )  # fmt: skip
-        ((_, shots),) = prepare(scene)
+        ((_, shots),) = prepare_shots(scene)
         for segment in range(3):
             _, whole = segment_spectrum(shots, 0, segment)
             for fraction in (0.3, 1e-2, 1e-3, 1e-5):
                 level = fraction * whole.max()
-                bins, part = segment_spectrum(shots, 0, segment, level=level)
+                bins, part = segment_spectrum(shots, 0, segment, level_min=level)
                 assert part == pytest.approx(whole[bins], rel=1e-9, abs=1e-13 * whole.max())
                 left_out = np.delete(whole, bins)
                 # Line and image are each below the level.

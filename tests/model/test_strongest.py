@@ -9,14 +9,15 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 from shot_helpers import DRAWS, is_within_5_sigma, parametrize_product, prepare_single_category
 
-from sweep.model import alarms, truth
-from sweep.model.detection import Fading
-from sweep.model.effects.catalogue import CORE
-from sweep.model.marcum import marcum_q1
-from sweep.model.outputs import STRONGEST_OUTPUTS
-from sweep.model.shot import evaluate, find, statistics
-from sweep.model.waveform import ENDS, PEAKS, STRONGEST
-from sweep.model.window import samples
+from sweep.model import time_domain_truth
+from sweep.model.detection import bin_noise
+from sweep.model.detection.echo_detection import SegmentCorrelations
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import evaluate, evaluate_segments, shot_statistics
+from sweep.model.outputs import STRONGEST_PEAK_OUTPUTS
+from sweep.model.waveform import PEAKS_PATH, SEARCH_BAND_PATHS, STRONGEST_PEAK
+from sweep.model.window import window_samples
 
 RECORD = "instrument.receiver.record"
 SIZE = 1024
@@ -25,23 +26,25 @@ SMALL = {
     "range": 220.0, "radial_velocity": 3.0, "beamlets": 1, "detection": "any_bin",
     "noise_bins": "correlated",
 }  # fmt: skip
-FADING = (*CORE, "fading")
+FADING = (*DEFAULT_EFFECTS, "fading")
 ALONE = tuple(effect for effect in FADING if effect != "leakage")
 
 
-def scene_of(table_4_1, speckle="none", record="real", peaks=STRONGEST, **changes):
+def scene_of(table_4_1, speckle="none", record="real", peaks=STRONGEST_PEAK, **changes):
     """A short record in which the echo is faint, with one beamlet, whose speckle is shared."""
     scene = table_4_1(**(SMALL | changes))
     mixed = {"footprint.phases": "incoherent", "footprint.speckle": speckle}
-    return scene | {RECORD: record, PEAKS: peaks} | mixed
+    return scene | {RECORD: record, PEAKS_PATH: peaks} | mixed
 
 
 def spectra(shots, segment, echo, rng):
     """|X| of records: the exact echo times a factor of each, and white noise sampled with it."""
     length = shots.window.length
     shape = echo.size, length
-    taper, sigma = samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
-    signal = echo[:, None] * truth.analytic_record(shots, 0, segment, 0, range_walk=False)
+    taper, sigma = window_samples(shots.window.name, length), np.sqrt(shots.noise_variance[0])
+    signal = echo[:, None] * time_domain_truth.analytic_record(
+        shots, 0, segment, 0, with_range_walk=False
+    )
     if shots.complex_record:
         noise = np.sqrt(0.5) * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
         return np.abs(np.fft.fft(taper * (signal / 2 + sigma * noise), SIZE))
@@ -50,16 +53,18 @@ def spectra(shots, segment, echo, rng):
 
 def reported(shots, segment, echo, rng):
     """Count a segment's draws: (right, wrong), bool by draw."""
-    place = truth.find(shots)[segment, 3, 0] / (600e6 / SIZE)
+    place = time_domain_truth.evaluate_segments_in_time_domain(shots)[segment, 3, 0] / (
+        600e6 / SIZE
+    )
     magnitude = spectra(shots, segment, echo, rng)
     bins = np.arange(magnitude.shape[1])
     near = np.abs((bins - place + SIZE / 2) % SIZE - SIZE / 2) <= 2.01  # a main lobe
     searched = np.ones(bins.size, bool)
     if not shots.complex_record:
-        first = alarms.first_circular(shots.window, SIZE)
+        first = bin_noise.first_circular_bin(shots.window, SIZE)
         searched = (bins >= first) & (bins <= SIZE // 2 - first)
-    if shots.band is not None:
-        first, number = shots.band[segment, :, 0]
+    if shots.search_band is not None:
+        first, number = shots.search_band[segment, :, 0]
         searched &= (bins - first) % SIZE < number
     if shots.detection == "peak_bin":
         own = magnitude[:, int(np.rint(place)) % SIZE]
@@ -79,8 +84,8 @@ def speckle_of(kind, rng):
 
 def shares(shots, alike):
     """Shots whose segments share so much of their speckle."""
-    fading = Fading(*(alike * one for one in shots.fading))
-    return replace(shots, fading=fading)
+    fading = SegmentCorrelations(*(alike * one for one in shots.segment_correlations))
+    return replace(shots, segment_correlations=fading)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +100,7 @@ def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, reco
     changes = {"tnr": tnr, "detection": detection}
     shots = prepare_single_category(scene_of(table_4_1, speckle, record, **changes), FADING)
     shots = shots if alike is None else shares(shots, alike)
-    found, rng, each = statistics(shots), np.random.default_rng(71), []
+    found, rng, each = shot_statistics(shots), np.random.default_rng(71), []
     first, second = (speckle_of(speckle, rng) for _ in range(2))
     share = 1.0 if alike is None else alike
     for segment, name, own in ((0, "up", 0.0), (2, "down", np.sqrt(1 - share**2))):
@@ -115,7 +120,7 @@ def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, reco
 
 @pytest.mark.parametrize("speckle", ["none", "developed"])
 def test_drawn_records_that_are_searched_in_a_band(speckle, table_4_1):
-    band = dict(zip(ENDS, (160.0, 240.0, 2.0, 4.0), strict=True))
+    band = dict(zip(SEARCH_BAND_PATHS, (160.0, 240.0, 2.0, 4.0), strict=True))
     scene = scene_of(table_4_1, speckle, tnr=2.5) | band
     shots, found = prepare_single_category(scene, FADING), evaluate(scene, FADING)
     rng = np.random.default_rng(72)
@@ -140,8 +145,8 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         noise_bins="independent",
     )  # fmt: skip
     shots, found = prepare_single_category(scene, ALONE), evaluate(scene, ALONE)
-    crosses = evaluate(scene | {PEAKS: "all"}, ALONE)
-    sigma = shots.bin_deviation[0]
+    crosses = evaluate(scene | {PEAKS_PATH: "all"}, ALONE)
+    sigma = shots.bin_noise_sigma[0]
     level, signal = shots.threshold[0] / sigma, np.sqrt(2 * crosses["snr_up"][0])
     law, reach = stats.rice(signal), signal + 20
     missed = marcum_q1(signal, level).p
@@ -150,7 +155,7 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         law, reach = stats.rayleigh(scale=scale), 20 * scale
         missed = law.cdf(level)
     alarm = crosses["pfa_segment"][0]
-    bins = SIZE // 2 - find(shots)[0, 4, 0]  # but those that the echo occupies
+    bins = SIZE // 2 - evaluate_segments(shots)[0, 4, 0]  # but those that the echo occupies
     lost = of_one_bin(law, bins, level, min(reach, 40))
     wrong = alarm * missed + lost
     assert found["pd_up"][0] == pytest.approx(1 - missed - lost, abs=1e-6)
@@ -177,21 +182,21 @@ def test_right_wrong_and_nothing_add_to_one(detection, speckle, record, table_4_
         assert (crosses[f"pd_{name}"] - pd <= rare + 1e-12).all() and rare.min() < 1e-3
     both = found["pd_shot"] + found["p_wrong_range_shot"]
     assert both[0] == pytest.approx(1, abs=1e-3)  # both chirps report something
-    assert {name for name in found if name not in crosses} == set(STRONGEST_OUTPUTS)
+    assert {name for name in found if name not in crosses} == set(STRONGEST_PEAK_OUTPUTS)
 
 
 def test_of_strong_echoes_no_peak_is_wrong(table_4_1):
-    found = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), CORE)
+    found = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), DEFAULT_EFFECTS)
     assert found["pd_shot"] == pytest.approx([1]) and found["p_wrong_range_shot"] < 1e-6
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
     scene = scene_of(table_4_1, "developed", record, tnr=np.array([2.5, 4.0, 6.0]))
-    found = statistics(shares(prepare_single_category(scene, FADING), 0.0))
+    found = shot_statistics(shares(prepare_single_category(scene, FADING), 0.0))
     assert found["pd_shot"] == pytest.approx(found["pd_up"] * found["pd_down"], rel=1e-9)
     near, far = (
-        statistics(shares(prepare_single_category(scene, FADING), 1e-4 * k)) for k in (0, 1)
+        shot_statistics(shares(prepare_single_category(scene, FADING), 1e-4 * k)) for k in (0, 1)
     )
     for name in ("pd_shot", "p_wrong_range_shot"):
         assert near[name] == pytest.approx(far[name], rel=1e-4)
@@ -199,7 +204,7 @@ def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
 
 def test_an_echo_outside_the_band_is_never_right(table_4_1):
     """All alarms there are of noise, and of the echo's share in the band."""
-    band = dict(zip(ENDS, (20.0, 120.0, 2.0, 4.0), strict=True))
-    found = evaluate(scene_of(table_4_1, tnr=2.5) | band, CORE)
+    band = dict(zip(SEARCH_BAND_PATHS, (20.0, 120.0, 2.0, 4.0), strict=True))
+    found = evaluate(scene_of(table_4_1, tnr=2.5) | band, DEFAULT_EFFECTS)
     assert found["pd_up"] == found["pd_shot"] == 0
     assert found["p_wrong_range_up"] == pytest.approx(found["pfa_segment"], rel=1e-6)

@@ -7,8 +7,9 @@ import pytest
 from scipy.constants import c as speed_of_light
 from shot_helpers import magnitude_error, parametrize_product, prepare_single_category
 
-from sweep.model import segments, truth
-from sweep.model.window import samples
+from sweep.model import time_domain_truth
+from sweep.model.spectrum import segment_spectra
+from sweep.model.window import window_samples
 
 AGREEMENT = 1e-9
 """Largest difference between fast path and truth, all bins; as of :func:`engine.difference`."""
@@ -53,9 +54,11 @@ def drawn_scene(number):
 def disagreement(shots):
     """Of the fast path and the truth, over all segments and all bins 0..N/2."""
     worst = 0.0
-    for segment in np.flatnonzero(shots.segments):
-        bins, fast = segments.spectrum(shots, 0, int(segment))
-        exact = truth.spectrum(shots, 0, int(segment), range_walk=False)
+    for segment in np.flatnonzero(shots.has_segment):
+        bins, fast = segment_spectra.segment_spectrum(shots, 0, int(segment))
+        exact = time_domain_truth.time_domain_spectrum(
+            shots, 0, int(segment), with_range_walk=False
+        )
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
         worst = max(worst, magnitude_error(shots, fast, exact))
     return worst
@@ -120,10 +123,12 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
     for phases, v in (("coherent", 150.0), ("incoherent", 150.0), ("coherent", 0.0)):
         scene = table_4_1(fft_size=8192, phases=phases, radial_velocity=v, grazing_angle=0.4)
         shots = prepare_single_category(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
-        own = replace(shots, doppler=rng.uniform(-1e-8, 1e-8, shots.offset.shape))
+        own = replace(
+            shots, doppler_ratio_offset=rng.uniform(-1e-8, 1e-8, shots.relative_range_offset.shape)
+        )
         assert disagreement(own) < AGREEMENT
-        _, with_shifts = segments.spectrum(own, 0, 1)
-        _, without = segments.spectrum(shots, 0, 1)
+        _, with_shifts = segment_spectra.segment_spectrum(own, 0, 1)
+        _, without = segment_spectra.segment_spectrum(shots, 0, 1)
         assert np.abs(with_shifts - without).max() > 0.01 * without.max()
 
 
@@ -156,11 +161,11 @@ def test_the_frequency_of_the_record_is_that_of_the_delayed_chirp_less_the_chirp
     received_less_sent = f * 2 * v / speed_of_light + sign * rate * (
         -delay + (t - delay) * 2 * v / speed_of_light
     )
-    record = truth.analytic_record(shots, 0, segment, 0)
+    record = time_domain_truth.analytic_record(shots, 0, segment, 0)
     measured = np.diff(np.unwrap(np.angle(record))) * 600e6 / (2 * np.pi)
     # Rounding: 1e-11 cycles a sample; the walk is 8 v/300 Hz a sample and 4 kHz v/150 in all.
     assert np.abs(measured - received_less_sent).max() < 0.05
-    steady = truth.analytic_record(shots, 0, segment, 0, range_walk=False)
+    steady = time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=False)
     measured = np.diff(np.unwrap(np.angle(steady))) * 600e6 / (2 * np.pi)
     at_start = f * 2 * v / speed_of_light - sign * rate * 2 * 2000.0 / speed_of_light * (
         1 + 2 * v / speed_of_light
@@ -189,7 +194,7 @@ def test_the_record_is_what_a_balanced_detector_makes_of_two_optical_fields(
     oscillator, received = field(1e-3, t), np.sqrt(0.5) * field(echo, t - delay)
     one, other = (oscillator + received) / np.sqrt(2), (oscillator - received) / np.sqrt(2)
     voltage = 7e3 * 1.1 * 3.0 * (np.abs(one) ** 2 - np.abs(other) ** 2)
-    record = truth.analytic_record(prepare_single_category(scene), 0, segment, 0).real
+    record = time_domain_truth.analytic_record(prepare_single_category(scene), 0, segment, 0).real
     # Phases of 2e9 t + 1e12 t^2 < 1e5 cycles round to 1e-11; powers of 1e-3 W to 1e-19 W, against
     # a beat of sqrt(1e-3 echo) = 2e-7 W.
     assert np.abs(record - voltage).max() < 1e-8 * np.abs(voltage).max()
@@ -208,7 +213,7 @@ def test_a_tone_stands_at_half_its_amplitude_times_the_windows_sum(window, loss_
     for bins in (1000.0, 1000.5):
         v = velocity_for(bins * 600e6 / 4096, sign=0, parameters=scene)
         shots = prepare_single_category(scene | {"target.radial_velocity": v})
-        magnitude = truth.spectrum(shots, 0, 1, range_walk=False)
+        magnitude = time_domain_truth.time_domain_spectrum(shots, 0, 1, with_range_walk=False)
         heights.append(magnitude[1000])
         if bins == 1000.0:
             assert np.argmax(magnitude) == 1000
@@ -230,14 +235,14 @@ def test_incoherent_truth_is_the_root_mean_square_over_independent_phases(table_
     shots = prepare_single_category(scene | {"footprint.phases": "incoherent"})
     weights = 0.54 - 0.46 * np.cos(2 * np.pi * np.arange(512) / 512)
     for segment in range(3):
-        records = [truth.analytic_record(shots, 0, segment, b) for b in range(3)]
+        records = [time_domain_truth.analytic_record(shots, 0, segment, b) for b in range(3)]
         power = np.zeros(257)
         for steps in np.ndindex(5, 5, 5):
             turned = sum(
                 r * np.exp(2j * np.pi * s / 5) for r, s in zip(records, steps, strict=True)
             )
             power += np.abs(np.fft.rfft(weights * turned.real)) ** 2 / 125
-        exact = truth.spectrum(shots, 0, segment)
+        exact = time_domain_truth.time_domain_spectrum(shots, 0, segment)
         assert np.abs(np.sqrt(power) - exact).max() < 1e-12 * exact.max()
 
 
@@ -251,14 +256,17 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         radial_velocity=velocity,
     )  # fmt: skip
     shots = replace(prepare_single_category(scene), complex_record=True, phase_errors=())
-    w, half = samples(window, 4096), 2048
-    found = segments.find(shots)
+    w, half = window_samples(window, 4096), 2048
+    found = segment_spectra.evaluate_segments(shots)
     for segment in range(3):
-        records = [truth.analytic_record(shots, 0, segment, b, range_walk=False) for b in range(7)]
+        records = [
+            time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False)
+            for b in range(7)
+        ]
         spectra = np.fft.fft(w * np.array(records)) / 2
         coherent = abs(spectra.sum(axis=0))
         exact = coherent if phases == "coherent" else np.sqrt((abs(spectra) ** 2).sum(axis=0))
-        bins, magnitude = segments.spectrum(shots, 0, segment)
+        bins, magnitude = segment_spectra.segment_spectrum(shots, 0, segment)
         assert bins.size == 4096
         assert magnitude_error(shots, magnitude, exact[bins % 4096]) <= AGREEMENT
         peak = (exact.argmax() + half) % 4096 - half

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from scipy.constants import c as speed_of_light
 
 from sweep.model import waveform
-from sweep.model.waveform import FOLD_PENALTY, beat_frequency, fold, record_length, resolve
+from sweep.model.waveform import (
+    FOLD_PENALTY_BINS,
+    beat_frequency,
+    fold_frequency,
+    record_length,
+    resolve_range_velocity,
+)
 
 CARRIER, BANDWIDTH, DURATION = speed_of_light / 1550e-9, 1e9, 500e-6
 RATE = BANDWIDTH / DURATION
@@ -29,7 +35,7 @@ def beats(target_range, velocity):
 
 def resolved(up, doppler, down, sample_rate=600e6):
     """Range and velocity from three peaks, as floats."""
-    report = resolve(
+    report = resolve_range_velocity(
         up=np.array([up]), doppler=np.array([doppler]), down=np.array([down]), carrier=CARRIER,
         bandwidth=BANDWIDTH, duration=DURATION, sample_rate=sample_rate, bin_width=BIN,
     )  # fmt: skip
@@ -57,7 +63,9 @@ def test_a_folded_frequency_is_where_the_samples_of_a_tone_have_their_peak(fft_s
     for k in range(-3 * fft_size, 3 * fft_size, 7):
         tone = np.cos(2 * np.pi * k * np.arange(fft_size) / fft_size + 0.3)
         peak = np.abs(np.fft.rfft(tone)).argmax()
-        assert fold(k * 600e6 / fft_size, 600e6) == pytest.approx(peak * 600e6 / fft_size, abs=1.0)
+        assert fold_frequency(k * 600e6 / fft_size, 600e6) == pytest.approx(
+            peak * 600e6 / fft_size, abs=1.0
+        )
 
 
 @pytest.mark.parametrize(
@@ -117,10 +125,10 @@ def scene_beats(target_range, velocity, sample_rate):
     signed = beats(target_range, velocity)
     assume(max(abs(b) for b in signed) < sample_rate - 100 * BIN)  # one fold, not two
     folds = sum(abs(b) > sample_rate / 2 for b in signed)
-    peaks = [fold(b, sample_rate) for b in signed]
+    peaks = [fold_frequency(b, sample_rate) for b in signed]
     truth = (signed[0] + signed[2]) / 2, (signed[2] - signed[0]) / 2
     for mismatch, other in other_readings(peaks, truth, sample_rate):
-        assume(mismatch > 4 + FOLD_PENALTY * (folds - other))
+        assume(mismatch > 4 + FOLD_PENALTY_BINS * (folds - other))
     return signed, peaks
 
 
@@ -157,7 +165,7 @@ def test_equal_doppler_and_range_frequencies_cost_bins_and_no_more(sense):
     for offset in np.linspace(-6, 6, 241):
         f_r = RATE * 2 * 2500.0 / speed_of_light
         velocity = sense * (f_r + offset * BIN) * 1550e-9 / 2
-        peaks = [BIN * round(fold(b, 600e6) / BIN) for b in beats(2500.0, velocity)]
+        peaks = [BIN * round(fold_frequency(b, 600e6) / BIN) for b in beats(2500.0, velocity)]
         r, v = resolved(*peaks)
         assert abs(r - 2500.0) < 2.6 * RANGE_BIN
         assert abs(v - velocity) < 2.6 * VELOCITY_BIN
@@ -167,7 +175,7 @@ def test_equal_doppler_and_range_frequencies_cost_bins_and_no_more(sense):
 @pytest.mark.parametrize("beyond", [-100.3, -3.3, 6.3, 66.3, 1000.3])
 def test_a_peak_near_nyquist_is_read_right_outside_the_bins_that_a_fold_costs(beyond, sense):
     velocity = sense * (300e6 + beyond * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
-    r, v = resolved(*[fold(b, 600e6) for b in beats(9000.0, velocity)])
+    r, v = resolved(*[fold_frequency(b, 600e6) for b in beats(9000.0, velocity)])
     assert (r, v) == pytest.approx((9000.0, velocity), abs=1e-8)
 
 
@@ -176,8 +184,8 @@ def test_a_peak_just_past_nyquist_is_misread_by_no_more_than_it_lies_past_it(bey
     """A fold counts as FOLD_PENALTY bins of mismatch, so the nearest bins past it look unfolded."""
     velocity = (300e6 + beyond * BIN - beats(9000.0, 0.0)[2]) / CARRIER * speed_of_light / 2
     past = (beats(9000.0, velocity)[2] - 300e6) / BIN
-    r, v = resolved(*[fold(b, 600e6) for b in beats(9000.0, velocity)])
-    assert 0 < past < FOLD_PENALTY
+    r, v = resolved(*[fold_frequency(b, 600e6) for b in beats(9000.0, velocity)])
+    assert 0 < past < FOLD_PENALTY_BINS
     assert abs(r - 9000.0) < past * RANGE_BIN * 1.001
     assert abs(v - velocity) < past * VELOCITY_BIN * 1.001
 
@@ -205,7 +213,7 @@ def test_direct_detection_resolves_without_a_doppler_peak():
             )
             for sign in (1, 0, -1)
         )  # fmt: skip
-        report = resolve(
+        report = resolve_range_velocity(
             up=np.array([abs(up)]), doppler=None, down=np.array([abs(down)]),
             carrier=5.5e9, bandwidth=BANDWIDTH, duration=DURATION, sample_rate=600e6,
             bin_width=BIN,
@@ -230,9 +238,15 @@ def test_a_triangle_tells_range_and_velocity_of_what_is_far_enough(far, velocity
         for sign in (1, -1)
     )  # fmt: skip
     assert up <= 0 <= down
-    report = resolve(
-        up=fold(up, rate), doppler=None, down=fold(down, rate), carrier=carrier, bandwidth=6e9,
-        duration=32e-6, sample_rate=rate, bin_width=rate / 2**13,
-    )  # fmt: skip
+    report = resolve_range_velocity(
+        up=fold_frequency(up, rate),
+        doppler=None,
+        down=fold_frequency(down, rate),
+        carrier=carrier,
+        bandwidth=6e9,
+        duration=32e-6,
+        sample_rate=rate,
+        bin_width=rate / 2**13,
+    )
     assert report.range == pytest.approx(target, abs=1e-7)
     assert report.radial_velocity == pytest.approx(velocity, abs=1e-7)

@@ -19,9 +19,9 @@ import sweep
 from sweep.analysis.datasets import NotAStoreError
 from sweep.analysis.study_figures import GridResults, SceneResults
 from sweep.cli import main
-from sweep.model.pairing import TRUE
-from sweep.model.shot import evaluate
-from sweep.model.threshold import TNR
+from sweep.model.evaluation import evaluate
+from sweep.model.pointcloud.pairing import TRUE_FLAG
+from sweep.model.threshold import TNR_PATH
 from sweep.report import detector_charts, flight_charts
 from sweep.report.html_page import Control
 from sweep.report.study_report import write_report
@@ -120,7 +120,7 @@ def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(
     at = {
         m.path: m.values[position[axis.name]] for axis in study.spec.axes for m in axis.parameters
     }
-    of_model = evaluate(study.spec.parameters() | at | {TNR: curve["curve_tnr"].values}, [])
+    of_model = evaluate(study.spec.parameters() | at | {TNR_PATH: curve["curve_tnr"].values}, [])
     for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
                         ("in both chirps", "pfa_both_chirps")):  # fmt: skip
         # the model leaves out the few bins in which the target lies
@@ -173,7 +173,7 @@ def test_a_grid_s_page_opens_with_reach_alarms_and_tolerance(grid_page, grid_sto
 def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_store):
     group = sweep.open_scene(scene_store)["four"].to_dataset()
     flags, status = group["flags"].values, group["velocity_status"]
-    true = int(((flags & TRUE) > 0).sum())
+    true = int(((flags & TRUE_FLAG) > 0).sum())
     shots = flags[..., 0].size
     told = _answer(scene_page)
     assert told[1] == (
@@ -196,7 +196,7 @@ def test_errors_of_a_flight_are_measured_less_true(scene_store):
     seen, _ = flight_charts.select_recordings(study)
     chart = flight_charts.error_chart(seen)
     group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
-    true = (group["flags"].values & TRUE) > 0
+    true = (group["flags"].values & TRUE_FLAG) > 0
     expected = (group["range_interpolated"] - group["true_range"]).values[true]
     drawn = np.concatenate([line.y for line in chart.panels[0].lines])
     np.testing.assert_array_equal(np.sort(drawn), np.sort(expected))

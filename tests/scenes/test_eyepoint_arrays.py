@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sweep.model.eyepoints import observe
-from sweep.model.geometry.platform import ConstantAcceleration, Flight, Nadir
-from sweep.model.geometry.rays import Caster
-from sweep.model.geometry.scanner import cone, fixed
-from sweep.model.outputs import BEAMLETS, SHOTS
+from sweep.model.geometry.body_motion import ConstantAcceleration, MovingBody, NadirAttitude
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.geometry.scanner import cone_directions, fixed_beams
+from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
+from sweep.model.pointcloud.eyepoints import observe_eyepoints
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays, eyepoints_to_arrays
 from sweep.scenes.meshes import clean_mesh
 
@@ -18,19 +18,19 @@ def eyepoints():
     corners = 30.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     ground = clean_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
     path = ConstantAcceleration((0.0, 0.0, 100.0), (10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
-    return observe(
+    return observe_eyepoints(
         np.arange(24),
-        flight=Flight(path, Nadir()),
-        scanner=fixed(cone(3, half_angle=0.2), rate=2.0),
-        caster=Caster(ground),
+        flight=MovingBody(path, NadirAttitude()),
+        scanner=fixed_beams(cone_directions(3, half_angle=0.2), rate=2.0),
+        caster=RayCaster(ground),
         beam_divergence=0.03,
-        number=7,
+        n_beamlets=7,
     )
 
 
 def test_arrays_have_names_types_and_dimensions_of_the_store(eyepoints):
     arrays = eyepoints_to_arrays(eyepoints)
-    outputs = {**SHOTS, **BEAMLETS}
+    outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
     sizes = {"shot": 24, "beamlet": 7, "xyz": 3}
     assert arrays.keys() == outputs.keys()
     for name, output in outputs.items():
@@ -47,9 +47,9 @@ def test_what_is_read_back_is_what_was_cast_bit_for_bit(eyepoints):
 
 def test_the_surface_of_the_beam_is_that_of_its_first_beamlet_that_hits(eyepoints):
     surface = eyepoints_to_arrays(eyepoints)["beam_surface"]
-    partial = (eyepoints.surface[:, 0] < 0) & eyepoints.seen
-    assert partial.any() and not eyepoints.seen.all()
-    assert np.array_equal(surface >= 0, eyepoints.seen)
+    partial = (eyepoints.surface[:, 0] < 0) & eyepoints.has_target
+    assert partial.any() and not eyepoints.has_target.all()
+    assert np.array_equal(surface >= 0, eyepoints.has_target)
     reference = np.nanargmin(np.abs(eyepoints.offset[partial]), axis=1)
     hit = eyepoints.surface[partial, reference]
     assert np.array_equal(surface[partial], hit)

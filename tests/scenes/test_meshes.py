@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from facet_areas import triangle_areas
 
-from sweep.model.geometry.mesh import Mesh, merge
+from sweep.model.geometry.mesh import Mesh, merge_meshes
 from sweep.scenes.meshes import clean_mesh, read_mesh
 from sweep.scenes.scene_files import SceneError
 
@@ -182,7 +182,7 @@ def exact(vertices, faces):
 def test_a_clean_closed_mesh_needs_nothing():
     mesh, report = clean_mesh(CORNERS, CUBE, 3)
     assert report.summary() == "12 faces on 8 vertices; nothing to mend"
-    assert (mesh.surface == 3).all()
+    assert (mesh.surface_index == 3).all()
     assert world(mesh) == exact(CORNERS, CUBE)
 
 
@@ -192,7 +192,7 @@ def test_faces_without_data_are_dropped_and_the_rest_kept_in_order():
     surface = np.arange(14)
     mesh, report = clean_mesh(vertices, faces, surface)
     assert (report.non_finite, report.unreferenced) == (2, 2)
-    assert mesh.surface.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
+    assert mesh.surface_index.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
     assert world(mesh) == exact(CORNERS, CUBE)
 
 
@@ -201,7 +201,7 @@ def test_faces_without_area_are_dropped_but_the_thinnest_with_area_is_kept():
     faces = [[0, 1, 2], [0, 2, 3], [4, 4, 5], [0, 1, 4]]
     mesh, report = clean_mesh(vertices, faces, [0, 1, 2, 3])
     assert report.degenerate == 2
-    assert mesh.surface.tolist() == [1, 3]
+    assert mesh.surface_index.tolist() == [1, 3]
 
 
 def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_copies():
@@ -211,7 +211,7 @@ def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_cop
     mesh, report = clean_mesh(vertices, faces, surface)
     assert report.duplicate == 6
     assert (report.merged, report.unreferenced) == (4, 5)
-    assert (mesh.surface == 0).all()
+    assert (mesh.surface_index == 0).all()
     assert world(mesh) == exact(CORNERS, CUBE)
 
 
@@ -225,9 +225,9 @@ def test_a_soup_of_separate_triangles_becomes_watertight():
 def test_merged_meshes_keep_every_triangle_where_it_was():
     near, _ = clean_mesh(CORNERS, CUBE, 0)
     far, _ = clean_mesh(CORNERS + np.array([4e6, -3e6, 0.5]), CUBE, 1)
-    both = merge([near, far])
+    both = merge_meshes([near, far])
     assert world(both) == world(near) + world(far)
-    assert both.surface.tolist() == [0] * 12 + [1] * 12
+    assert both.surface_index.tolist() == [0] * 12 + [1] * 12
 
 
 @pytest.mark.parametrize(

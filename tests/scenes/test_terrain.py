@@ -8,7 +8,7 @@ from facet_areas import triangle_areas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.geometry.quaternion import about
+from sweep.model.geometry.quaternion import axis_angle
 from sweep.scenes import terrain as ground_
 from sweep.scenes.meshes import Facets, clean_mesh, join_facets
 from sweep.scenes.rasters import read_image, read_raster
@@ -112,7 +112,7 @@ def test_a_placed_object_is_scaled_and_turned_about_its_origin():
     corner = Facets.on_one_surface(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30)
     )
-    placed = corner.transform(rotation=about(2, math.pi / 2), scale=2.0)
+    placed = corner.transform(rotation=axis_angle(2, math.pi / 2), scale=2.0)
     corners = [[10, 22, 30], [8, 20, 30], [10, 20, 32]]
     np.testing.assert_allclose(placed.vertices + placed.origin, corners, atol=1e-12)
 
@@ -125,7 +125,7 @@ def test_facets_become_a_mesh_at_the_same_place():
         np.sort(facets.vertices + facets.origin, axis=0),
         atol=1e-8,
     )
-    assert (mesh.surface == 3).all() and report.n_faces == len(mesh.faces) == 32
+    assert (mesh.surface_index == 3).all() and report.n_faces == len(mesh.faces) == 32
 
 
 def test_refining_keeps_the_given_heights_and_reproduces_cubics():

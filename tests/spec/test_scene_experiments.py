@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sweep.model.eyepoints import observe
+from sweep.model.pointcloud.eyepoints import observe_eyepoints
 from sweep.spec import SceneSpec, SpecError, load
 from sweep.spec.yaml_document import read_document
 
@@ -24,14 +24,14 @@ def flown(name):
     spec = load(EXPERIMENTS / f"{name}.yaml")
     world = spec.build_scene()
     return spec, {
-        scanner: observe(
+        scanner: observe_eyepoints(
             np.arange(spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)),
             flight=spec.build_flight(),
             scanner=spec.scan_pattern(scanner),
             caster=world.caster,
-            bodies=world.body_flights,
+            body_motions=world.body_flights,
             beam_divergence=spec.instrument.laser.beam_divergence,
-            number=spec.footprint.beamlets,
+            n_beamlets=spec.footprint.beamlets,
             pattern=spec.beamlet_pattern,
         )
         for scanner in spec.scanners
@@ -53,7 +53,7 @@ def grounded(eyes):
 def test_every_beam_meets_the_ground(name):
     spec, eyes = flown(name)
     for seen in eyes.values():
-        assert seen.seen.all() and (seen.surface >= 0).mean() > 0.999
+        assert seen.has_target.all() and (seen.surface >= 0).mean() > 0.999
         assert 2 * seen.range.max() / 299_792_458 < 0.1 * spec.instrument.chirp.duration
     parameters = spec.parameters()
     reflectances = {surface.reflectance for surface in spec.surfaces()}
@@ -207,7 +207,7 @@ def test_gale_crater_is_real_ground_under_all_beams_where_it_is_there():
     spec = load(GALE)
     assert isinstance(spec, SceneSpec)
     spec, eyes = only("gale_crater_descent")
-    assert eyes.seen.all() and (eyes.surface == 0).all()
+    assert eyes.has_target.all() and (eyes.surface == 0).all()
     assert 10 < eyes.range.min() < 12 and np.abs(grounded(eyes)[:, :2]).max() < 170
     origin = spec.build_scene().origin
     assert np.abs(origin[:2]).max() > 1e5 and -4473 < origin[2] < -4437

@@ -102,7 +102,7 @@ def test_a_spinning_platform_turns_at_its_rate_from_where_it_began():
     }  # fmt: skip
     ahead, state = forward({"platform.attitude": spin}, t=4.0)
     np.testing.assert_allclose(ahead, [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(state.rate[0], [0, 0, math.radians(20)])
+    np.testing.assert_allclose(state.angular_velocity[0], [0, 0, math.radians(20)])
 
 
 def test_a_track_follows_the_table_of_the_path_and_of_another_file(tmp_path):
@@ -179,7 +179,7 @@ def test_squares_take_turns_from_the_widest_to_the_narrowest():
     )
     assert spec.shots_per_cycle("one") == 4
     shots = spec.scan_pattern("one").shots(np.arange(16))
-    assert len(set(shots.beam)) == 16
+    assert len(set(shots.beam_number)) == 16
     angles = angle_from_nadir(shots.direction).reshape(4, 4)
     assert (np.diff(angles.mean(axis=1)) <= 1e-9).all() and np.ptp(angles, axis=1).max() < 1e-9
 

@@ -17,8 +17,8 @@ from base_scene_spec import (
     scene_with_object,
 )
 
-from sweep.model.eyepoints import observe
-from sweep.model.geometry.rays import Pose
+from sweep.model.geometry.ray_casting import Pose
+from sweep.model.pointcloud.eyepoints import observe_eyepoints
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec
 
@@ -33,14 +33,14 @@ def built(mapping, base="."):
 
 def seen(spec, world, name="three"):
     """Eyepoints of a whole flight."""
-    return observe(
+    return observe_eyepoints(
         np.arange(spec.number_of_cycles(name) * spec.shots_per_cycle(name)),
         flight=spec.build_flight(),
         scanner=spec.scan_pattern(name),
         caster=world.caster,
-        bodies=world.body_flights,
+        body_motions=world.body_flights,
         beam_divergence=spec.instrument.laser.beam_divergence,
-        number=spec.footprint.beamlets,
+        n_beamlets=spec.footprint.beamlets,
         pattern=spec.beamlet_pattern,
     )
 
@@ -51,8 +51,8 @@ def straight_down(world, x, y, height=1000.0, time=0.0):
     down = np.broadcast_to([0.0, 0.0, -1.0], places.shape)
     poses = [None if b is None else b.state(np.array([time])) for b in world.body_flights]
     poses = [None if p is None else Pose(p.position[0], p.attitude[0]) for p in poses]
-    hits = world.caster.bundle(places, down[:, None], poses=poses)
-    return height - hits.range, hits.surface[:, 0]
+    hits = world.caster.cast_bundles(places, down[:, None], poses=poses)
+    return height - hits.range, hits.surface_index[:, 0]
 
 
 def test_a_plane_is_seen_at_its_distance_and_closing_speed():
@@ -231,7 +231,9 @@ def test_trees_have_leaves_and_trunks_of_their_own_on_the_ground():
     ]
     assert [surface.reflectance for surface in world.surfaces] == [0.1, 0.4, 0.2]
     mesh = world.caster.meshes[0]
-    heights = {k: (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface == k]] for k in (1, 2)}
+    heights = {
+        k: (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface_index == k]] for k in (1, 2)
+    }
     assert heights[1][..., 2].min() > 2 and heights[1][..., 2].max() > 9
     assert -1 < heights[2][..., 2].min() < 0  # trunks reach below the ground
     trunks = heights[2][..., :2].reshape(-1, 2)
@@ -244,7 +246,7 @@ def test_boulders_lie_in_their_square_only():
     mapping["scene"]["objects"]["ground"]["spacing"] = "5 m"
     _, world = built(mapping)
     mesh = world.caster.meshes[0]
-    corners = (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface == 1]].reshape(-1, 3)
+    corners = (mesh.vertices + mesh.origin)[mesh.faces[mesh.surface_index == 1]].reshape(-1, 3)
     away = np.abs(corners[:, :2] - [30, -20]).max(axis=0)
     assert (away < 30 + 2).all() and (away > 20).all()  # widened to whole steps of 5 m
 
@@ -256,7 +258,7 @@ def test_a_power_law_strews_as_many_boulders_as_it_says():
             BOULDERS_OBJECT, law=law, smallest="1 m", largest="5 m", within="1 km", subdivisions=0
         )
     )
-    faces = (world.caster.meshes[0].surface == 1).sum()
+    faces = (world.caster.meshes[0].surface_index == 1).sum()
     expected = 0.02 * (1 - 5**-3) * 1000**2
     assert faces / 12 == pytest.approx(expected, abs=5 * math.sqrt(expected))
 

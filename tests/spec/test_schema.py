@@ -11,7 +11,7 @@ from base_scene_spec import changed_scene as flight
 from base_spec import changed_spec
 
 from sweep.model import window as model_window
-from sweep.model.ground import LAWS
+from sweep.model.ground import REFLECTANCE_LAWS
 from sweep.spec import GridSpec, SceneSpec, SpecError, json_schema, load
 from sweep.spec.fields import fields_by_name, identity_digest, reachable_models, rule_of_field
 from sweep.spec.rules import COSINE_SUM_WINDOWS, NumericRule
@@ -220,11 +220,11 @@ def test_an_editor_sees_the_mistake_in_a_flight_by_the_schema(changes, validator
     assert list(validator.iter_errors(flight(changes)))
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", REFLECTANCE_LAWS)
 def test_every_law_of_the_model_is_one_that_surfaces_take(law, validator):
     mapping = scene_with_object(SPHERE_OBJECT, reflectance_law=law)
     validator.validate(mapping)
-    assert SceneSpec.from_mapping(mapping).surfaces()[1].law == law
+    assert SceneSpec.from_mapping(mapping).surfaces()[1].reflectance_law == law
 
 
 def test_every_parameter_is_described_with_an_example():
@@ -261,10 +261,16 @@ def test_every_field_is_described_and_its_default_reads_back_as_it_is_written(ki
 
 @pytest.mark.parametrize(
     "name",
-    [*COSINE_SUM_WINDOWS, *model_window.ALIASES, "kaiser(8.6)", "chebwin(100)", "tukey( 0.5 )"],
+    [
+        *COSINE_SUM_WINDOWS,
+        *model_window.WINDOW_NAME_ALIASES,
+        "kaiser(8.6)",
+        "chebwin(100)",
+        "tukey( 0.5 )",
+    ],
 )
 def test_every_window_that_a_spec_takes_the_model_makes(name):
     read = GridSpec.from_mapping(
         changed_spec({"instrument.processing.window": name})
     ).instrument.processing.window
-    assert model_window.samples(read, 32).shape == (32,)
+    assert model_window.window_samples(read, 32).shape == (32,)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.analysis.tables import noise_only_reference
-from sweep.model.threshold import PFA_SHOT, TNR, tnr_of
+from sweep.model.threshold import DESIGN_PFA_SHOT_PATH, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec, SpecError
 from sweep.tasks.studies.grid_study import GridStudy
 
@@ -194,21 +194,23 @@ def test_ten_million_values_take_seconds(values):
 
 
 def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
-    axes = {PFA_SHOT: {"log": [1e-9, 1e-3], "number": 3}}
-    spec = GridSpec.from_mapping(changed_spec({TNR: ..., PFA_SHOT: 1e-6}, axes=axes))
-    assert spec.parameters()[PFA_SHOT] == 1e-9 and TNR not in spec.parameters()
+    axes = {DESIGN_PFA_SHOT_PATH: {"log": [1e-9, 1e-3], "number": 3}}
+    spec = GridSpec.from_mapping(
+        changed_spec({TNR_PATH: ..., DESIGN_PFA_SHOT_PATH: 1e-6}, axes=axes)
+    )
+    assert spec.parameters()[DESIGN_PFA_SHOT_PATH] == 1e-9 and TNR_PATH not in spec.parameters()
     assert GridSpec.from_mapping(spec.to_yaml_mapping()).id == spec.id
     found = GridStudy(spec).evaluate(0)
     # all but the few bins that the target takes
     assert found["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
     at = spec.parameters_with({"tnr": 10})
-    assert at[TNR] == 10 and PFA_SHOT not in at
-    first = tnr_of(spec.parameters() | {PFA_SHOT: 1e-9})
+    assert at[TNR_PATH] == 10 and DESIGN_PFA_SHOT_PATH not in at
+    first = tnr_from_parameters(spec.parameters() | {DESIGN_PFA_SHOT_PATH: 1e-9})
     assert noise_only_reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
     with pytest.raises(SpecError, match=r"has no threshold; write 'tnr: 10', or threshold_to_mean"):
-        GridSpec.from_mapping(changed_spec({TNR: ...}))
+        GridSpec.from_mapping(changed_spec({TNR_PATH: ...}))
     with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):
-        GridSpec.from_mapping(changed_spec({PFA_SHOT: 1e-6}, axes={TNR: [5, 10]}))
+        GridSpec.from_mapping(changed_spec({DESIGN_PFA_SHOT_PATH: 1e-6}, axes={TNR_PATH: [5, 10]}))
 
 
 def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sweep.spec.fields
-from sweep.model.effects.catalogue import EFFECTS, NAMES, PARAMETERS
+from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECT_PARAMETERS, EFFECTS
 from sweep.model.effects.effect import Parameter
 from sweep.spec import (
     GridSpec,
@@ -29,7 +29,7 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import Effects, Laser, parameter_rules
 from sweep.spec.yaml_document import read_document
 
-BROUGHT = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.path)
+BROUGHT = pytest.mark.parametrize("parameter", EFFECT_PARAMETERS, ids=lambda p: p.path)
 RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jitter",
           "atmosphere.turbulence": "scintillation"}  # fmt: skip
 """Parameters that bring a random effect."""
@@ -57,7 +57,7 @@ def mistakes(kind, mapping):
 
 def values(parameter):
     """Good values of a parameter as a user writes them, more than its default."""
-    if parameter.table:
+    if parameter.is_table:
         return [parameter.default, [["0 us", "0 Hz"], ["250 us", "1 kHz"], ["500 us", "2 kHz"]]]
     return list(parameter.options) or [parameter.example]
 
@@ -85,7 +85,7 @@ def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
 
 @BROUGHT
 def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
-    if parameter.table:  # one for a whole study (test_spec_reading)
+    if parameter.is_table:  # one for a whole study (test_spec_reading)
         return
     written_values = values(parameter)
     mapping = changed_spec(NEEDED, axes={parameter.path: written_values})
@@ -109,7 +109,9 @@ def test_a_flight_has_the_parameters_that_are_not_its_targets(parameter):
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data):
-    parameter = data.draw(st.sampled_from([p for p in PARAMETERS if not (p.options or p.table)]))
+    parameter = data.draw(
+        st.sampled_from([p for p in EFFECT_PARAMETERS if not (p.options or p.is_table)])
+    )
     value = data.draw(st.floats(1e-300, 1e300, allow_nan=False))
     rule = parameter_rules()[parameter.path]
     assert isinstance(rule, NumericRule)
@@ -119,9 +121,9 @@ def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data)
 
 def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
     """Both decorators read the catalogue: what is added there is in the sections."""
-    new = Parameter(path="instrument.laser.colours", about="Colours", default=2.0,
+    new = Parameter(path="instrument.laser.colours", description="Colours", default=2.0,
                     example="3", limits=("1", None))  # fmt: skip
-    monkeypatch.setattr(sweep.spec.fields, "PARAMETERS", (new,))
+    monkeypatch.setattr(sweep.spec.fields, "EFFECT_PARAMETERS", (new,))
     monkeypatch.setattr(sweep.spec.fields, "EFFECTS", EFFECTS[:1])
 
     class Bare(SpecSection):
@@ -148,11 +150,11 @@ def test_a_section_keeps_its_name_and_words():
 
 def test_every_effect_is_simulated_where_the_scene_calls_for_it_by_default():
     for study in (spec(), SceneSpec.from_mapping(flight())):
-        assert study.effect_modes() == dict.fromkeys(NAMES, "auto")
+        assert study.effect_modes() == dict.fromkeys(EFFECT_NAMES, "auto")
         assert study.identity()["effects"] == study.effect_modes()
     for effect in EFFECTS:
         about = rule_of_field(Effects.model_fields[effect.name]).description
-        assert about[0].isupper() and about[1:] == effect.about[1:]
+        assert about[0].isupper() and about[1:] == effect.description[1:]
 
 
 @pytest.mark.parametrize(
@@ -170,7 +172,7 @@ def test_a_mode_is_read_from_yaml_with_or_without_quotes(text, mode, tmp_path, v
     assert GridSpec.from_stored(study.to_json()).effect_modes() == study.effect_modes()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EFFECT_NAMES)
 @pytest.mark.parametrize("kind", [GridSpec, SceneSpec])
 def test_a_mode_is_part_of_the_identity(name, kind):
     base = {GridSpec: changed_spec, SceneSpec: flight}[kind]
@@ -180,12 +182,12 @@ def test_a_mode_is_part_of_the_identity(name, kind):
     assert kind.from_mapping(base({f"effects.{name}": False})).id == off.id
 
 
-@pytest.mark.parametrize("effect", [e for e in EFFECTS if e.within], ids=lambda e: e.name)
+@pytest.mark.parametrize("effect", [e for e in EFFECTS if e.parent], ids=lambda e: e.name)
 def test_an_effect_is_on_only_within_one_that_is_not_off(effect):
-    on, off = f"effects.{effect.name}", f"effects.{effect.within}"
+    on, off = f"effects.{effect.name}", f"effects.{effect.parent}"
     (mistake,) = mistakes(GridSpec, changed_spec({on: True, off: False}))
-    assert mistake.startswith(f"{on}: acts within {effect.within}, which is off")
-    assert f"turn {effect.within} on" in mistake
+    assert mistake.startswith(f"{on}: acts within {effect.parent}, which is off")
+    assert f"turn {effect.parent} on" in mistake
     for changes in ({on: "auto", off: "off"}, {on: "on"}, {on: "off", off: "on"}):
         assert not mistakes(GridSpec, changed_spec(changes))
 

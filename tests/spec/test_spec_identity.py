@@ -9,8 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sweep.spec.specs
-from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
-from sweep.model.waveform import ENDS, PEAKS
+from sweep.model.threshold import (
+    DESIGN_PFA_BIN_PATH,
+    DESIGN_PFA_SEGMENT_PATH,
+    DESIGN_PFA_SHOT_PATH,
+    THRESHOLD_PATHS,
+    TNR_PATH,
+)
+from sweep.model.waveform import PEAKS_PATH, SEARCH_BAND_PATHS
 from sweep.spec import GridSpec, describe_differences
 from sweep.spec.grid_checks import is_detector_or_estimator
 from sweep.spec.rules import ChoiceRule
@@ -18,9 +24,9 @@ from sweep.spec.sections import MODEL_BY_SECTION, default_value, parameter_rules
 
 AXES = {"target.range": {"step": ["1 m", "100 m", "1 m"]}, "instrument.laser.power": ["1 W", "3 W"]}
 
-OTHER_WAYS = set(WAYS) - {TNR} | set(ENDS)
+OTHER_WAYS = set(THRESHOLD_PATHS) - {TNR_PATH} | set(SEARCH_BAND_PATHS)
 """Of setting the threshold, of which a spec has one; and a search band, which none need have."""
-BAND = dict(zip(ENDS, ("10 m", "2 km", "-5 m/s", "95 m/s"), strict=True))
+BAND = dict(zip(SEARCH_BAND_PATHS, ("10 m", "2 km", "-5 m/s", "95 m/s"), strict=True))
 
 CUT = {"zip": [{"target.grazing_angle": ["1 deg", "2 deg"], "footprint.beamlets": 7}]}
 
@@ -141,7 +147,7 @@ def other_value(path):
         "accuracy.confidence": 0.9,
         "instrument.processing.bits": 12,
         "instrument.processing.fft_size": "2^16",
-        **dict.fromkeys((PFA_BIN, PFA_SEGMENT, PFA_SHOT), 0.01),
+        **dict.fromkeys((DESIGN_PFA_BIN_PATH, DESIGN_PFA_SEGMENT_PATH, DESIGN_PFA_SHOT_PATH), 0.01),
         "instrument.receiver.field_of_view": "1 mrad",
         "instrument.receiver.iq_gain_imbalance": "0.5 dB",
         "instrument.receiver.iq_phase_imbalance": "3 deg",
@@ -180,11 +186,11 @@ def test_every_parameter_is_part_of_the_id(path):
         every |= {"instrument.receiver.record": "complex"}
     if path == "instrument.telescope.leak_path":
         every |= {"instrument.telescope.isolation": "60 dB"}
-    if path in ENDS:
+    if path in SEARCH_BAND_PATHS:
         every |= BAND
-    if path == PEAKS:  # of closed forms, without draws
+    if path == PEAKS_PATH:  # of closed forms, without draws
         every = {}
-    instead = {TNR: ...} if path in WAYS and path != TNR else {}
+    instead = {TNR_PATH: ...} if path in THRESHOLD_PATHS and path != TNR_PATH else {}
     base, changed = spec(every), spec(every | instead | {path: other_value(path)})
     assert changed.id != base.id
     lines = describe_differences(base, changed)

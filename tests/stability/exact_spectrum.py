@@ -7,8 +7,8 @@ import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.preparation import Shots
-from sweep.model.waveform import SIGNS
-from sweep.model.window import COSINE_SUMS, samples
+from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, window_samples
 
 
 def dirichlet(bins: mp.mpf, length: int) -> mp.mpc:
@@ -23,7 +23,7 @@ def dirichlet(bins: mp.mpf, length: int) -> mp.mpc:
 def window_transform(window_name: str, length: int, bins: mp.mpf) -> mp.mpc:
     """W(y) of a cosine sum of `length` samples, y bins of fs/L, as a sum of such kernels."""
     total = mp.mpc(0)
-    for m, text in enumerate(COSINE_SUMS[window_name]):
+    for m, text in enumerate(COSINE_SUM_COEFFICIENTS[window_name]):
         for shifted_bins in (bins - m, bins + m):
             total += (-1) ** m * mp.mpf(text) / 2 * dirichlet(shifted_bins, length)
     return total
@@ -41,21 +41,27 @@ class ExactLine:
     """One beamlet's beat in one segment of a shot: place [bins], weight at t_0."""
 
     def __init__(self, shots: Shots, point: int, segment: int, beamlet: int) -> None:
-        row, sign = shots.row[point], SIGNS[segment]
+        row, sign = shots.footprint_row[point], DEFAULT_CHIRP_SLOPES[segment]
         rate, carrier = (
             point_value(shots.chirp_rate, point),
             point_value(shots.carriers[segment], point),
         )
-        range_m = point_value(shots.range, point) * (1 + mp.mpf(float(shots.offset[row, beamlet])))
+        range_m = point_value(shots.range, point) * (
+            1 + mp.mpf(float(shots.relative_range_offset[row, beamlet]))
+        )
         delay = 2 * range_m / mp.mpf(SPEED_OF_LIGHT)
-        beta = point_value(shots.beta, point) + mp.mpf(float(shots.doppler[row, beamlet]))
+        beta = point_value(shots.doppler_ratio, point) + mp.mpf(
+            float(shots.doppler_ratio_offset[row, beamlet])
+        )
         self.beat = carrier * beta - sign * rate * delay * (1 + beta)
         self.bins = self.beat * shots.fft_size / point_value(shots.sample_rate, point)
         start = self.beat * point_value(shots.acquisition_delay, point)
         self.phase = -carrier * delay + sign * rate * delay**2 / 2 + start
         poles = 1 + 1j * self.beat / point_value(shots.detector_bandwidth, point)
         poles *= 1 + 1j * self.beat / point_value(shots.amplifier_bandwidth, point)
-        scale = point_value(shots.beat_scale, point) * mp.mpf(float(shots.amplitude[row, beamlet]))
+        scale = point_value(shots.beat_amplitude_scale, point) * mp.mpf(
+            float(shots.relative_amplitude[row, beamlet])
+        )
         self.weight = scale / 2 / poles * mp.expjpi(2 * self.phase)
 
 
@@ -70,8 +76,14 @@ def exact_magnitudes(
 ) -> list[mp.mpf]:
     """|X[k]| of some bins: lines, and images if wanted, as amplitudes or as powers."""
     window, result = shots.window, []
-    lines = [ExactLine(shots, point, segment, b) for b in range(shots.offset.shape[1])]
-    weights = None if window.name in COSINE_SUMS else samples(window.name, window.length)
+    lines = [
+        ExactLine(shots, point, segment, b) for b in range(shots.relative_range_offset.shape[1])
+    ]
+    weights = (
+        None
+        if window.name in COSINE_SUM_COEFFICIENTS
+        else window_samples(window.name, window.length)
+    )
 
     def transform_at(distance: mp.mpf) -> mp.mpc:
         bins_of_record = distance * window.length / shots.fft_size
@@ -89,7 +101,7 @@ def exact_magnitudes(
             )
             for line in lines
         ]
-        if shots.incoherent:
+        if shots.adds_powers:
             result.append(mp.sqrt(mp.fsum(abs(x) ** 2 for pair in pairs for x in pair)))
         else:
             result.append(abs(mp.fsum(x for pair in pairs for x in pair)))
@@ -98,7 +110,9 @@ def exact_magnitudes(
 
 def peak_magnitude(shots: Shots, point: int, segment: int) -> float:
     """Height on a bin of a line with the weight of all lines of a segment."""
-    lines = (ExactLine(shots, point, segment, b) for b in range(shots.offset.shape[1]))
+    lines = (
+        ExactLine(shots, point, segment, b) for b in range(shots.relative_range_offset.shape[1])
+    )
     return float(mp.fsum(abs(line.weight) for line in lines)) * shots.window.sum
 
 

@@ -9,11 +9,12 @@ from exact_spectrum import error_over_peak, peak_magnitude
 from hard_cases import EPS, Family
 from table_4_1_shots import prepare_shot, velocity_for
 
-from sweep.model import segments, truth
+from sweep.model import time_domain_truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.preparation import Shots
-from sweep.model.waveform import beat_frequency, resolve
-from sweep.model.window import COSINE_SUMS
+from sweep.model.spectrum import segment_spectra
+from sweep.model.waveform import beat_frequency, resolve_range_velocity
+from sweep.model.window import COSINE_SUM_COEFFICIENTS
 
 FFT_SIZE, SAMPLE_RATE = 4096, 600e6
 NYQUIST = SAMPLE_RATE / 2
@@ -47,7 +48,7 @@ def case_fields(
 
 def bins_to_check(single_shot: Shots, segment: int) -> list[int]:
     """Bins about the line, at both ends of the spectrum and in between."""
-    _, magnitude = segments.spectrum(single_shot, 0, segment)
+    _, magnitude = segment_spectra.segment_spectrum(single_shot, 0, segment)
     centre, half = int(np.argmax(magnitude)), single_shot.fft_size // 2
     near = range(centre - 4, centre + 5)
     return sorted({k for k in (0, 1, 2, *near, half - 1, half, 77, 1234) if 0 <= k <= half})
@@ -56,9 +57,9 @@ def bins_to_check(single_shot: Shots, segment: int) -> list[int]:
 def error_of_all_segments(single_shot: Shots) -> float:
     """Largest error of the fast path's bins over the peak, all segments."""
     worst = 0.0
-    for segment in np.flatnonzero(single_shot.segments).tolist():
+    for segment in np.flatnonzero(single_shot.has_segment).tolist():
         bins = bins_to_check(single_shot, segment)
-        _, magnitude = segments.spectrum(single_shot, 0, segment)
+        _, magnitude = segment_spectra.segment_spectrum(single_shot, 0, segment)
         worst = max(worst, error_over_peak(single_shot, segment, bins, magnitude[bins]))
     return worst
 
@@ -137,7 +138,7 @@ def receding() -> float:
 
 def doppler_tones(bins: float, **changes: Any) -> Iterator[Shots]:
     """Shots whose Doppler line lies on a place of the spectrum, every cosine sum."""
-    for window in COSINE_SUMS:
+    for window in COSINE_SUM_COEFFICIENTS:
         radial_velocity = velocity_for(bins * SAMPLE_RATE / FFT_SIZE, 1)
         yield prepare_shot(
             radial_velocity=radial_velocity, window=window, fft_size=FFT_SIZE, **changes
@@ -172,15 +173,17 @@ def time_domain() -> float:
         "bohman",
     )
     worst = 0.0
-    for window in (*COSINE_SUMS, *tabulated_windows):
+    for window in (*COSINE_SUM_COEFFICIENTS, *tabulated_windows):
         for bins in (0.0, 0.5, 300.0, 511.5, 3456.789):
             radial_velocity = velocity_for(bins * SAMPLE_RATE / 1024, 1)
             single_shot = prepare_shot(
                 radial_velocity=radial_velocity, window=window, fft_size=1024
             )
             for segment in range(3):
-                _, magnitude = segments.spectrum(single_shot, 0, segment)
-                exact_magnitude = truth.spectrum(single_shot, 0, segment, range_walk=False)
+                _, magnitude = segment_spectra.segment_spectrum(single_shot, 0, segment)
+                exact_magnitude = time_domain_truth.time_domain_spectrum(
+                    single_shot, 0, segment, with_range_walk=False
+                )
                 worst = max(
                     worst,
                     float(np.abs(magnitude - exact_magnitude).max())
@@ -214,7 +217,7 @@ def iter_reading_errors(*velocities: float) -> Iterator[tuple[float, float, floa
             )
             for sign in (1, 0, -1)
         )
-        reading = resolve(
+        reading = resolve_range_velocity(
             up=up, doppler=doppler, down=down, carrier=np.float64(carrier),
             bandwidth=np.float64(BANDWIDTH), duration=np.float64(DURATION),
             sample_rate=np.float64(1e12), bin_width=np.float64(4577.6),

@@ -9,8 +9,8 @@ from hard_cases import EPS, Family
 from shot_helpers import segment_lines
 from table_4_1_shots import prepare_shot, table_4_1_parameters
 
-from sweep.model import footprint
-from sweep.model.elementary import product_fraction, quotient, sincos_cycles
+from sweep.model import beamlets
+from sweep.model.elementary_functions import exact_quotient, product_cycle_fraction, sincos_cycles
 from sweep.model.geometry import quaternion
 from sweep.model.preparation import Shots
 
@@ -33,9 +33,9 @@ def phase_of_range_rounding(range_m: float) -> float:
 
 def footprint_error(grazing: float, divergence: float) -> float:
     """Worst error of offset and cosine of 109 beamlets, over what their cancellations allow."""
-    (beamlet_across, beamlet_along), _ = footprint.beamlets(109)
-    offset, cosine, weight, _ = footprint.plane_footprint(
-        grazing_angle=np.array([grazing]), beam_divergence=np.array([divergence]), number=109
+    (beamlet_across, beamlet_along), _ = beamlets.place_beamlets(109)
+    offset, cosine, weight, _ = beamlets.plane_footprint(
+        grazing_angle=np.array([grazing]), beam_divergence=np.array([divergence]), n_beamlets=109
     )
     angle, sigma, worst = mp.mpf(grazing), mp.mpf(divergence) / 4, mp.mpf(0)
     for b in np.flatnonzero(weight[0] > 0):
@@ -76,9 +76,9 @@ def footprints_at_all_angles() -> float:
     because="pi/2, rounded, times the beam's angle",
 )
 def normal_incidence() -> float:
-    (beamlet_across, beamlet_along), _ = footprint.beamlets(109)
-    offset, _, _, _ = footprint.plane_footprint(
-        grazing_angle=np.array([math.pi / 2]), beam_divergence=np.array([50e-6]), number=109
+    (beamlet_across, beamlet_along), _ = beamlets.place_beamlets(109)
+    offset, _, _, _ = beamlets.plane_footprint(
+        grazing_angle=np.array([math.pi / 2]), beam_divergence=np.array([50e-6]), n_beamlets=109
     )
     with mp.workdps(40):
         sigma, worst = mp.mpf(50e-6) / 4, mp.mpf(0)
@@ -172,12 +172,12 @@ def fast_target() -> float:
 
 def optical_phase_error(*ranges_m: float) -> float:
     """Worst error of 2 R / lambda, R exact, in cycles."""
-    high, low = quotient(2.0, WAVELENGTH)
+    high, low = exact_quotient(2.0, WAVELENGTH)
     worst = 0.0
     with mp.workdps(60):
         for range_m in ranges_m:
             exact = 2 * mp.mpf(range_m) / mp.mpf(WAVELENGTH)
-            difference = mp.mpf(product_fraction(high, low, range_m)) - exact
+            difference = mp.mpf(product_cycle_fraction(high, low, range_m)) - exact
             worst = max(worst, float(abs(difference - mp.nint(difference))))
     return worst
 

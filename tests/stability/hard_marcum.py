@@ -8,7 +8,7 @@ from pathlib import Path
 import mpmath as mp
 from hard_cases import EPS, Family
 
-from sweep.model.marcum import excess_crossing, marcum_q1
+from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
 
 FAMILY = Family(
     "Marcum Q",
@@ -195,7 +195,7 @@ def excess_over_noise() -> float:
         for a, b in points:
             exact_value = excess_by_poisson_mixture(mp.mpf(a), mp.mpf(b))
             if exact_value >= SMALLEST_NORMAL:
-                value = mp.mpf(excess_crossing(a, b))
+                value = mp.mpf(marcum_q1_excess(a, b))
                 largest = max(largest, float(abs(value / exact_value - 1)))
     return largest
 

@@ -8,7 +8,7 @@ import numpy as np
 from exact_rays import error_in_ulps, intersect_triangle, nearest_triangle, to_fractions
 from hard_cases import Family
 
-from sweep.model.geometry.rays import Caster
+from sweep.model.geometry.ray_casting import RayCaster
 from sweep.scenes.meshes import clean_mesh
 
 FAMILY = Family(
@@ -35,8 +35,8 @@ def unit_vector(v: np.ndarray) -> np.ndarray:
 def worst_range_error(scene: Scene) -> float:
     """Worst error of the ranges of a scene's rays [last places]."""
     vertices, faces, origins, directions = scene
-    caster = Caster(clean_mesh(vertices, faces, np.zeros(len(faces)))[0])
-    hits = caster.bundle(origins, np.asarray(directions)[:, None])
+    caster = RayCaster(clean_mesh(vertices, faces, np.zeros(len(faces)))[0])
+    hits = caster.cast_bundles(origins, np.asarray(directions)[:, None])
     worst = 0.0
     for hit_range, origin, direction in zip(hits.range, origins, directions, strict=True):
         exact = nearest_triangle(np.asarray(vertices, float), np.asarray(faces), origin, direction)
@@ -253,7 +253,7 @@ def close_layers() -> Scene:
 )
 def relative_ranges() -> float:
     corners = np.array([[-1e6, -1e6, 3.1], [1.1e6, -1e6, -2.7], [0, 1.2e6, 0.4]])
-    caster, worst = Caster(clean_mesh(corners, [[0, 1, 2]], [0])[0]), 0.0
+    caster, worst = RayCaster(clean_mesh(corners, [[0, 1, 2]], [0])[0]), 0.0
     for degrees in (0.01, 0.1, 1.0, 30.0, 89.0):
         grazing_angle = math.radians(degrees)
         centre = np.array([math.cos(grazing_angle), 0.0, -math.sin(grazing_angle)])
@@ -262,11 +262,11 @@ def relative_ranges() -> float:
         )
         directions = np.concatenate([centre[None], beamlets])
         origin = np.array([-10e3 * math.cos(grazing_angle), 0.0, 10e3 * math.sin(grazing_angle)])
-        hits = caster.bundle(origin[None], directions[None])
+        hits = caster.cast_bundles(origin[None], directions[None])
         ranges = [intersect_triangle(corners, origin, direction)[0] for direction in directions]
         for b in range(1, 21):
             exact = ranges[b] - ranges[0]
-            worst = max(worst, float(abs(Fraction(hits.offset[0, b]) / exact - 1)))
+            worst = max(worst, float(abs(Fraction(hits.range_offset[0, b]) / exact - 1)))
     return worst
 
 

@@ -4,8 +4,8 @@ import mpmath as mp
 import numpy as np
 from hard_cases import EPS, Family
 
-from sweep.model.crossings import any_crossing
-from sweep.model.marcum import at_least_one, log_at_least_one
+from sweep.model.detection.added_crossings import any_crossing_probability
+from sweep.model.detection.marcum import at_least_one_probability, log_at_least_one_probability
 
 FAMILY = Family(
     "Many small chances",
@@ -36,7 +36,7 @@ def relative_error(value: float, exact_value: mp.mpf) -> float:
 def small_probabilities() -> float:
     with mp.workdps(DIGITS_FOR_TINY_PROBABILITIES):
         return max(
-            relative_error(at_least_one(p, n), at_least_one_exactly(mp.mpf(p), n))
+            relative_error(at_least_one_probability(p, n), at_least_one_exactly(mp.mpf(p), n))
             for p in (1e-300, 1e-100, 1.1e-16, 1e-12, 4.79e-10, 1e-9, 1e-3, 0.47, 0.5)
             for n in (1, 2, 65536, 2**30)
         )
@@ -53,7 +53,7 @@ def small_probabilities() -> float:
 def denormal_probabilities() -> float:
     step = 5e-324
     return max(
-        abs(float(at_least_one(k * step, n)) / step - k * n)
+        abs(float(at_least_one_probability(k * step, n)) / step - k * n)
         for k in (1, 7, 1000)
         for n in (1, 3, 65536, 2**20)
     )
@@ -78,7 +78,9 @@ def log_probabilities() -> float:
                     if log_p < -650
                     else mp.log(at_least_one_exactly(mp.exp(log), n))
                 )
-                largest = max(largest, relative_error(log_at_least_one(log_p, n), exact_value))
+                largest = max(
+                    largest, relative_error(log_at_least_one_probability(log_p, n), exact_value)
+                )
     return largest
 
 
@@ -96,7 +98,7 @@ def nearly_certain_probabilities() -> float:
         for log_p, n in ((-1e-3, 1), (-1e-9, 1), (-1e-16, 1), (-0.5, 7), (-1e-3, 4), (-3.0, 600)):
             p = mp.exp(mp.mpf(log_p))
             probability_of_none = (1 - p) ** n
-            computed_none = -mp.expm1(mp.mpf(float(log_at_least_one(log_p, n))))
+            computed_none = -mp.expm1(mp.mpf(float(log_at_least_one_probability(log_p, n))))
             largest = max(
                 largest, float(abs(computed_none / probability_of_none - 1) / (2 + n * p / (1 - p)))
             )
@@ -115,4 +117,6 @@ def union_of_probabilities() -> float:
     probabilities = 10 ** np.random.default_rng(5).uniform(-300, -3, 10_000)
     with mp.workdps(60):
         exact_value = -mp.expm1(mp.fsum(mp.log1p(-mp.mpf(float(p))) for p in probabilities))
-        return relative_error(any_crossing(probabilities, 0, probabilities.size), exact_value)
+        return relative_error(
+            any_crossing_probability(probabilities, 0, probabilities.size), exact_value
+        )

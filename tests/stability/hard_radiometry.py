@@ -8,17 +8,17 @@ import numpy as np
 from hard_cases import EPS, Family
 from table_4_1_shots import prepare_shot, table_4_1_parameters
 
-from sweep.model.effects.catalogue import CORE, EFFECTS
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS
 from sweep.model.effects.line_width import (
-    coherent_share,
-    density_under_line,
-    gaussian_shifts,
-    power_under_line,
+    coherent_power_fraction,
+    gaussian_frequency_shifts,
+    pedestal_density_under_line,
+    pedestal_power_under_line,
 )
-from sweep.model.effects.saturation import clipping
-from sweep.model.segments import spectrum as segment_spectrum
-from sweep.model.shot import evaluate
-from sweep.model.window import samples, window
+from sweep.model.effects.saturation import clipping_gains
+from sweep.model.evaluation import evaluate
+from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
+from sweep.model.window import get_window, window_samples
 
 FAMILY = Family(
     "Radiometry and noise",
@@ -48,7 +48,7 @@ def no_reflectance() -> float:
     worst = 0.0
     with mp.workdps(30):
         for architecture in ("homodyne", "heterodyne", "direct"):
-            for effects in ((), CORE, CERTAIN_EFFECTS):
+            for effects in ((), DEFAULT_EFFECTS, CERTAIN_EFFECTS):
                 for tnr in (1e-3, 1.0, 10.0, 37.0):
                     statistics = statistics_without_reflectance(architecture, tnr, effects)
                     for name in ("pd_up", "pd_down"):
@@ -145,7 +145,9 @@ def false_alarms_by_logarithm() -> float:
             statistics = evaluate(table_4_1_parameters(reflectance=0.0, tnr=tnr, fft_size=1024), ())
             log = -(4 - mp.pi) / 4 * mp.mpf(tnr) ** 2
             n_bins = int(
-                prepare_shot((), reflectance=0.0, fft_size=1024).counted_bins(np.array([0]))[0]
+                prepare_shot((), reflectance=0.0, fft_size=1024).alarm_equivalent_bins(
+                    np.array([0])
+                )[0]
             )
             p = mp.exp(log) if log > -600 else None
             bin_counts = [n_bins - n_exempt for n_exempt in (2, 3)]
@@ -201,7 +203,7 @@ def clipping_error(*scenes: tuple[float, float, float]) -> float:
     with mp.workdps(30):
         for scene in scenes:
             amplitude, deviation, full_scale = scene
-            gains = clipping(amplitude=amplitude, deviation=deviation, full_scale=full_scale)
+            gains = clipping_gains(amplitude=amplitude, deviation=deviation, full_scale=full_scale)
             line, noise = clipping_gains_exactly(amplitude, deviation, full_scale)
             worst = max(worst, float(abs(float(gains.signal_gain) / line - 1)))
             worst = max(worst, float(abs(float(gains.noise_gain) / noise - 1)))
@@ -261,7 +263,7 @@ def no_width() -> float:
     for shape in ("gaussian", "lorentzian"):
         for width in (0.0, 5e-324):
             single_shot = prepare_shot(
-                (*CORE, "line_width"), **scene, line_width=width, line_shape=shape
+                (*DEFAULT_EFFECTS, "line_width"), **scene, line_width=width, line_shape=shape
             )
             magnitude = segment_spectrum(single_shot, 0, 0)[1]
             worst = max(worst, float(np.abs(magnitude / spectrum_without_width - 1).max()))
@@ -277,11 +279,19 @@ def no_width() -> float:
     because="the trapezium rule is meant to 1e-12 of the peak's power, 1e-3 of which is here",
 )
 def wider_than_the_band() -> float:
-    single_shot = prepare_shot((*CORE, "line_width"), fft_size=256, window="hann", line_width=2.4e9,
-                detector_bandwidth=1e30, amplifier_bandwidth=1e30)  # fmt: skip
+    single_shot = prepare_shot(
+        (*DEFAULT_EFFECTS, "line_width"),
+        fft_size=256,
+        window="hann",
+        line_width=2.4e9,
+        detector_bandwidth=1e30,
+        amplifier_bandwidth=1e30,
+    )
     _, magnitude = segment_spectrum(single_shot, 0, 1)
-    half_amplitude = float(single_shot.beat_scale * single_shot.amplitude[0, 0]) / 2
-    even_magnitude = half_amplitude * math.sqrt(2 * float((samples("hann", 256) ** 2).sum()))
+    half_amplitude = (
+        float(single_shot.beat_amplitude_scale * single_shot.relative_amplitude[0, 0]) / 2
+    )
+    even_magnitude = half_amplitude * math.sqrt(2 * float((window_samples("hann", 256) ** 2).sum()))
     return float(np.abs(magnitude[3:-3] / even_magnitude - 1).max())
 
 
@@ -304,7 +314,7 @@ def pedestal_density() -> float:
         for width, delay in widths_and_delays():
             gamma = 2 * mp.pi * mp.mpf(width)
             exact_density = 2 / gamma * (1 - mp.exp(-gamma * delay) * (1 + gamma * delay))
-            density = density_under_line(line_width=np.array(width), delay=np.array(delay))
+            density = pedestal_density_under_line(line_width=np.array(width), delay=np.array(delay))
             worst = max(worst, float(abs(float(density) / exact_density - 1)))
     return worst
 
@@ -319,7 +329,7 @@ def pedestal_density() -> float:
 )
 def noise_under_line() -> float:
     length, rate = 2048, 600e6
-    w = samples("hann", length)
+    w = window_samples("hann", length)
     window_correlation = np.correlate(w, w, "full")[length - 1 :]
     lags, worst = np.arange(length), 0.0
     for width in (1e-6, 1e3, 1e5, 1e6, 9.5e6, 9.6e6, 1e8, 1e10, 1e14):
@@ -329,9 +339,9 @@ def noise_under_line() -> float:
             np.exp(-gamma * lags / rate) * -np.expm1(-gamma * delay_beyond_lag) * window_correlation
         )
         exact = 2 * math.fsum(lag_terms) - lag_terms[0]
-        power = power_under_line(
+        power = pedestal_power_under_line(
             line_width=np.array([width]), delay=np.array([delay]),
-            duration=np.array([duration]), window=window("hann", length),
+            duration=np.array([duration]), window=get_window("hann", length),
         )  # fmt: skip
         worst = max(worst, abs(float(power[0]) / exact - 1))
     return worst
@@ -349,7 +359,7 @@ def share_of_the_line() -> float:
     worst = 0.0
     with mp.workdps(30):
         for width, delay in ((1e-9, 1e-5), (1e4, 1e-5), (1e7, 1e-5), (1e11, 1e-9)):
-            share = coherent_share(
+            share = coherent_power_fraction(
                 line_width=np.array(width), delay=np.array(delay), duration=np.array(1.0)
             )
             exact_share = mp.exp(-2 * mp.pi * mp.mpf(width) * mp.mpf(delay))
@@ -368,11 +378,13 @@ def share_of_the_line() -> float:
 def gaussian_line_shifts() -> float:
     worst = 0.0
     for width in (1e-6, 1e-3, 1.0, 30.0, 500.0):
-        line_shifts = gaussian_shifts(
+        line_shifts = gaussian_frequency_shifts(
             fwhm=np.array([width * 2.3548200450309493]), duration=np.ones(1)
         )
         for order, moment in ((0, 1.0), (2, width**2), (4, 3 * width**4)):
-            weighted_moment = math.fsum((line_shifts.weight * line_shifts.offset**order)[0])
+            weighted_moment = math.fsum(
+                (line_shifts.weight * line_shifts.offset_window_bins**order)[0]
+            )
             worst = max(worst, abs(weighted_moment / moment - 1))
     return worst
 
@@ -401,7 +413,7 @@ def extinction_of_air() -> float:
                 worst = max(worst, float(abs(float(single_shot.echo_power[0]) / exact_power - 1)))
             statistics = evaluate(
                 table_4_1_parameters(profile="layer", extinction=extinction, depth=1e5),
-                (*CORE, "extinction"),
+                (*DEFAULT_EFFECTS, "extinction"),
             )
             if extinction > 1:
                 worst = max(

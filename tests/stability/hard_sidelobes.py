@@ -13,12 +13,18 @@ from hard_marcum import excess_by_poisson_mixture
 from shot_helpers import detected_window, line_shape_of_window
 from table_4_1_shots import prepare_shot
 
-from sweep.model.line_shape import SHARED
-from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
-from sweep.model.segments import tangents
-from sweep.model.shot import find
-from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field
-from sweep.model.window import COSINE_SUMS, samples, window
+from sweep.model.evaluation import evaluate_segments
+from sweep.model.spectrum.bin_spectrum import (
+    F_IM,
+    F_RE,
+    LINE_BATCH_CELLS_MAX,
+    N_SCRATCH_ROWS,
+    compute_field,
+)
+from sweep.model.spectrum.line_shape import SHARED_TABLE_BINS
+from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
+from sweep.model.spectrum.segment_spectra import bin_tangents
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
 FAMILY = Family(
     "Sidelobes",
@@ -37,19 +43,26 @@ def window_magnitudes(
     window_name: str, size: int, line_offset: float, bins: Iterable[int]
 ) -> Iterator[float]:
     """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
-    table, outline, sizes, _, _ = line_shape_of_window(window(window_name, size), size)
-    scratch = np.empty((ROOM, max(LEAST_WIDTH, MOST_CELLS) + 16))
+    table, outline, sizes, _, _ = line_shape_of_window(get_window(window_name, size), size)
+    scratch = np.empty((N_SCRATCH_ROWS, max(SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
     scratch[PLACE, 0], scratch[RE, 0], scratch[IM, 0] = line_offset, 1.0, 0.0
     for k in bins:
-        field(
-            k, 1, (1, line_offset, line_offset, 0.0), table, outline, sizes, tangents(size), scratch
+        compute_field(
+            k,
+            1,
+            (1, line_offset, line_offset, 0.0),
+            table,
+            outline,
+            sizes,
+            bin_tangents(size),
+            scratch,
         )
         yield float(np.hypot(scratch[F_RE, 0], scratch[F_IM, 0]))
 
 
 def far_bins(size: int) -> list[int]:
     """Bins from beyond the table to well before Nyquist."""
-    return [SHARED + 9, SHARED + 123, size // 8, size // 4, size // 3]
+    return [SHARED_TABLE_BINS + 9, SHARED_TABLE_BINS + 123, size // 8, size // 4, size // 3]
 
 
 def far_sidelobe_error(window_name: str) -> float:
@@ -69,7 +82,7 @@ def far_sidelobe_error(window_name: str) -> float:
 
 def add_closed_form_cases() -> None:
     """A case for each sum of cosines."""
-    for name in COSINE_SUMS:
+    for name in COSINE_SUM_COEFFICIENTS:
         FAMILY.case(
             f"{name}, 2^12 to 2^24 points, bins to N/3",
             reference="sum of the terms, 100 digits",
@@ -94,7 +107,7 @@ add_closed_form_cases()
 def last_bins() -> float:
     worst = 0.0
     with mp.workdps(100):
-        for name in COSINE_SUMS:
+        for name in COSINE_SUM_COEFFICIENTS:
             for size in (2**12, 2**17, 2**24):
                 bins = [size // 2 - 3, size // 2 - 1]
                 for k, magnitude in zip(
@@ -116,9 +129,9 @@ def last_bins() -> float:
 def main_lobes() -> float:
     worst, bins = 0.0, [*range(9), 40, 123, 240, 511, 512]
     with mp.workdps(100):
-        for name, size in product(COSINE_SUMS, (1024, 4096)):
+        for name, size in product(COSINE_SUM_COEFFICIENTS, (1024, 4096)):
             for delta in (0.0, 1e-300, 1e-9, 0.25, 0.5):
-                peak = window(name, size).sum
+                peak = get_window(name, size).sum
                 for k, magnitude in zip(
                     bins, window_magnitudes(name, size, delta, bins), strict=True
                 ):
@@ -129,7 +142,7 @@ def main_lobes() -> float:
 
 def window_magnitude_by_samples(name: str, size: int, delta: float, k: int) -> float:
     """|W| by the plain sum: phases of whole cycles taken off exactly, sums rounded once."""
-    weights, sample_numbers = samples(name, size), np.arange(size)
+    weights, sample_numbers = window_samples(name, size), np.arange(size)
     turns = (sample_numbers * k % size) / size - sample_numbers * (delta / size)
     real, imaginary = weights * np.cos(2 * np.pi * turns), weights * np.sin(2 * np.pi * turns)
     return math.hypot(math.fsum(real), math.fsum(imaginary))
@@ -146,7 +159,7 @@ def tabulated_error(names: Iterable[str], sizes: Iterable[int], bins: Iterable[i
                     all_bins, window_magnitudes(name, size, delta, all_bins), strict=True
                 ):
                     exact = window_magnitude_by_samples(name, size, delta, k)
-                    worst = max(worst, abs(magnitude - exact) / window(name, size).sum)
+                    worst = max(worst, abs(magnitude - exact) / get_window(name, size).sum)
     return worst
 
 
@@ -250,13 +263,13 @@ def leakage_of_2000_bins() -> float:
 def leakage_error(window_name: str, size: int, range_m: float) -> float:
     """Relative error of the leakage of a shot's up segment."""
     single_shot = prepare_shot(LEAKAGE_EFFECTS, window=window_name, fft_size=size, range=range_m)
-    results = find(single_shot)[0]
+    results = evaluate_segments(single_shot)[0]
     return abs(results[5, 0] / exact_leakage(single_shot, int(results[4, 0])) - 1)
 
 
 def exact_leakage(single_shot: Any, n_exempted: int) -> float:
     """Chance that a bin of the up segment but those about the peak crosses, over noise alone."""
-    sigma, threshold = float(single_shot.bin_deviation[0]), float(single_shot.threshold[0])
+    sigma, threshold = float(single_shot.bin_noise_sigma[0]), float(single_shot.threshold[0])
     with mp.workdps(30):
         bins = exact_magnitudes(
             single_shot, 0, 0, range(single_shot.fft_size // 2 + 1), image=False

@@ -10,8 +10,9 @@ from hard_beats import error_of_all_segments
 from hard_cases import EPS, Family
 from table_4_1_shots import prepare_shot, velocity_for
 
-from sweep.model import segments, truth
+from sweep.model import time_domain_truth
 from sweep.model.preparation import Shots
+from sweep.model.spectrum import segment_spectra
 
 FAMILY = Family(
     "Sizes",
@@ -34,7 +35,9 @@ def position_rounding(frequency: float, size: int, rate: float = SAMPLE_RATE) ->
 def error_next_to_line(single_shot: Shots, segment: int, relative_level: float) -> float:
     """Worst error over the peak of the bins next to a line."""
     peak_height = peak_magnitude(single_shot, 0, segment)
-    bins, magnitude = segments.spectrum(single_shot, 0, segment, level=relative_level * peak_height)
+    bins, magnitude = segment_spectra.segment_spectrum(
+        single_shot, 0, segment, level_min=relative_level * peak_height
+    )
     peak_index = int(np.argmax(magnitude))
     checked = sorted(
         {0, len(bins) - 1, *range(max(peak_index - 4, 0), min(peak_index + 5, len(bins)))}
@@ -122,7 +125,9 @@ def error_of_long_time_record() -> float:
     size, worst = 2**20, 0.0
     single_shot = prepare_shot(fft_size=size, window="hann", duration=2 * size / SAMPLE_RATE)
     for segment in range(3):
-        magnitude = truth.spectrum(single_shot, 0, segment, range_walk=False)
+        magnitude = time_domain_truth.time_domain_spectrum(
+            single_shot, 0, segment, with_range_walk=False
+        )
         peak_bin = int(np.argmax(magnitude))
         checked_bins = [1, size // 5, *range(peak_bin - 4, peak_bin + 5)]
         worst = max(
@@ -135,12 +140,12 @@ def error_of_coincident_beamlets(phases: str, n_beamlets: int) -> float:
     """A footprint so small that all of it is one line, over that line and its amplitudes' sum."""
     scene = {"fft_size": 4096, "beam_divergence": 1e-9, "window": "hann", "phases": phases}
     shots_of_many, shots_of_one = prepare_shot(**scene, beamlets=n_beamlets), prepare_shot(**scene)
-    weights = shots_of_many.amplitude[0] / shots_of_one.amplitude[0, 0]
+    weights = shots_of_many.relative_amplitude[0] / shots_of_one.relative_amplitude[0, 0]
     amplitude_sum = math.fsum(weights) if phases == "coherent" else math.sqrt(math.fsum(weights**2))
     worst = 0.0
     for segment in range(3):
-        _, magnitude_of_one = segments.spectrum(shots_of_one, 0, segment)
-        _, magnitude_of_many = segments.spectrum(shots_of_many, 0, segment)
+        _, magnitude_of_one = segment_spectra.segment_spectrum(shots_of_one, 0, segment)
+        _, magnitude_of_many = segment_spectra.segment_spectrum(shots_of_many, 0, segment)
         worst = max(
             worst,
             float(
@@ -187,8 +192,10 @@ def error_against_time_domain(
     for n_beamlets in beamlet_numbers:
         single_shot = prepare_shot(beamlets=n_beamlets, fft_size=512, window="hann", **changes)
         for segment in segments_checked:
-            _, magnitude = segments.spectrum(single_shot, 0, segment)
-            exact = truth.spectrum(single_shot, 0, segment, range_walk=False)
+            _, magnitude = segment_spectra.segment_spectrum(single_shot, 0, segment)
+            exact = time_domain_truth.time_domain_spectrum(
+                single_shot, 0, segment, with_range_walk=False
+            )
             worst = max(worst, float(np.abs(magnitude - exact).max() / exact.max()))
     return worst
 

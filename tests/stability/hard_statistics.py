@@ -11,10 +11,10 @@ from hard_cases import EPS, Family
 from table_4_1_shots import table_4_1_parameters
 
 from sweep.analysis.scene_results.navigation_errors import ErrorTally, merge_tallies
-from sweep.model.effects.catalogue import CORE
-from sweep.model.outputs import OUTPUTS
-from sweep.model.realisations import Means
-from sweep.model.sampling import simulate
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.outputs import GRID_OUTPUTS
+from sweep.model.sampling.realisations import RunningMeans
+from sweep.model.sampling.samplers import simulate_draws
 
 FAMILY = Family(
     "Statistics",
@@ -36,10 +36,10 @@ SAMPLE_SETS = {
 
 
 def means_in_pieces(values: Sequence[float], pieces: int = 7) -> dict[str, float]:
-    """Results of :class:`Means` for draws of every output, added in pieces."""
-    means = Means(1)
+    """Results of :class:`RunningMeans` for draws of every output, added in pieces."""
+    means = RunningMeans(1)
     for piece in np.array_split(np.asarray(values, float), pieces):
-        outputs = dict.fromkeys(OUTPUTS, piece)
+        outputs = dict.fromkeys(GRID_OUTPUTS, piece)
         means.add(np.zeros(piece.size, np.int64), outputs)
     return {name: float(value[0]) for name, value in means.results().items()}
 
@@ -169,10 +169,13 @@ def means_of_logarithms() -> float:
 
 def simulated_counts(method: str, number: int, **changes: Any) -> dict[str, np.ndarray]:
     """Detections and false alarms of so many draws."""
-    return simulate(
-        table_4_1_parameters(fft_size=1024, **changes), CORE, keys=np.array([[7, 11]], np.uint64),
-        batch_sizes=[number], method=method,
-    )  # fmt: skip
+    return simulate_draws(
+        table_4_1_parameters(fft_size=1024, **changes),
+        DEFAULT_EFFECTS,
+        keys=np.array([[7, 11]], np.uint64),
+        batch_sizes=[number],
+        method=method,
+    )
 
 
 @FAMILY.case(

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import CORE, DEFAULTS
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import prepare_shots
 from sweep.model.preparation import Shots
-from sweep.model.shot import prepare
 from sweep.spec import GridSpec
 
 ROOT = Path(__file__).parents[2]
@@ -37,7 +37,9 @@ def study_mapping(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _table_4_1() -> dict[str, Any]:
-    return DEFAULTS | GridSpec.from_mapping(study_mapping({}), base=ROOT).parameters_with({})
+    return PARAMETER_DEFAULTS | GridSpec.from_mapping(study_mapping({}), base=ROOT).parameters_with(
+        {}
+    )
 
 
 def table_4_1_parameters(**changes: Any) -> dict[str, Any]:
@@ -46,9 +48,9 @@ def table_4_1_parameters(**changes: Any) -> dict[str, Any]:
     return _table_4_1() | {path_by_name[name]: value for name, value in changes.items()}
 
 
-def prepare_shot(effects: Collection[str] = CORE, **changes: Any) -> Shots:
+def prepare_shot(effects: Collection[str] = DEFAULT_EFFECTS, **changes: Any) -> Shots:
     """One shot of one category."""
-    ((_, prepared),) = prepare(table_4_1_parameters(**changes), effects)
+    ((_, prepared),) = prepare_shots(table_4_1_parameters(**changes), effects)
     return prepared
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from small_studies import STUDY_MAPPING, small_spec
 
-from sweep.model import footprint, line_shape
+from sweep.model import beamlets
 from sweep.model.effects import atmosphere, scintillation
-from sweep.model.effects.catalogue import EFFECTS, NAMES, names_of
-from sweep.model.shot import nodes, prepare
+from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS, unpack_effect_flags
+from sweep.model.evaluation import prepare_shots, select_effects
+from sweep.model.spectrum import line_shape
 from sweep.tasks.studies.grid_study import GridStudy
 
 AIR = {"extinction", "backscatter", "scintillation"}
@@ -35,21 +36,23 @@ def calls(monkeypatch):
         )
         return plain
 
-    acts = [(effect, watch(effect, "act", effect.name)) for effect in EFFECTS if effect.act]
-    watch(footprint, "plane_footprint", "plane_footprint")
+    acts = [(effect, watch(effect, "apply", effect.name)) for effect in EFFECTS if effect.apply]
+    watch(beamlets, "plane_footprint", "plane_footprint")
     watch(atmosphere, "optical_depth", "optical_depth")
     watch(scintillation, "rytov_variance", "rytov_variance")
-    watch(line_shape, "find_modes", "find_modes")
+    watch(line_shape, "decompose_phase_errors", "decompose_phase_errors")
     yield counted
     for effect, plain in acts:
-        object.__setattr__(effect, "act", plain)
+        object.__setattr__(effect, "apply", plain)
 
 
 def evaluated(spec):
     """Effects that any point of a study calls for, by computing all of it."""
     study = GridStudy(spec)
     flags = [study.evaluate(block)["effects"].ravel() for block in range(study.n_blocks)]
-    return {name for flag in np.unique(np.concatenate(flags)) for name in names_of(int(flag))}
+    return {
+        name for flag in np.unique(np.concatenate(flags)) for name in unpack_effect_flags(int(flag))
+    }
 
 
 def test_over_the_moon_there_is_no_air(calls):
@@ -69,7 +72,7 @@ def test_a_hovering_lidar_sees_no_doppler_shift(calls):
     still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
     called = evaluated(small_spec(axes=MOON, target=still, effects={"overlap": "off"}))
     assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
-    assert calls["doppler"] == calls["range_walk"] == calls["find_modes"] == 0
+    assert calls["doppler"] == calls["range_walk"] == calls["decompose_phase_errors"] == 0
 
 
 def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):
@@ -81,17 +84,23 @@ def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):
     )
     called = evaluated(spec)
     assert "footprint" not in called and calls["plane_footprint"] == 0
-    ((_, one),) = prepare(spec.parameters(), called)
-    ((_, every),) = prepare(spec.parameters(), {*called, "footprint"})
-    assert one.offset.shape == (1, 1) and every.offset.shape == (1, 109)
+    ((_, one),) = prepare_shots(spec.parameters(), called)
+    ((_, every),) = prepare_shots(spec.parameters(), {*called, "footprint"})
+    assert one.relative_range_offset.shape == (1, 1) and every.relative_range_offset.shape == (
+        1,
+        109,
+    )
 
 
 def test_nodes_of_a_chain_are_its_effects_and_no_more():
-    assert nodes(()) == ()
-    assert [node.name for node in nodes({"leakage", "footprint"})] == ["footprint", "leakage"]
-    assert tuple(node.name for node in nodes(NAMES)) == NAMES
+    assert select_effects(()) == ()
+    assert [node.name for node in select_effects({"leakage", "footprint"})] == [
+        "footprint",
+        "leakage",
+    ]
+    assert tuple(node.name for node in select_effects(EFFECT_NAMES)) == EFFECT_NAMES
     with pytest.raises(ValueError, match="no effect wind: choose from footprint"):
-        nodes({"wind"})
+        select_effects({"wind"})
 
 
 def test_what_spreads_beamlets_does_nothing_where_there_are_none():
@@ -104,19 +113,23 @@ def test_what_spreads_beamlets_does_nothing_where_there_are_none():
             "transverse_velocity": "100 m/s",
         },
     )
-    ((_, alone),) = prepare(spec.parameters(), {"doppler_spread", "several_returns"})
-    ((_, both),) = prepare(spec.parameters(), {"footprint", "doppler_spread"})
-    assert alone.doppler.shape == (1, 1) and not alone.doppler.any()
-    assert both.doppler.shape == (1, 9) and both.doppler.any()
+    ((_, alone),) = prepare_shots(spec.parameters(), {"doppler_spread", "several_returns"})
+    ((_, both),) = prepare_shots(spec.parameters(), {"footprint", "doppler_spread"})
+    assert alone.doppler_ratio_offset.shape == (1, 1) and not alone.doppler_ratio_offset.any()
+    assert both.doppler_ratio_offset.shape == (1, 9) and both.doppler_ratio_offset.any()
 
 
 def test_bare_shots_hold_nothing_of_any_effect():
     spec = small_spec(axes={})
-    ((_, bare),) = prepare(spec.parameters(), ())
-    assert bare.offset.shape == (1, 1) and bare.phase.size == 0 and bare.beta == 0.0
-    assert bare.phase_errors == () and bare.gaussian_width is None
-    assert not bare.image and not bare.leakage and bare.incoherent
-    assert set(bare.noise_sources) == {"local_oscillator_shot", "detector", "amplifier"}
+    ((_, bare),) = prepare_shots(spec.parameters(), ())
+    assert (
+        bare.relative_range_offset.shape == (1, 1)
+        and bare.beamlet_phase_cycles.size == 0
+        and bare.doppler_ratio == 0.0
+    )
+    assert bare.phase_errors == () and bare.gaussian_line_width is None
+    assert not bare.sums_images and not bare.includes_leakage and bare.adds_powers
+    assert set(bare.noise_variances) == {"local_oscillator_shot", "detector", "amplifier"}
 
 
 def test_forced_effects_without_their_parameters_are_not_in_the_graph(calls):
@@ -127,7 +140,7 @@ def test_forced_effects_without_their_parameters_are_not_in_the_graph(calls):
     assert calls["line_width"] == calls["acceleration"] == calls["chirp_nonlinearity"] == 0
     axes = {"target.acceleration": ["0 m/s^2", "1 m/s^2"]}
     flags = GridStudy(small_spec(axes=axes, effects={"acceleration": "on"})).evaluate(0)["effects"]
-    assert [bool(flag >> NAMES.index("acceleration") & 1) for flag in flags] == [False, True]
+    assert [bool(flag >> EFFECT_NAMES.index("acceleration") & 1) for flag in flags] == [False, True]
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])

@@ -9,7 +9,7 @@ import xarray as xr
 from small_flights import SCENE_MAPPING, small_scene_spec
 from small_studies import STUDY_MAPPING, small_spec
 
-from sweep.model.effects.catalogue import NAMES
+from sweep.model.effects.catalogue import EFFECT_NAMES
 from sweep.tasks.accuracy import measurement, settings
 from sweep.tasks.accuracy import study_sample as benches
 from sweep.tasks.accuracy.measurement import measure_accuracy as measured
@@ -113,7 +113,11 @@ def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
 
 
 def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
-    sets = {0.1: frozenset({"doppler"}), 1e-3: frozenset({"doppler"}), 1e-6: frozenset(NAMES[:2])}
+    sets = {
+        0.1: frozenset({"doppler"}),
+        1e-3: frozenset({"doppler"}),
+        1e-6: frozenset(EFFECT_NAMES[:2]),
+    }
     ladder = settings.add_fixed_effect_settings(
         settings.build_ladder(small_spec()), small_spec(), sets
     )

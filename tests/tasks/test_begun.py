@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_studies import STUDY_MAPPING, file_digests, receipt_blocks, run_serially, small_spec
 
-from sweep.model import sampling
+from sweep.model.sampling import samplers
 from sweep.storage.locations import ObjectPath
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine import journal, progress, worker
@@ -51,9 +51,9 @@ def drawn(kind="fixed", ranges=("2 km",), **draws):
 
 def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
     """Take so few draws at once; by default save them each time, as though they had taken long."""
-    assign(sampling, "PIECE", piece)
-    assign(sampling, "ROWS", rows)
-    assign(sampling, "SAMPLES", samples)
+    assign(samplers, "NOISE_DRAWS_PER_STEP", piece)
+    assign(samplers, "DRAWS_PER_BATCH", rows)
+    assign(samplers, "SPECTRUM_SAMPLES_PER_STEP", samples)
     assign(worker, "CHECKPOINT_INTERVAL", seconds)
 
 
@@ -199,13 +199,13 @@ def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     assert killed.returncode == -signal.SIGKILL and left(store) == ["begun-0"]
     before = status(store).points_begun * drawn(kind).draws.number
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: None)  # it draws once
-    taken, real = [], sampling.Drawn.take
+    taken, real = [], samplers.Sampler.draw
 
     def take(self, points, number):
         taken.append((self.number[points[0]], number))
         real(self, points, number)
 
-    monkeypatch.setattr(sampling.Drawn, "take", take)
+    monkeypatch.setattr(samplers.Sampler, "draw", take)
     assert quiet_resume(store).complete
     assert taken[0][0] == before > 0
     assert sum(number for _, number in taken) == drawn(kind).draws.number - before

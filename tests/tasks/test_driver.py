@@ -22,7 +22,7 @@ from small_studies import (
     thread_cluster_client,
 )
 
-from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
+from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_COUNT_OUTPUTS
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine import session, study_store
 from sweep.tasks.engine.progress import Progress
@@ -87,7 +87,7 @@ def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn
     again, at_one_watt = xr.open_zarr(whole.store), xr.open_zarr(one_watt.store)
     for name, values in expected.data_vars.items():
         assert again[name].values.tobytes() == values.values.tobytes(), name
-    for name in (*ACCURACY_OUTPUTS, *DRAW_OUTPUTS):
+    for name in (*ACCURACY_OUTPUTS, *DRAW_COUNT_OUTPUTS):
         np.testing.assert_array_equal(at_one_watt[name].values, expected[name].values[0])
 
 

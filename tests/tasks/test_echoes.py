@@ -10,7 +10,7 @@ from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.model.pairing import FLAGS
+from sweep.model.pointcloud.pairing import FLAG_BITS
 from sweep.tasks.studies.echo_warnings import echo_warnings
 from sweep.tasks.studies.study_loading import make_study
 
@@ -136,10 +136,10 @@ def test_a_flight_sees_nothing_where_echoes_arrive_after_the_record(tmp_path, he
     assert run_serially(spec, tmp_path / "hover.zarr").complete
     found = sweep.open_scene(tmp_path / "hover.zarr")["down"].to_dataset()
     assert bool((found.pd_shot.fillna(0) > 0.5).all()) == seen
-    assert bool((found.flags.values & FLAGS["true"] > 0).any()) == seen
+    assert bool((found.flags.values & FLAG_BITS["true"] > 0).any()) == seen
     if not seen:
         assert (found.pd_up.fillna(0) == 0).all() and (found.snr_up.fillna(0) == 0).all()
-        assert not (found.flags.values & FLAGS["misread"]).any()
+        assert not (found.flags.values & FLAG_BITS["misread"]).any()
         assert (found.surfaces_seen == 0).all()
 
 
@@ -151,7 +151,7 @@ def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
     assert run_serially(spec, tmp_path / "fold.zarr").complete
     found = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
     flags = found.flags.values
-    assert (flags & FLAGS["misread"]).any() and not (flags & FLAGS["true"]).any()
+    assert (flags & FLAG_BITS["misread"]).any() and not (flags & FLAG_BITS["true"]).any()
 
 
 def test_a_phase_that_walks_far_within_a_delay_is_told_but_of_drawn_spectra():

@@ -9,7 +9,13 @@ import zarr
 from small_flights import small_scene_spec
 from small_studies import STUDY_MAPPING, run_serially, small_spec
 
-from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
+from sweep.model.effects.catalogue import (
+    EFFECT_NAMES,
+    EFFECTS,
+    effect_flag_attributes,
+    pack_effect_flags,
+    unpack_effect_flags,
+)
 from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies.flight_study import _tile_runs
@@ -90,12 +96,12 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
     )
     selection = EffectPlanner(spec, ParameterBlockGrid(spec))
     tiles = np.arange(selection.tiles.n_blocks)
-    kept = np.zeros((len(NAMES), tiles.size), bool)
+    kept = np.zeros((len(EFFECT_NAMES), tiles.size), bool)
     for chosen, plan in selection.iter_plans(tiles):
-        kept[:, chosen] = plan.kept
+        kept[:, chosen] = plan.is_kept
     for alike in selection.tiles.group_tiles(tiles):
         whole = selection._plan_group(alike)
-        assert (kept[:, alike.requested_indices] == whole.kept).all()
+        assert (kept[:, alike.requested_indices] == whole.is_kept).all()
     assert not kept.all(axis=1)[kept.any(axis=1)].all()
 
 
@@ -109,7 +115,7 @@ def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
 
 
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
-    bit = {name: np.uint32(1 << k) for k, name in enumerate(NAMES)}
+    bit = {name: np.uint32(1 << k) for k, name in enumerate(EFFECT_NAMES)}
     base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
     flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
     found = {
@@ -123,15 +129,15 @@ def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_a
 
 
 def test_flags_and_names_are_each_other():
-    kept = np.zeros((len(NAMES), 3), bool)
+    kept = np.zeros((len(EFFECT_NAMES), 3), bool)
     kept[[0, 3], 0] = kept[-1, 1] = True
-    flags = flags_of(kept)
-    assert names_of(int(flags[0])) == (NAMES[0], NAMES[3])
-    assert names_of(int(flags[1])) == (NAMES[-1],)
-    assert names_of(int(flags[2])) == ()
-    meanings = flag_attributes()["flag_meanings"].split()
-    assert [m for m, mask in zip(meanings, flag_attributes()["flag_masks"], strict=True)
-            if flags[0] & mask] == [NAMES[0], NAMES[3]]  # fmt: skip
+    flags = pack_effect_flags(kept)
+    assert unpack_effect_flags(int(flags[0])) == (EFFECT_NAMES[0], EFFECT_NAMES[3])
+    assert unpack_effect_flags(int(flags[1])) == (EFFECT_NAMES[-1],)
+    assert unpack_effect_flags(int(flags[2])) == ()
+    meanings = effect_flag_attributes()["flag_meanings"].split()
+    assert [m for m, mask in zip(meanings, effect_flag_attributes()["flag_masks"], strict=True)
+            if flags[0] & mask] == [EFFECT_NAMES[0], EFFECT_NAMES[3]]  # fmt: skip
 
 
 def test_what_is_simulated_does_not_depend_on_blocks():
@@ -176,8 +182,8 @@ def test_less_is_simulated_the_larger_the_tolerance():
 
 def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
     flags = whole(small_spec(effects={"leakage": "on", "image": "off"}))["effects"]
-    assert (flags >> NAMES.index("leakage") & 1).all()
-    assert not (flags >> NAMES.index("image") & 1).any()
+    assert (flags >> EFFECT_NAMES.index("leakage") & 1).all()
+    assert not (flags >> EFFECT_NAMES.index("image") & 1).any()
 
 
 def test_a_plan_is_made_once_for_a_tile(monkeypatch):
@@ -240,7 +246,7 @@ def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
     same = {"footprint": footprint, "draws": draws}
     beside = whole(small_spec(axes=axes, **same))
     alone = whole(small_spec(axes=axes | {"target.roughness": ["0 um"]}, **same))
-    bit = np.uint32(1 << NAMES.index("speckle"))
+    bit = np.uint32(1 << EFFECT_NAMES.index("speckle"))
     assert (beside["effects"] & bit > 0).tolist() == [[False] * 2, [True] * 2]
     np.testing.assert_allclose(beside["pd_shot"][0], alone["pd_shot"][0], atol=1e-3, rtol=0)
     assert (beside["pd_shot_error"][0] == 0).all() and (beside["pd_shot_error"][1] > 0).any()
@@ -257,7 +263,7 @@ def test_a_plan_tells_the_shares_of_points_that_the_store_has(kind, flight, tmp_
         store = run_serially(spec, tmp_path / "some.zarr").store
     arrays = [zarr.open_array(path, mode="r")[...] for path in store.rglob("effects")]
     flags = np.concatenate([values.ravel() for values in arrays])
-    shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(NAMES)}
+    shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(EFFECT_NAMES)}
     table = effects_table(make_study(spec, store), costs=False)
     assert {row.name: row.simulated_fraction for row in table.rows} == pytest.approx(shares)
     assert len(set(shares.values())) > 1 and table.tile_fraction == 1

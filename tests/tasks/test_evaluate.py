@@ -7,20 +7,20 @@ from click.testing import CliRunner
 from small_studies import run_serially, small_spec
 
 from sweep.cli import main
-from sweep.model.effects.catalogue import CORE
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
-    RUNNING,
-    RUNNING_COLUMNS,
+    DRAW_COUNT_OUTPUTS,
+    GRID_OUTPUTS,
+    N_RUNNING_SUMS,
+    RUNNING_SUMS,
+    STANDARD_ERROR_OUTPUTS,
 )
 from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
 from sweep.tasks.studies.store_summary import count_unsupported_points
 
-RANDOM = (*CORE, "speckle", "pointing_jitter")
+RANDOM = (*DEFAULT_EFFECTS, "speckle", "pointing_jitter")
 
 
 def points(**draws):
@@ -31,19 +31,25 @@ def points(**draws):
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
-@pytest.mark.parametrize("effects", [CORE, RANDOM])
+@pytest.mark.parametrize("effects", [DEFAULT_EFFECTS, RANDOM])
 @pytest.mark.parametrize("much", [{"number": 40, "batch": 25}, {"limit": 40, "batch": 15}])
 def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     spec, parameters, count = points(**much, method=method)
     together = evaluate_points(spec, parameters, count, effects)
-    sums = {RUNNING: (RUNNING_COLUMNS,)} if effects == RANDOM else {}
-    assert set(together) == {*OUTPUTS, *ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS, *sums}
+    sums = {RUNNING_SUMS: (N_RUNNING_SUMS,)} if effects == RANDOM else {}
+    assert set(together) == {
+        *GRID_OUTPUTS,
+        *STANDARD_ERROR_OUTPUTS,
+        *ACCURACY_OUTPUTS,
+        *DRAW_COUNT_OUTPUTS,
+        *sums,
+    }
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
         alone = evaluate_points(spec, select_parameters(parameters, np.array([i])), 1, effects)
         for name, values in alone.items():
-            in_batches = name in DRAW_OUTPUTS and "number" in much
+            in_batches = name in DRAW_COUNT_OUTPUTS and "number" in much
             assert values.shape == (1, *((2,) if in_batches else sums.get(name, ())))
             np.testing.assert_array_equal(values[0], together[name][i], err_msg=name)
 
@@ -51,8 +57,8 @@ def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
 def test_random_effects_are_refused_in_a_study_without_draws():
     spec, parameters, count = points(number=0)
     with pytest.raises(ValueError, match="speckle: simulated by draws"):
-        evaluate_points(spec, parameters, count, (*CORE, "speckle"))
-    assert set(evaluate_points(spec, parameters, count, CORE)) == set(OUTPUTS)
+        evaluate_points(spec, parameters, count, (*DEFAULT_EFFECTS, "speckle"))
+    assert set(evaluate_points(spec, parameters, count, DEFAULT_EFFECTS)) == set(GRID_OUTPUTS)
 
 
 @pytest.mark.parametrize(

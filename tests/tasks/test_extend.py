@@ -25,7 +25,7 @@ from small_studies import (
 )
 
 from sweep.cli import main
-from sweep.model import sampling
+from sweep.model.sampling import samplers
 from sweep.storage.locations import staging_path_for
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.engine.progress import Progress, StoreError
@@ -201,13 +201,13 @@ CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
 def drawn(monkeypatch, computed):
     """Draws that the model takes, call by call."""
     calls: list[int] = []
-    real = sampling.Drawn.take
+    real = samplers.Sampler.draw
 
     def counted(self, points, number):
         calls.append(len(points) * number)
         real(self, points, number)
 
-    monkeypatch.setattr(sampling.Drawn, "take", counted)
+    monkeypatch.setattr(samplers.Sampler, "draw", counted)
     return calls
 
 

@@ -11,7 +11,7 @@ from small_studies import file_contents, file_digests, run_serially
 from test_extend import Interrupting, larger, see_it_refused
 
 from sweep.cli import main
-from sweep.model import clouds, navigation
+from sweep.model.pointcloud import navigation, point_cloud
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.engine import worker
 from sweep.tasks.engine.journal import read_recipe
@@ -69,7 +69,7 @@ class Computed:
 @pytest.fixture
 def computed(monkeypatch):
     """What is computed from here on, but for what compiles the model."""
-    count, cloud, solve = Computed(), clouds.cloud, navigation.solve
+    count, cloud, solve = Computed(), point_cloud.simulate_cloud, navigation.solve_navigation
 
     def drawn(eyepoints, *, draws, **rest):
         count.shots += len(eyepoints.time) * draws
@@ -80,8 +80,8 @@ def computed(monkeypatch):
         count.cycles += found["altitude"].size
         return found
 
-    monkeypatch.setattr(clouds, "cloud", drawn)
-    monkeypatch.setattr(navigation, "solve", solved)
+    monkeypatch.setattr(point_cloud, "simulate_cloud", drawn)
+    monkeypatch.setattr(navigation, "solve_navigation", solved)
     monkeypatch.setattr(FlightStudy, "compile_kernels", lambda self: None)
     return count
 

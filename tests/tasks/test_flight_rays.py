@@ -15,8 +15,8 @@ import sweep
 from sweep.analysis.answers.comparison import compare_flights as compare
 from sweep.analysis.datasets import open_scene
 from sweep.cli import main
-from sweep.model.accuracy import Accuracy
-from sweep.model.resolution import rays_needed
+from sweep.model.beamlet_counts import initial_ray_count
+from sweep.model.error_budget import ErrorBudget
 from sweep.report.study_report import accuracy_sentences
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import eyepoints_path
@@ -25,7 +25,7 @@ from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.studies.store_summary import ray_accuracy_rows
 
-RAYS = Accuracy.rays
+RAYS = ErrorBudget.ray_counts
 
 LASER = SCENE_MAPPING["instrument"]["laser"] | {"beam_divergence": "4 mrad", "power": "1 mW"}
 OVER_FACETS = SCENE_MAPPING | {
@@ -110,7 +110,7 @@ def test_shots_have_the_rays_that_their_tolerance_needs(flown, name, tolerance):
     told, rays = found.beamlets_error.values, found.beamlets.values
     assert found.beamlets_error.dims == found.beamlets.dims == ("power", "shot")
     assert (told[rays < 8017] <= tolerance).all() and (real <= tolerance).mean() >= 0.999
-    fewest = rays_needed(facets().parameters(), Accuracy(tolerance))
+    fewest = initial_ray_count(facets().parameters(), ErrorBudget(tolerance))
     assert set(np.unique(rays)) <= set(RAYS) and rays.min() == fewest
     assert (rays[0] > fewest).mean() > 0.3, "of the weak laser, whose pd is undecided"
     off = real > 1e-5
@@ -143,8 +143,8 @@ def test_a_comparison_allows_what_is_told(flown):
 
 def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypatch):
     """Where the most that may be cast are too few."""
-    few = partial(Accuracy.of, rays=(19, 37))
-    monkeypatch.setattr(Accuracy, "of", few)
+    few = partial(ErrorBudget.from_parameters, ray_counts=(19, 37))
+    monkeypatch.setattr(ErrorBudget, "from_parameters", few)
     spec = facets(1e-3, draws={"number": 1})
     store = run_serially(spec, tmp_path / "most.zarr").store
     (row,) = ray_accuracy_rows(store)
@@ -174,7 +174,7 @@ def test_rays_are_added_until_they_are_enough():
         return rough[places] / rays
 
     latest = np.full(rough.size, 37)
-    eyepoint_study.refine_rays(37, rough / 37, Accuracy(1e-4), again)
+    eyepoint_study.refine_rays(37, rough / 37, ErrorBudget(1e-4), again)
     error = rough / latest
     assert (error[latest < RAYS[-1]] <= 1e-4).all() and (latest == 37).any()
     assert (latest[error > 1e-4] == RAYS[-1]).all() and (latest < RAYS[-1]).mean() > 0.8

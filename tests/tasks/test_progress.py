@@ -8,7 +8,7 @@ from numba.core.event import trigger_event
 from small_studies import small_mapping, small_spec
 
 from sweep.cli import main
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.tasks.driver import run
 from sweep.tasks.engine import progress
 from sweep.tasks.studies.grid_study import GridStudy
@@ -121,7 +121,7 @@ def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, argu
     def compiled(*_, **__):
         with compiling():
             told.until("compiling the model, once; functions so far: 0")
-        raise UnsupportedShot("enough")
+        raise UnsupportedShotError("enough")
 
     monkeypatch.setattr(inner, compiled)
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)

@@ -18,8 +18,15 @@ from small_studies import (
 )
 from test_driver import StopAfter
 
-from sweep.model.geometry.rays import Caster
-from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
+from sweep.model.geometry.ray_casting import RayCaster
+from sweep.model.outputs import (
+    CYCLE_VARIABLES,
+    EFFECT_VARIABLES,
+    NAVIGATION_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+)
 from sweep.storage.locations import eyepoints_path
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine.journal import StoreLock
@@ -60,8 +67,7 @@ def no_rays(monkeypatch):
     def refuse(self, *_, **__):
         raise AssertionError("a ray was cast")
 
-    monkeypatch.setattr(Caster, "cast", refuse)
-    monkeypatch.setattr(Caster, "bundle", refuse)
+    monkeypatch.setattr(RayCaster, "cast_bundles", refuse)
 
 
 def test_a_study_holds_every_array_that_the_model_names(undisturbed):
@@ -69,9 +75,20 @@ def test_a_study_holds_every_array_that_the_model_names(undisturbed):
     assert set(found.children) == {"three", "line", "scene_map"}
     assert set(found["scene_map"].data_vars) == {"height"}
     assert set(found["three"].data_vars) == {
-            *SHOTS, *CYCLES, *STATISTICS, *SIMULATED, *POINTS, *NAVIGATION,
-        }  # fmt: skip
-    assert set(found["line"].data_vars) == {*SHOTS, *CYCLES, *STATISTICS, *SIMULATED, *POINTS}
+        *SHOT_VARIABLES,
+        *CYCLE_VARIABLES,
+        *SHOT_STATISTIC_VARIABLES,
+        *EFFECT_VARIABLES,
+        *POINT_VARIABLES,
+        *NAVIGATION_VARIABLES,
+    }
+    assert set(found["line"].data_vars) == {
+        *SHOT_VARIABLES,
+        *CYCLE_VARIABLES,
+        *SHOT_STATISTIC_VARIABLES,
+        *EFFECT_VARIABLES,
+        *POINT_VARIABLES,
+    }
     three = found["three"]
     assert three.range.dims == ("power", "shot", "draw", "return_number")
     assert three.range.shape == (2, 222, 5, 3) and three.velocity.shape == (2, 74, 5, 3)
@@ -137,7 +154,9 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
     monkeypatch.setattr(
         "sweep.tasks.studies.study_warnings.issue_study_warnings", lambda study, say: None
     )
-    monkeypatch.setattr("sweep.model.eyepoints.observe", lambda *a, **k: looks.append(a))
+    monkeypatch.setattr(
+        "sweep.model.pointcloud.eyepoints.observe_eyepoints", lambda *a, **k: looks.append(a)
+    )
     outcome = run_serially(other, tmp_path / "darker.zarr")
     assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not looks
     dark, bright = opened(outcome.store)["three"], opened(undisturbed.store)["three"]

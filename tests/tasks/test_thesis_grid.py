@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model import segments, truth
-from sweep.model.shot import evaluate, find, prepare
+from sweep.model import time_domain_truth
+from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
+from sweep.model.spectrum import segment_spectra
 from sweep.tasks.accuracy import study_sample
 
 WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")
@@ -35,7 +36,7 @@ def drawn(table_4_1, number=12, **changes):
         radial_velocity=rng.choice([150.0, -30.0, 0.0], number),
         **changes,
     )
-    ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
+    ((_, shots),) = prepare_shots(scene, WITHOUT_LEAKAGE)
     return shots
 
 
@@ -43,7 +44,7 @@ def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
     """Bins around a point's lines, and |X| there, without noise."""
     (cells,) = study_sample.cells_per_point(shots)[[i]].tolist()
     low, magnitude = study_sample.grid_magnitudes(
-        shots, shots.point_table(), np.array([i]), segment, cells, (degree, real, folded)
+        shots, shots.point_parameter_table(), np.array([i]), segment, cells, (degree, real, folded)
     )
     bins = low[0] + np.arange(magnitude.shape[1])
     within = (bins >= 0) & (bins <= shots.fft_size // 2)
@@ -55,14 +56,16 @@ def error(shots, degree):
 
     Of |X|; of |X|^2 where powers add, as a root of rounding is much.
     """
-    worst, order = 0.0, 2 if shots.incoherent else 1
+    worst, order = 0.0, 2 if shots.adds_powers else 1
     for i in range(shots.size):
         gain = 1 / (1 + (2e8 / shots.detector_bandwidth) ** 2)  # of lines below 200 MHz, at least
-        peak = shots.amplitude[shots.row[i]]
-        peak = np.sqrt((peak**2).sum()) if shots.incoherent else peak.sum()
-        peak *= np.broadcast_to(shots.beat_scale, shots.size)[i] * shots.window.sum / 2 * gain
+        peak = shots.relative_amplitude[shots.footprint_row[i]]
+        peak = np.sqrt((peak**2).sum()) if shots.adds_powers else peak.sum()
+        peak *= (
+            np.broadcast_to(shots.beat_amplitude_scale, shots.size)[i] * shots.window.sum / 2 * gain
+        )
         for segment in range(3):
-            _, exact = segments.spectrum(shots, i, segment)
+            _, exact = segment_spectra.segment_spectrum(shots, i, segment)
             bins, found = spectrum(shots, i, segment, degree=degree)
             inner = slice(bins.size // 4, -bins.size // 4)
             apart = np.abs(found**order - exact[bins] ** order) / peak**order
@@ -74,7 +77,7 @@ def error(shots, degree):
 @pytest.mark.parametrize("window", DEPOSIT)
 def test_lines_in_cells_are_as_near_as_cells_can_be(window, phases, table_4_1):
     number = 2 if "kaiser" in window else 12  # whose whole spectrum takes its time
-    shots = replace(drawn(table_4_1, number, window=window, phases=phases), image=False)
+    shots = replace(drawn(table_4_1, number, window=window, phases=phases), sums_images=False)
     nearest, shared = DEPOSIT[window]
     assert 1e-3 < error(shots, 0) < nearest
     # Powers have twice the bandwidth: 2^10 times the remainder.
@@ -93,13 +96,13 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
             radial_velocity=v, phases=phases, fft_size=fft_size, beamlets=7,
             acquisition_delay=acquisition_delay,
         )  # fmt: skip
-        ((_, shots),) = prepare(scene, WITHOUT_LEAKAGE)
+        ((_, shots),) = prepare_shots(scene, WITHOUT_LEAKAGE)
         for i in range(2):
-            _, exact = segments.spectrum(shots, i, 1)
+            _, exact = segment_spectra.segment_spectrum(shots, i, 1)
             bins, found = spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
-            without = segments.spectrum(replace(shots, image=False), i, 1)[1]
+            without = segment_spectra.segment_spectrum(replace(shots, sums_images=False), i, 1)[1]
             assert np.abs(without - exact).max() > 0.01 * exact.max()
 
 
@@ -111,7 +114,7 @@ def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1)
         _, real = spectrum(shots, i, segment, real=True)
         _, folded = spectrum(shots, i, segment, folded=True)
         _, both = spectrum(shots, i, segment, real=True, folded=True)
-        order = 2 if shots.incoherent else 1  # a root of rounding is much
+        order = 2 if shots.adds_powers else 1  # a root of rounding is much
         for other in (real, folded, both):
             assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
 
@@ -121,9 +124,11 @@ def test_the_same_detections_come_of_it(table_4_1):
     scene = table_4_1(
         range=rng.uniform(200.0, 9000.0, 40), grazing_angle=np.radians(rng.uniform(5.0, 90.0, 40))
     )
-    exact = evaluate(scene, WITHOUT_LEAKAGE, look=find)
+    exact = evaluate(scene, WITHOUT_LEAKAGE, segment_evaluator=evaluate_segments)
     found = evaluate(
-        scene, WITHOUT_LEAKAGE, look=lambda s: study_sample.find_peaks_on_grid(s, degree=9)
+        scene,
+        WITHOUT_LEAKAGE,
+        segment_evaluator=lambda s: study_sample.find_peaks_on_grid(s, degree=9),
     )
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
         # Images beyond the grid are left out: 1e-4 of a line at the very most.
@@ -132,12 +137,14 @@ def test_the_same_detections_come_of_it(table_4_1):
 
 
 def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
-    wide = prepare(table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE)
+    wide = prepare_shots(
+        table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE
+    )
     ((_, shots),) = wide
     assert list(study_sample.cells_per_point(shots)) == [2**13, 2**12]
     assert list(study_sample.cells_per_point(shots, 2**11)) == [2**13, 2**11]
     bins, found = spectrum(shots, 0, 0, degree=9)
-    _, exact = segments.spectrum(shots, 0, 0)
+    _, exact = segment_spectra.segment_spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
 
 
@@ -146,7 +153,9 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
         range=np.array([700.0, 3000.0]), fft_size=4096, beamlets=19, radial_velocity=0.0
     )
     exact = evaluate(scene, WITHOUT_LEAKAGE)
-    found = evaluate(scene, WITHOUT_LEAKAGE, look=truth.find)
+    found = evaluate(
+        scene, WITHOUT_LEAKAGE, segment_evaluator=time_domain_truth.evaluate_segments_in_time_domain
+    )
     for name in ("pd_up", "pd_doppler", "pd_shot", "miss_shot", "snr_up", "range_error"):
         assert found[name] == pytest.approx(exact[name], rel=1e-6, abs=1e-9), name
     assert np.array_equal(found["pfa_both_chirps"], exact["pfa_both_chirps"])
@@ -154,6 +163,11 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
 
 def test_direct_detection_has_no_doppler_segment(table_4_1):
     scene = table_4_1(architecture="direct", range=np.array([20.0, 30.0]), radial_velocity=0.0)
-    for look in (study_sample.find_peaks_on_grid, truth.find):
-        found = evaluate(scene | {"instrument.processing.fft_size": 4096}, ("image",), look=look)
+    for look in (
+        study_sample.find_peaks_on_grid,
+        time_domain_truth.evaluate_segments_in_time_domain,
+    ):
+        found = evaluate(
+            scene | {"instrument.processing.fft_size": 4096}, ("image",), segment_evaluator=look
+        )
         assert np.isnan(found["pd_doppler"]).all() and (found["pd_up"] > 0).all()

@@ -19,10 +19,10 @@ from sweep.analysis.answers.dataset_lookup import (
     to_si,
 )
 from sweep.analysis.charts import LOG, Chart, ChartAxis, ChartLine, Panel
-from sweep.model.accuracy import clopper_pearson
-from sweep.model.accuracy import half_width as interval_half_width
-from sweep.model.outputs import OUTPUTS, PROMISED, SPECTRA_OUTPUTS, STATISTICS
-from sweep.model.pairing import TRUE
+from sweep.model.error_budget import clopper_pearson_interval
+from sweep.model.error_budget import interval_half_width as interval_half_width
+from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABLES, SPECTRA_OUTPUTS
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 PD_ROUNDING_MAX = 1e-12
 """Change of a probability by another processor's last digits, at the most."""
@@ -61,8 +61,8 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     ours, other = (
         provenance.check_single_study(dataset, require_axes=True) for dataset in (ours, other)
     )
-    variables = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
-    return compute_differences(ours, other, variables, bounded_variables=PROMISED)
+    variables = [n for n in {**GRID_OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
+    return compute_differences(ours, other, variables, bounded_variables=PD_OUTPUTS)
 
 
 def compute_differences(
@@ -196,7 +196,7 @@ ERROR_BOUND_VARIABLES = ("effects_error", "beamlets_error")
 
 COMPARED_STATISTICS = tuple(
     name
-    for name, output in STATISTICS.items()
+    for name, output in SHOT_STATISTIC_VARIABLES.items()
     if output.dtype == "float64" and name not in ERROR_BOUND_VARIABLES
 )
 
@@ -275,7 +275,7 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
         quantities_of_both[0],
         quantities_of_both[1],
         variables,
-        bounded_variables=(*PROMISED, DETECTED_VARIABLE),
+        bounded_variables=(*PD_OUTPUTS, DETECTED_VARIABLE),
     )
     return result.assign_coords(shot_coords).assign_attrs(
         ours=title_with_id(ours), other=title_with_id(other), scanner=scanner,
@@ -332,10 +332,12 @@ def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: boo
     if not all_drawn:
         return quantities
     confidence, draws = spec_of_dataset(quantities).accuracy.confidence, group.sizes["draw"]
-    detections = ((group["flags"] & TRUE) > 0).any("return_number").sum("draw")
+    detections = ((group["flags"] & TRUE_FLAG) > 0).any("return_number").sum("draw")
 
     def half_width(successes: np.ndarray) -> np.ndarray:
-        interval = clopper_pearson(successes=successes, trials=draws, confidence=confidence)
+        interval = clopper_pearson_interval(
+            successes=successes, trials=draws, confidence=confidence
+        )
         return interval_half_width(successes / draws, interval)
 
     half_widths = xr.apply_ufunc(half_width, detections, dask="parallelized", output_dtypes=[float])
@@ -358,7 +360,7 @@ DIFFERENCE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "large
 OpenedStore = xr.Dataset | xr.DataTree
 
 TABULATED_VARIABLES = (
-    *PROMISED, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
+    *PD_OUTPUTS, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
     "log10_pfa_shot", "p_leakage_up", "p_leakage_down", "snr_up", "snr_doppler", "snr_down",
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
     "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_VARIABLE,
@@ -449,7 +451,9 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
         if "shot" in differences.dims:
             has_other_axes = any(n > 1 for dim, n in differences.sizes.items() if dim != "shot")
             noun, count_note = "shot", ", counted at each place along the axes" * has_other_axes
-        pairs = [(differences[n], differences[f"{n}_agrees"]) for n in PROMISED if n in differences]
+        pairs = [
+            (differences[n], differences[f"{n}_agrees"]) for n in PD_OUTPUTS if n in differences
+        ]
         n_points += max((int(array.notnull().sum()) for array, _ in pairs), default=0)
         n_different += max(
             (int((array.notnull() & ~agrees).sum()) for array, agrees in pairs), default=0
@@ -487,7 +491,7 @@ def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart 
     compared_groups = list(differences_by_scanner.values())
     variables = [
         n
-        for n in PROMISED
+        for n in PD_OUTPUTS
         if any(n in part and part[n].notnull().any() for part in compared_groups)
     ]
     if not variables:

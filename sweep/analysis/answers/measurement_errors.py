@@ -14,13 +14,19 @@ from sweep.analysis.answers.dataset_lookup import (
     parameter_in_si,
     require_variables,
 )
-from sweep.model import estimators, waveform
+from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import DEFAULTS, EFFECTS, NAMES, names_of
-from sweep.model.looks import COHERENT
-from sweep.model.shot import prepare
-from sweep.model.wander import mean_wander
-from sweep.model.window import Window, transform, window
+from sweep.model.detection import estimators
+from sweep.model.detection.looks import COMBINE_COHERENT
+from sweep.model.effects.catalogue import (
+    EFFECT_NAMES,
+    EFFECTS,
+    PARAMETER_DEFAULTS,
+    unpack_effect_flags,
+)
+from sweep.model.evaluation import prepare_shots
+from sweep.model.sampling.speckle_wander import mean_wander_variance
+from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
 _SEGMENTS = ("up", "doppler", "down")
@@ -59,8 +65,9 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         [m], lazy. `reported` is the reported less the true range without noise, from whole bins.
         `resolution` is the mean spread that whole bins make: a bin over sqrt(24), because two
         peaks share the error. `bound` is the least standard deviation, that of a lone line with
-        the stored SNR in the three segments together (:mod:`sweep.model.estimators`), with what
-        developed speckle adds to echoes that are detected (:mod:`sweep.model.wander`). Below the
+        the stored SNR in the three segments together (:mod:`sweep.model.detection.estimators`),
+        with what developed speckle adds to echoes that are detected
+        (:mod:`sweep.model.sampling.speckle_wander`). Below the
         threshold noise is taken for signal, and no estimate comes near the bound. A study that
         draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
     """
@@ -92,7 +99,7 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     }
     effect_by_flag = {"walks": "range_walk", "moves": "segment_motion", "late": "overlap"}
     for name, effect in effect_by_flag.items():
-        parameters[name] = (dataset["effects"] & (1 << NAMES.index(effect))) > 0
+        parameters[name] = (dataset["effects"] & (1 << EFFECT_NAMES.index(effect))) > 0
     snr = [dataset[name] for name in snr_names]
 
     def point_bounds(*arrays: np.ndarray) -> np.ndarray:
@@ -132,13 +139,13 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
 
 def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
     """Return the deviation that developed speckle adds to an estimate; 0 where nothing fades."""
-    is_fading = (dataset["effects"] & (1 << NAMES.index("fading"))) > 0
+    is_fading = (dataset["effects"] & (1 << EFFECT_NAMES.index("fading"))) > 0
     if (
         spec.effect_modes()["fading"] == "off"
         or spec.parameters()["footprint.speckle"] != "developed"
     ):
         return xr.zeros_like(is_fading, float)
-    fixed_parameters = DEFAULTS | spec.parameters()
+    fixed_parameters = PARAMETER_DEFAULTS | spec.parameters()
     varying_parameters = {
         axis_parameter.path: parameter_in_si(dataset, axis_parameter.path, spec)
         for axis in spec.axes
@@ -152,15 +159,19 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
         variance = np.zeros(columns[0].size)
         for flag_bits in np.unique(columns[0]):
             rows = np.flatnonzero(columns[0] == flag_bits)
-            effects = [name for name in names_of(int(flag_bits)) if name not in _RANDOM_EFFECTS]
+            effects = [
+                name for name in unpack_effect_flags(int(flag_bits)) if name not in _RANDOM_EFFECTS
+            ]
             if "fading" not in effects:
                 continue
             varying_values = dict(
                 zip(varying_parameters, (column[rows] for column in columns[7:]), strict=True)
             )
             pd, snr = (np.array([c[rows] for c in columns[k : k + 3]]) for k in (1, 4))
-            for batch_rows, shots in prepare(fixed_parameters | varying_values, effects):
-                estimate_variances = mean_wander(shots, pd[:, batch_rows], snr[:, batch_rows])
+            for batch_rows, shots in prepare_shots(fixed_parameters | varying_values, effects):
+                estimate_variances = mean_wander_variance(
+                    shots, pd[:, batch_rows], snr[:, batch_rows]
+                )
                 variance[rows[batch_rows]] = estimate_variances[0 if quantity == "range" else 1]
         return np.sqrt(variance).reshape(shape)
 
@@ -172,7 +183,7 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
 
 def _cramer_rao_bounds(
     snr: tuple[np.ndarray, ...], parameters: dict[str, np.ndarray]
-) -> estimators.Deviation:
+) -> estimators.RangeVelocityDeviation:
     """Bounds of points that share no more than their order; words and sizes one by one."""
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
     flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}
@@ -186,12 +197,12 @@ def _cramer_rao_bounds(
     ).indices.values():
         group_parameters = {name: a[rows] for name, a in flat_parameters.items()}
         deviations[:, rows] = _bounds_of_group([s[rows] for s in flat_snr], group_parameters)
-    return estimators.Deviation(*deviations.reshape(2, *shape))
+    return estimators.RangeVelocityDeviation(*deviations.reshape(2, *shape))
 
 
 def _bounds_of_group(
     snr: list[np.ndarray], parameters: dict[str, np.ndarray]
-) -> estimators.Deviation:
+) -> estimators.RangeVelocityDeviation:
     """Bounds of points of one architecture, waveform, window and record."""
     fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
     record_parameters = {
@@ -207,7 +218,7 @@ def _bounds_of_group(
             record_parameters | {"instrument.chirp.duration": parameters["duration"][0]}
         )
     )
-    taper = window(str(parameters["window"][0]), record_length)
+    taper = get_window(str(parameters["window"][0]), record_length)
     slopes = (
         np.ones_like(parameters["down_slope"]),
         parameters["doppler_slope"],
@@ -218,11 +229,11 @@ def _bounds_of_group(
         wavelength=parameters["wavelength"],
         start_frequency=parameters["start_frequency"],
         bandwidth=parameters["bandwidth"],
-        slopes=slopes,
+        chirp_slopes=slopes,
     )
     chirp_rate = parameters["bandwidth"] / parameters["duration"]
     deviations = []
-    segment_order = waveform.order_of(
+    segment_order = waveform.existing_segments(
         str(parameters["architecture"][0]), str(parameters["segments"][0])
     )
     segment_starts = waveform.segment_starts(
@@ -259,12 +270,16 @@ def _bounds_of_group(
         beat_frequency = np.where(
             parameters["walks"], beat_frequency + walk_frequency, beat_frequency
         )
-        beat_bin = waveform.fold(beat_frequency, parameters["sample_rate"]) / sample_rate * fft_size
+        beat_bin = (
+            waveform.fold_frequency(beat_frequency, parameters["sample_rate"])
+            / sample_rate
+            * fft_size
+        )
         # in bins of fs/L: a padded FFT's bins are finer than the window's
-        missing_samples = waveform.samples_before_echo(
+        missing_samples = waveform.count_samples_before_echo(
             delay=2 / SPEED_OF_LIGHT * (parameters["range"] - distance_moved),
-            beta=0.0,
-            start=parameters["delay"],
+            doppler_ratio=0.0,
+            record_start=parameters["delay"],
             sample_rate=parameters["sample_rate"],
             length=record_length,
         )
@@ -287,10 +302,10 @@ def _bounds_of_group(
             cnr = estimators.carrier_to_noise_ratio(
                 snr=segment_snr / amplitude_loss**2, window=taper
             )
-            deviation = estimators.beat_deviation(
-                cnr=cnr, samples=remaining_samples, sample_rate=sample_rate
+            deviation = estimators.beat_frequency_bound(
+                cnr=cnr, n_samples=remaining_samples, sample_rate=sample_rate
             )
-        phase_noise_deviation = estimators.phase_deviation(
+        phase_noise_deviation = estimators.phase_noise_deviation(
             line_width=np.where(
                 parameters["line_shape"] == "lorentzian", parameters["line_width"], 0.0
             ),
@@ -299,17 +314,17 @@ def _bounds_of_group(
         )
         # The stored SNR is that of a sum of looks, or of each of those that tell by themselves.
         deviation = deviation / np.sqrt(
-            np.where(parameters["combine"] == COHERENT, 1.0, parameters["looks"])
+            np.where(parameters["combine"] == COMBINE_COHERENT, 1.0, parameters["looks"])
         )
         deviation = np.hypot(deviation, phase_noise_deviation / np.sqrt(parameters["looks"]))
         deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
     up, doppler, down = deviations
-    resolved = estimators.resolved_deviation(
+    resolved = estimators.range_velocity_deviation(
         up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
         range=parameters["range"], radial_velocity=parameters["radial_velocity"], slopes=slopes,
     )  # fmt: skip
     has_no_echo = np.isnan(snr[0]) | np.isnan(snr[2])
-    return estimators.Deviation(*(np.where(has_no_echo, np.nan, b) for b in resolved))
+    return estimators.RangeVelocityDeviation(*(np.where(has_no_echo, np.nan, b) for b in resolved))
 
 
 @lru_cache(maxsize=8)
@@ -334,5 +349,5 @@ def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
     """|W(delta)| / W(0) over delta from 0 to half a bin of fs/L, to 1e-8."""
-    taper, bin_offsets = window(window_name, length), np.linspace(0.0, 0.5, 33)
-    return CubicSpline(bin_offsets, np.abs(transform(taper, bin_offsets)) / taper.sum)
+    taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
+    return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

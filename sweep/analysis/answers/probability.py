@@ -18,12 +18,17 @@ from sweep.analysis.answers.dataset_lookup import (
     to_si,
 )
 from sweep.model import waveform
-from sweep.model.effects.catalogue import EFFECTS, names_of
-from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
-from sweep.model.philox import point_keys
-from sweep.model.sampling import simulate
-from sweep.model.shot import evaluate
-from sweep.model.threshold import TNR, WAYS, tnr_of
+from sweep.model.detection.looks import (
+    LOOKS_COMBINE_PATH,
+    LOOKS_NUMBER_PATH,
+    LOOKS_VOTES_PATH,
+    Looks,
+)
+from sweep.model.effects.catalogue import EFFECTS, unpack_effect_flags
+from sweep.model.evaluation import evaluate
+from sweep.model.sampling.philox import point_keys
+from sweep.model.sampling.samplers import simulate_draws
+from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
@@ -123,7 +128,7 @@ def false_alarms_per_second(
             )
         )  # fmt: skip
         n_segments = xr.apply_ufunc(
-            lambda a, names: len(waveform.order_of(str(a), str(names))),
+            lambda a, names: len(waveform.existing_segments(str(a), str(names))),
             architecture,
             segment_order,
             vectorize=True,
@@ -349,14 +354,16 @@ def roc(
     looks = _looks_of_study(grid_spec_of_dataset(dataset))
     detection_rule, peak_rule = (
         parameter_in_si(dataset, path, grid_spec_of_dataset(dataset))
-        for path in (waveform.SHOT_DETECTION, waveform.PEAKS)
+        for path in (waveform.SHOT_DETECTION_PATH, waveform.PEAKS_PATH)
     )
     dataset = dataset[list(dict.fromkeys(variables))].compute()
-    threshold_ratio = xr.DataArray(looks.level(np.log(pfas)), dims=["pfa_bin"])
+    threshold_ratio = xr.DataArray(
+        looks.threshold_ratio_from_log_pfa(np.log(pfas)), dims=["pfa_bin"]
+    )
     pd, is_exact = _closed_form_pd(dataset, segment, threshold_ratio, looks)
     if segment == "shot":  # else of two segments out of three
         is_exact = is_exact & (detection_rule == waveform.BOTH_CHIRPS)
-    is_exact = is_exact & (peak_rule == waveform.ALL)
+    is_exact = is_exact & (peak_rule == waveform.ALL_PEAKS)
     tnr = threshold_ratio * _study_tnr(dataset) / _study_threshold_ratio(dataset, looks)
     result = xr.Dataset(
         {"pd": pd, CURVE_TNR: tnr, "simulated": ~is_exact, "half_width": xr.zeros_like(pd)},
@@ -371,13 +378,15 @@ def roc(
 def _looks_of_study(spec: GridSpec) -> Looks:
     """Return the looks of all points."""
     axis_paths = (axis_parameter.path for axis in spec.axes for axis_parameter in axis.parameters)
-    if varying_paths := sorted({NUMBER, COMBINE, VOTES} & set(axis_paths)):
+    if varying_paths := sorted(
+        {LOOKS_NUMBER_PATH, LOOKS_COMBINE_PATH, LOOKS_VOTES_PATH} & set(axis_paths)
+    ):
         raise ValueError(
             f"{', '.join(varying_paths)} varies, and with it the threshold that a chance of false "
             "alarms "
             "makes: put the design pfa on an axis, and read pd over it"
         )
-    return Looks.of(spec.parameters())
+    return Looks.from_parameters(spec.parameters())
 
 
 def _closed_form_pd(
@@ -404,22 +413,24 @@ def _closed_form_pd(
 
 def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
     """Return the study's own threshold over the noise per quadrature."""
-    if looks.several:
-        return xr.apply_ufunc(looks.level, np.log(10) * dataset["log10_pfa_bin"])
+    if looks.is_noncoherent:
+        return xr.apply_ufunc(
+            looks.threshold_ratio_from_log_pfa, np.log(10) * dataset["log10_pfa_bin"]
+        )
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
 
 
 def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
     """Return the study's own threshold-to-noise ratio at each point."""
     spec, template = grid_spec_of_dataset(dataset), dataset["log10_pfa_bin"]
-    if TNR in spec.parameters():
-        return parameter_in_si(dataset, TNR, spec)
+    if TNR_PATH in spec.parameters():
+        return parameter_in_si(dataset, TNR_PATH, spec)
     indices = [
         dict(zip(template.dims, point_index, strict=True))
         for point_index in np.ndindex(template.shape)
     ]
     tnrs = [
-        tnr_of(_point_parameters(template.isel(point_index).coords, spec))
+        tnr_from_parameters(_point_parameters(template.isel(point_index).coords, spec))
         for point_index in indices
     ]
     return template.copy(data=np.reshape(np.array(tnrs, float), template.shape))
@@ -436,7 +447,7 @@ def _crossing_probability(
 ) -> np.ndarray:
     """Q_1, or its like in several looks; nan where the amplitude or the level is."""
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
-    probability = looks.steady(
+    probability = looks.pd_and_miss_steady(
         np.where(is_finite, signal_ratio, 0), np.where(is_finite, threshold_ratio, 0)
     )[0]
     return np.where(is_finite, probability, np.nan)
@@ -477,22 +488,22 @@ def _simulate_curve(
     if not is_finite.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
     flags = int(point["effects"])
-    effects = names_of(flags)
+    effects = unpack_effect_flags(flags)
     pd_name = variable_name("pd", segment)
     parameter_arrays = {
-        p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS
+        p: np.full(tnr.size, value) for p, value in parameters.items() if p not in THRESHOLD_PATHS
     }
-    parameter_arrays[TNR] = tnr
+    parameter_arrays[TNR_PATH] = tnr
     if flags & _RANDOM_EFFECT_FLAGS:
         # One key for all thresholds: the same draws, so that curves fall without noise.
-        key_parameters = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
+        key_parameters = {p: v for p, v in sorted(parameters.items()) if p not in THRESHOLD_PATHS}
         key_values = [[v for v in key_parameters.values() if not isinstance(v, str)]]
         keys = np.repeat(
             point_keys(np.array(key_values, float), domain=ROC_KEY_DOMAIN, seed=spec.seed),
             tnr.size,
             0,
         )
-        outputs = simulate(
+        outputs = simulate_draws(
             parameter_arrays, effects, keys=keys, batch_sizes=[draws], method="probabilities"
         )
         return outputs[pd_name], outputs[f"{pd_name}_half_width"]

@@ -32,7 +32,7 @@ from sweep.analysis.scene_results.recordings import (
     quantity_label,
     to_shown_units,
 )
-from sweep.model.pairing import TRUE
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.store_format import MAP_GROUP
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
@@ -484,7 +484,7 @@ def draw_scatter_sheet(
     """Draw one quantity over another."""
     column_arrays = thinned_rows.to_columns()
     is_true = (
-        (column_arrays["flags"] & TRUE) > 0
+        (column_arrays["flags"] & TRUE_FLAG) > 0
         if "flags" in column_arrays
         else np.ones(len(column_arrays[x]), bool)
     )

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from sweep.model.navigation import EXCLUDED
-from sweep.model.pairing import TRUE
+from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
+from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.locations import Location
 
 ERROR_RATIO_MAX = 2.0
@@ -166,7 +166,7 @@ _NEEDED_VARIABLES = (
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
     """Return the errors over standard errors by quantity, without sign; only those there are."""
-    is_true = (sample["flags"] & TRUE).values > 0
+    is_true = (sample["flags"] & TRUE_FLAG).values > 0
     errors_by_quantity: dict[str, np.ndarray] = {}
     for quantity, variable in _VARIABLE_BY_QUANTITY.items():
         reported = sample[f"{variable}_interpolated"].values[is_true]
@@ -195,7 +195,7 @@ def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 def _is_solved(status: xr.DataArray) -> np.ndarray:
     """Return the mask of solutions that there are; -1 stands for those not computed yet."""
-    return ((status >= 0) & (status <= EXCLUDED)).values
+    return ((status >= 0) & (status <= STATUS_EXCLUDED)).values
 
 
 def _mahalanobis_distances(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:

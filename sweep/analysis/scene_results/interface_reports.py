@@ -20,7 +20,7 @@ from sweep.analysis.scene_results.point_export import resolve_recording
 from sweep.analysis.scene_results.recordings import INTERPOLATED, Recording, array_name
 from sweep.analysis.study_figures import SceneResults
 from sweep.messages import STORE_PLACEHOLDER, suggestion
-from sweep.model.pairing import UNCONFIRMED
+from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.scene_sections import Interface
 from sweep.storage.locations import Location, atomic_path
@@ -143,7 +143,7 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
     Shots have ``time``, ``beam``, ``flags``, the values and standard errors of their first return,
     and the truth on the beam's axis, ``beam_range`` and ``beam_radial_velocity``.
     """
-    is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED == 0)
+    is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED_FLAG == 0)
     report_index, report_periods = _assign_periods(shot_columns, interface.rate)
     n_valid = np.bincount(report_index[is_valid_shot], minlength=report_periods["beam"].size)
     weights = _shot_weights(report_index, is_valid_shot, n_valid, interface.value)

@@ -15,7 +15,7 @@ from sweep.analysis.charts import LINEAR, LOG, Chart, ChartAxis, ChartLine, Pane
 from sweep.analysis.datasets import chunk_length, read_slices
 from sweep.analysis.scene_results.recordings import Recording
 from sweep.analysis.tables import Cell, PageTable, TablePage
-from sweep.model.navigation import EXCLUDED, SOLVED
+from sweep.model.pointcloud.navigation import STATUS_EXCLUDED, STATUS_SOLVED
 
 VELOCITY, ALTITUDE = "velocity", "altitude"
 
@@ -175,7 +175,7 @@ def _iter_tallies(
         status_values, solution = part[f"{quantity}_status"].values, part[quantity].values
         altitude = np.broadcast_to(part["true_altitude"].values[:, None], status_values.shape)
         altitude_bin = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), altitude_edges) - 1
-        altitude_bin = np.where(status_values.ravel() >= SOLVED, altitude_bin, -1)
+        altitude_bin = np.where(status_values.ravel() >= STATUS_SOLVED, altitude_bin, -1)
         if quantity == ALTITUDE:
             variance = part["altitude_variance"].values
         else:
@@ -185,7 +185,7 @@ def _iter_tallies(
         yield tally_errors(
             error.reshape(component_shape),
             variance.reshape(component_shape),
-            (status_values.ravel() >= SOLVED) & (status_values.ravel() <= EXCLUDED),
+            (status_values.ravel() >= STATUS_SOLVED) & (status_values.ravel() <= STATUS_EXCLUDED),
             altitude_bin,
             altitude_edges.size - 1,
         )

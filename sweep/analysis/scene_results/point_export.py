@@ -22,8 +22,8 @@ from sweep.analysis.scene_results.recordings import (
     find_axis_position,
 )
 from sweep.analysis.study_figures import SceneResults
-from sweep.model.outputs import CLOSING
-from sweep.model.pairing import FLAGS, TRUE
+from sweep.model.outputs import CLOSING_SIGN_NOTE
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
 from sweep.storage.locations import Location, atomic_path
@@ -51,7 +51,7 @@ UNIT_BY_COLUMN = {
 """Units of the columns that have any."""
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
-REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING)
+REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
 """What a value of a column means beyond its units."""
 
 DESCRIPTION_BY_COLUMN = {
@@ -261,7 +261,7 @@ def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type
     points[_STORED_RETURN_FIELD] = rows["return_number"]
     points["user_data"] = np.minimum(rows["beam"], _LAS_BEAM_MAX)
     points["scan_angle"] = np.round(rows["scan_angle"] / _LAS_SCAN_ANGLE_STEP_DEG)
-    points["classification"] = np.where(rows["flags"] & TRUE, LAS_UNCLASSIFIED, LAS_NOISE)
+    points["classification"] = np.where(rows["flags"] & TRUE_FLAG, LAS_UNCLASSIFIED, LAS_NOISE)
     snr_db = 10 * np.log10(np.maximum(rows["snr"], 1e-30))
     points["intensity"] = np.clip(np.round(100 * np.nan_to_num(snr_db)), 0, 65535)
     for name in extra_columns:
@@ -274,7 +274,7 @@ def _number_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Rows of a shot all come together.
     """
-    is_false = (rows["flags"] & TRUE) == 0
+    is_false = (rows["flags"] & TRUE_FLAG) == 0
     order = np.lexsort((rows["range"], is_false, rows["shot"]))
     starts_group = np.ones(rows.size, bool)
     starts_group[1:] = np.diff(rows["shot"][order].astype(np.int64)) != 0
@@ -428,7 +428,9 @@ def _file_remarks(
 ) -> list[str]:
     """Remarks in a file on its contents."""
     surface_remarks = [f"surface {i}: {name}" for i, name in enumerate(results.surface_labels)]
-    flag_remarks = [f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAGS.items()]
+    flag_remarks = [
+        f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAG_BITS.items()
+    ]
     selection_remark = (
         f"scanner {table.recording.scanner}, draw {table.draw}, {table.ranges} ranges"
     )

@@ -12,9 +12,16 @@ import xarray as xr
 from sweep.analysis import labels
 from sweep.analysis.datasets import chunk_length, read_attributes_of_kind, read_slices
 from sweep.analysis.selection import matches_any
-from sweep.model.eyepoints import Eyepoints
-from sweep.model.outputs import BEAMLETS, CYCLES, POINTS, SHOTS, STATISTICS, XYZ
-from sweep.model.pairing import FLAGS, TRUE
+from sweep.model.outputs import (
+    BEAMLET_VARIABLES,
+    CYCLE_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+    XYZ_DIM,
+)
+from sweep.model.pointcloud.eyepoints import Eyepoints
+from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
@@ -55,7 +62,7 @@ DECIBEL_QUANTITIES = ("snr", "snr_up")
 LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Quantities that go over orders of magnitude, and are above 0."""
 
-POINT_KINDS = {name: bit for name, bit in FLAGS.items() if name != "unconfirmed"}
+POINT_KINDS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
 """Flags of which a point has exactly one."""
 
 
@@ -70,9 +77,13 @@ class Quantity:
 
 def _list_quantities() -> dict[str, Quantity]:
     quantities = {}
-    for table, is_per_point in ((SHOTS, False), (STATISTICS, False), (POINTS, True)):
+    for table, is_per_point in (
+        (SHOT_VARIABLES, False),
+        (SHOT_STATISTIC_VARIABLES, False),
+        (POINT_VARIABLES, True),
+    ):
         for name, output in table.items():
-            if XYZ not in output.dims:
+            if XYZ_DIM not in output.dims:
                 quantities[name] = Quantity(output.long_name, output.units, is_per_point)
     short_names = {
         "range": "range", "radial_velocity": "radial velocity", "snr": "signal-to-noise ratio",
@@ -80,7 +91,7 @@ def _list_quantities() -> dict[str, Quantity]:
     }  # fmt: skip
     for name, long_name in short_names.items():
         quantities[name] = replace(quantities[name], long_name=long_name)
-    altitude = CYCLES["true_altitude"]
+    altitude = CYCLE_VARIABLES["true_altitude"]
     quantities["altitude"] = Quantity("altitude above ground", altitude.units, False)
     quantities |= {axis: Quantity(axis, "m", True) for axis in WORLD_AXES}
     return quantities | {"shot": Quantity("number of the shot", "1", False)}
@@ -290,7 +301,7 @@ def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
     fallback_shot = None
     for shot_slice in recording.shot_slices():
         surface_numbers = np.where(
-            (recording.read("flags", shot_slice, draw) & TRUE) > 0,
+            (recording.read("flags", shot_slice, draw) & TRUE_FLAG) > 0,
             recording.read("surface", shot_slice, draw).astype(float), np.nan,
         )  # fmt: skip
         low = np.where(np.isnan(surface_numbers), np.inf, surface_numbers).min(axis=1)
@@ -484,7 +495,7 @@ class PointCloud:
     @property
     def is_true(self) -> np.ndarray:
         """Mask of the true points."""
-        return np.asarray((self.points["flags"] & TRUE) > 0)
+        return np.asarray((self.points["flags"] & TRUE_FLAG) > 0)
 
     @property
     def remarks(self) -> list[str]:
@@ -565,7 +576,7 @@ def _bounding_box(
     coordinate_crops: Mapping[str, ValueLimits],
 ) -> CoordinateBox:
     """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
-    is_true = (point_columns["flags"] & TRUE) > 0
+    is_true = (point_columns["flags"] & TRUE_FLAG) > 0
     box: CoordinateBox = {}
     for axis in WORLD_AXES:
         values = point_columns[axis][is_true] if is_true.any() else point_columns[axis]
@@ -594,5 +605,7 @@ def read_eyepoints(
         open_verified_store(eyepoints_store, study_id), chunks=None, **OPEN_ZARR_KWARGS
     )
     selected = dataset.isel(shot=np.asarray(shot_indices))
-    arrays = {name: np.asarray(selected[name].values) for name in (*SHOTS, *BEAMLETS)}
+    arrays = {
+        name: np.asarray(selected[name].values) for name in (*SHOT_VARIABLES, *BEAMLET_VARIABLES)
+    }
     return eyepoints_from_arrays(arrays, np.asarray(dataset["weight"].values))

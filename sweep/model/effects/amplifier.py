@@ -30,87 +30,118 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sweep.model import link
+from sweep.model import receiver_chain
 from sweep.model.constants import PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
-from sweep.model.effects.points import Points
-from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots
+from sweep.model.effects.effect import (
+    Effect,
+    EffectContext,
+    ErrorBound,
+    Parameter,
+    add_noise_sources,
+)
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, Shots
 
-_INVERSION, _GAIN = LASER + "spontaneous_emission", LASER + "amplifier_gain"
-_AMPLIFIED, _ISOLATION = LASER + "amplified_light", TELESCOPE + "isolation"
-SENT, BOTH = "sent", "sent and local oscillator"
+_INVERSION_PATH, _GAIN_PATH = LASER_PREFIX + "spontaneous_emission", LASER_PREFIX + "amplifier_gain"
+_AMPLIFIED_LIGHT_PATH, _ISOLATION_PATH = (
+    LASER_PREFIX + "amplified_light",
+    TELESCOPE_PREFIX + "isolation",
+)
+SENT_LIGHT, SENT_AND_OSCILLATOR_LIGHT = "sent", "sent and local oscillator"
 
 
-def emission(p: Mapping[str, np.ndarray]) -> np.ndarray:
+def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Density n_sp (G - 1) h nu [W/Hz] of spontaneous emission, in one polarisation.
 
     >>> given = {_INVERSION: 1.0, _GAIN: 1001.0, LASER + "wavelength": 1550e-9}
     >>> f"{emission(given):.3g}"
     '1.28e-16'
     """
-    energy = PLANCK * SPEED_OF_LIGHT / p[LASER + "wavelength"]
-    return np.asarray(energy * p[_INVERSION] * (p[_GAIN] - 1))
+    photon_energy = PLANCK * SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"]
+    return np.asarray(photon_energy * parameters[_INVERSION_PATH] * (parameters[_GAIN_PATH] - 1))
 
 
-def current_variance(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
+def beat_noise_current_variance(
+    parameters: Mapping[str, np.ndarray], amplified_light: str
+) -> np.ndarray:
     """Return the current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission."""
-    oscillator = p[RECEIVER + "local_oscillator_power"]
-    mixed = p[RECEIVER + "mixing_efficiency"] / p[_ISOLATION]
-    if amplified == BOTH:
-        rejected = p[RECEIVER + "common_mode_rejection"] * p[LASER + "power"]
-        mixed = mixed + oscillator / rejected
-    scale = (p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]) ** 2
-    light = oscillator * (emission(p) * mixed)
-    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
-    return np.asarray(4 * scale * light * bandwidth)
+    oscillator_power = parameters[RECEIVER_PREFIX + "local_oscillator_power"]
+    mixing_factor = parameters[RECEIVER_PREFIX + "mixing_efficiency"] / parameters[_ISOLATION_PATH]
+    if amplified_light == SENT_AND_OSCILLATOR_LIGHT:
+        rejected_power = (
+            parameters[RECEIVER_PREFIX + "common_mode_rejection"]
+            * parameters[LASER_PREFIX + "power"]
+        )
+        mixing_factor = mixing_factor + oscillator_power / rejected_power
+    squared_responsivity = (
+        parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
+    ) ** 2
+    beat_power_density = oscillator_power * (
+        spontaneous_emission_density(parameters) * mixing_factor
+    )
+    bandwidth = receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters))
+    return np.asarray(4 * squared_responsivity * beat_power_density * bandwidth)
 
 
-def emission_size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the beat noise, exactly; the threshold is set on it."""
-    if points.architecture == "direct" or not points.has(_INVERSION):
+    if points.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
-    current = current_variance(points.parameters, points.word(_AMPLIFIED))
-    return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
+    current_variance = beat_noise_current_variance(
+        points.parameters, points.option(_AMPLIFIED_LIGHT_PATH)
+    )
+    return ErrorBound(
+        noise_variance_change=current_variance
+        * points.receiver_noise.variance_per_square_ampere
+        / points.receiver_noise_variance
+    )
 
 
-def add_emission(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Beat noise of spontaneous emission; direct detection has none."""
     if shots.architecture == "direct":
         return shots
-    current = current_variance(scene.parameters, str(scene.parameters[_AMPLIFIED]))
-    return noisier(shots, spontaneous_emission=current * shots.noise_scale)
+    current_variance = beat_noise_current_variance(
+        context.parameters, str(context.parameters[_AMPLIFIED_LIGHT_PATH])
+    )
+    return add_noise_sources(
+        shots, spontaneous_emission=current_variance * shots.noise_variance_per_square_ampere
+    )
 
 
 SPONTANEOUS_EMISSION = Effect(
     name="spontaneous_emission",
-    about="light that an optical amplifier adds",
+    description="light that an optical amplifier adds",
     stage="noise",
-    size=emission_size,
-    act=add_emission,
+    error_bound=error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=_INVERSION,
-            about="Inversion factor n_sp of an optical amplifier of the laser, half its noise "
+            path=_INVERSION_PATH,
+            description="Inversion factor n_sp of an optical amplifier of the laser, half its "
+            "noise "
             "figure at high gain; 0 for no amplifier",
             example="1.6",
             limits=("0", "1000"),
         ),
         Parameter(
-            path=_GAIN,
-            about="Gain of that amplifier",
+            path=_GAIN_PATH,
+            description="Gain of that amplifier",
             default=1000.0,
             example="30 dB",
             limits=("0 dB", "100 dB"),
         ),
         Parameter(
-            path=_AMPLIFIED,
-            about="Light that the amplifier raises: what is sent, or the local oscillator too",
-            default=SENT,
-            options=(SENT, BOTH),
+            path=_AMPLIFIED_LIGHT_PATH,
+            description="Light that the amplifier raises: what is sent, or the local oscillator "
+            "too",
+            default=SENT_LIGHT,
+            options=(SENT_LIGHT, SENT_AND_OSCILLATOR_LIGHT),
         ),
         Parameter(
-            path=_ISOLATION,
-            about="Isolation of the detector from the light sent, by circulator and window; the "
+            path=_ISOLATION_PATH,
+            description="Isolation of the detector from the light sent, by circulator and window; "
+            "the "
             "amplifier's emission passes it, and with leak_path the light itself",
             default=1e30,
             example="50 dB",

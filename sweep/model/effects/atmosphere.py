@@ -29,16 +29,22 @@ from numpy.typing import ArrayLike
 
 from sweep.model import beam
 from sweep.model.effects import noise_sources
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
-from sweep.model.effects.points import Points
-from sweep.model.link import aperture_area
-from sweep.model.preparation import LASER, TELESCOPE, Shots
+from sweep.model.effects.effect import (
+    Effect,
+    EffectContext,
+    ErrorBound,
+    Parameter,
+    add_noise_sources,
+)
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
+from sweep.model.receiver_chain import aperture_area
 
-_LEVEL = 1e-9
+_HEIGHT_DIFFERENCE_MIN = 1e-9
 """Difference in height [m] given to level paths, about their middle, so that there is a mean."""
 
 
-class Profile(NamedTuple):
+class ExtinctionProfile(NamedTuple):
     """Extinction over height, as a table."""
 
     height: tuple[float, ...]
@@ -47,65 +53,78 @@ class Profile(NamedTuple):
     """Extinction coefficient at each [1/m], >= 0."""
 
 
-def exponential(*, surface_extinction: float, scale_height: float) -> Profile:
+def exponential_profile(*, surface_extinction: float, scale_height: float) -> ExtinctionProfile:
     """Atmosphere whose extinction [1/m] falls by e over each scale height [m], 40 of them high."""
-    top = 40.0
-    return Profile(
-        (0.0, top * scale_height), (surface_extinction, surface_extinction * math.exp(-top))
+    top_scale_heights = 40.0
+    return ExtinctionProfile(
+        (0.0, top_scale_heights * scale_height),
+        (surface_extinction, surface_extinction * math.exp(-top_scale_heights)),
     )
 
 
-def layer(*, optical_depth: float, depth: float) -> Profile:
+def layer_profile(*, optical_depth: float, depth: float) -> ExtinctionProfile:
     """Even layer on the ground, of this optical depth seen from straight above, `depth` m high."""
-    return Profile((0.0, depth), (optical_depth / depth, optical_depth / depth))
+    return ExtinctionProfile((0.0, depth), (optical_depth / depth, optical_depth / depth))
 
 
-def visibility_extinction(*, visibility: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
+def extinction_from_visibility(*, visibility: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
     """Extinction [1/m] of haze from the visibility [m] (2 % contrast at 0.55 um), Kruse and Kim.
 
     3.912/V (wavelength / 0.55 um)^-q with q = 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34
     above 1 km, V - 0.5 above 0.5 km (V in km), 0 in fog.
     """
-    v = np.asarray(visibility, float)
-    km = v / 1e3
-    q = np.select(
-        [km > 50, km > 6, km > 1, km > 0.5], [1.6, 1.3, 0.16 * km + 0.34, km - 0.5], default=0.0
+    visibility_m = np.asarray(visibility, float)
+    visibility_km = visibility_m / 1e3
+    wavelength_exponent = np.select(
+        [visibility_km > 50, visibility_km > 6, visibility_km > 1, visibility_km > 0.5],
+        [1.6, 1.3, 0.16 * visibility_km + 0.34, visibility_km - 0.5],
+        default=0.0,
     )
-    return -math.log(0.02) / v * (np.asarray(wavelength, float) / 0.55e-6) ** -q
+    return (
+        -math.log(0.02)
+        / visibility_m
+        * (np.asarray(wavelength, float) / 0.55e-6) ** -wavelength_exponent
+    )
 
 
-def _haze(visibility: float) -> Profile:
-    surface = visibility_extinction(visibility=visibility, wavelength=1.55e-6)
-    return exponential(surface_extinction=float(surface), scale_height=1.2e3)
+def _haze_profile(visibility: float) -> ExtinctionProfile:
+    surface_extinction = extinction_from_visibility(visibility=visibility, wavelength=1.55e-6)
+    return exponential_profile(surface_extinction=float(surface_extinction), scale_height=1.2e3)
 
 
-def _dust(optical_depth: float) -> Profile:
-    return exponential(surface_extinction=optical_depth / 11e3, scale_height=11e3)
+def _dust_profile(optical_depth: float) -> ExtinctionProfile:
+    return exponential_profile(surface_extinction=optical_depth / 11e3, scale_height=11e3)
 
 
-PROFILES = {
-    "earth_clear": _haze(23e3),
-    "earth_haze": _haze(5e3),
-    "mars_clear": _dust(0.5),
-    "mars_dusty": _dust(1.0),
-    "mars_storm": _dust(5.0),
+EXTINCTION_PROFILES = {
+    "earth_clear": _haze_profile(23e3),
+    "earth_haze": _haze_profile(5e3),
+    "mars_clear": _dust_profile(0.5),
+    "mars_dusty": _dust_profile(1.0),
+    "mars_storm": _dust_profile(5.0),
 }
 
 
 def optical_depth(
-    profile: Profile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
+    profile: ExtinctionProfile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
 ) -> np.ndarray:
     """Optical depth of a straight path `range` [m] long between two heights [m], one way."""
-    ends = np.broadcast_arrays(np.asarray(start_height, float), np.asarray(end_height, float))
-    low, high = np.minimum(*ends), np.maximum(*ends)
+    end_heights = np.broadcast_arrays(
+        np.asarray(start_height, float), np.asarray(end_height, float)
+    )
+    low, high = np.minimum(*end_heights), np.maximum(*end_heights)
     # So high up that float64 knows no such difference, by what it does know.
-    least = np.maximum(_LEVEL, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high))))
-    level = np.maximum(least - (high - low), 0.0) / 2
-    low, high = low - level, high + level
-    bottoms = (-np.inf, *profile.height[:-1])
-    below = (profile.extinction[0], *profile.extinction[:-1])
+    difference_min = np.maximum(
+        _HEIGHT_DIFFERENCE_MIN, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high)))
+    )
+    widening = np.maximum(difference_min - (high - low), 0.0) / 2
+    low, high = low - widening, high + widening
+    lower_heights = (-np.inf, *profile.height[:-1])
+    lower_extinctions = (profile.extinction[0], *profile.extinction[:-1])
     total = np.zeros(low.shape)
-    for z0, z1, a0, a1 in zip(bottoms, profile.height, below, profile.extinction, strict=True):
+    for z0, z1, a0, a1 in zip(
+        lower_heights, profile.height, lower_extinctions, profile.extinction, strict=True
+    ):
         start, end = np.clip(low, z0, z1), np.clip(high, z0, z1)
         total += (end - start) * _mean_extinction(start, end, z0, z1, a0, a1)
     return np.asarray(total / (high - low) * np.asarray(range, float))
@@ -125,106 +144,120 @@ def _mean_extinction(
     return np.asarray(a0 + (a1 - a0) * ((start + end) / 2 - z0) / (z1 - z0))
 
 
-PATH_ELEVATION = "path.elevation"
+BEAM_ELEVATION_PATH = "path.elevation"
 """Angle of the beam below the horizon [rad] by shot; only of scenes."""
 
 
-def profile_of(p: Mapping[str, np.ndarray]) -> Profile | None:
+def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
     """Extinction over height for points of one category; None without an atmosphere."""
-    name = str(p["atmosphere.profile"])
-    surface, depth = float(p["atmosphere.extinction"]), float(p["atmosphere.depth"])
+    name = str(parameters["atmosphere.profile"])
+    surface_extinction, depth = (
+        float(parameters["atmosphere.extinction"]),
+        float(parameters["atmosphere.depth"]),
+    )
     if name == "exponential":
-        return exponential(surface_extinction=surface, scale_height=depth)
+        return exponential_profile(surface_extinction=surface_extinction, scale_height=depth)
     if name == "layer":
-        return layer(optical_depth=surface * depth, depth=depth)
-    return PROFILES.get(name)
+        return layer_profile(optical_depth=surface_extinction * depth, depth=depth)
+    return EXTINCTION_PROFILES.get(name)
 
 
-def path_heights(p: Mapping[str, np.ndarray], range: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def path_heights(
+    parameters: Mapping[str, np.ndarray], range: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Heights of lidar and target above the ground [m], (n,) each."""
-    target = np.asarray(p["atmosphere.target_height"], float) + np.zeros_like(range)
-    if str(p["atmosphere.path"]) == "level":
-        return target, target
-    elevation = p.get(PATH_ELEVATION, p.get("target.grazing_angle"))
-    return target + range * np.sin(np.asarray(elevation, float)), target
+    target_height = np.asarray(parameters["atmosphere.target_height"], float) + np.zeros_like(range)
+    if str(parameters["atmosphere.path"]) == "level":
+        return target_height, target_height
+    elevation = parameters.get(BEAM_ELEVATION_PATH, parameters.get("target.grazing_angle"))
+    return target_height + range * np.sin(np.asarray(elevation, float)), target_height
 
 
-def _path(p: Mapping[str, np.ndarray], range: np.ndarray) -> dict[str, np.ndarray]:
-    lidar, target = path_heights(p, range)
-    return {"start_height": lidar, "end_height": target, "range": range}
+def _path_geometry(
+    parameters: Mapping[str, np.ndarray], range: np.ndarray
+) -> dict[str, np.ndarray]:
+    lidar_height, target_height = path_heights(parameters, range)
+    return {"start_height": lidar_height, "end_height": target_height, "range": range}
 
 
-def dim(shots: Shots, scene: Scene) -> Shots:
+def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
     """Echoes dimmed by T^2 [T 4.4], light from the ground, such as the sun's, by T."""
-    air = profile_of(scene.parameters)
-    if air is None:
+    profile = extinction_profile(context.parameters)
+    if profile is None:
         return shots
-    t = np.exp(-optical_depth(air, **_path(scene.parameters, shots.range)))
+    transmission = np.exp(
+        -optical_depth(profile, **_path_geometry(context.parameters, shots.range))
+    )
     return replace(
         shots,
-        echo_scale=shots.echo_scale * t**2,
-        beat_scale=shots.beat_scale * (t**2 if shots.architecture == "direct" else t),
-        ground_transmission=t,
+        echo_power_scale=shots.echo_power_scale * transmission**2,
+        beat_amplitude_scale=shots.beat_amplitude_scale
+        * (transmission**2 if shots.architecture == "direct" else transmission),
+        ground_transmission=transmission,
     )
 
 
-def dimming_size(points: Points) -> Size | None:
+def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
     """Loss of the echo by the air, and of the shot noise of light from the target."""
-    air = profile_of(points.parameters)
-    if air is None:
+    profile = extinction_profile(points.parameters)
+    if profile is None:
         return None
-    t = np.exp(-optical_depth(air, **_path(points.parameters, points.range)))
-    light = points.echo_noise
-    if (sun := noise_sources.sun_size(points)) is not None:
-        light = light + sun.noise
+    transmission = np.exp(
+        -optical_depth(profile, **_path_geometry(points.parameters, points.range))
+    )
+    light_noise_ratio = points.echo_noise_ratio
+    if (solar_bound := noise_sources.solar_background_bound(points)) is not None:
+        light_noise_ratio = light_noise_ratio + solar_bound.noise_variance_change
     # the threshold follows the sun's part and not the echo's: the worse is taken
-    return Size(
-        magnitude=1 - (t**2 if points.architecture == "direct" else t),
-        noise=-(1 - t**2) * light / (1 + light),
-        threshold_follows=False,
+    return ErrorBound(
+        magnitude_change=1 - (transmission**2 if points.architecture == "direct" else transmission),
+        noise_variance_change=-(1 - transmission**2) * light_noise_ratio / (1 + light_noise_ratio),
+        threshold_follows_noise=False,
     )
 
 
 EXTINCTION = Effect(
     name="extinction",
-    about="air, haze and dust that dim the light",
+    description="air, haze and dust that dim the light",
     stage="light",
-    size=dimming_size,
-    act=dim,
+    error_bound=extinction_bound,
+    apply=apply_extinction,
     parameters=(
         Parameter(
             path="atmosphere.profile",
-            about="Extinction over height: none, one of the tables, an exponential one, an even "
+            description="Extinction over height: none, one of the tables, an exponential one, an "
+            "even "
             "layer",
             default="none",
-            options=("none", *PROFILES, "exponential", "layer"),
+            options=("none", *EXTINCTION_PROFILES, "exponential", "layer"),
         ),
         Parameter(
             path="atmosphere.extinction",
-            about="Extinction coefficient on the ground, of the profiles exponential and layer",
+            description="Extinction coefficient on the ground, of the profiles exponential and "
+            "layer",
             example="1e-4 1/m",
             limits=("0 1/m", "1e9 1/m"),
-            category=True,
+            is_category_key=True,
         ),
         Parameter(
             path="atmosphere.depth",
-            about="Scale height of the profile exponential, depth of the profile layer",
+            description="Scale height of the profile exponential, depth of the profile layer",
             default=1e3,
             example="1 km",
             limits=("1 um", "1e15 m"),
             si_unit="m",
-            category=True,
+            is_category_key=True,
         ),
         Parameter(
             path="atmosphere.path",
-            about="Whether the beam slants down at the grazing angle, or runs level over the "
+            description="Whether the beam slants down at the grazing angle, or runs level over the "
             "ground",
             default="slant",
             options=("slant", "level"),
         ),
         Parameter(
             path="atmosphere.target_height",
-            about="Height of the target above the ground that profiles count from",
+            description="Height of the target above the ground that profiles count from",
             example="10 m",
             limits=("-20 km", "1000 km"),
             si_unit="m",
@@ -233,22 +266,22 @@ EXTINCTION = Effect(
 )
 
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-_FOLDS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
+_CUT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
 """Cuts of a row of the table for the integral, in e-foldings of its extinction."""
-_NEAR = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
+_CUT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Cuts of the path for the integral, in units of r_0."""
 
 
-def returned(
-    profile: Profile,
+def backscatter_integral(
+    profile: ExtinctionProfile,
     *,
     start_height: ArrayLike,
     end_height: ArrayLike,
     range: ArrayLike,
-    near: ArrayLike,
+    near_range: ArrayLike,
 ) -> np.ndarray:
-    """Integral over 0..R of alpha(r) T(r)^2 / (r^2 + r_0^2) dr [1/m^2], r_0 = D / Theta = `near`.
+    """Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], r_0 = D/Theta = `near_range`.
 
     A continuous beam has P_tx A tau_o / S times it sent back by the air to the detector [W], S the
     lidar ratio [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its
@@ -258,87 +291,117 @@ def returned(
     between the rows of the profile that the path crosses, those cut where the extinction or the
     overlap has fallen; within 1e-8. Heights as of :func:`optical_depth`.
     """
-    given = (np.asarray(value, float) for value in (start_height, end_height, range, near))
-    h0, h1, far, near = (np.expand_dims(column, -1) for column in np.broadcast_arrays(*given))
-    rise = h1 - h0
-    crossed = (_cut_heights(profile) - h0) / np.where(rise == 0, np.inf, rise)
-    inner = [np.clip(crossed, 0, 1) * far, np.minimum(np.asarray(_NEAR) * near, far)]
-    cuts = np.sort(np.concatenate([np.zeros_like(far), *inner, far], axis=-1), axis=-1)
-    angle = np.arctan(cuts / near)
-    half = np.diff(angle)[..., None] / 2
-    u = (angle[..., :-1, None] + half) + half * _NODES
-    r = near[..., None] * np.tan(u)
-    height = h0[..., None] + rise[..., None] * (r / far[..., None])
-    depth = optical_depth(profile, start_height=h0[..., None], end_height=height, range=r)
-    local = optical_depth(profile, start_height=height, end_height=height, range=1.0)
-    total = (half * _WEIGHTS * local * np.exp(-2 * depth)).sum(axis=(-1, -2))
-    return np.asarray(total / near[..., 0])
+    columns = (np.asarray(value, float) for value in (start_height, end_height, range, near_range))
+    lidar_height, target_height, target_range, near_range = (
+        np.expand_dims(column, -1) for column in np.broadcast_arrays(*columns)
+    )
+    height_difference = target_height - lidar_height
+    crossing_fraction = (_integration_heights(profile) - lidar_height) / np.where(
+        height_difference == 0, np.inf, height_difference
+    )
+    inner_cuts = [
+        np.clip(crossing_fraction, 0, 1) * target_range,
+        np.minimum(np.asarray(_CUT_RANGE_RATIOS) * near_range, target_range),
+    ]
+    cuts = np.sort(
+        np.concatenate([np.zeros_like(target_range), *inner_cuts, target_range], axis=-1), axis=-1
+    )
+    angle = np.arctan(cuts / near_range)
+    half_width = np.diff(angle)[..., None] / 2
+    node_angle = (angle[..., :-1, None] + half_width) + half_width * _GAUSS_NODES
+    distance = near_range[..., None] * np.tan(node_angle)
+    height = lidar_height[..., None] + height_difference[..., None] * (
+        distance / target_range[..., None]
+    )
+    depth = optical_depth(
+        profile, start_height=lidar_height[..., None], end_height=height, range=distance
+    )
+    extinction = optical_depth(profile, start_height=height, end_height=height, range=1.0)
+    total = (half_width * _GAUSS_WEIGHTS * extinction * np.exp(-2 * depth)).sum(axis=(-1, -2))
+    return np.asarray(total / near_range[..., 0])
 
 
-def _cut_heights(profile: Profile) -> np.ndarray:
+def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
     """Heights between which extinction is smooth and falls by a few e-foldings at most."""
     cuts = [profile.height[0]]
     rows = [*zip(profile.height, profile.extinction, strict=True)]
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
-        folds = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
-        steps = [fold / folds for fold in _FOLDS if fold < folds]
+        e_foldings = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
+        steps = [e_folding / e_foldings for e_folding in _CUT_E_FOLDINGS if e_folding < e_foldings]
         cuts += [z0 + step * (z1 - z0) if a1 < a0 else z1 - step * (z1 - z0) for step in steps]
         cuts.append(z1)
     return np.array(cuts)
 
 
-def _light(p: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
-    """Light [W] that the air sends back, from :func:`returned`."""
-    collected = p[LASER + "power"] * aperture_area(beam.receiving_field(p)[0])
-    collected = collected * p[TELESCOPE + "optical_efficiency"]
-    return np.asarray(collected * integral / p["atmosphere.lidar_ratio"])
+def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
+    """Light [W] that the air sends back, from :func:`backscatter_integral`."""
+    collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
+        beam.receiving_aperture_and_angle(parameters)[0]
+    )
+    collected_power = collected_power * parameters[TELESCOPE_PREFIX + "optical_efficiency"]
+    return np.asarray(collected_power * integral / parameters["atmosphere.lidar_ratio"])
 
 
-def scatter_back(shots: Shots, scene: Scene) -> Shots:
+def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Shot noise of the light that the air sends back.
 
     Its beat with the local oscillator, from ever new grains, is spread over the bins from the
     nearest range to the target's and is left out; [T 3.3.1] counts it among the noise too.
     """
-    p = scene.parameters
-    air = profile_of(p)
-    if air is None:
+    parameters = context.parameters
+    profile = extinction_profile(parameters)
+    if profile is None:
         return shots
-    aperture, angle = beam.receiving_field(p)
-    light = _light(p, returned(air, near=aperture / angle, **_path(p, shots.range)))
-    return noisier(shots, backscatter_shot=np.asarray(shots.shot_noise_scale * light))
+    aperture, field_angle = beam.receiving_aperture_and_angle(parameters)
+    power = _backscattered_power(
+        parameters,
+        backscatter_integral(
+            profile, near_range=aperture / field_angle, **_path_geometry(parameters, shots.range)
+        ),
+    )
+    return add_noise_sources(
+        shots, backscatter_shot=np.asarray(shots.shot_noise_variance_per_watt * power)
+    )
 
 
-def backscatter_size(points: Points) -> Size | None:
+def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return an upper bound on backscatter; the threshold follows it.
 
     It is the lesser of two: the whole path with the air of its lower end, without extinction; or
     all the light that is lost on the path, sent back from the beam's near end.
     """
-    p = points.parameters
-    air = profile_of(p)
-    if air is None:
+    parameters = points.parameters
+    profile = extinction_profile(parameters)
+    if profile is None:
         return None
-    path = _path(p, points.range)
-    aperture, angle = beam.receiving_field(p)
-    lowest = np.minimum(path["start_height"], path["end_height"])
-    near = aperture / angle
-    local = optical_depth(air, start_height=lowest, end_height=lowest, range=1.0)
-    even = local * np.arctan(points.range / near) / near
-    most = np.minimum(even, -np.expm1(-2 * optical_depth(air, **path)) / 2 / near**2)
-    return Size(noise=_light(p, most) * points.receiver.per_watt / points.noise_variance)
+    path_geometry = _path_geometry(parameters, points.range)
+    aperture, field_angle = beam.receiving_aperture_and_angle(parameters)
+    lowest_height = np.minimum(path_geometry["start_height"], path_geometry["end_height"])
+    near_range = aperture / field_angle
+    extinction = optical_depth(
+        profile, start_height=lowest_height, end_height=lowest_height, range=1.0
+    )
+    uniform_bound = extinction * np.arctan(points.range / near_range) / near_range
+    integral_max = np.minimum(
+        uniform_bound, -np.expm1(-2 * optical_depth(profile, **path_geometry)) / 2 / near_range**2
+    )
+    return ErrorBound(
+        noise_variance_change=_backscattered_power(parameters, integral_max)
+        * points.receiver_noise.shot_noise_variance_per_watt
+        / points.receiver_noise_variance
+    )
 
 
 BACKSCATTER = Effect(
     name="backscatter",
-    about="shot noise of light that the air sends back",
+    description="shot noise of light that the air sends back",
     stage="noise",
-    size=backscatter_size,
-    act=scatter_back,
+    error_bound=backscatter_bound,
+    apply=apply_backscatter,
     parameters=(
         Parameter(
             path="atmosphere.lidar_ratio",
-            about="Extinction over backscatter",
+            description="Extinction over backscatter",
             default=50.0,
             example="50 sr",
             limits=("1e-6 sr", "1e9 sr"),

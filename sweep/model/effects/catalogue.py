@@ -4,13 +4,15 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import beam, looks, waveform
+from sweep.model import beam, waveform
+from sweep.model.detection import looks
 from sweep.model.effects import (
     amplifier,
     atmosphere,
     circulator_leak,
     doppler,
     footprint,
+    image_and_leakage,
     iq_imbalance,
     lag,
     line_width,
@@ -21,11 +23,10 @@ from sweep.model.effects import (
     saturation,
     scintillation,
     segment_motion,
-    sidelobes,
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.preparation import RECORD
+from sweep.model.preparation import RECORD_PATH
 
 EFFECTS: tuple[Effect, ...] = (
     footprint.FOOTPRINT,
@@ -51,59 +52,63 @@ EFFECTS: tuple[Effect, ...] = (
     line_width.LINE_WIDTH,
     saturation.SATURATION,
     iq_imbalance.IQ_IMBALANCE,
-    sidelobes.IMAGE,
-    sidelobes.LEAKAGE,
+    image_and_leakage.IMAGE,
+    image_and_leakage.LEAKAGE,
     speckle.FADING,
     pointing_jitter.POINTING_JITTER,
     speckle.SPECKLE,
     scintillation.SCINTILLATION,
 )
 
-NAMES = tuple(effect.name for effect in EFFECTS)
+EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
 
-PARAMETERS: tuple[Parameter, ...] = tuple(
+EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
     parameter for effect in EFFECTS for parameter in effect.parameters
 )
 """Fields that effects bring into a spec."""
 
-SHARED = tuple(parameter.path for parameter in PARAMETERS if parameter.category)
+EFFECT_CATEGORY_PATHS = tuple(
+    parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
+)
 """Numbers of effects that points must share to be prepared together."""
 
-DEFAULTS: dict[str, float | int | str | np.ndarray] = (
-    beam.DEFAULTS
-    | waveform.DEFAULTS
-    | looks.DEFAULTS
-    | {RECORD: "real"}
-    | {parameter.path: parameter.default for parameter in PARAMETERS}
+PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
+    beam.BEAM_DEFAULTS
+    | waveform.WAVEFORM_DEFAULTS
+    | looks.LOOKS_DEFAULTS
+    | {RECORD_PATH: "real"}
+    | {parameter.path: parameter.default for parameter in EFFECT_PARAMETERS}
 )
 """Of the beams' parameters, the waveform's, the looks', the record's and the effects'."""
 
-CORE = (
+DEFAULT_EFFECTS = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
 """Effects that the model's functions simulate if nothing is said: pure lines and their noise."""
 
-FLAGS_APART = np.uint32(sum(1 << k for k, effect in enumerate(EFFECTS) if effect.apart))
+OWN_BATCH_FLAGS = np.uint32(
+    sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_own_batch)
+)
 """Flags of effects that points with and without them are computed apart by."""
 
 
-def flags_of(kept: np.ndarray) -> np.ndarray:
+def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
     """Pack effects that are kept, (effects, m) bool in the catalogue's order, as (m,) uint32."""
-    masks = np.uint32(1) << np.arange(kept.shape[0], dtype=np.uint32)
-    return np.bitwise_or.reduce(np.where(kept, masks[:, None], np.uint32(0)), axis=0)
+    flag_masks = np.uint32(1) << np.arange(is_kept.shape[0], dtype=np.uint32)
+    return np.bitwise_or.reduce(np.where(is_kept, flag_masks[:, None], np.uint32(0)), axis=0)
 
 
-def names_of(flags: int) -> tuple[str, ...]:
+def unpack_effect_flags(flags: int) -> tuple[str, ...]:
     """Names of the effects that flags stand for."""
-    return tuple(name for k, name in enumerate(NAMES) if flags >> k & 1)
+    return tuple(name for k, name in enumerate(EFFECT_NAMES) if flags >> k & 1)
 
 
-def flag_attributes() -> dict[str, Any]:
+def effect_flag_attributes() -> dict[str, Any]:
     """Meaning of the flags in the words of the CF conventions."""
     return {
         "units": "1",
         "long_name": "effects that were simulated",
-        "flag_masks": [1 << k for k in range(len(NAMES))],
-        "flag_meanings": " ".join(NAMES),
+        "flag_masks": [1 << k for k in range(len(EFFECT_NAMES))],
+        "flag_meanings": " ".join(EFFECT_NAMES),
     }

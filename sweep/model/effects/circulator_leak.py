@@ -24,15 +24,16 @@ path of a metre takes 3 ns of a record that begins with the chirp. Records that 
 have it whole.
 
 The processing knows the line, as it is always there: bins in which it comes to
-:data:`MASKED_FROM` of the threshold, at whatever phase, are **masked**. They raise no alarm, and an
+:data:`MASK_THRESHOLD_FRACTION` of the threshold, at whatever phase, are **masked**. They raise no
+alarm, and an
 echo whose largest bin is among them is not detected. In other bins the line's skirts, as powers
 add, help an echo over the threshold. They help noise as well, which counts as leakage
 (`p_leakage_up`, `p_leakage_down`): the mean over the phase, in which all bins share. An echo that
 fades in developed speckle crosses with Q_1(L / s, Th / s), s^2 = sigma^2 + |X|^2 / 2.
 
 Left out: saturation of the ADC by the line; the line's own image of I and Q; and the echo's and the
-line's skirts raising one bin together. The spectrum of :func:`sweep.model.segments.spectrum` is
-that of the echo alone.
+line's skirts raising one bin together. The spectrum of
+:func:`sweep.model.spectrum.segment_spectra.segment_spectrum` is that of the echo alone.
 """
 
 from collections.abc import Mapping
@@ -42,248 +43,378 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import link
+from sweep.model import receiver_chain
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
-from sweep.model.effects.points import Points
-from sweep.model.looks import Looks
-from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots, beat_current
-from sweep.model.waveform import samples_before_echo
-from sweep.model.window import Window, samples
+from sweep.model.detection.looks import Looks
+from sweep.model.effects.effect import (
+    Effect,
+    EffectContext,
+    ErrorBound,
+    Parameter,
+    add_noise_sources,
+)
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import (
+    LASER_PREFIX,
+    RECEIVER_PREFIX,
+    TELESCOPE_PREFIX,
+    Shots,
+    beat_current,
+)
+from sweep.model.waveform import count_samples_before_echo
+from sweep.model.window import Window, window_samples
 
-MASKED_FROM = 0.5
+MASK_THRESHOLD_FRACTION = 0.5
 """Share of the threshold from which on a bin's line has it masked: less raises few alarms."""
-PHASES = 16
+N_PHASES = 16
 """Phases of the line over which alarms are averaged."""
 
-PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
+LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
 
 
-def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray, np.ndarray]:
+def _leaked_power_and_current(
+    parameters: Mapping[str, np.ndarray], architecture: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
-    power = np.asarray(p[LASER + "power"] / p[ISOLATION])
-    return power, beat_current(architecture, p, power)
+    power = np.asarray(parameters[LASER_PREFIX + "power"] / parameters[ISOLATION_PATH])
+    return power, beat_current(architecture, parameters, power)
 
 
-def excess(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
+def beat_noise_current_variance(
+    parameters: Mapping[str, np.ndarray], architecture: str, line_shape: str
+) -> np.ndarray:
     """Compute the current variance [A^2] of the beat's noise; direct detection has no beat."""
     if architecture == "direct":
         return np.zeros(())
-    light, current = _leaked(p, architecture)
-    scale = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
-    band, delay = link.electrical_bandwidth(link.receiver_values(p)), p[PATH] / SPEED_OF_LIGHT
-    half = np.square(current / scale) / 2
-    common = (2 * p[RECEIVER + "local_oscillator_power"] + light) * light
-    common = common / p[RECEIVER + "common_mode_rejection"]
-    variance = p[LASER + "relative_intensity_noise"] * band * (common + half)
-    if shape == "lorentzian":
-        phase = 2 * np.pi * p[LASER + "line_width"] * delay * np.minimum(2 * delay * band, 1.0)
-        variance = variance + half * phase
-    return np.asarray(scale**2 * variance)
+    leaked_power, beat_current = _leaked_power_and_current(parameters, architecture)
+    responsivity = (
+        parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
+    )
+    bandwidth, delay = (
+        receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters)),
+        parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT,
+    )
+    beat_power = np.square(beat_current / responsivity) / 2
+    rejected_power = (
+        2 * parameters[RECEIVER_PREFIX + "local_oscillator_power"] + leaked_power
+    ) * leaked_power
+    rejected_power = rejected_power / parameters[RECEIVER_PREFIX + "common_mode_rejection"]
+    variance = (
+        parameters[LASER_PREFIX + "relative_intensity_noise"]
+        * bandwidth
+        * (rejected_power + beat_power)
+    )
+    if line_shape == "lorentzian":
+        phase_noise = (
+            2
+            * np.pi
+            * parameters[LASER_PREFIX + "line_width"]
+            * delay
+            * np.minimum(2 * delay * bandwidth, 1.0)
+        )
+        variance = variance + beat_power * phase_noise
+    return np.asarray(responsivity**2 * variance)
 
 
-def leak_size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the leak's noise, exactly; its line may hide any echo, and always counts."""
-    if not points.has(PATH):
+    if not points.any_nonzero(LEAK_LENGTH_PATH):
         return None
-    p, own = points.parameters, points.receiver
-    noise = _leaked(p, points.architecture)[0] * own.per_watt
-    shape = points.word(LASER + "line_shape")
-    noise = noise + excess(p, points.architecture, shape) * own.per_ampere
-    return Size(noise=noise / points.noise_variance, chance=1.0)
-
-
-def add_leak(shots: Shots, scene: Scene) -> Shots:
-    """Add the leaked light's noise and its line."""
-    p = scene.parameters
-    power, current = _leaked(p, shots.architecture)
-    beat = excess(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
-    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=beat)
-    return replace(
-        shots,
-        leak_amplitude=current * p[RECEIVER + "transimpedance"],
-        leak_delay=p[PATH] / SPEED_OF_LIGHT,
+    parameters, receiver_noise = points.parameters, points.receiver_noise
+    noise_variance = (
+        _leaked_power_and_current(parameters, points.architecture)[0]
+        * receiver_noise.shot_noise_variance_per_watt
+    )
+    line_shape = points.option(LASER_PREFIX + "line_shape")
+    noise_variance = (
+        noise_variance
+        + beat_noise_current_variance(parameters, points.architecture, line_shape)
+        * receiver_noise.variance_per_square_ampere
+    )
+    return ErrorBound(
+        noise_variance_change=noise_variance / points.receiver_noise_variance,
+        probability_change=1.0,
     )
 
 
-class Line(NamedTuple):
+def apply(shots: Shots, context: EffectContext) -> Shots:
+    """Add the leaked light's noise and its line."""
+    parameters = context.parameters
+    power, beat_current = _leaked_power_and_current(parameters, shots.architecture)
+    beat_noise = (
+        beat_noise_current_variance(
+            parameters, shots.architecture, str(parameters[LASER_PREFIX + "line_shape"])
+        )
+        * shots.noise_variance_per_square_ampere
+    )
+    shots = add_noise_sources(
+        shots, leak_shot=shots.shot_noise_variance_per_watt * power, leak_excess=beat_noise
+    )
+    return replace(
+        shots,
+        circulator_leak_amplitude=beat_current * parameters[RECEIVER_PREFIX + "transimpedance"],
+        circulator_leak_delay=parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT,
+    )
+
+
+class LeakLine(NamedTuple):
     """A line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
 
-    terms: np.ndarray
+    transforms: np.ndarray
     """(2, bins) complex: at its frequency, and at the negative one."""
-    most: np.ndarray
+    magnitude_max: np.ndarray
     """Its largest magnitude at any phase."""
-    rms: np.ndarray
+    magnitude_rms: np.ndarray
     """Root mean square of its magnitude over the phase."""
 
 
 @lru_cache(maxsize=16)
-def _line(window: Window, fft_size: int, place: float, signed: bool, late: int = 0) -> Line:
+def _leak_line(
+    window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
+) -> LeakLine:
     """Return the line at a place [bins] that lacks the first samples of the record."""
-    turns = place * np.arange(window.length) / fft_size
-    record = samples(window.name, window.length) * np.exp(2j * np.pi * (turns - np.rint(turns)))
-    record[:late] = 0.0
+    cycles = line_bin * np.arange(window.length) / fft_size
+    record = window_samples(window.name, window.length) * np.exp(
+        2j * np.pi * (cycles - np.rint(cycles))
+    )
+    record[:n_missing] = 0.0
     spectrum = np.fft.fft(record, fft_size)
-    half = np.arange(fft_size // 2 + 1)
-    both = [spectrum, 0 * spectrum] if signed else [spectrum[half], spectrum[-half].conj()]
-    terms = np.array(both)
-    return Line(terms, np.abs(terms).sum(axis=0), np.hypot(*np.abs(terms)))
+    real_bins = np.arange(fft_size // 2 + 1)
+    transform_rows = (
+        [spectrum, 0 * spectrum]
+        if is_complex
+        else [spectrum[real_bins], spectrum[-real_bins].conj()]
+    )
+    transforms = np.array(transform_rows)
+    return LeakLine(transforms, np.abs(transforms).sum(axis=0), np.hypot(*np.abs(transforms)))
 
 
-def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tuple[float, Line]:
+def leak_line_of_point(
+    shots: Shots, i: int, segment: int, noise_frequency: float | None = None
+) -> tuple[float, LeakLine]:
     """Return half of the amplitude [V] of point i's line in a segment, and that line.
 
-    The amplitude is over the noise at the line; or at a frequency ``at`` [Hz], for skirts there.
+    The amplitude is over the noise at the line; or at a frequency ``noise_frequency`` [Hz], for
+    skirts there.
     """
-    columns = (
-        shots.leak_amplitude, shots.leak_delay, shots.chirp_rate, shots.sample_rate,
-        shots.detector_bandwidth, shots.amplifier_bandwidth, shots.acquisition_delay,
-    )  # fmt: skip
-    assert shots.leak_amplitude is not None
-    amplitude, delay, rate, sampled, detector, amplifier, start = (
-        float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in columns
+    shot_columns = (
+        shots.circulator_leak_amplitude,
+        shots.circulator_leak_delay,
+        shots.chirp_rate,
+        shots.sample_rate,
+        shots.detector_bandwidth,
+        shots.amplifier_bandwidth,
+        shots.acquisition_delay,
     )
-    beat = -shots.waveform[segment].slope * rate * delay
-    gain = link.transfer(
-        np.array(beat),
-        detector_bandwidth=np.array(detector),
-        amplifier_bandwidth=np.array(amplifier),
+    assert shots.circulator_leak_amplitude is not None
+    (
+        amplitude,
+        delay,
+        chirp_rate,
+        sample_rate,
+        detector_bandwidth,
+        amplifier_bandwidth,
+        acquisition_delay,
+    ) = (float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in shot_columns)
+    beat_frequency = -shots.waveform_segments[segment].chirp_slope * chirp_rate * delay
+    transfer_gain = receiver_chain.receiver_transfer(
+        np.array(beat_frequency),
+        detector_bandwidth=np.array(detector_bandwidth),
+        amplifier_bandwidth=np.array(amplifier_bandwidth),
     )
-    whitened = shots.whitened(np.array(beat), None if at is None else np.array(at))
-    own = float(np.broadcast_to(whitened, shots.size)[i])
-    scale = 0.5 * amplitude * abs(complex(gain)) * own
-    place = beat * shots.fft_size / sampled
-    late = 0
-    if shots.first_sample is not None:
-        late = int(samples_before_echo(
-            delay=np.array(delay), beta=0.0, start=np.array(start), sample_rate=np.array(sampled),
-            length=shots.window.length,
-        ))  # fmt: skip
-    return scale, _line(shots.window, shots.fft_size, place, shots.complex_record, late)
+    whitened = shots.whitening_gain_at(
+        np.array(beat_frequency), None if noise_frequency is None else np.array(noise_frequency)
+    )
+    whitening_gain = float(np.broadcast_to(whitened, shots.size)[i])
+    half_amplitude = 0.5 * amplitude * abs(complex(transfer_gain)) * whitening_gain
+    line_bin = beat_frequency * shots.fft_size / sample_rate
+    n_missing = 0
+    if shots.n_samples_before_echo is not None:
+        n_missing = int(
+            count_samples_before_echo(
+                delay=np.array(delay),
+                doppler_ratio=0.0,
+                record_start=np.array(acquisition_delay),
+                sample_rate=np.array(sample_rate),
+                length=shots.window.length,
+            )
+        )
+    return half_amplitude, _leak_line(
+        shots.window, shots.fft_size, line_bin, shots.complex_record, n_missing
+    )
 
 
-def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: float) -> float:
+def line_alarm_probability(
+    looks: Looks,
+    line: LeakLine,
+    bins: np.ndarray,
+    *,
+    amplitude_ratio: float,
+    threshold_ratio: float,
+) -> float:
     """Probability that a line raises an alarm in some of its bins where noise alone does not.
 
-    ``scale`` and ``level`` are half of the line's amplitude and the threshold, over the noise.
+    ``amplitude_ratio`` and ``threshold_ratio`` are half of the line's amplitude and the threshold,
+    over the noise.
     """
-    one, other = scale * line.terms[:, bins]
-    phases = np.pi * (np.arange(PHASES) + 0.5) / PHASES  # its magnitude has this period
-    quiet = [
-        np.log1p(-np.minimum(looks.excess(np.abs(one * t + other * t.conjugate()), level), 1.0))
-        for t in np.exp(1j * phases)
+    positive_term, negative_term = amplitude_ratio * line.transforms[:, bins]
+    phases = np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES  # its magnitude has this period
+    log_no_alarm = [
+        np.log1p(
+            -np.minimum(
+                looks.added_crossing_probability(
+                    np.abs(positive_term * phasor + negative_term * phasor.conjugate()),
+                    threshold_ratio,
+                ),
+                1.0,
+            )
+        )
+        for phasor in np.exp(1j * phases)
     ]
-    return float(-np.expm1(np.sum(quiet, axis=1)).mean())
+    return float(-np.expm1(np.sum(log_no_alarm, axis=1)).mean())
 
 
-def bins_of_line(
-    shots: Shots, i: int, line: Line, *, scale: float, echo: np.ndarray
+def line_bin_masks(
+    shots: Shots, i: int, line: LeakLine, *, half_amplitude: float, echo_bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tell which bins of a segment of point i a line masks, and in which it raises alarms.
 
-    ``scale`` is half of the line's amplitude [V], ``echo`` the bins of the echo. Results are bool,
+    ``half_amplitude`` is half of the line's amplitude [V], ``echo_bins`` the bins of the echo.
+    Results are bool,
     (bins,): bins that are masked; bins that are searched for alarms, masked or not; bins in which
     the line may raise one.
     """
-    deviation, level, floor = (
-        float(np.broadcast_to(v, shots.size)[i])
-        for v in (shots.bin_deviation, shots.threshold, shots.floor)
+    noise_sigma, threshold, floor = (
+        float(np.broadcast_to(value, shots.size)[i])
+        for value in (shots.bin_noise_sigma, shots.threshold, shots.negligible_signal_ratio)
     )
-    most = scale * line.most
-    masked, searched = most >= MASKED_FROM * level, np.ones(line.most.size, bool)
+    magnitude_max = half_amplitude * line.magnitude_max
+    is_masked, is_searched = (
+        magnitude_max >= MASK_THRESHOLD_FRACTION * threshold,
+        np.ones(line.magnitude_max.size, bool),
+    )
     if not shots.complex_record:
-        first = shots.searched_from
-        searched[:first] = searched[searched.size - first :] = False
-    searched[echo % shots.fft_size if shots.complex_record else echo] = False
-    return masked, searched, searched & ~masked & (most >= floor * deviation)
+        first_searched = shots.first_searched_bin
+        is_searched[:first_searched] = is_searched[is_searched.size - first_searched :] = False
+    is_searched[echo_bins % shots.fft_size if shots.complex_record else echo_bins] = False
+    return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
 
 
-def raised(
-    own: np.ndarray, line: np.ndarray, *, deviation: float, level: float, fades: bool
+def raised_magnitude(
+    echo_magnitude: np.ndarray,
+    line_rms: np.ndarray,
+    *,
+    noise_sigma: float,
+    threshold: float,
+    in_speckle: bool,
 ) -> np.ndarray:
     """|X| of an echo's bins that cross as often as those with the line in them do, (m,).
 
-    ``own`` is |X| of the echo, the root mean square of one that ``fades``; ``line`` the root mean
-    square of the line's [V]; ``deviation`` and ``level`` noise per quadrature and threshold [V].
+    ``echo_magnitude`` is |X| of the echo, the root mean square of one that ``in_speckle``;
+    ``line_rms`` the root mean
+    square of the line's [V]; ``noise_sigma`` and ``threshold`` noise per quadrature and threshold
+    [V].
     """
-    from sweep.model.marcum import marcum_q1  # needs the compiler, too
+    from sweep.model.detection.marcum import marcum_q1  # needs the compiler, too
 
-    if not fades:
-        return np.hypot(own, line)
-    deep = np.sqrt(deviation**2 + own**2 / 2)
-    crosses, stays = marcum_q1(line / deep, level / deep)
+    if not in_speckle:
+        return np.hypot(echo_magnitude, line_rms)
+    total_sigma = np.sqrt(noise_sigma**2 + echo_magnitude**2 / 2)
+    pd, miss = marcum_q1(line_rms / total_sigma, threshold / total_sigma)
     with np.errstate(divide="ignore"):
-        power = level**2 / -np.where(stays < 0.5, np.log1p(-stays), np.log(crosses))
-    return np.where(line > 1e-6 * deviation, np.sqrt(np.maximum(power - 2 * deviation**2, 0)), own)
-
-
-def beside_leak(shots: Shots, runs: Any) -> Any:
-    """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
-    from sweep.model.detection import (  # needs the compiler, which reading specs does not
-        found_pair,
-        levels_of,
-        speckle_of,
+        power = threshold**2 / -np.where(miss < 0.5, np.log1p(-miss), np.log(pd))
+    return np.where(
+        line_rms > 1e-6 * noise_sigma,
+        np.sqrt(np.maximum(power - 2 * noise_sigma**2, 0)),
+        echo_magnitude,
     )
 
-    magnitudes = runs.magnitudes.copy()
+
+def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
+    """Apply the leaked light's line to spectra: it masks bins, and raises others."""
+    from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at, pd_and_miss
+
+    magnitudes = bin_spans.magnitudes.copy()
     pd, miss, exempted, leakage = (
-        v.copy() for v in (runs.pd, runs.miss, runs.exempted, runs.leakage)
+        values.copy()
+        for values in (bin_spans.pd, bin_spans.miss, bin_spans.n_exempt, bin_spans.leakage)
     )
-    deviation, under, level = (
-        np.broadcast_to(v, shots.size)[runs.part]
-        for v in (shots.bin_deviation, shots.line_deviation, shots.threshold)
+    noise_sigma, line_noise_sigma, threshold = (
+        np.broadcast_to(values, shots.size)[bin_spans.point_numbers]
+        for values in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
     )
-    size, rule, speckle = shots.fft_size, shots.echo_rule, shots.speckle_table
-    for s, i in np.argwhere(runs.bins > 0):
-        stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
-        at = runs.low[s, i] + np.arange(runs.bins[s, i])
-        at = at % size if shots.complex_record else at
-        (scale, line), peak = line_of(shots, int(runs.part[i]), s), runs.peak[s, i]
-        echo = runs.exempt[stretch]
-        masked, searched, alarms = bins_of_line(
-            shots, int(runs.part[i]), line, scale=scale, echo=at[echo]
+    fft_size, rule, speckle = shots.fft_size, shots.detection_rule, shots.speckle_table
+    for segment_index, i in np.argwhere(bin_spans.n_bins > 0):
+        bin_slice = slice(
+            bin_spans.span_start[segment_index, i],
+            bin_spans.span_start[segment_index, i] + bin_spans.n_bins[segment_index, i],
         )
-        echoes = float(
-            at[peak] / size * np.broadcast_to(shots.sample_rate, shots.size)[runs.part[i]]
+        bins = bin_spans.first_bin[segment_index, i] + np.arange(bin_spans.n_bins[segment_index, i])
+        bins = bins % fft_size if shots.complex_record else bins
+        (half_amplitude, line), peak = (
+            leak_line_of_point(shots, int(bin_spans.point_numbers[i]), segment_index),
+            bin_spans.peak_index[segment_index, i],
         )
-        beside, _ = line_of(shots, int(runs.part[i]), s, echoes)
-        skirts = np.where(masked[at], 0.0, beside * line.rms[at])
-        seen = raised(
-            runs.magnitudes[stretch], skirts, deviation=under[i], level=level[i],
-            fades=shots.fading is not None,
-        )  # fmt: skip
-        seen[masked[at]] = 0.0
-        magnitudes[stretch] = seen
-        if masked[at[peak]]:
-            pd[s, i], miss[s, i] = 0.0, 1.0
+        is_echo = bin_spans.is_exempt[bin_slice]
+        is_masked, is_searched, may_raise_alarm = line_bin_masks(
+            shots,
+            int(bin_spans.point_numbers[i]),
+            line,
+            half_amplitude=half_amplitude,
+            echo_bins=bins[is_echo],
+        )
+        peak_frequency = float(
+            bins[peak]
+            / fft_size
+            * np.broadcast_to(shots.sample_rate, shots.size)[bin_spans.point_numbers[i]]
+        )
+        skirt_half_amplitude, _ = leak_line_of_point(
+            shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
+        )
+        skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
+        raised_magnitudes = raised_magnitude(
+            bin_spans.magnitudes[bin_slice],
+            skirt_rms,
+            noise_sigma=line_noise_sigma[i],
+            threshold=threshold[i],
+            in_speckle=shots.segment_correlations is not None,
+        )
+        raised_magnitudes[is_masked[bins]] = 0.0
+        magnitudes[bin_slice] = raised_magnitudes
+        if is_masked[bins[peak]]:
+            pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
         else:
-            pd[s, i], miss[s, i] = found_pair(
-                seen, echo, peak, runs.low[s, i], rule,
-                levels_of(shots.bin_levels, runs.part[i]),
-                speckle_of(speckle, s, runs.part[i]),
+            pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
+                raised_magnitudes, is_echo, peak, bin_spans.first_bin[segment_index, i], rule,
+                bin_threshold_at(shots.bin_threshold_table, bin_spans.point_numbers[i]),
+                bin_speckle_at(speckle, segment_index, bin_spans.point_numbers[i]),
             )  # fmt: skip
-        exempted[s, i] += np.count_nonzero(masked & searched)
-        if shots.waveform[s].leaks:
-            chance = alarm(
-                shots.looks, line, np.flatnonzero(alarms), scale=scale / deviation[i],
-                level=level[i] / deviation[i],
-            )  # fmt: skip
-            leakage[s, i] += (1 - leakage[s, i]) * chance
-    return runs._replace(
-        magnitudes=magnitudes, pd=pd, miss=miss, exempted=exempted, leakage=leakage
+        exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)
+        if shots.waveform_segments[segment_index].includes_leakage:
+            alarm_probability = line_alarm_probability(
+                shots.looks,
+                line,
+                np.flatnonzero(may_raise_alarm),
+                amplitude_ratio=half_amplitude / noise_sigma[i],
+                threshold_ratio=threshold[i] / noise_sigma[i],
+            )
+            leakage[segment_index, i] += (1 - leakage[segment_index, i]) * alarm_probability
+    return bin_spans._replace(
+        magnitudes=magnitudes, pd=pd, miss=miss, n_exempt=exempted, leakage=leakage
     )
 
 
 CIRCULATOR_LEAK = Effect(
     name="circulator_leak",
-    about="light that leaks to the detector: a line near DC, and its noise",
+    description="light that leaks to the detector: a line near DC, and its noise",
     stage="noise",
-    size=leak_size,
-    act=add_leak,
+    error_bound=error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=PATH,
-            about="Optical path of the light that leaks past circulator and window (isolation) "
+            path=LEAK_LENGTH_PATH,
+            description="Optical path of the light that leaks past circulator and window "
+            "(isolation) "
             "beyond the local oscillator's, in all; 0 for no such light. Its line stands at the "
             "range of half this path; bins in which it alone reaches the threshold are masked, and "
             "hide echoes",

@@ -16,107 +16,126 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.points import Points, by_power
-from sweep.model.footprint import NO_SPREAD
+from sweep.model.beamlets import NO_SPREAD
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
 from sweep.model.preparation import Shots, doppler_ratio
 
-NOT_AWAY = 0.1
+OMITTED_SHIFT_MAX_BINS = 0.1
 """Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
 
 
-def size(points: Points) -> Size | None:
+def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by the shift: another transfer, another place between two bins.
 
     The shift in bins counts besides, as velocity is measured by it. A line that goes elsewhere is
     not left out.
     """
-    if not points.has("target.radial_velocity"):
+    if not points.any_nonzero("target.radial_velocity"):
         return None
-    return moved_size(points, np.abs(points.radial_velocity) * points.per_velocity)
+    return line_shift_bound(points, np.abs(points.radial_velocity) * points.bins_per_velocity)
 
 
-def moved_size(points: Points, moved: np.ndarray) -> Size:
+def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
     """Change of the largest bin by lines that all move by so many bins, by segment."""
-    away = (moved > NOT_AWAY).any(axis=0)
-    shift = np.where(away, 1.0, moved.max(axis=0))
-    if away.all():
-        return Size(shift=shift)
-    magnitude: np.ndarray | float = 0.0
-    added: np.ndarray | float = 0.0
+    is_far = (shift_bins > OMITTED_SHIFT_MAX_BINS).any(axis=0)
+    omitted_shift_bins = np.where(is_far, 1.0, shift_bins.max(axis=0))
+    if is_far.all():
+        return ErrorBound(shift_bins=omitted_shift_bins)
+    magnitude_change: np.ndarray | float = 0.0
+    coherent_change: np.ndarray | float = 0.0
     if points.architecture != "direct":
-        change = by_power(points.moved(NO_SPREAD, points.spread, moved))
-        magnitude = np.where(away, 0.0, change)
+        near_change = magnitude_change_from_power(
+            points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins)
+        )
+        magnitude_change = np.where(is_far, 0.0, near_change)
     if points.adds_amplitudes:
-        bins = moved * (1 + points.spread.extreme)  # the beat of a range stretches too
-        added = np.where(away, 0.0, points.in_phase(bins))
-    return Size(magnitude=magnitude, added=added, shift=shift)
+        stretched_shift_bins = shift_bins * (
+            1 + points.line_spread.extreme
+        )  # the beat of a range stretches too
+        coherent_change = np.where(is_far, 0.0, points.coherent_sum_bound(stretched_shift_bins))
+    return ErrorBound(
+        magnitude_change=magnitude_change,
+        coherent_sum_change=coherent_change,
+        shift_bins=omitted_shift_bins,
+    )
 
 
-def shift(shots: Shots, scene: Scene) -> Shots:
+def apply_doppler(shots: Shots, context: EffectContext) -> Shots:
     """Lines shifted by the radial velocity on the axis."""
-    return replace(shots, beta=doppler_ratio(shots.radial_velocity))
+    return replace(shots, doppler_ratio=doppler_ratio(shots.radial_velocity))
 
 
 DOPPLER = Effect(
     name="doppler",
-    about="shift of all lines by the radial velocity",
+    description="shift of all lines by the radial velocity",
     stage="lines",
-    size=size,
-    act=shift,
+    error_bound=doppler_bound,
+    apply=apply_doppler,
 )
 
 
-def spread_size(points: Points) -> Size | None:
+def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by differences of velocity.
 
     Of amplitudes that add, lines in phase change by their own moves.
     """
-    velocities = points.velocity_spread
-    if not np.any(velocities.extreme):
+    velocity_spread = points.velocity_spread
+    if not np.any(velocity_spread.extreme):
         return None
-    added = points.in_phase(velocities.extreme) if points.adds_amplitudes else 0.0
+    coherent_change = (
+        points.coherent_sum_bound(velocity_spread.extreme) if points.adds_amplitudes else 0.0
+    )
     if points.architecture == "direct":
-        return Size(added=added)
-    power = points.moved(velocities, points.range_spread)
-    return Size(magnitude=by_power(power), added=added)
+        return ErrorBound(coherent_sum_change=coherent_change)
+    power_change = points.power_change_bound(velocity_spread, points.range_spread)
+    return ErrorBound(
+        magnitude_change=magnitude_change_from_power(power_change),
+        coherent_sum_change=coherent_change,
+    )
 
 
-def spread(shots: Shots, scene: Scene) -> Shots:
+def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
     """Beamlets at their own radial velocities, where there are beamlets."""
-    doppler = scene.ground.beamlets.doppler
-    if shots.doppler.shape != doppler.shape:
+    doppler_ratios = context.ground.beamlets.doppler_ratio_offset
+    if shots.doppler_ratio_offset.shape != doppler_ratios.shape:
         return shots
-    doppler = scene.beamlets("doppler_spread", shots.row, doppler, shots.doppler)
-    return replace(shots, doppler=doppler)
+    doppler_ratios = context.select_beamlets(
+        "doppler_spread", shots.footprint_row, doppler_ratios, shots.doppler_ratio_offset
+    )
+    return replace(shots, doppler_ratio_offset=doppler_ratios)
 
 
 DOPPLER_SPREAD = Effect(
     name="doppler_spread",
-    about="radial velocities that differ over the footprint",
+    description="radial velocities that differ over the footprint",
     stage="lines",
-    size=spread_size,
-    act=spread,
-    apart=False,
+    error_bound=doppler_spread_bound,
+    apply=apply_doppler_spread,
+    needs_own_batch=False,
     parameters=(
         Parameter(
             path="target.transverse_velocity",
-            about="Speed across the line of sight, positive towards the near side of the footprint",
+            description="Speed across the line of sight, positive towards the near side of the "
+            "footprint",
             example="100 m/s",
             limits=("-1000 km/s", "1000 km/s"),
             si_unit="m/s",
-            alone=False,
+            is_sole_cause=False,
         ),
     ),
-    within="footprint",
+    parent="footprint",
 )
 
 
-def rotation_size(points: Points) -> Size | None:
+def rotation_bound(points: PlannerInputs) -> ErrorBound | None:
     """All or nothing: velocities of turning surfaces are in the scene, and not left out."""
-    return Size(chance=1.0) if points.rotating else None
+    return ErrorBound(probability_change=1.0) if points.has_rotating_body else None
 
 
 ROTATION = Effect(
-    name="rotation", about="surfaces of turning bodies", stage="lines", size=rotation_size
+    name="rotation",
+    description="surfaces of turning bodies",
+    stage="lines",
+    error_bound=rotation_bound,
 )

@@ -1,7 +1,7 @@
 """Physical effects to the rest of the model: where each acts, what it changes, what it does.
 
 Its parameters become fields of a spec. The planner asks for its size at the points of each tile;
-:mod:`sweep.model.shot` applies it where some point needs it, and nothing of it is computed
+:mod:`sweep.model.evaluation` applies it where some point needs it, and nothing of it is computed
 elsewhere. All effects are listed in :mod:`sweep.model.effects.catalogue`.
 """
 
@@ -16,9 +16,9 @@ from sweep.model.ground import Ground
 from sweep.model.preparation import Parameters, Shots
 
 if TYPE_CHECKING:
-    from sweep.model.effects.points import Points, Smear
+    from sweep.model.effects.planner_inputs import PhaseErrorBound, PlannerInputs
 
-MODES = ("auto", "on", "off")
+EFFECT_MODES = ("auto", "on", "off")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class Parameter:
     """A field that an effect brings into a spec: a number with a unit, or one of several words."""
 
     path: str
-    about: str
+    description: str
     default: float | int | str = 0.0
     """In SI; 0 or ``none`` means that there is nothing of the effect."""
     example: str = ""
@@ -35,11 +35,11 @@ class Parameter:
     si_unit: str | None = None
     """By default that of the least value."""
     options: tuple[str, ...] = ()
-    table: bool = False
-    """True for a table over time, given as text (:mod:`sweep.model.effects.sweep_table`)."""
-    alone: bool = True
+    is_table: bool = False
+    """True for a table over time, given as text (:mod:`sweep.model.effects.sweep_error_table`)."""
+    is_sole_cause: bool = True
     """Tell whether nothing else can bring the effect."""
-    category: bool = False
+    is_category_key: bool = False
     """True where points are computed together only if they share it; words always are."""
 
     @property
@@ -48,71 +48,71 @@ class Parameter:
         return self.limits[0].partition(" ")[2] if self.si_unit is None else self.si_unit
 
     @property
-    def brings(self) -> bool:
+    def enables_effect(self) -> bool:
         """True if other values than the default bring the effect; else it says how it acts."""
-        return self.alone and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
+        return self.is_sole_cause and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
 
 
-class Scene(NamedTuple):
+class EffectContext(NamedTuple):
     """Parameters and ground that an effect may use besides the shots."""
 
     parameters: Mapping[str, np.ndarray]
     """By dotted path, (n,) or scalar."""
     ground: Ground
-    where: Mapping[str, np.ndarray] = MappingProxyType({})
+    presence: Mapping[str, np.ndarray] = MappingProxyType({})
     """Of effects that not all points have: 1.0 for those that do, else 0.0; (n,)."""
 
-    def share(self, effect: str) -> np.ndarray | float:
+    def presence_factor(self, effect: str) -> np.ndarray | float:
         """1 for points that have an effect, 0 for others: (n,), or one number for all."""
-        return self.where.get(effect, 1.0)
+        return self.presence.get(effect, 1.0)
 
-    def beamlets(
-        self, effect: str, row: np.ndarray, having: np.ndarray, lacking: np.ndarray
+    def select_beamlets(
+        self, effect: str, row: np.ndarray, with_effect: np.ndarray, without_effect: np.ndarray
     ) -> np.ndarray:
         """Numbers of beamlets, (rows, beamlets), by whether the rows' points have an effect."""
-        if effect not in self.where:
-            return having
-        rows = np.ones((len(having), 1), np.bool_)
-        rows[row, 0] = self.where[effect] > 0
-        return np.where(rows, having, lacking)
+        if effect not in self.presence:
+            return with_effect
+        has_effect = np.ones((len(with_effect), 1), np.bool_)
+        has_effect[row, 0] = self.presence[effect] > 0
+        return np.where(has_effect, with_effect, without_effect)
 
 
-class Realisation(NamedTuple):
+class DrawAddresses(NamedTuple):
     """Random draws of some points: point i has those of its own key."""
 
-    keys: np.ndarray
+    point_keys: np.ndarray
     """(n, 2) uint64: random key of each point."""
-    draw: np.ndarray
+    draw_numbers: np.ndarray
     """(n,) int64: number of each point's draw."""
 
 
-Sized = np.ndarray | float
+ArrayOrFloat = np.ndarray | float
 
 
-class Size(NamedTuple):
+class ErrorBound(NamedTuple):
     """Changes by leaving an effect out at each point, by segment or alike in all."""
 
-    magnitude: Sized = 0.0
+    magnitude_change: ArrayOrFloat = 0.0
     """Relative change of the largest bin's magnitude; from 1 on nothing is known of it."""
-    added: Sized = 0.0
+    coherent_sum_change: ArrayOrFloat = 0.0
     """Besides, what is added to that magnitude or taken from it, as a share of what all amplitudes
     make in phase: sums that may cancel have no relative change."""
-    noise: Sized = 0.0
+    noise_variance_change: ArrayOrFloat = 0.0
     """Relative change of a bin's noise variance."""
-    threshold_follows: bool = True
+    threshold_follows_noise: bool = True
     """True where the threshold is set on the changed noise, as for noise that is always there; else
     it stays where it was, as for noise that comes with the signal."""
-    shift: Sized = 0.0
+    shift_bins: ArrayOrFloat = 0.0
     """Bins by which what is measured moves; they count as a change of a probability does."""
-    alarms: Sized = 0.0
+    log10_pfa_change: ArrayOrFloat = 0.0
     """Change of log10 of a shot's probability of a false alarm, by bins that cross the level."""
-    beside: Sized = 0.0
+    leaking_bin_change_sigma: ArrayOrFloat = 0.0
     """Sigmas by which bins that leak move, besides what the largest moves by."""
-    chance: Sized = 0.0
+    probability_change: ArrayOrFloat = 0.0
     """Change of a probability itself, summed over the segments where there is one of each."""
-    left: Sized = 0.0
+    residual_magnitude_change: ArrayOrFloat = 0.0
     """Relative change of the largest bin's magnitude that remains where the effect is simulated."""
-    left_of_all: Sized = 0.0
+    residual_coherent_sum_change: ArrayOrFloat = 0.0
     """The same as a share of what all amplitudes make in phase; the less of both counts."""
 
 
@@ -121,45 +121,50 @@ class Effect:
     """A physical effect, the same as no other."""
 
     name: str
-    about: str
+    description: str
     """Description in a few words, for tables and help."""
     stage: str
     """Stage at which it acts, in this order: on the ``lines`` of a footprint; on the ``light`` that
     comes back; on the ``noise``; on the ``record`` and its phases; on the ``spectrum``; on the
     ``detection``; and, in ``draws``, on all of these at random."""
-    size: "Callable[[Points], Size | None]"
+    error_bound: "Callable[[PlannerInputs], ErrorBound | None]"
     """Change at each point by leaving it out. None: the scene has nothing of it."""
-    smear: "Callable[[Points], Smear | None] | None" = None
+    phase_error_bound: "Callable[[PlannerInputs], PhaseErrorBound | None] | None" = None
     """Change of lines over the record; all smears are known before any size is asked for."""
-    act: Callable[[Shots, Scene], Shots] | None = None
+    apply: Callable[[Shots, EffectContext], Shots] | None = None
     """Change of shots, once."""
-    turn: Callable[[dict[str, np.ndarray], Realisation], dict[str, np.ndarray]] | None = None
+    perturb_parameters: (
+        Callable[[dict[str, np.ndarray], DrawAddresses], dict[str, np.ndarray]] | None
+    ) = None
     """Random change of parameters, before any shot is prepared."""
-    draw: Callable[[Shots, Scene, Realisation], Shots] | None = None
+    perturb_shots: Callable[[Shots, EffectContext, DrawAddresses], Shots] | None = None
     """Random change of shots, after all else but spectrum and detection."""
     parameters: tuple[Parameter, ...] = ()
-    within: str = ""
+    parent: str = ""
     """An effect that this is part of: kept wherever this is; where it is off, so is this."""
-    apart: bool = True
-    """True where points that have it are computed apart from those that don't. If not, `act` looks
-    at :attr:`Scene.where`, and leaves the bits of other points as they would be without it."""
-    needs: tuple[str, ...] = ()
+    needs_own_batch: bool = True
+    """True if points that have it are computed apart from those that don't. If not, `apply` looks
+    at :attr:`EffectContext.presence`, and leaves the bits of other points as they would be without
+    it."""
+    required_effects: tuple[str, ...] = ()
     """Effects that this one is simulated with, however little they change by themselves."""
 
     @property
     def is_random(self) -> bool:
         """True if it is simulated by draws."""
-        return self.turn is not None or self.draw is not None
+        return self.perturb_parameters is not None or self.perturb_shots is not None
 
-    def absent(self, parameters: Parameters) -> np.ndarray:
+    def is_absent(self, parameters: Parameters) -> np.ndarray:
         """Return true for points without it, by the parameters that bring it; (n,) or scalar."""
-        brought = [parameter for parameter in self.parameters if parameter.brings]
-        absent = np.asarray(bool(brought))
-        for parameter in brought:
-            absent = absent & np.equal(parameters[parameter.path], parameter.default)
-        return absent
+        enabling_parameters = [
+            parameter for parameter in self.parameters if parameter.enables_effect
+        ]
+        is_absent = np.asarray(bool(enabling_parameters))
+        for parameter in enabling_parameters:
+            is_absent = is_absent & np.equal(parameters[parameter.path], parameter.default)
+        return is_absent
 
 
-def noisier(shots: Shots, **variances: np.ndarray) -> Shots:
+def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
     """Shots with further sources of noise: variances at the ADC [V^2] by source."""
-    return replace(shots, noise_sources=shots.noise_sources | variances)
+    return replace(shots, noise_variances=shots.noise_variances | variances)

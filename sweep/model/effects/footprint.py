@@ -8,68 +8,73 @@ from dataclasses import replace
 
 import numpy as np
 
+from sweep.model.beamlets import BEAMLET_PATTERNS, NO_SPREAD
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import sidelobes
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.points import Points, by_power
-from sweep.model.footprint import NO_SPREAD, PATTERNS
-from sweep.model.preparation import CHIRP, Shots, relative_amplitude
+from sweep.model.effects import image_and_leakage
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
+from sweep.model.preparation import CHIRP_PREFIX, Shots, relative_amplitude
 
 
-def size(points: Points) -> Size | None:
+def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by the ranges of the footprint, and by how much more it echoes.
 
     Of powers, without velocities, other surfaces or phases: these are within it. In direct
     detection the echoes' beats always add as amplitudes, with the phases that the ranges give to
     the radio frequency.
     """
-    if points.number == 1:
+    if points.n_beamlets == 1:
         return None
-    power = points.moved(points.own_spread, NO_SPREAD)
-    echo = 2 * np.abs(points.footprint.echo_ratio - 1)
+    power_change = points.power_change_bound(points.axis_surface_spread, NO_SPREAD)
+    echo_change = 2 * np.abs(points.footprint_extent.total_echo_ratio - 1)
     if points.architecture != "direct":
-        return Size(magnitude=by_power(power + echo))
-    away = points.range * points.footprint.own_ranges.extreme
-    highest = points.carriers + 2 * points[CHIRP + "bandwidth"]
-    phase = np.minimum(4 * np.pi / SPEED_OF_LIGHT * highest * away, 2.0)
-    beside = np.where(points.near_image, 2 * phase, 0.5 * phase**2)
-    return Size(magnitude=by_power(power + echo) + beside + echo)
+        return ErrorBound(magnitude_change=magnitude_change_from_power(power_change + echo_change))
+    range_deviation = points.range * points.footprint_extent.axis_surface_range_offsets.extreme
+    highest_frequency = points.carriers + 2 * points[CHIRP_PREFIX + "bandwidth"]
+    phase_change = np.minimum(4 * np.pi / SPEED_OF_LIGHT * highest_frequency * range_deviation, 2.0)
+    coherent_change = np.where(points.is_near_image, 2 * phase_change, 0.5 * phase_change**2)
+    return ErrorBound(
+        magnitude_change=magnitude_change_from_power(power_change + echo_change)
+        + coherent_change
+        + echo_change
+    )
 
 
-def spread_out(shots: Shots, scene: Scene) -> Shots:
+def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
     """Beamlets at their own ranges, those on other surfaces at the axis's, all of its velocity."""
-    row, offset, _, echo = scene.ground.beamlets
-    if scene.ground.beside is not None:
-        offset = np.where(scene.ground.beside, 0.0, offset)
+    row, range_offset, _, echo = context.ground.beamlets
+    if context.ground.off_axis_surface is not None:
+        range_offset = np.where(context.ground.off_axis_surface, 0.0, range_offset)
     return replace(
         shots,
-        row=row,
-        offset=offset,
-        doppler=np.zeros_like(offset),
-        amplitude=relative_amplitude(shots.architecture, echo),
+        footprint_row=row,
+        relative_range_offset=range_offset,
+        doppler_ratio_offset=np.zeros_like(range_offset),
+        relative_amplitude=relative_amplitude(shots.architecture, echo),
     )
 
 
 FOOTPRINT = Effect(
     name="footprint",
-    about="beamlets at ranges of their own",
+    description="beamlets at ranges of their own",
     stage="lines",
-    size=size,
-    act=spread_out,
+    error_bound=footprint_bound,
+    apply=apply_footprint,
     parameters=(
         Parameter(
             path="footprint.pattern",
-            about="Arrangement of the beamlets; auto: as many as the tolerance needs lie in a line "
+            description="Arrangement of the beamlets; auto: as many as the tolerance needs lie in "
+            "a line "
             "along the slope, a given number in a hexagonal lattice where their powers add, else "
             "in a sunflower",
             default="auto",
-            options=("auto", *PATTERNS),
+            options=("auto", *BEAMLET_PATTERNS),
         ),
     ),
 )
 
 
-def phase_size(points: Points) -> Size | None:
+def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by optical phases: it may fade, or gain as a sum in phase does.
 
     The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. If that is not small
@@ -78,31 +83,31 @@ def phase_size(points: Points) -> Size | None:
     which is no less of a change. So the effect is kept wherever there are several beamlets. One
     beamlet's line adds to its own image.
     """
-    if not points.by_roots:
+    if not points.adds_field_amplitudes:
         return None
-    if points.number == 1:
-        return sidelobes.image_size(points)
-    return Size(magnitude=points.footprint.gain)
+    if points.n_beamlets == 1:
+        return image_and_leakage.image_bound(points)
+    return ErrorBound(magnitude_change=points.footprint_extent.amplitude_gain_max)
 
 
-def add_amplitudes(shots: Shots, scene: Scene) -> Shots:
+def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
     """Beamlets that add as amplitudes, where the spec says that their phases follow the surface."""
-    if str(scene.parameters["footprint.phases"]) != "coherent":
+    if str(context.parameters["footprint.phases"]) != "coherent":
         return shots
-    return replace(shots, incoherent=False)
+    return replace(shots, adds_powers=False)
 
 
 FOOTPRINT_PHASE = Effect(
     name="footprint_phase",
-    about="optical phases of a smooth surface",
+    description="optical phases of a smooth surface",
     stage="lines",
-    size=phase_size,
-    act=add_amplitudes,
-    within="footprint",
+    error_bound=footprint_phase_bound,
+    apply=apply_footprint_phase,
+    parent="footprint",
 )
 
 
-def surfaces_size(points: Points) -> Size | None:
+def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by the ranges of other surfaces than the axis's.
 
     As powers, with a share f off the axis's surface, whose own lines put a in their largest bin.
@@ -110,37 +115,59 @@ def surfaces_size(points: Points) -> Size | None:
     largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that add
     nothing is known but that no bin holds more than all in phase.
     """
-    share = np.minimum(points.footprint.beside, 1.0)
-    if not (share > 0).any():
+    off_axis_fraction = np.minimum(points.footprint_extent.off_axis_fraction, 1.0)
+    if not (off_axis_fraction > 0).any():
         return None
     if points.adds_amplitudes:
-        return Size(magnitude=np.where(share > 0, points.footprint.gain + 1.0, 0.0))
-    apart = points.footprint.apart * points.per_range
-    least = points.power_range(points.own_spread)[0]
-    elsewhere = np.minimum(np.exp(np.minimum(points.tilt * apart, 50.0)), 1 / points.transfer**2)
-    more = share * np.maximum(elsewhere, 1.0) * np.where(points.near_image, 2.0, 1.01)
-    kept = np.maximum((1 - share) * least, 1e-9)
-    return Size(magnitude=np.where(apart > 0, np.minimum(more / kept, 1e3), 0.0))
+        return ErrorBound(
+            magnitude_change=np.where(
+                off_axis_fraction > 0, points.footprint_extent.amplitude_gain_max + 1.0, 0.0
+            )
+        )
+    line_distance_bins = (
+        points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
+    )
+    power_min = points.peak_power_bounds_for(points.axis_surface_spread)[0]
+    gain_ratio_max = np.minimum(
+        np.exp(np.minimum(points.gain_slope_max * line_distance_bins, 50.0)),
+        1 / points.transfer_gain**2,
+    )
+    added_power = (
+        off_axis_fraction
+        * np.maximum(gain_ratio_max, 1.0)
+        * np.where(points.is_near_image, 2.0, 1.01)
+    )
+    kept_power = np.maximum((1 - off_axis_fraction) * power_min, 1e-9)
+    return ErrorBound(
+        magnitude_change=np.where(
+            line_distance_bins > 0, np.minimum(added_power / kept_power, 1e3), 0.0
+        )
+    )
 
 
-def part_surfaces(shots: Shots, scene: Scene) -> Shots:
+def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
     """Beamlets on other surfaces than the axis's at ranges of their own, where there are any.
 
     Without the effect they send their power back from the axis's own range.
     """
-    offset = scene.ground.beamlets.offset
-    if scene.ground.beside is None or shots.offset.shape != offset.shape:
+    range_offset = context.ground.beamlets.relative_range_offset
+    if (
+        context.ground.off_axis_surface is None
+        or shots.relative_range_offset.shape != range_offset.shape
+    ):
         return shots
-    offset = scene.beamlets("several_returns", shots.row, offset, shots.offset)
-    return replace(shots, offset=offset)
+    range_offset = context.select_beamlets(
+        "several_returns", shots.footprint_row, range_offset, shots.relative_range_offset
+    )
+    return replace(shots, relative_range_offset=range_offset)
 
 
 SEVERAL_RETURNS = Effect(
     name="several_returns",
-    about="more than one surface in a footprint",
+    description="more than one surface in a footprint",
     stage="lines",
-    size=surfaces_size,
-    act=part_surfaces,
-    within="footprint",
-    apart=False,
+    error_bound=several_returns_bound,
+    apply=apply_several_returns,
+    parent="footprint",
+    needs_own_batch=False,
 )

@@ -13,11 +13,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.points import Points
-from sweep.model.preparation import RECEIVER, Shots
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import RECEIVER_PREFIX, Shots
 
-GAIN, PHASE = RECEIVER + "iq_gain_imbalance", RECEIVER + "iq_phase_imbalance"
+GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
+    RECEIVER_PREFIX + "iq_gain_imbalance",
+    RECEIVER_PREFIX + "iq_phase_imbalance",
+)
 
 
 def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
@@ -29,41 +32,49 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
     >>> round(float(20 * np.log10(leak)), 1)
     -28.2
     """
-    turned = np.sqrt(np.asarray(gain, float)) * np.exp(1j * np.asarray(phase, float))
-    return np.asarray(np.abs(1 - turned) / np.abs(1 + turned))
+    quadrature_phasor = np.sqrt(np.asarray(gain, float)) * np.exp(1j * np.asarray(phase, float))
+    return np.asarray(np.abs(1 - quadrature_phasor) / np.abs(1 + quadrature_phasor))
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Anything, where there is an image: it may be a peak of its own."""
-    leak = image_gain(gain=points[GAIN], phase=points[PHASE])
-    return Size(magnitude=np.where(leak > 0, 1.0, 0.0)) if np.any(leak > 0) else None
+    image_amplitude = image_gain(
+        gain=points[GAIN_IMBALANCE_PATH], phase=points[PHASE_IMBALANCE_PATH]
+    )
+    return (
+        ErrorBound(magnitude_change=np.where(image_amplitude > 0, 1.0, 0.0))
+        if np.any(image_amplitude > 0)
+        else None
+    )
 
 
-def act(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Images of the lines, where the record is complex."""
     if not shots.complex_record:
         return shots
-    leak = image_gain(gain=scene.parameters[GAIN], phase=scene.parameters[PHASE])
-    return replace(shots, image_gain=leak)
+    image_amplitude = image_gain(
+        gain=context.parameters[GAIN_IMBALANCE_PATH], phase=context.parameters[PHASE_IMBALANCE_PATH]
+    )
+    return replace(shots, image_gain=image_amplitude)
 
 
 IQ_IMBALANCE = Effect(
     name="iq_imbalance",
-    about="unequal I and Q: images at negative frequencies in a complex record",
+    description="unequal I and Q: images at negative frequencies in a complex record",
     stage="record",
-    size=size,
-    act=act,
+    error_bound=error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=GAIN,
-            about="Gain of Q over that of I, of a record that is complex",
+            path=GAIN_IMBALANCE_PATH,
+            description="Gain of Q over that of I, of a record that is complex",
             default=1.0,
             example="0.5 dB",
             limits=("-60 dB", "60 dB"),
         ),
         Parameter(
-            path=PHASE,
-            about="Departure from 90 deg between I and Q, of a record that is complex",
+            path=PHASE_IMBALANCE_PATH,
+            description="Departure from 90 deg between I and Q, of a record that is complex",
             example="3 deg",
             limits=("-90 deg", "90 deg"),
             si_unit="rad",

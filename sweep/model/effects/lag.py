@@ -11,59 +11,63 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import beam
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.points import Points, by_power
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
 from sweep.model.preparation import Shots
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Loss of the echo, and of its shot noise."""
-    paths = beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT
-    if not (beam.is_single_mode(points.parameters) and points.has(*paths)):
+    paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
+    if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
         return None
-    lost = 1 - beam.offset_loss(points.parameters, points.range)
-    light = points.echo_noise
-    return Size(
-        magnitude=by_power(lost), noise=-lost * light / (1 + light), threshold_follows=False
+    lost_fraction = 1 - beam.axis_offset_transmission(points.parameters, points.range)
+    echo_noise_ratio = points.echo_noise_ratio
+    return ErrorBound(
+        magnitude_change=magnitude_change_from_power(lost_fraction),
+        noise_variance_change=-lost_fraction * echo_noise_ratio / (1 + echo_noise_ratio),
+        threshold_follows_noise=False,
     )
 
 
-def part(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Echoes that the local oscillator misses in part."""
-    if not beam.is_single_mode(scene.parameters):
+    if not beam.is_single_mode(context.parameters):
         return shots
-    left = beam.offset_loss(scene.parameters, shots.range)
+    kept_fraction = beam.axis_offset_transmission(context.parameters, shots.range)
     return replace(
         shots,
-        echo_scale=shots.echo_scale * left,
-        beat_scale=shots.beat_scale * np.sqrt(left),
+        echo_power_scale=shots.echo_power_scale * kept_fraction,
+        beat_amplitude_scale=shots.beat_amplitude_scale * np.sqrt(kept_fraction),
     )
 
 
 LAG = Effect(
     name="lag",
-    about="a receiver that looks beside the sent beam: lag of a scan, parallax, misalignment",
+    description="a receiver that looks beside the sent beam: lag of a scan, parallax, misalignment",
     stage="light",
-    size=size,
-    act=part,
+    error_bound=error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=beam.SCAN_RATE,
-            about="Rate at which a scan turns the beams, in flights besides scanner and platform; "
+            path=beam.SCAN_RATE_PATH,
+            description="Rate at which a scan turns the beams, in flights besides scanner and "
+            "platform; "
             "single_mode only, as the two that follow, which add to its lag where signs agree",
             example="100 deg/s",
             limits=("-1e6 rad/s", "1e6 rad/s"),
         ),
         Parameter(
-            path=beam.SEPARATION,
-            about="Distance of the received beam's axis from the sent one's at the instrument",
+            path=beam.SEPARATION_PATH,
+            description="Distance of the received beam's axis from the sent one's at the "
+            "instrument",
             example="40 mm",
             limits=("-1 km", "1 km"),
             si_unit="m",
         ),
         Parameter(
-            path=beam.MISALIGNMENT,
-            about="Angle of the received beam's axis off the sent one's",
+            path=beam.MISALIGNMENT_PATH,
+            description="Angle of the received beam's axis off the sent one's",
             example="5 urad",
             limits=("-10 deg", "10 deg"),
             si_unit="rad",

@@ -20,8 +20,9 @@ own length only: there the record's length takes the delay's place in the split.
 
 |X| does not tell a phase that the whole record has, and of what turns with it little at all: of the
 phase, less its mean under the window, the mean of exp(i phi) is the line that |X| sees, and only
-the part of the pedestal in phase with that changes |X| (:func:`seen_line`). Both are drawn as they
-are where whole spectra are (:func:`walked_phase`). An echo that arrives within the record has the
+the part of the pedestal in phase with that changes |X| (:func:`apparent_line_and_pedestal`). Both
+are drawn as they
+are where whole spectra are (:func:`phase_walk`). An echo that arrives within the record has the
 line and the pedestal of the samples that it has, told to a 32nd of the record.
 """
 
@@ -33,88 +34,95 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.phase_errors import added, means
-from sweep.model.effects.points import Points, Smear, by_power
-from sweep.model.preparation import LASER, Shots, energy_left
-from sweep.model.unsupported import UnsupportedShot
-from sweep.model.window import Window, last_part, samples
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.phase_errors import coherent_phase_change, window_moments
+from sweep.model.effects.planner_inputs import (
+    PhaseErrorBound,
+    PlannerInputs,
+    magnitude_change_from_power,
+)
+from sweep.model.preparation import LASER_PREFIX, Shots, window_energy_from_sample
+from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.window import Window, window_samples, zero_first_samples
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-DEVIATION_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
+DEVIATION_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 """Standard deviation of a Gaussian over its full width at half maximum."""
 
-TOLERANCE = 1e-12
+MEAN_POWER_TOLERANCE = 1e-12
 """Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
 
-MOST_BINS = 500
+LINE_DEVIATION_MAX_WINDOW_BINS = 500
 """Standard deviation of a Gaussian line [bins of fs/L] that shifts stand for."""
 
 
 _gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
-_GONE = 40.0
+_DECAY_EXPONENT_MAX = 40.0
 """Gamma T from where exp(-Gamma T) is nothing."""
 
-_FEW_LAGS = 0.1
+_DECAY_PER_SAMPLE_MIN = 0.1
 """Gamma over the sample rate from where lags are taken one by one: 400 of them, then none."""
 
-_SIGMAS = 6.0
+_LINE_REACH_DEVIATIONS = 6.0
 """Standard deviations of a Gaussian line beyond which there is no light to speak of."""
 
-_PLACES = 256
+_N_PHASE_NODES = 256
 """Places of the record at which the mean phase is taken off."""
 
-_LEAST = 1e-100
+_TINY = 1e-100
 """Share of a line's power that is none, and by which it can be divided."""
 
-_MOST_NOISE = 1.7932821329
+_DENSEST_PEDESTAL_EXPONENT = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
 
 
-class Shifts(NamedTuple):
+class FrequencyShifts(NamedTuple):
     """Frequencies over which |X|^2 is averaged."""
 
-    offset: np.ndarray
+    offset_window_bins: np.ndarray
     """(n, k): shifts of all lines [bins of fs/L]."""
     weight: np.ndarray
     """(n, k): weights of the powers, >= 0, sum 1."""
 
 
-def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
+def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> FrequencyShifts:
     """Shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
 
     The FWHM is that of the beat's line [Hz], the duration that of the record [s], (n,) each. One
     shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
     deviation; weights of 0 fill rows with fewer than k. With step h the error is exp(-2 pi^2 s^2
     (1/h - 1)^2) at the record's longest lag, by Poisson's summation formula; the Gaussian's tails
-    are cut where they hold as much. An UnsupportedShot for more than :data:`MOST_BINS` bins of
-    standard deviation.
+    are cut where they hold as much. An UnsupportedShot for more than
+    :data:`LINE_DEVIATION_MAX_WINDOW_BINS` bins of standard deviation.
     """
-    deviation = np.atleast_1d(DEVIATION_OF_FWHM * np.asarray(fwhm, float) * duration)
-    if deviation.max(initial=0.0) > MOST_BINS:
-        raise UnsupportedShot(
+    deviation = np.atleast_1d(DEVIATION_PER_FWHM * np.asarray(fwhm, float) * duration)
+    if deviation.max(initial=0.0) > LINE_DEVIATION_MAX_WINDOW_BINS:
+        raise UnsupportedShotError(
             f"instrument.laser.line_width makes a line of {deviation.max():.3g} bins standard "
-            f"deviation, and {MOST_BINS} can be simulated: lower it, or shorten the record by "
+            f"deviation, and {LINE_DEVIATION_MAX_WINDOW_BINS} can be simulated: lower it, or "
+            "shorten the record by "
             "instrument.processing.fft_size"
         )
-    room = math.sqrt(math.log(2 / TOLERANCE) / 2) / math.pi
-    per_deviation = deviation + room  # s / h
-    reach = math.sqrt(2 * math.log(1 / TOLERANCE))
-    most = int(np.ceil(reach * per_deviation.max(initial=0.0)))
-    place = np.arange(-most, most + 1) / per_deviation[:, None]
+    step_margin = math.sqrt(math.log(2 / MEAN_POWER_TOLERANCE) / 2) / math.pi
+    steps_per_deviation = deviation + step_margin  # s / h
+    reach_deviations = math.sqrt(2 * math.log(1 / MEAN_POWER_TOLERANCE))
+    n_steps = int(np.ceil(reach_deviations * steps_per_deviation.max(initial=0.0)))
+    position = np.arange(-n_steps, n_steps + 1) / steps_per_deviation[:, None]
     weight = np.where(
-        np.abs(place) <= reach + 1 / per_deviation[:, None], np.exp(-(place**2) / 2), 0.0
+        np.abs(position) <= reach_deviations + 1 / steps_per_deviation[:, None],
+        np.exp(-(position**2) / 2),
+        0.0,
     )
-    weight[deviation == 0] = np.arange(-most, most + 1) == 0
+    weight[deviation == 0] = np.arange(-n_steps, n_steps + 1) == 0
     # One after the other, so that zeros beside them, and thus other rows, change no bit.
     weight /= np.cumsum(weight, axis=1)[:, -1:]
-    return Shifts(deviation[:, None] * place, weight)
+    return FrequencyShifts(deviation[:, None] * position, weight)
 
 
-def coherent_share(
+def coherent_power_fraction(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
 ) -> np.ndarray:
     """Share of the beat's power in the pure line, exp(-2 pi dnu tau), (n,), 0..1.
@@ -125,27 +133,27 @@ def coherent_share(
     return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
 
 
-def density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
+def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
     """Power density of the pedestal under a line of power 1, 2 (1 - e^-g (1 + g)) / Gamma [1/Hz].
 
     dnu [Hz], > 0, and tau [s]; g = Gamma tau.
     """
     gamma = 2 * np.pi * np.asarray(line_width, float)
     g = gamma * delay
-    grown = -np.expm1(-g) - g * np.exp(-g)
+    bracket = -np.expm1(-g) - g * np.exp(-g)
     # the bracket would cancel for small g
-    grown = np.where(g < 0.02, g * g * (1 / 2 - g * (1 / 3 - g * (1 / 8 - g / 30))), grown)
-    return np.where(gamma > 0, 2 * gamma * grown / np.where(gamma > 0, gamma**2, 1.0), 0.0)
+    bracket = np.where(g < 0.02, g * g * (1 / 2 - g * (1 / 3 - g * (1 / 8 - g / 30))), bracket)
+    return np.where(gamma > 0, 2 * gamma * bracket / np.where(gamma > 0, gamma**2, 1.0), 0.0)
 
 
-def power_under_line(
+def pedestal_power_under_line(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
     """Mean |X|^2 that the pedestal leaves in its line's bin, over |C|^2 of the line, (n,), >= 0.
 
     A line of weight C (|C| = a/2) has mean bin power |C|^2 times (coherent share x |W(0)|^2 +
     this). It adds as noise does: circular, and new in every record. Arguments as of
-    :func:`coherent_share`.
+    :func:`coherent_power_fraction`.
 
     sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], r the window's autocorrelation, is taken as it
     stands where few lags are left of it. Else it is the integral over the lag, by Gauss and
@@ -156,46 +164,55 @@ def power_under_line(
     gamma = 2 * np.pi * np.asarray(line_width, float) * duration
     lag = np.minimum(np.asarray(delay, float) / duration, 1.0)
     gamma, lag = np.broadcast_arrays(np.atleast_1d(gamma), np.atleast_1d(lag))
-    power, few = np.empty(gamma.shape), gamma > _FEW_LAGS * window.length
-    for rows, taken in ((few, _by_lags), (~few, _by_integral)):
+    power, has_few_lags = np.empty(gamma.shape), gamma > _DECAY_PER_SAMPLE_MIN * window.length
+    for rows, method in (
+        (has_few_lags, _pedestal_power_by_lags),
+        (~has_few_lags, _pedestal_power_by_integral),
+    ):
         if rows.any():
-            power[rows] = taken(gamma[rows], lag[rows], window)
+            power[rows] = method(gamma[rows], lag[rows], window)
     return power
 
 
-def _by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
+def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
     """Sum over the lags directly, up to where the terms have decayed."""
-    j = np.arange(min(int(_GONE / _FEW_LAGS), window.length))
-    gone = (gamma / window.length)[:, None] * j
-    left = np.maximum((gamma * lag)[:, None] - gone, 0.0)
-    value = np.exp(-gone) * -np.expm1(-left) * autocorrelation(window)(j)
-    value[:, 1:] *= 2
-    return np.asarray(value.sum(axis=-1))
+    j = np.arange(min(int(_DECAY_EXPONENT_MAX / _DECAY_PER_SAMPLE_MIN), window.length))
+    decay = (gamma / window.length)[:, None] * j
+    decay_left = np.maximum((gamma * lag)[:, None] - decay, 0.0)
+    terms = np.exp(-decay) * -np.expm1(-decay_left) * window_autocorrelation(window)(j)
+    terms[:, 1:] *= 2
+    return np.asarray(terms.sum(axis=-1))
 
 
-def _by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
+def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
     """Integrate over the lag, and correct for what the integrand's kinks alias to.
 
     The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with
     B_2(x) = x^2 - x + 1/6.
     """
     length = window.length
-    reach = np.minimum(lag, _GONE / np.maximum(gamma, 1e-300))
-    x, weight = _gauss_legendre(128)
-    time = reach[:, None] * (x + 1) / 2
-    value = np.exp(-gamma[:, None] * time) * -np.expm1(-gamma[:, None] * (lag[:, None] - time))
-    r = autocorrelation(window)
-    value *= r(time * length) * length * reach[:, None] * weight
+    lag_max = np.minimum(lag, _DECAY_EXPONENT_MAX / np.maximum(gamma, 1e-300))
+    node, weight = _gauss_legendre(128)
+    lag_at_nodes = lag_max[:, None] * (node + 1) / 2
+    integrand = np.exp(-gamma[:, None] * lag_at_nodes) * -np.expm1(
+        -gamma[:, None] * (lag[:, None] - lag_at_nodes)
+    )
+    correlation = window_autocorrelation(window)
+    integrand *= correlation(lag_at_nodes * length) * length * lag_max[:, None] * weight
     # Jumps of the slope: r'(0) is the window's edge, the rest the bracket's.
-    per_sample, left = gamma / length, np.exp(-gamma * lag)
-    at_none = 2 * (r(0.0, 1) * (1 - left) - per_sample * r(0.0))
-    at_delay = per_sample * left * r(lag * length)
-    past = lag * length - np.floor(lag * length)
-    power = value.sum(axis=1) - at_none * (1 / 6 / 2)
-    return np.asarray(power - 2 * at_delay * ((past * past - past + 1 / 6) / 2))
+    decay_per_sample, decay_at_delay = gamma / length, np.exp(-gamma * lag)
+    kink_at_zero = 2 * (
+        correlation(0.0, 1) * (1 - decay_at_delay) - decay_per_sample * correlation(0.0)
+    )
+    kink_at_delay = decay_per_sample * decay_at_delay * correlation(lag * length)
+    fractional_lag = lag * length - np.floor(lag * length)
+    power = integrand.sum(axis=1) - kink_at_zero * (1 / 6 / 2)
+    return np.asarray(
+        power - 2 * kink_at_delay * ((fractional_lag * fractional_lag - fractional_lag + 1 / 6) / 2)
+    )
 
 
-def seen_line(
+def apparent_line_and_pedestal(
     *,
     line_width: np.ndarray,
     delay: np.ndarray,
@@ -206,8 +223,8 @@ def seen_line(
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
 
     Returns two values, (n,) each. The first is the share of the power |C W(0)|^2 in the line, more
-    than :func:`coherent_share`. The second is the mean square of what is in phase with it, over
-    |C|^2 of the line. As noise, half of this is the pedestal's share. If looks are added in
+    than :func:`coherent_power_fraction`. The second is the mean square of what is in phase with it,
+    over |C|^2 of the line. As noise, half of this is the pedestal's share. If looks are added in
     amplitude the phase of a record counts too: each has its own.
 
     C(t, s) is the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
@@ -215,110 +232,139 @@ def seen_line(
     c(t - s) - q(t) - q(s), with the triangle c of Gamma (tau - |t|). So each exponential is one of
     a lag times one of t and one of s: autocorrelations of w and of w exp(2 q), on 256 places.
     """
-    power = power_under_line(line_width=line_width, delay=delay, duration=duration, window=window)
+    power = pedestal_power_under_line(
+        line_width=line_width, delay=delay, duration=duration, window=window
+    )
     gamma = np.broadcast_to(2 * np.pi * np.asarray(line_width) * duration, power.shape)
     lag = np.broadcast_to(np.minimum(np.asarray(delay) / duration, 1.0), power.shape)
-    w, twice = _places(window)
-    x, variance, less = np.arange(w.size) / w.size, gamma * lag, np.exp(-gamma * lag)
+    w, double_integral = _window_at_nodes(window)
+    position, phase_variance, coherent_fraction = (
+        np.arange(w.size) / w.size,
+        gamma * lag,
+        np.exp(-gamma * lag),
+    )
 
-    def integral(t: np.ndarray) -> np.ndarray:
-        return np.where(t > 1, twice(1.0) + (t - 1) * twice(1.0, 1), twice(np.clip(t, 0, 1)))
+    def double_integral_at(t: np.ndarray) -> np.ndarray:
+        return np.where(
+            t > 1,
+            double_integral(1.0) + (t - 1) * double_integral(1.0, 1),
+            double_integral(np.clip(t, 0, 1)),
+        )
 
-    apart, at = lag[:, None], integral(x)
-    mean = gamma[:, None] * (integral(x + apart) - 2 * at + integral(x - apart))
-    mean -= 0.5 * (w * mean).sum(axis=1)[:, None]
+    lag_column, integral_at_position = lag[:, None], double_integral_at(position)
+    mean_exponent = gamma[:, None] * (
+        double_integral_at(position + lag_column)
+        - 2 * integral_at_position
+        + double_integral_at(position - lag_column)
+    )
+    mean_exponent -= 0.5 * (w * mean_exponent).sum(axis=1)[:, None]
     # a line that is gone needs no care
-    mean = np.where((variance[:, None] < _GONE) & (looks == 1), mean, 0.0)
-    once, double = np.exp(mean), w * np.exp(2 * mean)
-    sums = (w * once).sum(axis=1), double.sum(axis=1)
+    mean_exponent = np.where(
+        (phase_variance[:, None] < _DECAY_EXPONENT_MAX) & (looks == 1), mean_exponent, 0.0
+    )
+    single_factor, double_factor = np.exp(mean_exponent), w * np.exp(2 * mean_exponent)
+    sums = (w * single_factor).sum(axis=1), double_factor.sum(axis=1)
     nodes, weight = _gauss_legendre(128)
-    time = 0.5 * (nodes + 1) * lag[:, None]
+    lag_at_nodes = 0.5 * (nodes + 1) * lag[:, None]
     # A transform at a time: bits do not depend on how many there are.
-    spectra = [np.abs(np.fft.rfft(each, 2 * w.size)) ** 2 for each in double]
-    r = np.array([
-        np.interp(u * w.size, np.arange(w.size + 1), np.fft.irfft(s)[: w.size + 1])
-        for u, s in zip(time, spectra, strict=True)
-    ]).reshape(time.shape)  # fmt: skip
-    lost = -np.expm1(-gamma[:, None] * (lag[:, None] - time)) * r * weight
-    crossed = lost.sum(axis=1) * lag * w.size
-    total = window.sum**2
-    pedestal = 0.5 * (1 + sums[1] ** 2 - crossed) - sums[0] ** 2
-    share = np.maximum(less * sums[0] ** 2, _LEAST)
-    return share, np.maximum(0.5 * power + less * pedestal * total, 0.0)
+    spectra = [np.abs(np.fft.rfft(row, 2 * w.size)) ** 2 for row in double_factor]
+    correlation = np.array(
+        [
+            np.interp(
+                row_lags * w.size, np.arange(w.size + 1), np.fft.irfft(row_spectrum)[: w.size + 1]
+            )
+            for row_lags, row_spectrum in zip(lag_at_nodes, spectra, strict=True)
+        ]
+    ).reshape(lag_at_nodes.shape)
+    decorrelated = -np.expm1(-gamma[:, None] * (lag[:, None] - lag_at_nodes)) * correlation * weight
+    decorrelated_sum = decorrelated.sum(axis=1) * lag * w.size
+    squared_window_sum = window.sum**2
+    pedestal = 0.5 * (1 + sums[1] ** 2 - decorrelated_sum) - sums[0] ** 2
+    line_fraction = np.maximum(coherent_fraction * sums[0] ** 2, _TINY)
+    return line_fraction, np.maximum(
+        0.5 * power + coherent_fraction * pedestal * squared_window_sum, 0.0
+    )
 
 
 @lru_cache(maxsize=16)
-def _places(window: Window) -> "tuple[np.ndarray, CubicSpline]":
+def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
     """Return the window over the record, of sum 1, and its double integral, of end slope 1."""
     from scipy.interpolate import CubicSpline  # slow to import
 
-    w, x = samples(window.name, _PLACES), np.arange(_PLACES + 1) / _PLACES
-    end = w[0]
-    if window.missing:
-        w = np.where(x[:-1] < window.missing / window.length, 0.0, w)
-    twice = CubicSpline(x, np.append(w, end) / w.mean()).antiderivative(2)
-    return w / w.sum(), twice
+    w, position = (
+        window_samples(window.name, _N_PHASE_NODES),
+        np.arange(_N_PHASE_NODES + 1) / _N_PHASE_NODES,
+    )
+    end_value = w[0]
+    if window.n_missing:
+        w = np.where(position[:-1] < window.n_missing / window.length, 0.0, w)
+    double_integral = CubicSpline(position, np.append(w, end_value) / w.mean()).antiderivative(2)
+    return w / w.sum(), double_integral
 
 
-def walk_steps(*, delay: float, length: int) -> int:
-    """Return the steps that :func:`walked_phase` takes for a delay [samples], an even number.
+def n_phase_walk_steps(*, delay: float, length: int) -> int:
+    """Return the steps that :func:`phase_walk` takes for a delay [samples], an even number.
 
     A delay beyond the record counts as its length: the delayed record then shares none of it.
     """
     return 2 * (length + min(math.floor(delay), length))
 
 
-def walked_phase(
-    steps: np.ndarray, *, per_sample: float, delay: float, whole: bool = False
+def phase_walk(
+    steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
     """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
 
-    `steps` (walk_steps,) are standard normal numbers, `per_sample` the variance of theta's change
-    from sample to sample, Gamma / fs. `delay` is tau [samples]. With `whole` the result has the
+    `steps` (walk_steps,) are standard normal numbers, `variance_per_sample` the variance of theta's
+    change
+    from sample to sample, Gamma / fs. `delay` is tau [samples]. With `from_first_sample` the result
+    has the
     first sample's as well, for a delay shorter than the record. Each step between samples is taken
     in two, before and after the place in it at which delayed samples lie. So delays need not be
     whole.
     """
-    before, after = steps.reshape(2, -1)
-    part = delay - math.floor(delay)
-    before = before * math.sqrt(per_sample * (1 - part))
-    after = after * math.sqrt(per_sample * part)
-    length = max(before.size - math.floor(delay), before.size // 2)
-    now = (before + after)[before.size - length + 1 :]
-    then = before[1:length] + after[: length - 1]
-    phase = np.concatenate([[0.0], np.cumsum(now - then)])
-    if whole:
-        both = (before + after)[1 : math.floor(delay) + 1]
-        phase += after[0] + both.sum()
+    step_before, step_after = steps.reshape(2, -1)
+    fraction = delay - math.floor(delay)
+    step_before = step_before * math.sqrt(variance_per_sample * (1 - fraction))
+    step_after = step_after * math.sqrt(variance_per_sample * fraction)
+    length = max(step_before.size - math.floor(delay), step_before.size // 2)
+    undelayed_step = (step_before + step_after)[step_before.size - length + 1 :]
+    delayed_step = step_before[1:length] + step_after[: length - 1]
+    phase = np.concatenate([[0.0], np.cumsum(undelayed_step - delayed_step)])
+    if from_first_sample:
+        first_steps = (step_before + step_after)[1 : math.floor(delay) + 1]
+        phase += step_after[0] + first_steps.sum()
     return phase
 
 
 @lru_cache(maxsize=16)
-def autocorrelation(window: Window) -> "CubicSpline":
+def window_autocorrelation(window: Window) -> "CubicSpline":
     """Sum_n w_n w_(n+j) as a function of the lag j, 0..L [samples]."""
     from scipy.interpolate import CubicSpline  # slow to import
 
     spectrum = np.abs(np.fft.rfft(window.samples(), 2 * window.length)) ** 2
-    r = np.fft.irfft(spectrum, 2 * window.length)[: window.length + 1]
-    return CubicSpline(np.arange(window.length + 1), r)
+    correlation = np.fft.irfft(spectrum, 2 * window.length)[: window.length + 1]
+    return CubicSpline(np.arange(window.length + 1), correlation)
 
 
-_WIDTH, _SHAPE = LASER + "line_width", LASER + "line_shape"
+_WIDTH_PATH, _SHAPE_PATH = LASER_PREFIX + "line_width", LASER_PREFIX + "line_shape"
 
 
-def _deviation(points: Points) -> np.ndarray:
+def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
     """Return the standard deviation of a Gaussian line [bins of fs/L]."""
-    return DEVIATION_OF_FWHM * points[_WIDTH] * points.record_duration
+    return DEVIATION_PER_FWHM * points[_WIDTH_PATH] * points.record_duration
 
 
-def smear(points: Points) -> Smear | None:
+def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Reach of a Gaussian line."""
-    if not points.has(_WIDTH) or points.word(_SHAPE) != "gaussian":
+    if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
-    return Smear(reach=_SIGMAS * _deviation(points))
+    return PhaseErrorBound(
+        extra_shift_window_bins=_LINE_REACH_DEVIATIONS * _line_deviation_window_bins(points)
+    )
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the detecting bins by leaving the width out.
 
     The mean power under a Gaussian line departs from |X|^2 by at most (2 pi s)^2 var_w (sum |w|)^2,
@@ -326,100 +372,123 @@ def size(points: Points) -> Size | None:
     pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w); the pedestal is in no bin above
     sum w^2 (fs S(0) + 1 - exp(-g)), and is noise that comes with the signal.
     """
-    if not points.has(_WIDTH):
+    if not points.any_nonzero(_WIDTH_PATH):
         return None
-    if points.word(_SHAPE) == "lorentzian":
-        return _lorentzian(points)
-    known, deviation = means(points.window), _deviation(points)
-    spread = np.minimum((2 * np.pi * deviation) ** 2 * known.variance, 1.0)
-    smeared = 1 + 2 * points.smeared / points.margin
-    least = points.left_of(points.powers[0] / np.where(points.near_image, 2.0, 1.01) / smeared)
-    magnitude = by_power(known.most**2 * spread / least)
-    if not points.may_add:
-        return Size(magnitude=magnitude)
-    half = 0.5 * _SIGMAS * deviation
-    away = added(points, Smear((half, 0.0, 0.0, 0.0), constant=half))
-    return Size(magnitude=np.where(points.may_cancel, 0.0, magnitude), added=away)
-
-
-def _lorentzian(points: Points) -> Size:
-    width, delay = points[_WIDTH], np.minimum(points.delay, points.record_duration)
-    share = coherent_share(line_width=width, delay=delay, duration=np.asarray(np.inf))
-    most = np.minimum(width, _MOST_NOISE / (2 * np.pi * delay))
-    density = density_under_line(line_width=most, delay=delay)
-    ratio = points.footprint.echo_ratio
-    beat = points.beat * (ratio if points.architecture == "direct" else np.sqrt(ratio))
-    cnr = beat**2 / points.noise_variance  # with its image
-    return Size(
-        magnitude=1 - np.sqrt(share),
-        noise=cnr * (points.sample_rate * density + (1 - share)),
-        threshold_follows=False,
+    if points.option(_SHAPE_PATH) == "lorentzian":
+        return _lorentzian_bound(points)
+    moments, line_deviation = window_moments(points.window), _line_deviation_window_bins(points)
+    spread_loss = np.minimum((2 * np.pi * line_deviation) ** 2 * moments.position_variance, 1.0)
+    smear_factor = 1 + 2 * points.phase_error_shift_bins / points.padding_factor
+    power_min = points.power_without_missing(
+        points.peak_power_bounds[0] / np.where(points.is_near_image, 2.0, 1.01) / smear_factor
+    )
+    magnitude_change = magnitude_change_from_power(
+        moments.magnitude_sum**2 * spread_loss / power_min
+    )
+    if not points.amplitudes_may_add:
+        return ErrorBound(magnitude_change=magnitude_change)
+    half_reach = 0.5 * _LINE_REACH_DEVIATIONS * line_deviation
+    coherent_change = coherent_phase_change(
+        points, PhaseErrorBound((half_reach, 0.0, 0.0, 0.0), constant=half_reach)
+    )
+    return ErrorBound(
+        magnitude_change=np.where(points.may_cancel, 0.0, magnitude_change),
+        coherent_sum_change=coherent_change,
     )
 
 
-def _seen_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return :func:`seen_line` of points by the part of the record that the up-chirp's echo has."""
-    looks = shots.looks.added
-    if shots.first_sample is None:
-        return seen_line(window=shots.window, looks=looks, **timing)
-    first = shots.first_sample[0]
-    windows = [last_part(shots.window, number) for number in first.tolist()]
-    share, in_phase = np.empty((2, shots.size))
+def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
+    line_width, delay = points[_WIDTH_PATH], np.minimum(points.delay, points.record_duration)
+    coherent_fraction = coherent_power_fraction(
+        line_width=line_width, delay=delay, duration=np.asarray(np.inf)
+    )
+    densest_width = np.minimum(line_width, _DENSEST_PEDESTAL_EXPONENT / (2 * np.pi * delay))
+    density = pedestal_density_under_line(line_width=densest_width, delay=delay)
+    echo_ratio = points.footprint_extent.total_echo_ratio
+    beat_amplitude = points.beat_amplitude * (
+        echo_ratio if points.architecture == "direct" else np.sqrt(echo_ratio)
+    )
+    cnr = beat_amplitude**2 / points.receiver_noise_variance  # with its image
+    return ErrorBound(
+        magnitude_change=1 - np.sqrt(coherent_fraction),
+        noise_variance_change=cnr * (points.sample_rate * density + (1 - coherent_fraction)),
+        threshold_follows_noise=False,
+    )
+
+
+def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the apparent line and the pedestal, by the part of the record that an echo has."""
+    looks = shots.looks.n_coherent
+    if shots.n_samples_before_echo is None:
+        return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
+    n_before_echo = shots.n_samples_before_echo[0]
+    windows = [zero_first_samples(shots.window, n_missing) for n_missing in n_before_echo.tolist()]
+    line_fraction, in_phase_pedestal = np.empty((2, shots.size))
     timing = {name: np.broadcast_to(values, shots.size) for name, values in timing.items()}
     for window in dict.fromkeys(windows):
-        here = np.array([window is other for other in windows])
-        part = {name: values[here] for name, values in timing.items()}
-        share[here], in_phase[here] = seen_line(window=window, looks=looks, **part)
-        in_phase[here] *= energy_left(shots.window)[first[here]] / window.energy
-    return share, in_phase
+        has_window = np.array([window is other_window for other_window in windows])
+        part_timing = {name: values[has_window] for name, values in timing.items()}
+        line_fraction[has_window], in_phase_pedestal[has_window] = apparent_line_and_pedestal(
+            window=window, looks=looks, **part_timing
+        )
+        in_phase_pedestal[has_window] *= (
+            window_energy_from_sample(shots.window)[n_before_echo[has_window]] / window.energy
+        )
+    return line_fraction, in_phase_pedestal
 
 
-def act(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Give the beat a Gaussian line; or dim the pure line and add a pedestal of noise."""
-    width = np.asarray(scene.parameters[_WIDTH], float)
-    if str(scene.parameters[_SHAPE]) == "gaussian":
-        return replace(shots, gaussian_width=width + np.zeros(shots.size))
+    line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
+    if str(context.parameters[_SHAPE_PATH]) == "gaussian":
+        return replace(shots, gaussian_line_width=line_width + np.zeros(shots.size))
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    width = width + np.zeros(shots.size)
-    timing = {"line_width": width, "delay": delay, "duration": shots.record_duration}
-    if shots.looks.added > 1 and np.any(delay > shots.record_duration):
-        raise UnsupportedShot(
-            f"{_WIDTH} leaves of looks that are added what their phases have in common, which is "
+    line_width = line_width + np.zeros(shots.size)
+    timing = {"line_width": line_width, "delay": delay, "duration": shots.record_duration}
+    if shots.looks.n_coherent > 1 and np.any(delay > shots.record_duration):
+        raise UnsupportedShotError(
+            f"{_WIDTH_PATH} leaves of looks that are added what their phases have in common, which "
+            "is "
             f"known for echoes that come back within a record, of "
             f"{np.min(shots.record_duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
-    share, in_phase = _seen_lines(shots, timing)
-    power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
-    beside = power_under_line(window=shots.window, **timing)
-    if shots.first_sample is not None:
-        beside = beside * energy_left(shots.window)[shots.first_sample[0]] / shots.window.energy
+    line_fraction, in_phase_pedestal = _apparent_lines(shots, timing)
+    line_power = (shots.beat_amplitude_scale / 2) ** 2 * shots.total_relative_echo
+    side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
+    if shots.n_samples_before_echo is not None:
+        side_pedestal = (
+            side_pedestal
+            * window_energy_from_sample(shots.window)[shots.n_samples_before_echo[0]]
+            / shots.window.energy
+        )
     return replace(
         shots,
-        beat_scale=shots.beat_scale * np.sqrt(share),
-        laser_width=width,
-        pedestal=power * 2 * in_phase / shots.window.energy,
-        pedestal_beside=power * beside / shots.window.energy,
+        beat_amplitude_scale=shots.beat_amplitude_scale * np.sqrt(line_fraction),
+        lorentzian_line_width=line_width,
+        pedestal_variance_under_lines=line_power * 2 * in_phase_pedestal / shots.window.energy,
+        pedestal_variance_beside_lines=line_power * side_pedestal / shots.window.energy,
     )
 
 
 LINE_WIDTH = Effect(
     name="line_width",
-    about="width of the laser's line",
+    description="width of the laser's line",
     stage="record",
-    size=size,
-    smear=smear,
-    act=act,
+    error_bound=error_bound,
+    phase_error_bound=phase_error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=_WIDTH,
-            about="Full width at half maximum of the laser's line; Gaussian: of the beat's",
+            path=_WIDTH_PATH,
+            description="Full width at half maximum of the laser's line; Gaussian: of the beat's",
             example="10 kHz",
             limits=("0 Hz", "1e15 Hz"),
         ),
         Parameter(
-            path=_SHAPE,
-            about="Gaussian, slow against the record; or the Lorentzian of a laser mixed with "
+            path=_SHAPE_PATH,
+            description="Gaussian, slow against the record; or the Lorentzian of a laser mixed "
+            "with "
             "itself after the echo's delay",
             default="gaussian",
             options=("gaussian", "lorentzian"),

@@ -8,39 +8,55 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model import beam, link
+from sweep.model import beam, receiver_chain
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
-from sweep.model.effects.points import Points
-from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE, Shots
+from sweep.model.effects.effect import (
+    Effect,
+    EffectContext,
+    ErrorBound,
+    Parameter,
+    add_noise_sources,
+)
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import (
+    LASER_PREFIX,
+    PROCESSING_PREFIX,
+    RECEIVER_PREFIX,
+    TELESCOPE_PREFIX,
+    Shots,
+)
 
 # The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
 # oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
 
 
-def echo_size(points: Points) -> Size:
+def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
     """Shot noise of the echo, which the threshold does not follow."""
-    return Size(noise=points.echo_noise, threshold_follows=False)
+    return ErrorBound(noise_variance_change=points.echo_noise_ratio, threshold_follows_noise=False)
 
 
-def add_echo(shots: Shots, scene: Scene) -> Shots:
+def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
     """Shot noise of the whole echo."""
-    variance = shots.shot_noise_scale * shots.echo_power * scene.share("signal_shot_noise")
-    return noisier(shots, signal_shot=np.asarray(variance))
+    variance = (
+        shots.shot_noise_variance_per_watt
+        * shots.echo_power
+        * context.presence_factor("signal_shot_noise")
+    )
+    return add_noise_sources(shots, signal_shot=np.asarray(variance))
 
 
 SIGNAL_SHOT_NOISE = Effect(
     name="signal_shot_noise",
-    about="shot noise of the echo itself",
+    description="shot noise of the echo itself",
     stage="noise",
-    size=echo_size,
-    act=add_echo,
-    apart=False,
+    error_bound=signal_shot_noise_bound,
+    apply=apply_signal_shot_noise,
+    needs_own_batch=False,
 )
 
 
-_IRRADIANCE, _DISTANCE = "target.solar_irradiance", "target.sun_distance"
-_ELEVATION, _FIELD = "target.sun_elevation", RECEIVER + "field_of_view"
+_IRRADIANCE_PATH, _SUN_DISTANCE_PATH = "target.solar_irradiance", "target.sun_distance"
+_SUN_ELEVATION_PATH, _FIELD_OF_VIEW_PATH = "target.sun_elevation", RECEIVER_PREFIX + "field_of_view"
 
 SUN_TEMPERATURE = 5772.0
 """Effective temperature of the sun [K], IAU 2015 resolution B3."""
@@ -48,7 +64,9 @@ SUN_RADIUS = 6.957e8
 """Nominal radius of the sun [m], likewise."""
 
 
-def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike) -> np.ndarray:
+def solar_irradiance(
+    *, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
+) -> np.ndarray:
     """Spectral irradiance [W/m^3] of a level surface by a black sun; 0 for a distance of 0.
 
     Planck's radiance pi B(wavelength, T) (R / d)^2 sin(elevation).
@@ -62,65 +80,73 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     return np.asarray(exitance * dilution * np.maximum(np.sin(elevation), 0.0))
 
 
-def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
+def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Sunlight [W] that a diffuse surface sends onto the detector, without extinction.
 
     Radiance E rho / pi of a surface that fills the field of view, through the aperture, over the
     field's solid angle and the optical passband; E is the spectral irradiance on it [W/m^3].
     """
-    lit = p[_IRRADIANCE] + sunlight(
-        wavelength=p[LASER + "wavelength"], distance=p[_DISTANCE], elevation=p[_ELEVATION]
+    irradiance = parameters[_IRRADIANCE_PATH] + solar_irradiance(
+        wavelength=parameters[LASER_PREFIX + "wavelength"],
+        distance=parameters[_SUN_DISTANCE_PATH],
+        elevation=parameters[_SUN_ELEVATION_PATH],
     )
-    field = np.asarray(p[_FIELD], float)
-    diameter, angle = beam.receiving_field(p)
-    area = link.aperture_area(np.where(field > 0, p[TELESCOPE + "aperture"], diameter))
-    solid_angle = np.pi * (np.where(field > 0, field, angle) / 2) ** 2
-    radiance = lit * p["target.reflectance"] / np.pi
-    light = radiance * area * solid_angle * p[RECEIVER + "optical_passband"]
-    return np.asarray(light * p[TELESCOPE + "optical_efficiency"])
+    field_of_view = np.asarray(parameters[_FIELD_OF_VIEW_PATH], float)
+    aperture_diameter, field_angle = beam.receiving_aperture_and_angle(parameters)
+    area = receiver_chain.aperture_area(
+        np.where(field_of_view > 0, parameters[TELESCOPE_PREFIX + "aperture"], aperture_diameter)
+    )
+    solid_angle = np.pi * (np.where(field_of_view > 0, field_of_view, field_angle) / 2) ** 2
+    radiance = irradiance * parameters["target.reflectance"] / np.pi
+    light = radiance * area * solid_angle * parameters[RECEIVER_PREFIX + "optical_passband"]
+    return np.asarray(light * parameters[TELESCOPE_PREFIX + "optical_efficiency"])
 
 
-def sun_size(points: Points) -> Size | None:
+def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
     """Shot noise of sunlight, without the air; the threshold is set on it."""
-    if not points.has(_IRRADIANCE, _DISTANCE):
+    if not points.any_nonzero(_IRRADIANCE_PATH, _SUN_DISTANCE_PATH):
         return None
-    return Size(
-        noise=received(points.parameters) * points.receiver.per_watt / points.noise_variance
+    return ErrorBound(
+        noise_variance_change=received_sunlight(points.parameters)
+        * points.receiver_noise.shot_noise_variance_per_watt
+        / points.receiver_noise_variance
     )
 
 
-def add_sun(shots: Shots, scene: Scene) -> Shots:
+def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     """Shot noise of sunlight; the air dims it on its way up."""
-    share = scene.share("solar_background")
-    light = received(scene.parameters) * shots.ground_transmission * share
-    return noisier(shots, solar_shot=np.asarray(shots.shot_noise_scale * light))
+    presence = context.presence_factor("solar_background")
+    light = received_sunlight(context.parameters) * shots.ground_transmission * presence
+    return add_noise_sources(
+        shots, solar_shot=np.asarray(shots.shot_noise_variance_per_watt * light)
+    )
 
 
 SOLAR_BACKGROUND = Effect(
     name="solar_background",
-    about="shot noise of sunlight on the target",
+    description="shot noise of sunlight on the target",
     stage="noise",
-    size=sun_size,
-    act=add_sun,
-    apart=False,
+    error_bound=solar_background_bound,
+    apply=apply_solar_background,
+    needs_own_batch=False,
     parameters=(
         Parameter(
-            path=_DISTANCE,
-            about="Distance of the target from the sun, which then lights it; 0 for none",
+            path=_SUN_DISTANCE_PATH,
+            description="Distance of the target from the sun, which then lights it; 0 for none",
             example="1.52 au",
             limits=("0 m", "1e18 m"),
         ),
         Parameter(
-            path=_ELEVATION,
-            about="Elevation of that sun above the target's surface",
+            path=_SUN_ELEVATION_PATH,
+            description="Elevation of that sun above the target's surface",
             default=float(np.pi / 2),
             example="30 deg",
             limits=("0 deg", "90 deg"),
             si_unit="rad",
         ),
         Parameter(
-            path=_FIELD,
-            about="Full angle of the receiver's field of view; 0 for that of the beam",
+            path=_FIELD_OF_VIEW_PATH,
+            description="Full angle of the receiver's field of view; 0 for that of the beam",
             example="100 urad",
             limits=("0 rad", "180 deg"),
         ),
@@ -128,10 +154,13 @@ SOLAR_BACKGROUND = Effect(
 )
 
 
-_RIN, _REJECTION = LASER + "relative_intensity_noise", RECEIVER + "common_mode_rejection"
+_RIN_PATH, _REJECTION_PATH = (
+    LASER_PREFIX + "relative_intensity_noise",
+    RECEIVER_PREFIX + "common_mode_rejection",
+)
 
 
-def current_variance(p: Mapping[str, np.ndarray]) -> np.ndarray:
+def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Compute the current variance [A^2] from intensity noise of the local oscillator.
 
     One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
@@ -139,92 +168,105 @@ def current_variance(p: Mapping[str, np.ndarray]) -> np.ndarray:
     of the ratio of their currents) divides the variance. Both are taken to be flat over the
     electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
     """
-    current = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
-    current = current * p[RECEIVER + "local_oscillator_power"]
-    seen = p[_RIN] / p[_REJECTION]
-    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
-    return np.asarray(current**2 * seen * bandwidth)
+    current = (
+        parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
+    )
+    current = current * parameters[RECEIVER_PREFIX + "local_oscillator_power"]
+    intensity_density = parameters[_RIN_PATH] / parameters[_REJECTION_PATH]
+    bandwidth = receiver_chain.electrical_bandwidth(receiver_chain.receiver_parameters(parameters))
+    return np.asarray(current**2 * intensity_density * bandwidth)
 
 
-def intensity_size(points: Points) -> Size | None:
+def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
     """Intensity noise, exactly; the threshold is set on it."""
-    if points.architecture == "direct" or not points.has(_RIN):
+    if points.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
-    current = current_variance(points.parameters)
-    return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
+    current_variance = intensity_noise_current_variance(points.parameters)
+    return ErrorBound(
+        noise_variance_change=current_variance
+        * points.receiver_noise.variance_per_square_ampere
+        / points.receiver_noise_variance
+    )
 
 
-def add_intensity(shots: Shots, scene: Scene) -> Shots:
+def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shots:
     """Intensity noise of the local oscillator; direct detection has none."""
     if shots.architecture == "direct":
         return shots
-    current = current_variance(scene.parameters)
-    return noisier(shots, relative_intensity=current * shots.noise_scale)
+    current_variance = intensity_noise_current_variance(context.parameters)
+    return add_noise_sources(
+        shots, relative_intensity=current_variance * shots.noise_variance_per_square_ampere
+    )
 
 
 RELATIVE_INTENSITY_NOISE = Effect(
     name="relative_intensity_noise",
-    about="fluctuation of the local oscillator's power",
+    description="fluctuation of the local oscillator's power",
     stage="noise",
-    size=intensity_size,
-    act=add_intensity,
+    error_bound=relative_intensity_noise_bound,
+    apply=apply_relative_intensity_noise,
     parameters=(
         Parameter(
-            path=_RIN,
-            about="One-sided spectral density of the laser's relative intensity",
+            path=_RIN_PATH,
+            description="One-sided spectral density of the laser's relative intensity",
             example="-155 dB/Hz",
             limits=("0 1/Hz", "100 1/Hz"),
         ),
         Parameter(
-            path=_REJECTION,
-            about="Common-mode rejection of a balanced receiver; 0 dB for a single diode",
+            path=_REJECTION_PATH,
+            description="Common-mode rejection of a balanced receiver; 0 dB for a single diode",
             default=1.0,
             example="25 dB",
             limits=("0 dB", "300 dB"),
-            alone=False,
+            is_sole_cause=False,
         ),
     ),
 )
 
 
-_BITS = PROCESSING + "bits"
+_BITS_PATH = PROCESSING_PREFIX + "bits"
 
 
-def rounding_size(points: Points) -> Size | None:
+def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the noise of rounding, without clipping; the threshold follows it.
 
     It is white, and is compared with the density of the receiver's noise at the line. A spectrum
     in which all noise is made white scales a line by the root of both together, where the
     receiver's alone is left out.
     """
-    if not points.has(_BITS):
+    if not points.any_nonzero(_BITS_PATH):
         return None
-    white = points.rounding / points.noise_variance
-    least = np.finfo(float).tiny  # the density where filters let nothing pass
-    density = np.maximum(points.noise_density, least)
-    scaled = np.sqrt((1 + white) / (1 + white / density))
-    return Size(magnitude=np.abs(scaled - 1), noise=white / density)
-
-
-def add_rounding(shots: Shots, scene: Scene) -> Shots:
-    """White noise of lsb^2/12, where the ADC has a number of bits."""
-    p, in_quadrature = scene.parameters, shots.complex_record
-    added = link.rounding_variance(
-        full_scale=p[PROCESSING + "full_scale"], bits=p[_BITS], in_quadrature=in_quadrature
+    white_noise_ratio = points.quantisation_variance / points.receiver_noise_variance
+    density_min = np.finfo(float).tiny  # the density where filters let nothing pass
+    relative_density = np.maximum(points.relative_noise_density, density_min)
+    magnitude_factor = np.sqrt((1 + white_noise_ratio) / (1 + white_noise_ratio / relative_density))
+    return ErrorBound(
+        magnitude_change=np.abs(magnitude_factor - 1),
+        noise_variance_change=white_noise_ratio / relative_density,
     )
-    return noisier(shots, quantisation=added)
+
+
+def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
+    """White noise of lsb^2/12, where the ADC has a number of bits."""
+    parameters, samples_iq = context.parameters, shots.complex_record
+    variance = receiver_chain.quantisation_variance(
+        full_scale=parameters[PROCESSING_PREFIX + "full_scale"],
+        bits=parameters[_BITS_PATH],
+        samples_iq=samples_iq,
+    )
+    return add_noise_sources(shots, quantisation=variance)
 
 
 QUANTISATION = Effect(
     name="quantisation",
-    about="the ADC's steps",
+    description="the ADC's steps",
     stage="noise",
-    size=rounding_size,
-    act=add_rounding,
+    error_bound=quantisation_bound,
+    apply=apply_quantisation,
     parameters=(
         Parameter(
-            path=_BITS,
-            about="Effective number of bits of the ADC; 0 for one without steps",
+            path=_BITS_PATH,
+            description="Effective number of bits of the ADC; 0 for one without steps",
             example="12",
             limits=("0", "64"),
         ),

@@ -15,7 +15,8 @@ The line shape is that of the samples that the echo has, with what the window is
 
     G(y) = sum_{n >= n_0} w_n exp(-2 pi i y n / N),    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s).
 
-For a cosine sum this is a sum of partial Dirichlet kernels. :mod:`sweep.model.line_shape` has it
+For a cosine sum this is a sum of partial Dirichlet kernels. :mod:`sweep.model.spectrum.line_shape`
+has it
 for all phase errors. The peak falls by the window's share before n_0: for a rectangular window to
 1 - n_0 / L of its amplitude. The line grows wider, and its sidelobes fall as 1/y, as the echo
 begins with a step. [T] takes chirps to be far longer than delays, where records that begin at 0 are
@@ -23,9 +24,10 @@ whole (``overlap: off``).
 
 One n_0 serves all lines of a footprint's segment: that of the beam's axis. A beamlet that is d
 farther away has 2 d f_s / c samples fewer. It serves all looks of a shot as well, that of the
-middle one, between which the range changes. This is left out, and :func:`left` bounds it. It counts
+middle one, between which the range changes. This is left out, and :func:`residual_bound` bounds it.
+It counts
 in what a point's effects leave out (``effects_error``). Places between bins are corrected for n_0
-(:func:`sweep.model.interpolation.late_echo`).
+(:func:`sweep.model.detection.sub_bin_interpolation.late_echo_correction`).
 
 Size: c is the largest bin's magnitude over that of all lines on a bin, and b the share of sum |w|
 in the samples that lack. No bin changes by more than b, and so the largest by b / c of itself at
@@ -33,7 +35,7 @@ most. The planner takes sidelobes of leakage and images to be those of the windo
 rectangular one times the step at n_0. If no sample has an echo nothing is detected, while a bin
 without signal crosses as noise does: there the effect is always kept.
 
-Checks: :mod:`sweep.model.truth` gates each sample of each beamlet by its own delay.
+Checks: :mod:`sweep.model.time_domain_truth` gates each sample of each beamlet by its own delay.
 """
 
 from dataclasses import replace
@@ -43,77 +45,128 @@ import numpy as np
 
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Scene, Size
-from sweep.model.effects.phase_errors import missed
-from sweep.model.effects.points import Points, largest_about
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
+from sweep.model.effects.phase_errors import mean_phase_bound
+from sweep.model.effects.planner_inputs import PlannerInputs, window_max_near
 from sweep.model.preparation import Shots
 
-_IMAGE = 0.9
+_IMAGED_LINE_MIN = 0.9
 """Smallest fraction of a line's amplitude that a distant image leaves."""
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Upper bound on the output change if missing samples are ignored; None if none are missing."""
-    late = points.missing
-    if late is None:
+    missing = points.missing_samples
+    if missing is None:
         return None
-    besides = missed(points.smear, points.window) if points.smears else 0.0
-    least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / (1 + points.smear.reach)
-    c = _IMAGE * np.sqrt(least) - besides
-    magnitude = np.where(late.lost > 0, np.where(c > 0, late.lost / c, np.inf), 0.0)
-    each, gone = left(points), late.all.any(axis=0).astype(float)
-    remain: dict[str, Any] = {"left": each, "left_of_all": each * points.footprint.gain}
-    if not points.may_add:
-        lone = points.lobe.near(points.offset) - late.lost  # powers: each line by its own share
-        own = np.where(lone > 0, np.minimum(each / np.maximum(lone, 1e-300), 1.0), 1.0)
-        remain["left"] = np.where(each > 0, own, 0.0)
-        return Size(magnitude=magnitude, chance=gone, **remain)
-    alone = np.where(points.may_cancel, 0.0, magnitude)
-    whole = np.where(points.may_cancel, 2 * late.lost / points.lobe.worst, points.image)
-    added = np.where(late.lost > 0, whole, 0.0)
-    return Size(magnitude=alone, added=added, chance=gone, **remain)
+    phase_bound = (
+        mean_phase_bound(points.total_phase_error_bound, points.window)
+        if points.phase_error_bounds
+        else 0.0
+    )
+    power_min = (
+        points.peak_power_bounds[0]
+        / np.where(points.is_near_image, 2.0, 1.01)
+        / (1 + points.total_phase_error_bound.extra_shift_window_bins)
+    )
+    line_amplitude_min = _IMAGED_LINE_MIN * np.sqrt(power_min) - phase_bound
+    magnitude_change = np.where(
+        missing.lost_fraction > 0,
+        np.where(line_amplitude_min > 0, missing.lost_fraction / line_amplitude_min, np.inf),
+        0.0,
+    )
+    bound, all_missing = residual_bound(points), missing.all_missing.any(axis=0).astype(float)
+    residual: dict[str, Any] = {
+        "residual_magnitude_change": bound,
+        "residual_coherent_sum_change": bound * points.footprint_extent.amplitude_gain_max,
+    }
+    if not points.amplitudes_may_add:
+        line_share = (
+            points.window_response.scalloping_gain(points.bin_offset) - missing.lost_fraction
+        )  # powers: each line by its own share
+        lone_bound = np.where(
+            line_share > 0, np.minimum(bound / np.maximum(line_share, 1e-300), 1.0), 1.0
+        )
+        residual["residual_magnitude_change"] = np.where(bound > 0, lone_bound, 0.0)
+        return ErrorBound(
+            magnitude_change=magnitude_change, probability_change=all_missing, **residual
+        )
+    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    summed_change = np.where(
+        points.may_cancel,
+        2 * missing.lost_fraction / points.window_response.scalloping_gain_min,
+        points.image_bound,
+    )
+    coherent_change = np.where(missing.lost_fraction > 0, summed_change, 0.0)
+    return ErrorBound(
+        magnitude_change=lone_change,
+        coherent_sum_change=coherent_change,
+        probability_change=all_missing,
+        **residual,
+    )
 
 
-def left(points: Points) -> np.ndarray:
+def residual_bound(points: PlannerInputs) -> np.ndarray:
     """Bound the error of one first sample, the axis's at the middle look, for all beamlets.
 
     Relative to the magnitude that all lines make on a bin, by segment.
     """
-    late = points.missing
-    assert late is not None
-    ranges = points.footprint.ranges
-    off = np.minimum(np.abs(ranges.mean) + ranges.rms, ranges.extreme)
-    looks = points.sample_rate * 2 / SPEED_OF_LIGHT * np.abs(points.approach) * points.late
-    farthest = points.sample_rate * points.delay * np.minimum(ranges.extreme, 1e3) + looks
-    number = points.sample_rate * points.delay * np.minimum(off, 1e3) + looks
+    missing = points.missing_samples
+    assert missing is not None
+    range_moments = points.footprint_extent.range_offsets
+    mean_range = np.minimum(np.abs(range_moments.mean) + range_moments.rms, range_moments.extreme)
+    look_drift_samples = (
+        points.sample_rate
+        * 2
+        / SPEED_OF_LIGHT
+        * np.abs(points.approach_speed)
+        * points.middle_look_delay
+    )
+    extra_samples_max = (
+        points.sample_rate * points.delay * np.minimum(range_moments.extreme, 1e3)
+        + look_drift_samples
+    )
+    extra_samples_mean = (
+        points.sample_rate * points.delay * np.minimum(mean_range, 1e3) + look_drift_samples
+    )
     # Numbers of samples are whole: those of two delays differ by up to one more.
-    whole = np.where(farthest > 0, number + 1, 0.0)
+    whole_samples = np.where(extra_samples_max > 0, extra_samples_mean + 1, 0.0)
     # Of none of the samples, and of all, the same lack at delays that are close.
-    middle = points.sample_rate * (points.delay - points.start)
-    begins = (middle + farthest > -1) & (middle - farthest < points.window.length + 1)
+    samples_to_echo = points.sample_rate * (points.delay - points.acquisition_delay)
+    record_starts_inside = (samples_to_echo + extra_samples_max > -1) & (
+        samples_to_echo - extra_samples_max < points.window.length + 1
+    )
     # The few samples change all bins alike, and the image at negative frequency does so as well.
-    each = 2 * largest_about(points.window, late.first, farthest + 1) * whole
-    each = np.minimum(each, 1.0)
-    return np.asarray(np.where(begins, each, 0.0))
+    bound = (
+        2 * window_max_near(points.window, missing.n_missing, extra_samples_max + 1) * whole_samples
+    )
+    bound = np.minimum(bound, 1.0)
+    return np.asarray(np.where(record_starts_inside, bound, 0.0))
 
 
-def act(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Set ``first_sample``: the number of record samples before the echo, by segment."""
-    first = np.zeros((len(shots.waveform), shots.size), np.int64)
-    for s in np.flatnonzero(shots.segments):
-        segment = shots.waveform[s]
-        first[s] = waveform.samples_before_echo(
-            delay=2 / SPEED_OF_LIGHT * (shots.range - segment.nearer), beta=segment.beta,
-            start=shots.acquisition_delay, sample_rate=shots.sample_rate,
+    n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
+    for segment_index in np.flatnonzero(shots.has_segment):
+        segment = shots.waveform_segments[segment_index]
+        n_samples_before_echo[segment_index] = waveform.count_samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease),
+            doppler_ratio=segment.doppler_ratio,
+            record_start=shots.acquisition_delay,
+            sample_rate=shots.sample_rate,
             length=shots.window.length,
-        )  # fmt: skip
-    return replace(shots, first_sample=first) if first.any() else shots
+        )
+    return (
+        replace(shots, n_samples_before_echo=n_samples_before_echo)
+        if n_samples_before_echo.any()
+        else shots
+    )
 
 
 OVERLAP = Effect(
     name="overlap",
-    about="echoes that arrive after the record has begun",
+    description="echoes that arrive after the record has begun",
     stage="record",
-    size=size,
-    act=act,
+    error_bound=error_bound,
+    apply=apply,
 )

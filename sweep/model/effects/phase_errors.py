@@ -30,8 +30,8 @@ beat (delayed wave less local oscillator) gains exactly
 
 about -tau e(t): nothing at no range, and the more the farther. The Doppler segment has no sweep.
 An error that was measured comes as a table, of frequency errors by the time in the up-chirp. It is
-fitted once by a Chebyshev series (:mod:`sweep.model.effects.sweep_table`), whose integral over the
-delay is exact.
+fitted once by a Chebyshev series (:mod:`sweep.model.effects.sweep_error_table`), whose integral
+over the delay is exact.
 
 Sizes: w is real and even about the record's middle. A phase error has an odd and an even part, phi
 = o(x) + e(x); a constant does not matter. It changes a line's spectrum W(y), real but for the
@@ -58,153 +58,201 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size, Sized
-from sweep.model.effects.points import NO_SMEAR, Points, Smear
-from sweep.model.effects.sweep_table import SweepTable, sweep_table
-from sweep.model.looks import coherent_gain
-from sweep.model.preparation import CHIRP, PhaseError, Shots
-from sweep.model.window import Window, samples
+from sweep.model.detection.looks import coherent_gain
+from sweep.model.effects.effect import ArrayOrFloat, Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import NO_PHASE_ERROR, PhaseErrorBound, PlannerInputs
+from sweep.model.effects.sweep_error_table import SweepErrorTable, fit_sweep_error
+from sweep.model.preparation import CHIRP_PREFIX, PhaseError, Shots
+from sweep.model.window import Window, window_samples
 
-_NODES = 256
-_TURN = 2 * math.pi
-_IMAGE = 0.9
+_N_NODES = 256
+_RADIANS_PER_CYCLE = 2 * math.pi
+_IMAGED_LINE_MIN = 0.9
 """Least that an image far away leaves of a line whose amplitude it adds to."""
 
 
-class Means(NamedTuple):
+class WindowMoments(NamedTuple):
     """Means of powers of x over a window's |w| / sum w, by power 1..4, and what else is needed."""
 
-    absolute: tuple[float, ...]
+    mean_absolute: tuple[float, ...]
     """<|x^k|> of odd powers, <|x^k - <x^k>|> of even ones."""
-    square: tuple[float, ...]
+    root_mean_square: tuple[float, ...]
     """Root of <(x^k - <x^k>)^2> of even powers, 0 of odd ones."""
-    steady: tuple[float, ...]
+    linear_slope: tuple[float, ...]
     """Slope of the best straight line of odd powers, 0 of even ones; last, of what is within 1."""
-    most: float
+    magnitude_sum: float
     """Sum |w| over sum w, >= 1."""
-    edge: float
+    first_weight: float
     """|w_0| over sum w."""
-    variance: float
+    position_variance: float
     """Of the place in the record, in records, under |w|."""
 
 
 @lru_cache(maxsize=16)
-def means(window: Window) -> Means:
+def window_moments(window: Window) -> WindowMoments:
     """Means that sizes of phase errors need of a window."""
-    x = (2 * np.arange(_NODES) + 1) / _NODES - 1
-    w = samples(window.name, window.length)
-    place = 2 * np.arange(window.length + 1) / window.length - 1
-    at_nodes = np.interp(x, place, np.append(w, w[0]))
-    weight = np.abs(at_nodes) / at_nodes.sum()
-    most, straight = float(weight.sum()), float((x * x * weight).sum())
-    absolute, square, steady = [], [], []
+    node = (2 * np.arange(_N_NODES) + 1) / _N_NODES - 1
+    w = window_samples(window.name, window.length)
+    sample_position = 2 * np.arange(window.length + 1) / window.length - 1
+    window_at_nodes = np.interp(node, sample_position, np.append(w, w[0]))
+    weight = np.abs(window_at_nodes) / window_at_nodes.sum()
+    magnitude_sum, second_moment = float(weight.sum()), float((node * node * weight).sum())
+    mean_absolute, root_mean_square, linear_slope = [], [], []
     for k in range(1, 5):
-        power = x**k
-        steady.append(float((power * x * weight).sum()) / straight if k % 2 else 0.0)
+        power = node**k
+        linear_slope.append(float((power * node * weight).sum()) / second_moment if k % 2 else 0.0)
         if k % 2 == 0:
-            power = power - (power * weight).sum() / most
-        absolute.append(float((abs(power) * weight).sum()))
-        square.append(float(np.sqrt((power**2 * weight).sum())) if k % 2 == 0 else 0.0)
-    steady.append(absolute[0] / straight)
-    edge = abs(window.edge) / window.sum
-    variance = straight / 4 / most
-    return Means(tuple(absolute), tuple(square), tuple(steady), most, edge, variance)
+            power = power - (power * weight).sum() / magnitude_sum
+        mean_absolute.append(float((abs(power) * weight).sum()))
+        root_mean_square.append(float(np.sqrt((power**2 * weight).sum())) if k % 2 == 0 else 0.0)
+    linear_slope.append(mean_absolute[0] / second_moment)
+    first_weight = abs(window.first_value) / window.sum
+    position_variance = second_moment / 4 / magnitude_sum
+    return WindowMoments(
+        tuple(mean_absolute),
+        tuple(root_mean_square),
+        tuple(linear_slope),
+        magnitude_sum,
+        first_weight,
+        position_variance,
+    )
 
 
-def over_record(points: Points, terms: Mapping[int, np.ndarray]) -> Smear:
+def phase_over_record(
+    points: PlannerInputs, coefficient_by_power: Mapping[int, np.ndarray]
+) -> PhaseErrorBound:
     """Polynomial in the place in the record of a phase sum_j c_j t^j, c_j [cycles/s^j] by j."""
-    half = 0.5 * points.record_duration
-    middle = points.start + half
-    found: list[np.ndarray | float] = [0.0] * 5
-    for j, coefficient in terms.items():
+    half_duration = 0.5 * points.record_duration
+    record_middle = points.acquisition_delay + half_duration
+    polynomial: list[np.ndarray | float] = [0.0] * 5
+    for j, coefficient in coefficient_by_power.items():
         for k in range(j + 1):
-            found[k] = found[k] + math.comb(j, k) * middle ** (j - k) * half**k * coefficient
-    return Smear(tuple(np.abs(c) for c in found[1:]), constant=np.abs(found[0]))
+            polynomial[k] = (
+                polynomial[k]
+                + math.comb(j, k) * record_middle ** (j - k) * half_duration**k * coefficient
+            )
+    return PhaseErrorBound(tuple(np.abs(c) for c in polynomial[1:]), constant=np.abs(polynomial[0]))
 
 
-def missed(smear: Smear, window: Window) -> np.ndarray:
+def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
     """<|phi|>, by which any bin of a line changes at most, relative to its peak."""
-    known = means(window)
-    total = smear.rest * known.most
-    for value, mean in zip(smear.powers, known.absolute, strict=True):
+    moments = window_moments(window)
+    total = phase_bound.non_polynomial * moments.magnitude_sum
+    for value, mean in zip(phase_bound.coefficients, moments.mean_absolute, strict=True):
         total = total + value * mean
-    return np.minimum(_TURN * total, 2 * known.most)
+    return np.minimum(_RADIANS_PER_CYCLE * total, 2 * moments.magnitude_sum)
 
 
-def added(points: Points, smear: Smear) -> np.ndarray:
-    """Part of a phase error in sums of amplitudes, lines and images, as of :class:`Size`.
+def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
+    """Part of a phase error in sums of amplitudes, lines and images, as of :class:`ErrorBound`.
 
     Lines next to their images change by the phase in the record's middle too, and so does a line by
     what an image far away adds to it.
     """
-    known = means(points.window)
-    anywhere = np.minimum(_TURN * (sum(smear.powers) + smear.rest + smear.constant), 2.0)
-    each = np.where(points.near_image, known.most * anywhere, missed(smear, points.window))
-    whole = 2 * each / points.lobe.worst
-    return np.where(points.may_cancel, whole, points.image * anywhere)
+    moments = window_moments(points.window)
+    phase_anywhere = np.minimum(
+        _RADIANS_PER_CYCLE
+        * (sum(phase_bound.coefficients) + phase_bound.non_polynomial + phase_bound.constant),
+        2.0,
+    )
+    phase_change = np.where(
+        points.is_near_image,
+        moments.magnitude_sum * phase_anywhere,
+        mean_phase_bound(phase_bound, points.window),
+    )
+    near_change = 2 * phase_change / points.window_response.scalloping_gain_min
+    return np.where(points.may_cancel, near_change, points.image_bound * phase_anywhere)
 
 
-def phase_size(points: Points, name: str) -> Size | None:
+def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     """Size of one of the phase errors, whichever of the others are there."""
-    own = points.smears.get(name)
-    if own is None:
+    own_bound = points.phase_error_bounds.get(name)
+    if own_bound is None:
         return None
-    known, others = means(points.window), NO_SMEAR
-    for other, smear in points.smears.items():
-        others = others if other == name else others.plus(smear)
-    one, two, three, four = own.powers
-    rest = _TURN * own.rest
-    odd = rest * known.most
-    odd = odd + _TURN * (one * known.absolute[0] + three * known.absolute[2])
-    even = rest * known.most
-    even = even + _TURN * (two * known.absolute[1] + four * known.absolute[3])
-    root = rest * math.sqrt(known.most)
-    root = root + _TURN * (two * known.square[1] + four * known.square[3])
-    turned: np.ndarray | float = 0.0
-    besides: np.ndarray | float = 0.0
-    if len(points.smears) > 1:
-        besides = missed(others, points.window)
-        far = _TURN * (sum(others.powers) + others.rest)
-        turned = missed(own, points.window) * np.minimum(far, 2.0)
-    late = points.missing
-    if late is not None:  # what lacks of the record is not turned; the rest has another middle
-        besides = besides + late.lost
-        turned = turned + late.lost * np.minimum(_TURN * (sum(own.powers) + own.rest), 2.0)
-    a = np.minimum(odd, 2 * known.most) + np.minimum(root * root / 2, 2 * known.most) + turned
-    b = np.minimum(even, known.most) + turned
-    least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / (1 + others.reach)
-    c = _IMAGE * np.sqrt(least) - besides
-    magnitude = np.where(c > 0, (a + b * known.edge / c) / c + 0.5 * (b / c) ** 2, np.inf)
-    moved = rest / _TURN * known.steady[4]
-    for value, steady in zip(own.powers, known.steady, strict=False):
-        moved = moved + value * steady
-    if late is not None:
-        moved = moved + late.middle * (2 * two + 3 * three + 4 * four)
-    shift = 2 * moved * points.margin
-    if not points.may_add:
-        return Size(magnitude=magnitude, shift=shift)
-    alone = np.where(points.may_cancel, 0.0, magnitude)
-    return Size(magnitude=alone, added=added(points, own), shift=shift)
+    moments, other_bounds = window_moments(points.window), NO_PHASE_ERROR
+    for other_name, other_bound in points.phase_error_bounds.items():
+        other_bounds = other_bounds if other_name == name else other_bounds.plus(other_bound)
+    linear, quadratic, cubic, quartic = own_bound.coefficients
+    non_polynomial = _RADIANS_PER_CYCLE * own_bound.non_polynomial
+    odd_phase = non_polynomial * moments.magnitude_sum
+    odd_phase = odd_phase + _RADIANS_PER_CYCLE * (
+        linear * moments.mean_absolute[0] + cubic * moments.mean_absolute[2]
+    )
+    even_phase = non_polynomial * moments.magnitude_sum
+    even_phase = even_phase + _RADIANS_PER_CYCLE * (
+        quadratic * moments.mean_absolute[1] + quartic * moments.mean_absolute[3]
+    )
+    even_root_mean_square = non_polynomial * math.sqrt(moments.magnitude_sum)
+    even_root_mean_square = even_root_mean_square + _RADIANS_PER_CYCLE * (
+        quadratic * moments.root_mean_square[1] + quartic * moments.root_mean_square[3]
+    )
+    turned_by_others: np.ndarray | float = 0.0
+    others_phase: np.ndarray | float = 0.0
+    if len(points.phase_error_bounds) > 1:
+        others_phase = mean_phase_bound(other_bounds, points.window)
+        others_far = _RADIANS_PER_CYCLE * (
+            sum(other_bounds.coefficients) + other_bounds.non_polynomial
+        )
+        turned_by_others = mean_phase_bound(own_bound, points.window) * np.minimum(others_far, 2.0)
+    missing = points.missing_samples
+    if missing is not None:  # what lacks of the record is not turned; the rest has another middle
+        others_phase = others_phase + missing.lost_fraction
+        turned_by_others = turned_by_others + missing.lost_fraction * np.minimum(
+            _RADIANS_PER_CYCLE * (sum(own_bound.coefficients) + own_bound.non_polynomial), 2.0
+        )
+    a = (
+        np.minimum(odd_phase, 2 * moments.magnitude_sum)
+        + np.minimum(even_root_mean_square * even_root_mean_square / 2, 2 * moments.magnitude_sum)
+        + turned_by_others
+    )
+    b = np.minimum(even_phase, moments.magnitude_sum) + turned_by_others
+    power_min = (
+        points.peak_power_bounds[0]
+        / np.where(points.is_near_image, 2.0, 1.01)
+        / (1 + other_bounds.extra_shift_window_bins)
+    )
+    c = _IMAGED_LINE_MIN * np.sqrt(power_min) - others_phase
+    magnitude_change = np.where(
+        c > 0, (a + b * moments.first_weight / c) / c + 0.5 * (b / c) ** 2, np.inf
+    )
+    mean_slope = non_polynomial / _RADIANS_PER_CYCLE * moments.linear_slope[4]
+    for coefficient, linear_slope in zip(
+        own_bound.coefficients, moments.linear_slope, strict=False
+    ):
+        mean_slope = mean_slope + coefficient * linear_slope
+    if missing is not None:
+        mean_slope = mean_slope + missing.centroid_bound * (2 * quadratic + 3 * cubic + 4 * quartic)
+    shift_bins = 2 * mean_slope * points.padding_factor
+    if not points.amplitudes_may_add:
+        return ErrorBound(magnitude_change=magnitude_change, shift_bins=shift_bins)
+    lone_change = np.where(points.may_cancel, 0.0, magnitude_change)
+    return ErrorBound(
+        magnitude_change=lone_change,
+        coherent_sum_change=coherent_phase_change(points, own_bound),
+        shift_bins=shift_bins,
+    )
 
 
-def _with_phase(shots: Shots, phase: Callable[..., np.ndarray], **values: Any) -> Shots:
+def _add_phase_error(
+    shots: Shots, phase_function: Callable[..., np.ndarray], **values: Any
+) -> Shots:
     """Shots with a further phase error."""
-    error = PhaseError(phase, values | shots.echo_record)
-    return replace(shots, phase_errors=(*shots.phase_errors, error))
+    phase_error = PhaseError(phase_function, values | shots.echo_record_times)
+    return replace(shots, phase_errors=(*shots.phase_errors, phase_error))
 
 
-def record_times(x: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
+def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
     """Time since the segment's start [s] at places x of the record, (n, m)."""
     start, duration = np.atleast_1d(start), np.atleast_1d(duration)
-    return start[:, None] + duration[:, None] * (np.asarray(x) + 1) / 2
+    return start[:, None] + duration[:, None] * (np.asarray(position) + 1) / 2
 
 
-def _column(value: np.ndarray) -> np.ndarray:
+def _as_column(value: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.asarray(value, float))[:, None]
 
 
-def walk_phase(
-    x: np.ndarray,
+def range_walk_phase(
+    position: np.ndarray,
     *,
     sign: int,
     chirp_rate: np.ndarray,
@@ -218,74 +266,90 @@ def walk_phase(
     ``slide`` is the speed [m/s] by which the range along the beam falls faster than at the radial
     velocity at the segment's start.
     """
-    beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
-    drift = sign * chirp_rate * (beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT)
-    return np.atleast_1d(drift)[:, None] * record_times(x, start=start, duration=duration) ** 2
-
-
-def walk_smear(points: Points) -> Smear | None:
-    """Return the phase that range walk adds over the record; None where there is none."""
-    slide = points.approach - points.radial_velocity
-    beta = points.beta + points.faster
-    each = beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT
-    if not each.any():
-        return None
-    return over_record(points, {2: points.signs * points.chirp_rate * each})
-
-
-def walk(shots: Shots, scene: Scene) -> Shots:
-    """Let the beats of the two chirps drift over the record: at t, to that of R - 2 v_r t."""
-    velocity, slide = shots.motion["radial_velocity"], shots.approach - shots.radial_velocity
-    shots = _with_phase(
-        shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
+    doppler_ratio = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
+    drift_rate = (
+        sign * chirp_rate * (doppler_ratio * (1 + doppler_ratio / 2) + slide / SPEED_OF_LIGHT)
     )
-    return replace(shots, walk=shots.walk + drift_time(shots))
+    return (
+        np.atleast_1d(drift_rate)[:, None]
+        * record_times(position, start=start, duration=duration) ** 2
+    )
 
 
-def drift_time(shots: Shots) -> np.ndarray:
+def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
+    """Return the phase that range walk adds over the record; None where there is none."""
+    slide_speed = points.approach_speed - points.radial_velocity
+    doppler_ratio = points.doppler_ratio + points.doppler_ratio_growth
+    drift_ratio = doppler_ratio * (1 + doppler_ratio / 2) + slide_speed / SPEED_OF_LIGHT
+    if not drift_ratio.any():
+        return None
+    return phase_over_record(
+        points, {2: points.existing_chirp_rates * points.chirp_rate * drift_ratio}
+    )
+
+
+def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
+    """Let the beats of the two chirps drift over the record: at t, to that of R - 2 v_r t."""
+    velocity, slide = (
+        shots.motion_by_segment["radial_velocity"],
+        shots.approach_speed - shots.radial_velocity,
+    )
+    shots = _add_phase_error(
+        shots, range_walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
+    )
+    return replace(shots, range_walk_time=shots.range_walk_time + chirp_drift_time(shots))
+
+
+def chirp_drift_time(shots: Shots) -> np.ndarray:
     """Slope of t^2 over the records that the echo has of both chirps [s], (n,) or scalar.
 
     That of the best straight line under the window: twice the time of the middle of a whole record.
     """
-    within = 2 * shots.acquisition_delay + shots.record_duration
-    if shots.first_sample is None:
-        return np.asarray(within)
-    slope = _slope_of_square(shots.window)[shots.first_sample[::2]].mean(axis=0)
-    return np.asarray(within + 0.5 * shots.record_duration * slope)
+    drift_time = 2 * shots.acquisition_delay + shots.record_duration
+    if shots.n_samples_before_echo is None:
+        return np.asarray(drift_time)
+    slope = _square_slope_by_first_sample(shots.window)[shots.n_samples_before_echo[::2]].mean(
+        axis=0
+    )
+    return np.asarray(drift_time + 0.5 * shots.record_duration * slope)
 
 
 @lru_cache(maxsize=8)
-def _slope_of_square(window: Window) -> np.ndarray:
+def _square_slope_by_first_sample(window: Window) -> np.ndarray:
     """Slope of the best line to x^2 over the samples from each on, (L + 1,), under the window.
 
     The places x of all samples are -1..1, whose slope is 0.
     """
-    x = 2 * np.arange(window.length) / window.length - 1
-    powers = (window.samples() * x**k for k in range(4))
-    zero, one, two, three = (np.cumsum(v[::-1])[::-1] for v in powers)
+    position = 2 * np.arange(window.length) / window.length - 1
+    powers = (window.samples() * position**exponent for exponent in range(4))
+    moment_0, moment_1, moment_2, moment_3 = (
+        np.cumsum(moment_terms[::-1])[::-1] for moment_terms in powers
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, two, three = one / zero, two / zero, three / zero
-        slope = (three - one * two) / (two - one * one)
-    slope = np.clip(np.where(np.isfinite(slope), slope, 2 * x), np.minimum(2 * x, 0.0), 2.0)
+        moment_1, moment_2, moment_3 = moment_1 / moment_0, moment_2 / moment_0, moment_3 / moment_0
+        slope = (moment_3 - moment_1 * moment_2) / (moment_2 - moment_1 * moment_1)
+    slope = np.clip(
+        np.where(np.isfinite(slope), slope, 2 * position), np.minimum(2 * position, 0.0), 2.0
+    )
     slope[0] = 0.0
     return np.append(slope, 2.0)
 
 
 RANGE_WALK = Effect(
     name="range_walk",
-    about="drift of the beat as the target moves",
+    description="drift of the beat as the target moves",
     stage="record",
-    size=partial(phase_size, name="range_walk"),
-    smear=walk_smear,
-    act=walk,
+    error_bound=partial(phase_omission_bound, name="range_walk"),
+    phase_error_bound=range_walk_phase_bound,
+    apply=apply_range_walk,
 )
 
 
-_ACCELERATION = "target.acceleration"
+_ACCELERATION_PATH = "target.acceleration"
 
 
 def acceleration_phase(
-    x: np.ndarray,
+    position: np.ndarray,
     *,
     sign: int,
     carrier: np.ndarray,
@@ -297,74 +361,74 @@ def acceleration_phase(
     duration: np.ndarray,
 ) -> np.ndarray:
     """Phase [cycles] that acceleration adds to the beat, (n, m); values at the segment's start."""
-    alpha = _column(np.asarray(acceleration) / SPEED_OF_LIGHT)
-    beta = _column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _column(2 * np.asarray(range) / SPEED_OF_LIGHT)
-    t = record_times(x, start=start, duration=duration)
-    chirped = -delay + (1 + beta) * t + alpha * t**2 / 2
-    slope = _column(sign * np.asarray(chirp_rate))
-    return np.asarray(alpha * t**2 * (_column(carrier) + slope * chirped))
+    alpha = _as_column(np.asarray(acceleration) / SPEED_OF_LIGHT)
+    beta = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
+    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
+    t = record_times(position, start=start, duration=duration)
+    chirp_term = -delay + (1 + beta) * t + alpha * t**2 / 2
+    signed_chirp_rate = _as_column(sign * np.asarray(chirp_rate))
+    return np.asarray(alpha * t**2 * (_as_column(carrier) + signed_chirp_rate * chirp_term))
 
 
-def acceleration_smear(points: Points) -> Smear | None:
+def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the phase that acceleration adds over the record; None where there is none."""
-    if not points.has(_ACCELERATION):
+    if not points.any_nonzero(_ACCELERATION_PATH):
         return None
-    alpha = points[_ACCELERATION] / SPEED_OF_LIGHT
-    slope = points.signs * points.chirp_rate
-    terms = {
-        2: alpha * (points.carriers - slope * points.delay),
-        3: alpha * slope * (1 + points.beta),
-        4: alpha**2 * slope * 0.5,
+    alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT
+    signed_chirp_rate = points.existing_chirp_rates * points.chirp_rate
+    coefficient_by_power = {
+        2: alpha * (points.carriers - signed_chirp_rate * points.delay),
+        3: alpha * signed_chirp_rate * (1 + points.doppler_ratio),
+        4: alpha**2 * signed_chirp_rate * 0.5,
     }
-    return over_record(points, terms)
+    return phase_over_record(points, coefficient_by_power)
 
 
-def acceleration_size(points: Points) -> Size | None:
+def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin by its drift, in a record and over looks that are added."""
-    found = phase_size(points, "acceleration")
-    if found is None or points.looks.added == 1:
-        return found
-    left = coherent_gain(
+    bound = phase_omission_bound(points, "acceleration")
+    if bound is None or points.looks.n_coherent == 1:
+        return bound
+    gain = coherent_gain(
         points.looks, acceleration=points.acceleration, carrier=points.carriers[0],
-        period=points.look_period,
+        look_period=points.look_period,
     )  # fmt: skip
-    return found._replace(magnitude=found.magnitude + 1 - left)
+    return bound._replace(magnitude_change=bound.magnitude_change + 1 - gain)
 
 
-def accelerate(shots: Shots, scene: Scene) -> Shots:
+def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
     """Let the Doppler frequency drift over the record of every segment.
 
     The loss that it causes in looks that are added in amplitude is included.
     """
-    if shots.looks.added > 1:
-        left = coherent_gain(
+    if shots.looks.n_coherent > 1:
+        gain = coherent_gain(
             shots.looks, acceleration=shots.acceleration, carrier=shots.carriers[0],
-            period=shots.look_period,
+            look_period=shots.look_period,
         )  # fmt: skip
-        shots = replace(shots, beat_scale=shots.beat_scale * left)
-    shots = replace(shots, speeding=shots.acquisition_delay + shots.record_duration / 2)
-    return _with_phase(
+        shots = replace(shots, beat_amplitude_scale=shots.beat_amplitude_scale * gain)
+    shots = replace(shots, velocity_drift_time=shots.acquisition_delay + shots.record_duration / 2)
+    return _add_phase_error(
         shots,
         acceleration_phase,
         carrier=shots.carriers,
         chirp_rate=shots.chirp_rate,
         acceleration=shots.acceleration,
-        **shots.motion,
+        **shots.motion_by_segment,
     )
 
 
 ACCELERATION = Effect(
     name="acceleration",
-    about="drift of the Doppler frequency",
+    description="drift of the Doppler frequency",
     stage="record",
-    size=acceleration_size,
-    smear=acceleration_smear,
-    act=accelerate,
+    error_bound=acceleration_bound,
+    phase_error_bound=acceleration_phase_bound,
+    apply=apply_acceleration,
     parameters=(
         Parameter(
-            path=_ACCELERATION,
-            about="Rate at which the radial velocity grows",
+            path=_ACCELERATION_PATH,
+            description="Rate at which the radial velocity grows",
             example="10 m/s^2",
             limits=("-1e6 m/s^2", "1e6 m/s^2"),
         ),
@@ -372,16 +436,16 @@ ACCELERATION = Effect(
 )
 
 
-_SHAPES = ("quadratic", "cubic", "sinusoidal")
-_PEAKS = tuple(f"{CHIRP}{shape}_error" for shape in _SHAPES)
-_PERIODS = CHIRP + "error_periods"
-ERROR_TABLE, NO_TABLE = CHIRP + "error_table", "none"
+_ERROR_SHAPES = ("quadratic", "cubic", "sinusoidal")
+_ERROR_PEAK_PATHS = tuple(f"{CHIRP_PREFIX}{shape}_error" for shape in _ERROR_SHAPES)
+_ERROR_PERIODS_PATH = CHIRP_PREFIX + "error_periods"
+ERROR_TABLE_PATH, NO_TABLE = CHIRP_PREFIX + "error_table", "none"
 
 
-def table_phase(
-    x: np.ndarray,
+def error_table_phase(
+    position: np.ndarray,
     *,
-    table: SweepTable,
+    table: SweepErrorTable,
     sign: int,
     chirp_duration: np.ndarray,
     range: np.ndarray,
@@ -395,16 +459,16 @@ def table_phase(
     error stays what it is there.
     """
     if sign == 0:
-        return np.zeros((np.size(range), np.size(x)))
-    t = record_times(x, start=start, duration=duration)
-    beta = _column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _column(2 * np.asarray(range) / SPEED_OF_LIGHT) - beta * t
-    at = t if sign > 0 else _column(chirp_duration) - t  # in the up-chirp
-    return -sign * table.integral(at - sign * delay, at)
+        return np.zeros((np.size(range), np.size(position)))
+    t = record_times(position, start=start, duration=duration)
+    doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
+    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT) - doppler_ratio * t
+    sweep_time = t if sign > 0 else _as_column(chirp_duration) - t  # in the up-chirp
+    return -sign * table.integrate_error(sweep_time - sign * delay, sweep_time)
 
 
-def sweep_phase(
-    x: np.ndarray,
+def chirp_nonlinearity_phase(
+    position: np.ndarray,
     *,
     sign: int,
     chirp_duration: np.ndarray,
@@ -422,128 +486,176 @@ def sweep_phase(
     Peaks q, k and p [Hz], either sign, and periods m > 0 of the last over a sweep of length T [s].
     """
     if sign == 0:
-        return np.zeros((np.size(range), np.size(x)))
-    t = record_times(x, start=start, duration=duration)
-    beta = _column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
-    delay = _column(2 * np.asarray(range) / SPEED_OF_LIGHT)
-    length, periods = _column(chirp_duration), _column(periods)
-    u = sign * (2 * t / length - 1)
-    h = -sign * 2 * (delay - beta * t) / length
+        return np.zeros((np.size(range), np.size(position)))
+    t = record_times(position, start=start, duration=duration)
+    doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
+    delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
+    sweep_duration, periods = _as_column(chirp_duration), _as_column(periods)
+    u = sign * (2 * t / sweep_duration - 1)
+    h = -sign * 2 * (delay - doppler_ratio * t) / sweep_duration
     # The integral of e over u from u to u + h, in forms whose terms do not cancel for small h: the
     # mean of T_2 and T_3 over a step about its middle; that of a sine is sinc times it.
-    middle, square = u + h / 2, h * h
-    mean = _column(quadratic) * (2 * middle**2 - 1 + square / 6)
-    mean = mean + _column(cubic) * middle * (4 * middle**2 - 3 + square)
-    sine = np.sin(np.pi * periods * middle)
-    mean = mean + _column(sinusoidal) * np.sinc(periods * h / 2) * sine
-    return np.asarray(sign * length / 2 * (h * mean))
+    step_middle, squared_step = u + h / 2, h * h
+    mean_error = _as_column(quadratic) * (2 * step_middle**2 - 1 + squared_step / 6)
+    mean_error = mean_error + _as_column(cubic) * step_middle * (
+        4 * step_middle**2 - 3 + squared_step
+    )
+    sine = np.sin(np.pi * periods * step_middle)
+    mean_error = mean_error + _as_column(sinusoidal) * np.sinc(periods * h / 2) * sine
+    return np.asarray(sign * sweep_duration / 2 * (h * mean_error))
 
 
-def sweep_smear(points: Points) -> Smear | None:
+def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the phase that the sweep's error adds over the record; None where there is none.
 
     Square and cube are polynomials in the place in the record; the sine and what a table departs
     from the middle of its span are taken at their largest.
     """
-    text = points.word(ERROR_TABLE)
-    if not points.has(*_PEAKS):
-        return None if text == NO_TABLE else _table_smear(points, sweep_table(text))
-    quadratic, cubic, sinusoidal = (points[path] for path in _PEAKS)
-    half, signs = 0.5 * points.record_duration, points.signs
-    middle, per_length = points.start + half, 2 / points[CHIRP + "duration"]
-    delay = [points.delay - points.beta * middle, -points.beta * half]
-    step = [-signs * per_length * part for part in delay]
-    place = [
-        signs * (per_length * middle - 1) + 0.5 * step[0],
-        signs * per_length * half + 0.5 * step[1],
+    table_text = points.option(ERROR_TABLE_PATH)
+    if not points.any_nonzero(*_ERROR_PEAK_PATHS):
+        return (
+            None
+            if table_text == NO_TABLE
+            else _error_table_phase_bound(points, fit_sweep_error(table_text))
+        )
+    quadratic, cubic, sinusoidal = (points[path] for path in _ERROR_PEAK_PATHS)
+    half_duration, chirp_rates = 0.5 * points.record_duration, points.existing_chirp_rates
+    record_middle, position_per_second = (
+        points.acquisition_delay + half_duration,
+        2 / points[CHIRP_PREFIX + "duration"],
+    )
+    delay = [
+        points.delay - points.doppler_ratio * record_middle,
+        -points.doppler_ratio * half_duration,
     ]
-    square, small = _product(place, place), _product(step, step)
-    mean = [quadratic * (2 * a + b / 6) for a, b in zip(square, small, strict=True)]
-    mean[0] = mean[0] - quadratic
-    factor = [4 * a + b for a, b in zip(square, small, strict=True)]
-    factor[0] = factor[0] - 3
-    cube = [cubic * part for part in _product(place, factor)]
-    mean = [a + b for a, b in zip([*mean, np.zeros(())], cube, strict=True)]
-    chirped = np.abs(signs)
-    constant, *powers = (chirped * np.abs(part) for part in _product(delay, mean))
-    rest = chirped * (np.abs(delay[0]) + np.abs(delay[1])) * np.abs(sinusoidal)
-    turns = 2 * np.pi * points[_PERIODS] * per_length * half
-    smear = Smear(tuple(powers), rest, constant, rest * turns)
-    return smear if text == NO_TABLE else smear.plus(_table_smear(points, sweep_table(text)))
+    step = [-chirp_rates * position_per_second * part for part in delay]
+    sweep_position = [
+        chirp_rates * (position_per_second * record_middle - 1) + 0.5 * step[0],
+        chirp_rates * position_per_second * half_duration + 0.5 * step[1],
+    ]
+    squared_position, squared_step = (
+        _polynomial_product(sweep_position, sweep_position),
+        _polynomial_product(step, step),
+    )
+    mean_error = [
+        quadratic * (2 * a + b / 6) for a, b in zip(squared_position, squared_step, strict=True)
+    ]
+    mean_error[0] = mean_error[0] - quadratic
+    cubic_factor = [4 * a + b for a, b in zip(squared_position, squared_step, strict=True)]
+    cubic_factor[0] = cubic_factor[0] - 3
+    cubic_error = [cubic * part for part in _polynomial_product(sweep_position, cubic_factor)]
+    mean_error = [a + b for a, b in zip([*mean_error, np.zeros(())], cubic_error, strict=True)]
+    slope_magnitude = np.abs(chirp_rates)
+    constant, *coefficients = (
+        slope_magnitude * np.abs(part) for part in _polynomial_product(delay, mean_error)
+    )
+    sine_phase = slope_magnitude * (np.abs(delay[0]) + np.abs(delay[1])) * np.abs(sinusoidal)
+    sine_phase_slope = 2 * np.pi * points[_ERROR_PERIODS_PATH] * position_per_second * half_duration
+    phase_bound = PhaseErrorBound(
+        tuple(coefficients), sine_phase, constant, sine_phase * sine_phase_slope
+    )
+    return (
+        phase_bound
+        if table_text == NO_TABLE
+        else phase_bound.plus(_error_table_phase_bound(points, fit_sweep_error(table_text)))
+    )
 
 
-def _table_smear(points: Points, table: SweepTable) -> Smear:
+def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> PhaseErrorBound:
     """Phase of a table's error e, about -tau e, by the middle of its span, the rest and e'."""
-    place = np.cos(np.linspace(0, np.pi, 16 * table.series.size + 1))
-    error, slope = table.error(place), np.polynomial.chebyshev.chebder(table.series)
-    middle, swing = (error.max() + error.min()) / 2, np.ptp(error) / 2
-    steep = np.abs(np.polynomial.chebyshev.chebval(place, slope)).max()
-    steep = steep * 2 / (table.last - table.first)
-    length, walk, chirped = points.record_duration, np.abs(points.beta), np.abs(points.signs)
-    delay = points.delay + walk * (points.start + length)
-    linear = 0.5 * walk * length * abs(middle)
-    reach = (delay * steep + walk * swing) * length
-    powers = (chirped * linear, 0.0, 0.0, 0.0)
-    return Smear(powers, chirped * delay * swing, chirped * delay * abs(middle), chirped * reach)
+    position = np.cos(np.linspace(0, np.pi, 16 * table.chebyshev_coefficients.size + 1))
+    errors, slope_coefficients = (
+        table.frequency_error(position),
+        np.polynomial.chebyshev.chebder(table.chebyshev_coefficients),
+    )
+    mid_error, half_span = (errors.max() + errors.min()) / 2, np.ptp(errors) / 2
+    error_slope_max = np.abs(np.polynomial.chebyshev.chebval(position, slope_coefficients)).max()
+    error_slope_max = error_slope_max * 2 / (table.last_time - table.first_time)
+    record_duration, delay_rate, slope_magnitude = (
+        points.record_duration,
+        np.abs(points.doppler_ratio),
+        np.abs(points.existing_chirp_rates),
+    )
+    delay_max = points.delay + delay_rate * (points.acquisition_delay + record_duration)
+    linear_phase = 0.5 * delay_rate * record_duration * abs(mid_error)
+    extra_shift = (delay_max * error_slope_max + delay_rate * half_span) * record_duration
+    coefficients = (slope_magnitude * linear_phase, 0.0, 0.0, 0.0)
+    return PhaseErrorBound(
+        coefficients,
+        slope_magnitude * delay_max * half_span,
+        slope_magnitude * delay_max * abs(mid_error),
+        slope_magnitude * extra_shift,
+    )
 
 
-def _product(one: Sequence[Sized], other: Sequence[Sized]) -> list[Sized]:
+def _polynomial_product(
+    first: Sequence[ArrayOrFloat], second: Sequence[ArrayOrFloat]
+) -> list[ArrayOrFloat]:
     """Coefficients of a product of polynomials, lowest power first."""
-    product: list[Sized] = [0.0] * (len(one) + len(other) - 1)
-    for i, a in enumerate(one):
-        for j, b in enumerate(other):
+    product: list[ArrayOrFloat] = [0.0] * (len(first) + len(second) - 1)
+    for i, a in enumerate(first):
+        for j, b in enumerate(second):
             product[i + j] = product[i + j] + a * b
     return product
 
 
-def bend_sweep(shots: Shots, scene: Scene) -> Shots:
+def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
     """Add the sweep's error to the record of the two chirps."""
-    p, own = scene.parameters, {"chirp_duration": shots.duration, **shots.motion}
-    if (text := str(p[ERROR_TABLE])) != NO_TABLE:
-        shots = _with_phase(shots, partial(table_phase, table=sweep_table(text)), **own)
-    return _with_phase(
+    parameters, phase_inputs = (
+        context.parameters,
+        {"chirp_duration": shots.chirp_duration, **shots.motion_by_segment},
+    )
+    if (table_text := str(parameters[ERROR_TABLE_PATH])) != NO_TABLE:
+        shots = _add_phase_error(
+            shots, partial(error_table_phase, table=fit_sweep_error(table_text)), **phase_inputs
+        )
+    return _add_phase_error(
         shots,
-        sweep_phase,
-        **own,
-        **{shape: p[path] for shape, path in zip(_SHAPES, _PEAKS, strict=True)},
-        periods=p[_PERIODS],
+        chirp_nonlinearity_phase,
+        **phase_inputs,
+        **{
+            error_shape: parameters[path]
+            for error_shape, path in zip(_ERROR_SHAPES, _ERROR_PEAK_PATHS, strict=True)
+        },
+        periods=parameters[_ERROR_PERIODS_PATH],
     )
 
 
 CHIRP_NONLINEARITY = Effect(
     name="chirp_nonlinearity",
-    about="departure of the sweep from a straight line",
+    description="departure of the sweep from a straight line",
     stage="record",
-    size=partial(phase_size, name="chirp_nonlinearity"),
-    smear=sweep_smear,
-    act=bend_sweep,
+    error_bound=partial(phase_omission_bound, name="chirp_nonlinearity"),
+    phase_error_bound=chirp_nonlinearity_phase_bound,
+    apply=apply_chirp_nonlinearity,
     parameters=(
         *(
             Parameter(
                 path=path,
-                about=f"Peak of the sweep's frequency error that goes as a {form}",
+                description=f"Peak of the sweep's frequency error that goes as a {form}",
                 example="100 kHz",
                 limits=("-1e15 Hz", "1e15 Hz"),
             )
-            for path, form in zip(_PEAKS, ("square", "cube", "sine"), strict=True)
+            for path, form in zip(_ERROR_PEAK_PATHS, ("square", "cube", "sine"), strict=True)
         ),
         Parameter(
-            path=_PERIODS,
-            about="Periods of the sinusoidal error over the sweep",
+            path=_ERROR_PERIODS_PATH,
+            description="Periods of the sinusoidal error over the sweep",
             default=1.0,
             example="5",
             limits=("1e-6", "1000"),
         ),
         Parameter(
-            path=ERROR_TABLE,
-            about="Measured frequency error of the sweep over the up-chirp, which the down-chirp "
+            path=ERROR_TABLE_PATH,
+            description="Measured frequency error of the sweep over the up-chirp, which the "
+            "down-chirp "
             "runs through backwards: a list of times and errors, [[0 us, 0 Hz], [10 us, 2 kHz], "
             "...], or a CSV file with the columns 'time [us], error [kHz]'; none for no table. It "
             "must cover the chirp from 0 to duration, and be smooth: a Chebyshev series of degree "
             "64 at the most stands for it, to 1e-3 of its span. Echoes that arrive after the "
             "record begins (acquisition_delay) see its ends held, and take longer to compute",
             default=NO_TABLE,
-            table=True,
+            is_table=True,
         ),
     ),
 )

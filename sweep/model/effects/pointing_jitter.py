@@ -23,17 +23,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.effect import Effect, Parameter, Realisation, Size
-from sweep.model.effects.points import Points, Smear, by_power
-from sweep.model.footprint import NO_SPREAD, reach_of
+from sweep.model.beamlets import NO_SPREAD, pattern_radius
+from sweep.model.effects.effect import DrawAddresses, Effect, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import (
+    PhaseErrorBound,
+    PlannerInputs,
+    magnitude_change_from_power,
+)
 
-RARE = 1e-6
+RARE_DRAW_PROBABILITY = 1e-6
 """Probability of a draw whose beam is further off than its size takes it to be."""
 
-_JITTER = "target.pointing_jitter"
+_JITTER_PATH = "target.pointing_jitter"
 
 
-class Turned(NamedTuple):
+class PerturbedGeometry(NamedTuple):
     """Geometry of a turned beam, each of the broadcast shape; nan where it misses the plane."""
 
     range: np.ndarray
@@ -44,123 +48,148 @@ class Turned(NamedTuple):
     """[m/s], positive when closing."""
 
 
-def angles(realisation: Realisation, sigma: np.ndarray) -> np.ndarray:
+def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
     """Angles (a, b) by which beams of this standard deviation are off, (n, 2) [rad]."""
-    from sweep.model.philox import STREAM_POINTING_JITTER, normals, uniforms
+    from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row, uniforms
 
-    draws = uniforms(realisation.keys, realisation.draw, STREAM_POINTING_JITTER, 2)
-    return normals(draws) * np.asarray(sigma, float)[..., None]
+    uniform_draws = uniforms(
+        draw_addresses.point_keys, draw_addresses.draw_numbers, STREAM_POINTING_JITTER, 2
+    )
+    return to_normals_by_row(uniform_draws) * np.asarray(sigma, float)[..., None]
 
 
-def turned(
+def perturb_geometry(
     *,
     range: ArrayLike,
     grazing_angle: ArrayLike,
     radial_velocity: ArrayLike,
-    angles: np.ndarray,
-    velocity_across: ArrayLike = (0.0, 0.0),
-) -> Turned:
+    jitter_angles: np.ndarray,
+    transverse_velocity: ArrayLike = (0.0, 0.0),
+) -> PerturbedGeometry:
     """Geometry of beams that are off by some angles (..., 2) [rad].
 
     Range, grazing angle and velocity [m, rad, m/s] are those of the axis as aimed; they broadcast
     against the angles' leading axes. The angles are a, positive towards grazing (upwards), and b,
-    and `velocity_across` (..., 2) the instrument's velocity along their directions [m/s].
+    and `transverse_velocity` (..., 2) the instrument's velocity along their directions [m/s].
     """
-    aimed, off = np.asarray(grazing_angle, float), np.asarray(angles, float)
-    angle = np.hypot(off[..., 0], off[..., 1])
-    ratio, cosine = np.sinc(angle / math.pi), np.cos(angle)
-    sine = np.sin(aimed) * cosine - off[..., 0] * np.cos(aimed) * ratio
-    ahead = np.cos(aimed) * cosine + off[..., 0] * np.sin(aimed) * ratio
-    grazing = np.arctan2(sine, np.hypot(ahead, off[..., 1] * ratio))
-    across = (np.asarray(velocity_across, float) * off).sum(axis=-1) * ratio
-    hits = sine > 0
-    far = np.asarray(range, float) * np.sin(aimed) / np.where(hits, sine, 1.0)
-    return Turned(
-        np.where(hits, far, np.nan),
-        np.where(hits, grazing, np.nan),
-        np.asarray(radial_velocity, float) * cosine + across,
+    aimed_grazing, offsets = np.asarray(grazing_angle, float), np.asarray(jitter_angles, float)
+    total_angle = np.hypot(offsets[..., 0], offsets[..., 1])
+    sinc, cosine = np.sinc(total_angle / math.pi), np.cos(total_angle)
+    grazing_sine = np.sin(aimed_grazing) * cosine - offsets[..., 0] * np.cos(aimed_grazing) * sinc
+    grazing_cosine = np.cos(aimed_grazing) * cosine + offsets[..., 0] * np.sin(aimed_grazing) * sinc
+    grazing = np.arctan2(grazing_sine, np.hypot(grazing_cosine, offsets[..., 1] * sinc))
+    transverse_speed = (np.asarray(transverse_velocity, float) * offsets).sum(axis=-1) * sinc
+    hits_plane = grazing_sine > 0
+    hit_range = (
+        np.asarray(range, float) * np.sin(aimed_grazing) / np.where(hits_plane, grazing_sine, 1.0)
+    )
+    return PerturbedGeometry(
+        np.where(hits_plane, hit_range, np.nan),
+        np.where(hits_plane, grazing, np.nan),
+        np.asarray(radial_velocity, float) * cosine + transverse_speed,
     )
 
 
-def _furthest(points: Points) -> tuple[np.ndarray, np.ndarray]:
+def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
     """Ratio of ranges, less 1, and bins by which lines move, by the furthest turn but for few.
 
     Down to the lowest beamlets; infinite where one may pass over the horizon.
     """
-    off = points[_JITTER] * math.sqrt(2 * math.log(1 / RARE))
-    rim: np.ndarray | float = 0.0
-    if points.number > 1:
-        rim = reach_of(points.number, points.pattern) * points.angles.places / 4
-    lowest = points["target.grazing_angle"] - rim
-    sure = lowest > off
-    lowest = np.where(sure, lowest, 1.0)
-    ratio = np.where(sure, np.sin(lowest) / np.sin(lowest - np.where(sure, off, 0.0)) - 1, np.inf)
-    across = np.abs(points["target.transverse_velocity"])
-    doppler = np.abs(points.radial_velocity) * off**2 / 2 + across * off
-    ratio = np.where(off > 0, np.maximum(ratio, off**2 / 2), 0.0)
-    bins = points.per_range * np.minimum(ratio, 1e6) + points.per_velocity * doppler
-    return ratio, bins
+    turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
+    rim_angle: np.ndarray | float = 0.0
+    if points.n_beamlets > 1:
+        rim_angle = (
+            pattern_radius(points.n_beamlets, points.beamlet_pattern)
+            * points.footprint_angles.positions
+            / 4
+        )
+    lowest_grazing = points["target.grazing_angle"] - rim_angle
+    stays_on_plane = lowest_grazing > turn_max
+    lowest_grazing = np.where(stays_on_plane, lowest_grazing, 1.0)
+    range_ratio = np.where(
+        stays_on_plane,
+        np.sin(lowest_grazing) / np.sin(lowest_grazing - np.where(stays_on_plane, turn_max, 0.0))
+        - 1,
+        np.inf,
+    )
+    transverse_speed = np.abs(points["target.transverse_velocity"])
+    velocity_change = np.abs(points.radial_velocity) * turn_max**2 / 2 + transverse_speed * turn_max
+    range_ratio = np.where(turn_max > 0, np.maximum(range_ratio, turn_max**2 / 2), 0.0)
+    shift_bins = (
+        points.bins_per_relative_range * np.minimum(range_ratio, 1e6)
+        + points.bins_per_velocity * velocity_change
+    )
+    return range_ratio, shift_bins
 
 
-def smear(points: Points) -> Smear | None:
+def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Reach of lines that draws throw off."""
-    if not points.has(_JITTER):
+    if not points.any_nonzero(_JITTER_PATH):
         return None
-    return Smear(reach=_furthest(points)[1] / points.margin)
+    return PhaseErrorBound(extra_shift_window_bins=_largest_turn(points)[1] / points.padding_factor)
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change by leaving jitter out in all draws but few.
 
     Echo powers go by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
     footprint whose phases follow its geometry may fade altogether, or not any more, and so may
     lines with their images: of those nothing is known.
     """
-    if not points.has(_JITTER):
+    if not points.any_nonzero(_JITTER_PATH):
         return None
-    ratio, bins = _furthest(points)
-    echo = 3 * ratio * (1 + ratio) ** 2
-    power = points.moved(NO_SPREAD, points.spread, bins) + echo
-    unknown = points.may_cancel & (points[_JITTER] > 0)
-    added: np.ndarray | float = 0.0
-    if points.may_add:  # a line turns against its image as the range changes
-        turns = points.carriers * points.delay * np.minimum(ratio, 1e6)
-        added = points.image * np.minimum(4 * math.pi * turns, 2.0)
-    return Size(
-        magnitude=np.where(unknown, 1.0, by_power(power)),
-        added=added,
-        noise=np.minimum(echo, 1e6) * points.echo_noise,
-        threshold_follows=False,
+    range_ratio, shift_bins = _largest_turn(points)
+    echo_change = 3 * range_ratio * (1 + range_ratio) ** 2
+    power_change = (
+        points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins) + echo_change
+    )
+    is_unknown = points.may_cancel & (points[_JITTER_PATH] > 0)
+    coherent_change: np.ndarray | float = 0.0
+    if points.amplitudes_may_add:  # a line turns against its image as the range changes
+        turned_cycles = points.carriers * points.delay * np.minimum(range_ratio, 1e6)
+        coherent_change = points.image_bound * np.minimum(4 * math.pi * turned_cycles, 2.0)
+    return ErrorBound(
+        magnitude_change=np.where(is_unknown, 1.0, magnitude_change_from_power(power_change)),
+        coherent_sum_change=coherent_change,
+        noise_variance_change=np.minimum(echo_change, 1e6) * points.echo_noise_ratio,
+        threshold_follows_noise=False,
     )
 
 
-def turn(p: dict[str, np.ndarray], realisation: Realisation) -> dict[str, np.ndarray]:
+def perturb_parameters(
+    parameters: dict[str, np.ndarray], draw_addresses: DrawAddresses
+) -> dict[str, np.ndarray]:
     """Range, grazing angle and velocities of beams that are off; no echo where they miss."""
-    off = angles(realisation, p[_JITTER])
-    across = np.zeros_like(off)
-    across[:, 0] = -p["target.transverse_velocity"]  # towards the near side is off grazing
-    aimed = {name: p[f"target.{name}"] for name in Turned._fields}
-    seen = turned(angles=off, velocity_across=across, **aimed)
-    hits = np.isfinite(seen.range)
-    return p | {
-        "target.range": np.where(hits, seen.range, 1.0),
-        "target.grazing_angle": np.where(hits, seen.grazing_angle, math.pi / 2),
-        "target.radial_velocity": seen.radial_velocity,
-        "target.reflectance": np.where(hits, p["target.reflectance"], 0.0),
+    jitter_angles = draw_jitter_angles(draw_addresses, parameters[_JITTER_PATH])
+    transverse_velocity = np.zeros_like(jitter_angles)
+    transverse_velocity[:, 0] = -parameters[
+        "target.transverse_velocity"
+    ]  # towards the near side is off grazing
+    aimed_geometry = {name: parameters[f"target.{name}"] for name in PerturbedGeometry._fields}
+    perturbed = perturb_geometry(
+        jitter_angles=jitter_angles, transverse_velocity=transverse_velocity, **aimed_geometry
+    )
+    hits_plane = np.isfinite(perturbed.range)
+    return parameters | {
+        "target.range": np.where(hits_plane, perturbed.range, 1.0),
+        "target.grazing_angle": np.where(hits_plane, perturbed.grazing_angle, math.pi / 2),
+        "target.radial_velocity": perturbed.radial_velocity,
+        "target.reflectance": np.where(hits_plane, parameters["target.reflectance"], 0.0),
     }
 
 
 POINTING_JITTER = Effect(
     name="pointing_jitter",
-    about="a beam that wanders from shot to shot",
+    description="a beam that wanders from shot to shot",
     stage="draws",
-    size=size,
-    smear=smear,
-    turn=turn,
+    error_bound=error_bound,
+    phase_error_bound=phase_error_bound,
+    perturb_parameters=perturb_parameters,
     parameters=(
         Parameter(
-            path=_JITTER,
-            about="Standard deviation of the beam's direction, on each axis, from shot to shot",
+            path=_JITTER_PATH,
+            description="Standard deviation of the beam's direction, on each axis, from shot to "
+            "shot",
             example="20 urad",
             limits=("0 rad", "10 deg"),
         ),

@@ -23,28 +23,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from sweep.model import link, waveform
+from sweep.model import receiver_chain, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import amplifier, atmosphere, circulator_leak, noise_sources
-from sweep.model.effects.effect import Effect, Parameter, Scene, Size
-from sweep.model.effects.points import Points
-from sweep.model.preparation import PROCESSING, Shots
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import PROCESSING_PREFIX, Shots
+from sweep.model.unsupported_shot import UnsupportedShotError
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
-_CUTS = np.array([-8.0, 0.0, 8.0])
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
+_CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
 """Point at which the quarter of a period is cut, in deviations of the noise off full scale: the
 integrands are smooth in between.
 """
-_SMALLEST = 1e-30
+_TINY = 1e-30
 """Stands for what is no more than positive."""
-_NO_LIMIT = 1e100
-_FAINTEST = 1e-5
+_UNLIMITED_VOLTAGE = 1e100
+_AMPLITUDE_MIN_SIGMA = 1e-5
 """Deviations of the noise below which beats are taken for that strong: their gain is the same to
 the square of this, and could not be told from the rounding of 1."""
 
 
-class Clipping(NamedTuple):
+class ClippingGains(NamedTuple):
     """A sine with noise once it is clipped, (n,) each."""
 
     signal_gain: np.ndarray
@@ -53,38 +53,40 @@ class Clipping(NamedTuple):
     """Factor on the noise variance, 0..1."""
 
 
-def clipping(*, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike) -> Clipping:
+def clipping_gains(
+    *, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike
+) -> ClippingGains:
     """Gain of line and noise by clipping, from voltages at the ADC [V], > 0, (n,) or scalars.
 
     They are the beat's amplitude, the noise's deviation, and the largest voltage that does not
     clip, to either side.
     """
-    given = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
-    a, s, v = (value[..., None] for value in np.broadcast_arrays(*given))
-    a = np.maximum(a, _FAINTEST * s)
-    phase, weight = _phases(a, s, v)
+    voltages = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
+    a, s, v = (value[..., None] for value in np.broadcast_arrays(*voltages))
+    a = np.maximum(a, _AMPLITUDE_MIN_SIGMA * s)
+    phase, weight = _phase_rule(a, s, v)
     sine = np.sin(phase)
-    loss, spread = _lost(a * sine, s, v)
-    taken = 2 * (weight * loss * sine).sum(axis=-1)  # off the line's amplitude
-    return Clipping(
-        signal_gain=1 - taken / a[..., 0],
-        noise_gain=(weight * spread).sum(axis=-1) / s[..., 0] ** 2,
+    voltage_loss, variance_left = _clipping_loss(a * sine, s, v)
+    amplitude_loss = 2 * (weight * voltage_loss * sine).sum(axis=-1)  # off the line's amplitude
+    return ClippingGains(
+        signal_gain=1 - amplitude_loss / a[..., 0],
+        noise_gain=(weight * variance_left).sum(axis=-1) / s[..., 0] ** 2,
     )
 
 
-def _phases(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Phases in a quarter of a period and weights whose sum is 1, (n, nodes) each."""
-    inner = np.arcsin(np.clip((v + _CUTS * s) / a, 0.0, 1.0))
-    ends = np.zeros(a.shape)
-    cuts = np.concatenate([ends, inner, ends + math.pi / 2], axis=-1)
-    half = np.diff(cuts)[..., None] / 2
-    phase = (cuts[..., :-1, None] + half) + half * _NODES
-    weight = half * _WEIGHTS / (math.pi / 2)
-    shape = (*a.shape[:-1], -1)
-    return phase.reshape(shape), weight.reshape(shape)
+    cut_phases = np.arcsin(np.clip((v + _CUT_DEVIATIONS * s) / a, 0.0, 1.0))
+    zeros = np.zeros(a.shape)
+    cuts = np.concatenate([zeros, cut_phases, zeros + math.pi / 2], axis=-1)
+    half_width = np.diff(cuts)[..., None] / 2
+    phase = (cuts[..., :-1, None] + half_width) + half_width * _GAUSS_NODES
+    weight = half_width * _GAUSS_WEIGHTS / (math.pi / 2)
+    flat_shape = (*a.shape[:-1], -1)
+    return phase.reshape(flat_shape), weight.reshape(flat_shape)
 
 
-def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean of what clipping takes off x + n, x >= 0, and the variance of what it leaves.
 
     In units of s, with ends a = (V - x)/s and b = (-V - x)/s: clipped noise is a above a, b below
@@ -92,115 +94,131 @@ def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.n
     """
     a, b = (v - x) / s, (-v - x) / s
     density = [np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (a, b)]
-    above, below = ndtr(-a), ndtr(b)
-    cut = (density[0] - a * above) - (density[1] + b * below)
-    square = a * a * above + b * b * below + (ndtr(a) - below) + b * density[1] - a * density[0]
-    return s * np.maximum(cut, 0.0), s * s * np.maximum(square - cut * cut, 0.0)
+    probability_above, probability_below = ndtr(-a), ndtr(b)
+    mean_loss = (density[0] - a * probability_above) - (density[1] + b * probability_below)
+    mean_square = (
+        a * a * probability_above
+        + b * b * probability_below
+        + (ndtr(a) - probability_below)
+        + b * density[1]
+        - a * density[0]
+    )
+    return s * np.maximum(mean_loss, 0.0), s * s * np.maximum(
+        mean_square - mean_loss * mean_loss, 0.0
+    )
 
 
-_FULL_SCALE = PROCESSING + "full_scale"
+_FULL_SCALE_PATH = PROCESSING_PREFIX + "full_scale"
 
-NOISE = (
+NOISE_EFFECTS = (
     noise_sources.SOLAR_BACKGROUND, atmosphere.BACKSCATTER,
     noise_sources.RELATIVE_INTENSITY_NOISE, amplifier.SPONTANEOUS_EMISSION,
     circulator_leak.CIRCULATOR_LEAK, noise_sources.QUANTISATION,
 )  # fmt: skip
 """Effects that add noise before the ADC clips, besides the shot noise of the echo."""
 
-MOST_BEYOND = 1e6
+FULL_SCALE_EXCESS_MAX = 1e6
 """Signal or noise over full scale; what clipping leaves has lost as many digits as this has."""
 
 
-def act(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Line and noise as clipping leaves them.
 
     The record is taken for one sine with the power of all lines. An UnsupportedShot for records
-    that exceed full scale more than :data:`MOST_BEYOND` times.
+    that exceed full scale more than :data:`FULL_SCALE_EXCESS_MAX` times.
     """
-    full_scale = np.asarray(scene.parameters[_FULL_SCALE], float)
-    limited = full_scale > 0
-    if not limited.any():
+    full_scale = np.asarray(context.parameters[_FULL_SCALE_PATH], float)
+    is_limited = full_scale > 0
+    if not is_limited.any():
         return shots
-    each = 0.5 if shots.complex_record else 1.0  # I and Q have half of the light each
-    amplitude = np.maximum(beat_amplitude(shots) * each, _SMALLEST)
-    deviation = np.sqrt(shots.noise_variance * each)
-    limit = np.where(limited, full_scale, _NO_LIMIT)
+    light_fraction = 0.5 if shots.complex_record else 1.0  # I and Q have half of the light each
+    amplitude = np.maximum(total_beat_amplitude(shots) * light_fraction, _TINY)
+    deviation = np.sqrt(shots.noise_variance * light_fraction)
+    voltage_limit = np.where(is_limited, full_scale, _UNLIMITED_VOLTAGE)
     with np.errstate(over="ignore"):  # a denormal limit is exceeded endlessly
-        beyond = float((np.maximum(amplitude, deviation) / limit).max())
-    if beyond > MOST_BEYOND:
-        raise UnsupportedShot(
-            f"instrument.processing.full_scale is exceeded {beyond:.3g} times by signal or noise, "
-            f"and {MOST_BEYOND:g} times can be simulated: raise it, or lower "
+        excess = float((np.maximum(amplitude, deviation) / voltage_limit).max())
+    if excess > FULL_SCALE_EXCESS_MAX:
+        raise UnsupportedShotError(
+            f"instrument.processing.full_scale is exceeded {excess:.3g} times by signal or noise, "
+            f"and {FULL_SCALE_EXCESS_MAX:g} times can be simulated: raise it, or lower "
             "instrument.receiver.transimpedance"
         )
-    left = clipping(amplitude=amplitude, deviation=deviation, full_scale=limit)
+    gains = clipping_gains(amplitude=amplitude, deviation=deviation, full_scale=voltage_limit)
     return replace(
         shots,
-        beat_scale=shots.beat_scale * left.signal_gain,
-        noise_gain=shots.noise_gain * left.noise_gain,
+        beat_amplitude_scale=shots.beat_amplitude_scale * gains.signal_gain,
+        noise_variance_gain=shots.noise_variance_gain * gains.noise_gain,
     )
 
 
-def beat_amplitude(shots: Shots) -> np.ndarray:
+def total_beat_amplitude(shots: Shots) -> np.ndarray:
     """Amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
     In the segment that passes the receiver best, of those that there are: at its lowest frequency.
     """
-    shape = {
+    beat_inputs = {
         "chirp_rate": shots.chirp_rate, "range": shots.range,
-        "radial_velocity": np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
+        "radial_velocity": np.asarray(shots.doppler_ratio * SPEED_OF_LIGHT / 2),
     }  # fmt: skip
-    beats = [
-        waveform.beat_frequency(shots.slopes[s], carrier=shots.carriers[s], **shape)
-        for s in np.flatnonzero(shots.segments)
+    beat_frequencies = [
+        waveform.beat_frequency(
+            shots.chirp_slopes[segment_index], carrier=shots.carriers[segment_index], **beat_inputs
+        )
+        for segment_index in np.flatnonzero(shots.has_segment)
     ]
-    lowest = np.min(np.abs(beats), axis=0)
-    gain = link.transfer(
-        lowest,
+    lowest_beat = np.min(np.abs(beat_frequencies), axis=0)
+    gain = receiver_chain.receiver_transfer(
+        lowest_beat,
         detector_bandwidth=shots.detector_bandwidth,
         amplifier_bandwidth=shots.amplifier_bandwidth,
     )
-    if shots.antialias:
-        gain = gain * np.sqrt(link.antialias_power(lowest, **shots.antialias))
-    echo = shots.relative_echo
+    if shots.antialias_filter:
+        gain = gain * np.sqrt(
+            receiver_chain.antialias_power_transmission(lowest_beat, **shots.antialias_filter)
+        )
+    echo = shots.total_relative_echo
     echo = echo if shots.architecture == "direct" else np.sqrt(echo)
-    return np.asarray(shots.beat_scale * echo * np.abs(gain))
+    return np.asarray(shots.beat_amplitude_scale * echo * np.abs(gain))
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change by leaving clipping out, whatever else is noise or dims the echo.
 
     Line and noise lose no more than the probability that the highest sample is clipped, as the mean
     slope of what is left is one less that probability; the threshold stays.
     """
-    if not points.has(_FULL_SCALE):
+    if not points.any_nonzero(_FULL_SCALE_PATH):
         return None
-    echo = np.maximum(points.footprint.echo_ratio, 1.0)
-    together = echo if points.architecture == "direct" else np.sqrt(echo)
-    amplitude = (points.beat * together * points.transfer).max(axis=0)
-    louder = 1 + points.echo_noise
-    for effect in NOISE:
-        if (change := effect.size(points)) is not None:
-            louder = louder + change.noise
-    deviation = np.sqrt(points.noise_variance * louder)
-    limit = points[_FULL_SCALE]
-    v = np.where(limit > 0, limit, _NO_LIMIT)
-    clipped = ndtr((amplitude - v) / deviation) + ndtr(-(amplitude + v) / deviation)
-    return Size(
-        magnitude=clipped, noise=-clipped * (2 - clipped) * (1 - 1e-9), threshold_follows=False
+    echo_ratio = np.maximum(points.footprint_extent.total_echo_ratio, 1.0)
+    amplitude_ratio = echo_ratio if points.architecture == "direct" else np.sqrt(echo_ratio)
+    amplitude = (points.beat_amplitude * amplitude_ratio * points.transfer_gain).max(axis=0)
+    noise_factor = 1 + points.echo_noise_ratio
+    for effect in NOISE_EFFECTS:
+        if (bound := effect.error_bound(points)) is not None:
+            noise_factor = noise_factor + bound.noise_variance_change
+    deviation = np.sqrt(points.receiver_noise_variance * noise_factor)
+    full_scale = points[_FULL_SCALE_PATH]
+    voltage_limit = np.where(full_scale > 0, full_scale, _UNLIMITED_VOLTAGE)
+    clip_probability = ndtr((amplitude - voltage_limit) / deviation) + ndtr(
+        -(amplitude + voltage_limit) / deviation
+    )
+    return ErrorBound(
+        magnitude_change=clip_probability,
+        noise_variance_change=-clip_probability * (2 - clip_probability) * (1 - 1e-9),
+        threshold_follows_noise=False,
     )
 
 
 SATURATION = Effect(
     name="saturation",
-    about="clipping at the ADC's full scale",
+    description="clipping at the ADC's full scale",
     stage="record",
-    size=size,
-    act=act,
+    error_bound=error_bound,
+    apply=apply,
     parameters=(
         Parameter(
-            path=_FULL_SCALE,
-            about="Largest voltage, to either side, that the ADC takes; 0 V for no limit",
+            path=_FULL_SCALE_PATH,
+            description="Largest voltage, to either side, that the ADC takes; 0 V for no limit",
             example="1 V",
             limits=("0 V", "1e12 V"),
         ),

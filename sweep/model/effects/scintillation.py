@@ -28,50 +28,50 @@ from scipy import special
 
 from sweep.model import beam
 from sweep.model.effects.atmosphere import path_heights
-from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
-from sweep.model.effects.points import Points
-from sweep.model.preparation import LASER, TELESCOPE, Shots
+from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
 
-_ENDS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
+_DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Powers of the distances to receiver and source in the integral over the path."""
-_LARGE = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
+_LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
 
 
-class Turbulence(NamedTuple):
+class TurbulenceProfile(NamedTuple):
     """Profile of the refractive index's structure constant over height above the ground."""
 
     uniform: float = 0.0
     """Part that is the same at all heights [m^(-2/3)]: alone, a constant C_n^2."""
-    surface: float = 0.0
+    surface_layer: float = 0.0
     """Hufnagel and Valley's A [m^(-2/3)] on the ground, e-folding over 100 m: 1.7e-14."""
-    wind: float = 0.0
+    wind_speed: float = 0.0
     """Their rms wind speed aloft [m/s]: 21."""
-    middle: float = 0.0
+    mid_altitude: float = 0.0
     """Their [m^(-2/3)] of e-folding height 1500 m: 2.7e-16."""
 
 
-HUFNAGEL_VALLEY = Turbulence(surface=1.7e-14, wind=21.0, middle=2.7e-16)
+HUFNAGEL_VALLEY = TurbulenceProfile(surface_layer=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16)
 """The 5/7 model: at 0.5 um 5 cm of coherence and 7 urad of isoplanatic angle [Valley 1980]."""
 
 
-class LogVariances(NamedTuple):
+class LogIrradianceVariances(NamedTuple):
     """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
 
-    large: np.ndarray
-    small: np.ndarray
+    large_eddies: np.ndarray
+    small_eddies: np.ndarray
 
 
-def structure_constant(turbulence: Turbulence, height: ArrayLike) -> np.ndarray:
+def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.ndarray:
     """C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground that on it."""
     h = np.maximum(np.asarray(height, float), 0.0)
-    aloft = 0.00594 * (turbulence.wind / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
-    middle = turbulence.middle * np.exp(-h / 1.5e3)
-    return turbulence.uniform + aloft + middle + turbulence.surface * np.exp(-h / 100)
+    aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
+    mid_altitude = turbulence.mid_altitude * np.exp(-h / 1.5e3)
+    return turbulence.uniform + aloft + mid_altitude + turbulence.surface_layer * np.exp(-h / 100)
 
 
 def rytov_variance(
     wave: str,
-    turbulence: Turbulence,
+    turbulence: TurbulenceProfile,
     *,
     wavelength: ArrayLike,
     range: ArrayLike,
@@ -85,29 +85,36 @@ def rytov_variance(
     Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height. `wave` is
     ``plane`` or ``spherical``, all else in [m], (n,) or scalar; it starts at the wave's source.
     """
-    share, weights = _rule(wave)
+    path_fraction, weights = _path_quadrature(wave)
     h0, h1 = (np.asarray(h, float)[..., None] for h in (start_height, end_height))
-    mean = (structure_constant(turbulence, h0 + (h1 - h0) * share) * weights).sum(axis=-1)
-    k = 2 * math.pi / np.asarray(wavelength, float)
-    return np.asarray(2.25 * k ** (7 / 6) * np.asarray(range, float) ** (11 / 6) * mean)
+    mean_structure_constant = (
+        structure_constant(turbulence, h0 + (h1 - h0) * path_fraction) * weights
+    ).sum(axis=-1)
+    wavenumber = 2 * math.pi / np.asarray(wavelength, float)
+    return np.asarray(
+        2.25
+        * wavenumber ** (7 / 6)
+        * np.asarray(range, float) ** (11 / 6)
+        * mean_structure_constant
+    )
 
 
 @lru_cache(maxsize=2)
-def _rule(wave: str) -> tuple[np.ndarray, np.ndarray]:
+def _path_quadrature(wave: str) -> tuple[np.ndarray, np.ndarray]:
     """Shares of the way from source to receiver and weights that hold the powers."""
-    to_receiver, to_source = _ENDS[wave]
-    x, weights = special.roots_jacobi(64, to_receiver, to_source)
-    return (1 + x) / 2, weights / 2 ** (1 + to_receiver + to_source)
+    to_receiver, to_source = _DISTANCE_EXPONENTS[wave]
+    nodes, weights = special.roots_jacobi(64, to_receiver, to_source)
+    return (1 + nodes) / 2, weights / 2 ** (1 + to_receiver + to_source)
 
 
-def log_variances(
+def log_irradiance_variances(
     wave: str,
     *,
     rytov_variance: ArrayLike,
     wavelength: ArrayLike,
     range: ArrayLike,
     aperture: ArrayLike,
-) -> LogVariances:
+) -> LogIrradianceVariances:
     """Log variances of the irradiance averaged over an aperture, by large and small eddies.
 
     exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
@@ -116,40 +123,52 @@ def log_variances(
     1.3 times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where
     it is 10. The Rytov variance is that of `wave`; the aperture's diameter [m] is 0 for a point.
     """
-    v = np.asarray(rytov_variance, float)
-    k = 2 * math.pi / np.asarray(wavelength, float)
-    d2 = k * np.asarray(aperture, float) ** 2 / (4 * np.asarray(range, float))
-    strength = v**1.2  # sigma_R^(12/5)
-    by_aperture, by_strength = _LARGE[wave]
-    large = 0.49 * v / (1 + by_aperture * d2 + by_strength * strength) ** (7 / 6)
-    small = 0.51 * v * (1 + 0.69 * strength) ** (-5 / 6)
-    return LogVariances(large, small / (1 + 0.90 * d2 + 0.62 * d2 * strength))
+    rytov = np.asarray(rytov_variance, float)
+    wavenumber = 2 * math.pi / np.asarray(wavelength, float)
+    aperture_ratio = wavenumber * np.asarray(aperture, float) ** 2 / (4 * np.asarray(range, float))
+    strength = rytov**1.2  # sigma_R^(12/5)
+    aperture_coefficient, strength_coefficient = _LARGE_EDDY_COEFFICIENTS[wave]
+    large_eddies = (
+        0.49
+        * rytov
+        / (1 + aperture_coefficient * aperture_ratio + strength_coefficient * strength) ** (7 / 6)
+    )
+    small_eddies = 0.51 * rytov * (1 + 0.69 * strength) ** (-5 / 6)
+    return LogIrradianceVariances(
+        large_eddies, small_eddies / (1 + 0.90 * aperture_ratio + 0.62 * aperture_ratio * strength)
+    )
 
 
-DISTRIBUTIONS = ("log_normal", "gamma_gamma")
-_LEAST_SPREAD = 1e-5
-_STEEPEST, _MOST_BENT = 0.5, 0.5
+IRRADIANCE_DISTRIBUTIONS = ("log_normal", "gamma_gamma")
+_GAMMA_VARIANCE_MIN = 1e-5
+_PD_SLOPE_MAX, _PD_CURVATURE_MAX = 0.5, 0.5
 """Suprema over a of |dQ_1(a, b)/d ln a| over 1 + b, and of its second derivative over 1 + b^2."""
 
 
-def factors(
-    distribution: str, legs: Sequence[LogVariances], realisation: Realisation
+def draw_scintillation_factors(
+    distribution: str, legs: Sequence[LogIrradianceVariances], draw_addresses: DrawAddresses
 ) -> np.ndarray:
     """Random factors of unit mean on the echo's power, (n,), of legs that are independent.
 
     Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies, turned into factors
     by the inverse of their distribution.
     """
-    from sweep.model import philox
+    from sweep.model.sampling import philox
 
-    uniforms = philox.uniforms(realisation.keys, realisation.draw, philox.STREAM_SCINTILLATION, 4)
-    total = np.ones(realisation.draw.size)
+    uniform_draws = philox.uniforms(
+        draw_addresses.point_keys, draw_addresses.draw_numbers, philox.STREAM_SCINTILLATION, 4
+    )
+    factor = np.ones(draw_addresses.draw_numbers.size)
     for i, variance in enumerate(v for leg in legs for v in leg):
-        total *= _inverse(distribution, uniforms[:, i], np.asarray(variance, float))
-    return total
+        factor *= _inverse_distribution(
+            distribution, uniform_draws[:, i], np.asarray(variance, float)
+        )
+    return factor
 
 
-def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarray, np.ndarray]:
+def _log_amplitude_moments(
+    distribution: str, legs: Sequence[LogIrradianceVariances]
+) -> tuple[np.ndarray, np.ndarray]:
     """|E L| and E L^2, or more, of half the logarithm of the whole factor.
 
     A gamma law of shape 1/s has ln I of mean above -(s/2 + s^2/12) and a variance below
@@ -157,128 +176,159 @@ def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarra
     """
     variances = [np.asarray(v, float) for leg in legs for v in leg]
     if distribution == "log_normal":
-        spread = sum(variances)
-        mean = spread / 2
+        variance = sum(variances)
+        mean = variance / 2
     else:
-        shapes = [np.expm1(v) for v in variances]
-        mean = sum(s / 2 + s**2 / 12 for s in shapes)
-        spread = sum(s + s**2 / 2 + s**3 / 6 for s in shapes)
-    return np.asarray(mean / 2), np.asarray((mean**2 + spread) / 4)
+        gamma_variances = [np.expm1(v) for v in variances]
+        mean = sum(s / 2 + s**2 / 12 for s in gamma_variances)
+        variance = sum(s + s**2 / 2 + s**3 / 6 for s in gamma_variances)
+    return np.asarray(mean / 2), np.asarray((mean**2 + variance) / 4)
 
 
-def _inverse(distribution: str, chance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _inverse_distribution(
+    distribution: str, probability: np.ndarray, variance: np.ndarray
+) -> np.ndarray:
     """Value that a factor of unit mean and this log variance falls below with a given probability.
 
     A gamma law of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5, which
     the library's inverse can get wrong, go by Wilson and Hilferty's cube of a normal number,
     there within 1e-3 standard deviations.
     """
-    z = special.ndtri(chance)
+    normal_quantile = special.ndtri(probability)
     if distribution == "log_normal":
-        return np.asarray(np.exp(np.sqrt(variance) * z - variance / 2))
-    spread = np.expm1(variance)
-    shape = 1 / np.maximum(spread, _LEAST_SPREAD)
-    cube = (1 - spread / 9 + np.sqrt(spread) / 3 * z) ** 3
-    return np.where(spread > _LEAST_SPREAD, special.gammaincinv(shape, chance) / shape, cube)
+        return np.asarray(np.exp(np.sqrt(variance) * normal_quantile - variance / 2))
+    gamma_variance = np.expm1(variance)
+    gamma_shape = 1 / np.maximum(gamma_variance, _GAMMA_VARIANCE_MIN)
+    normal_approximation = (
+        1 - gamma_variance / 9 + np.sqrt(gamma_variance) / 3 * normal_quantile
+    ) ** 3
+    return np.where(
+        gamma_variance > _GAMMA_VARIANCE_MIN,
+        special.gammaincinv(gamma_shape, probability) / gamma_shape,
+        normal_approximation,
+    )
 
 
-_TURBULENCE, _CONSTANT = "atmosphere.turbulence", "atmosphere.structure_constant"
-_LAW = "atmosphere.scintillation_law"
+_TURBULENCE_PATH, _STRUCTURE_CONSTANT_PATH = (
+    "atmosphere.turbulence",
+    "atmosphere.structure_constant",
+)
+_DISTRIBUTION_PATH = "atmosphere.scintillation_law"
 
 
-def turbulence_of(p: Mapping[str, np.ndarray]) -> Turbulence | None:
+def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfile | None:
     """Turbulence over height for points of one category; None in still air."""
-    name = str(p[_TURBULENCE])
+    name = str(parameters[_TURBULENCE_PATH])
     if name == "uniform":
-        return Turbulence(uniform=float(p[_CONSTANT]))
+        return TurbulenceProfile(uniform=float(parameters[_STRUCTURE_CONSTANT_PATH]))
     return HUFNAGEL_VALLEY if name == "hufnagel_valley" else None
 
 
-def both_ways(
-    air: Turbulence, p: Mapping[str, np.ndarray], range: np.ndarray
-) -> tuple[LogVariances, LogVariances]:
+def two_way_log_variances(
+    turbulence: TurbulenceProfile, parameters: Mapping[str, np.ndarray], range: np.ndarray
+) -> tuple[LogIrradianceVariances, LogIrradianceVariances]:
     """Log variances of the way out, averaged over the footprint, and back, over the aperture."""
-    lidar, target = path_heights(p, range)
-    aperture = np.asarray(p[TELESCOPE + "aperture"], float)
-    footprint = aperture + beam.divergence(p) * range
-    ways = (("plane", lidar, target, footprint), ("spherical", target, lidar, aperture))
-    light = {"wavelength": p[LASER + "wavelength"], "range": range}
+    lidar_height, target_height = path_heights(parameters, range)
+    aperture = np.asarray(parameters[TELESCOPE_PREFIX + "aperture"], float)
+    footprint_diameter = aperture + beam.far_field_divergence(parameters) * range
+    legs = (
+        ("plane", lidar_height, target_height, footprint_diameter),
+        ("spherical", target_height, lidar_height, aperture),
+    )
+    common_inputs = {"wavelength": parameters[LASER_PREFIX + "wavelength"], "range": range}
     out, back = (
-        log_variances(
+        log_irradiance_variances(
             wave,
-            rytov_variance=rytov_variance(wave, air, start_height=start, end_height=end, **light),
-            aperture=width,
-            **light,
+            rytov_variance=rytov_variance(
+                wave, turbulence, start_height=start, end_height=end, **common_inputs
+            ),
+            aperture=diameter,
+            **common_inputs,
         )
-        for wave, start, end, width in ways
+        for wave, start, end, diameter in legs
     )
     return out, back
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of mean probabilities by leaving twinkling out.
 
     With L half the logarithm of the factor I, E I = 1, and h the probability over the logarithm of
     the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2. In a product of
     segments, which twinkle alike, the suprema of two slopes, times E L^2, come on top.
     """
-    if points.word(_TURBULENCE) == "none" or (air := turbulence_of(points.parameters)) is None:
+    if (
+        points.option(_TURBULENCE_PATH) == "none"
+        or (turbulence := turbulence_profile(points.parameters)) is None
+    ):
         return None
-    mean, square = _moments(points.word(_LAW), both_ways(air, points.parameters, points.range))
-    b = points.threshold
-    slope, bend = _STEEPEST * (1 + b), _MOST_BENT * (1 + b * b)
-    each = slope * mean + 0.5 * (bend + slope**2) * square
-    return Size(chance=np.minimum(len(points.signs) * each, 1.0))
+    mean_log_amplitude, mean_square = _log_amplitude_moments(
+        points.option(_DISTRIBUTION_PATH),
+        two_way_log_variances(turbulence, points.parameters, points.range),
+    )
+    threshold_ratio = points.threshold_ratio
+    slope, curvature = (
+        _PD_SLOPE_MAX * (1 + threshold_ratio),
+        _PD_CURVATURE_MAX * (1 + threshold_ratio * threshold_ratio),
+    )
+    segment_bound = slope * mean_log_amplitude + 0.5 * (curvature + slope**2) * mean_square
+    return ErrorBound(
+        probability_change=np.minimum(len(points.existing_chirp_rates) * segment_bound, 1.0)
+    )
 
 
-def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
+def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
     """Draw the scintillation of each shot's echo, the same in all its segments."""
-    p = scene.parameters
-    air = turbulence_of(p)
-    if air is None:
+    parameters = context.parameters
+    turbulence = turbulence_profile(parameters)
+    if turbulence is None:
         return shots
-    legs = both_ways(air, p, shots.range)
-    power = factors(str(p[_LAW]), legs, realisation)
-    beat = power if shots.architecture == "direct" else np.sqrt(power)
-    sources = shots.noise_sources
-    if "signal_shot" in sources:
-        sources = sources | {"signal_shot": sources["signal_shot"] * power}
+    legs = two_way_log_variances(turbulence, parameters, shots.range)
+    power_factor = draw_scintillation_factors(
+        str(parameters[_DISTRIBUTION_PATH]), legs, draw_addresses
+    )
+    beat_factor = power_factor if shots.architecture == "direct" else np.sqrt(power_factor)
+    noise_variances = shots.noise_variances
+    if "signal_shot" in noise_variances:
+        noise_variances = noise_variances | {
+            "signal_shot": noise_variances["signal_shot"] * power_factor
+        }
     return replace(
         shots,
-        echo_scale=shots.echo_scale * power,
-        beat_scale=shots.beat_scale * beat,
-        noise_sources=sources,
-        pedestal=shots.pedestal * beat**2,
-        pedestal_beside=shots.pedestal_beside * beat**2,
+        echo_power_scale=shots.echo_power_scale * power_factor,
+        beat_amplitude_scale=shots.beat_amplitude_scale * beat_factor,
+        noise_variances=noise_variances,
+        pedestal_variance_under_lines=shots.pedestal_variance_under_lines * beat_factor**2,
+        pedestal_variance_beside_lines=shots.pedestal_variance_beside_lines * beat_factor**2,
     )
 
 
 SCINTILLATION = Effect(
     name="scintillation",
-    about="an echo that twinkles in turbulent air",
+    description="an echo that twinkles in turbulent air",
     stage="draws",
-    size=size,
-    draw=draw,
+    error_bound=error_bound,
+    perturb_shots=perturb_shots,
     parameters=(
         Parameter(
-            path=_TURBULENCE,
-            about="Turbulence over height: none, even, or Hufnagel and Valley's 5/7 model",
+            path=_TURBULENCE_PATH,
+            description="Turbulence over height: none, even, or Hufnagel and Valley's 5/7 model",
             default="none",
             options=("none", "uniform", "hufnagel_valley"),
         ),
         Parameter(
-            path=_CONSTANT,
-            about="Structure constant of the refractive index of even turbulence",
+            path=_STRUCTURE_CONSTANT_PATH,
+            description="Structure constant of the refractive index of even turbulence",
             default=1e-14,
             example="1e-14 m^(-2/3)",
             limits=("0 m^(-2/3)", "100 m^(-2/3)"),
-            category=True,
+            is_category_key=True,
         ),
         Parameter(
-            path=_LAW,
-            about="Distribution of the irradiance",
+            path=_DISTRIBUTION_PATH,
+            description="Distribution of the irradiance",
             default="gamma_gamma",
-            options=DISTRIBUTIONS,
+            options=IRRADIANCE_DISTRIBUTIONS,
         ),
     ),
 )

@@ -19,10 +19,11 @@ interpolated are put right for the velocity that is measured with them (as they 
 by v_r t_m and by that share. Nothing in the beats tells of the acceleration, or of a beam that
 slides over slanting ground.
 
-In several looks (:mod:`sweep.model.looks`) segments start as those of the middle look do, to whose
+In several looks (:mod:`sweep.model.detection.looks`) segments start as those of the middle look do,
+to whose
 time interpolated ranges are put right, and lines move on by the same number of bins from look to
 look. Averaged powers are smeared by that; looks that are counted, added in amplitude or that fade
-apart are not followed, and must lie within :data:`MOST_DRIFT`.
+apart are not followed, and must lie within :data:`LOOK_DRIFT_MAX_WINDOW_BINS`.
 """
 
 import math
@@ -31,57 +32,65 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.doppler import moved_size
-from sweep.model.effects.effect import Effect, Scene, Size
-from sweep.model.effects.points import Points
-from sweep.model.looks import MOST_PLACES, NUMBER
+from sweep.model.detection.looks import DRIFT_POSITIONS_MAX, LOOKS_NUMBER_PATH
+from sweep.model.effects.doppler import line_shift_bound
+from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots, doppler_ratio
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.unsupported_shot import UnsupportedShotError
 
-MOST_DRIFT = 0.25
+LOOK_DRIFT_MAX_WINDOW_BINS = 0.25
 """Bins of fs/L from the first look to the last that leave all of them alike: 1 % of the power."""
 
 
-def size(points: Points) -> Size | None:
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Change of the largest bin as its line moves, with the phases of lines that add up.
 
     A line meets its image at the phase of where it has come to. Beamlets with velocities of their
     own turn against each other. If it is off segments begin at one range, by
     the law of [T]: that is no error of the simulation.
     """
-    if points.at_one_range or not any(
-        np.any(v) for v in (points.radial_velocity, points.approach, points.acceleration)
+    if points.ignores_segment_motion or not any(
+        np.any(speed)
+        for speed in (points.radial_velocity, points.approach_speed, points.acceleration)
     ):
         return None
-    moved = points.bins_between
-    made = moved_size(points, moved)
+    shift_bins = points.line_drift_max_bins
+    bound = line_shift_bound(points, shift_bins)
     if not points.adds_amplitudes:
-        return made
-    apart = points.velocity_spread.extreme * points.bin_width * points.starts
-    turned = np.minimum(2 * np.pi * apart, 2.0) / points.lobe.worst
-    cycles = 2 / SPEED_OF_LIGHT * points.carriers * points.metres_between
-    imaged = points.image * np.minimum(4 * np.pi * cycles, 2.0)
-    added = made.added + 2 * turned + imaged
-    return made._replace(added=added)
+        return bound
+    spread_cycles = points.velocity_spread.extreme * points.bin_width * points.segment_starts
+    spread_change = (
+        np.minimum(2 * np.pi * spread_cycles, 2.0) / points.window_response.scalloping_gain_min
+    )
+    cycles = 2 / SPEED_OF_LIGHT * points.carriers * points.range_drift_max
+    image_change = points.image_bound * np.minimum(4 * np.pi * cycles, 2.0)
+    coherent_change = bound.coherent_sum_change + 2 * spread_change + image_change
+    return bound._replace(coherent_sum_change=coherent_change)
 
 
-def act(shots: Shots, scene: Scene) -> Shots:
+def apply(shots: Shots, context: EffectContext) -> Shots:
     """Segments that start one after the other."""
-    starts, looks = shots.schedule, shots.looks.number
-    middle, half = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
-    if looks > 1:
-        late = 0.5 * (looks - 1) * shots.look_period
-        starts, middle = tuple(start + late for start in starts), middle + late
+    starts, n_looks = shots.scheduled_segment_starts, shots.looks.number
+    middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
+    if n_looks > 1:
+        middle_look_delay = 0.5 * (n_looks - 1) * shots.look_period
+        starts, middle_time = (
+            tuple(start + middle_look_delay for start in starts),
+            middle_time + middle_look_delay,
+        )
     shots = replace(
         shots,
-        starts=starts,
-        walk=shots.walk + middle,
-        slowing=shots.chirp_rate * half / (shots.carriers[0] + shots.bandwidth / 2),
+        segment_starts=starts,
+        range_walk_time=shots.range_walk_time + middle_time,
+        velocity_bias_fraction=shots.chirp_rate
+        * half_interval
+        / (shots.carriers[0] + shots.chirp_bandwidth / 2),
     )
-    return replace(shots, look_drift=drift(shots)) if looks > 1 else shots
+    return replace(shots, line_drift_per_look=line_drift_per_look(shots)) if n_looks > 1 else shots
 
 
-def drift(shots: Shots) -> np.ndarray:
+def line_drift_per_look(shots: Shots) -> np.ndarray:
     """Bins by which lines of each segment move on from look to look, (segments, n).
 
     Raises
@@ -89,55 +98,85 @@ def drift(shots: Shots) -> np.ndarray:
     UnsupportedShot
         Of looks that are not followed: they move too far.
     """
-    faster = doppler_ratio(shots.acceleration)
-    bins = np.zeros((len(shots.waveform), shots.size))
-    for s in np.flatnonzero(shots.segments):
-        each = shots.waveform[s]
-        closing = shots.approach + shots.acceleration * each.start
-        beat = each.carrier * faster + each.chirp_rate * (2 / SPEED_OF_LIGHT) * (
-            closing * (1 + each.beta) - (shots.range - each.nearer) * faster
+    doppler_ratio_rate = doppler_ratio(shots.acceleration)
+    drift_bins = np.zeros((len(shots.waveform_segments), shots.size))
+    for segment_index in np.flatnonzero(shots.has_segment):
+        segment = shots.waveform_segments[segment_index]
+        closing_speed = shots.approach_speed + shots.acceleration * segment.start_time
+        beat_rate = segment.carrier * doppler_ratio_rate + segment.chirp_rate * (
+            2 / SPEED_OF_LIGHT
+        ) * (
+            closing_speed * (1 + segment.doppler_ratio)
+            - (shots.range - segment.range_decrease) * doppler_ratio_rate
         )
-        bins[s] = beat * shots.look_period * shots.fft_size / shots.sample_rate
-    looks, last = shots.looks, shots.looks.number - 1
-    most = float(np.abs(bins).max(initial=0.0)) * last * shots.window.length / shots.fft_size
-    faded_apart = looks.independent and shots.architecture != "direct" and shots.incoherent
-    limit = MOST_DRIFT if looks.averaged == 1 or faded_apart else math.inf
-    if last >= MOST_PLACES:  # as few places stand for all
-        limit = min(limit, MOST_PLACES / 2)
-    turned = np.abs(shots.doppler).max(initial=0.0) * np.max(shots.carriers[0] * shots.look_period)
-    if not shots.incoherent and shots.architecture != "direct" and turned * last > MOST_DRIFT:
-        raise UnsupportedShot(
-            f"{NUMBER} takes {last + 1} looks in which beamlets of coherent phases turn against "
-            f"each other by {turned * last:.3g} cycles, and {MOST_DRIFT} leave them alike: take "
+        drift_bins[segment_index] = (
+            beat_rate * shots.look_period * shots.fft_size / shots.sample_rate
+        )
+    looks, last_look = shots.looks, shots.looks.number - 1
+    drift_max_window_bins = (
+        float(np.abs(drift_bins).max(initial=0.0))
+        * last_look
+        * shots.window.length
+        / shots.fft_size
+    )
+    fade_independently = (
+        looks.has_independent_speckle and shots.architecture != "direct" and shots.adds_powers
+    )
+    drift_limit = (
+        LOOK_DRIFT_MAX_WINDOW_BINS
+        if looks.n_power_averaged == 1 or fade_independently
+        else math.inf
+    )
+    if last_look >= DRIFT_POSITIONS_MAX:  # as few places stand for all
+        drift_limit = min(drift_limit, DRIFT_POSITIONS_MAX / 2)
+    turned_cycles = np.abs(shots.doppler_ratio_offset).max(initial=0.0) * np.max(
+        shots.carriers[0] * shots.look_period
+    )
+    if (
+        not shots.adds_powers
+        and shots.architecture != "direct"
+        and turned_cycles * last_look > LOOK_DRIFT_MAX_WINDOW_BINS
+    ):
+        raise UnsupportedShotError(
+            f"{LOOKS_NUMBER_PATH} takes {last_look + 1} looks in which beamlets of coherent phases "
+            "turn against "
+            f"each other by {turned_cycles * last_look:.3g} cycles, and "
+            f"{LOOK_DRIFT_MAX_WINDOW_BINS} leave them alike: take "
             "fewer, or footprint.phases: incoherent"
         )
-    if most > limit:
-        raise UnsupportedShot(
-            f"{NUMBER} takes {last + 1} looks from the first to the last of which the target moves "
-            f"the echo by {most:.3g} bins, and {limit:.3g} is the most that looks of this kind are "
+    if drift_max_window_bins > drift_limit:
+        raise UnsupportedShotError(
+            f"{LOOKS_NUMBER_PATH} takes {last_look + 1} looks from the first to the last of which "
+            "the target moves "
+            f"the echo by {drift_max_window_bins:.3g} bins, and {drift_limit:.3g} is the most that "
+            "looks of this kind are "
             "followed by: take fewer, shorten instrument.chirp.duration, or take combine: power "
             "with speckle: common"
         )
-    return bins
+    return drift_bins
 
 
-def looks_of(shots: Shots) -> list[Shots]:
+def split_looks(shots: Shots) -> list[Shots]:
     """Shots as each of their looks finds them; themselves where all are alike."""
-    if not np.any(shots.look_drift):
+    if not np.any(shots.line_drift_per_look):
         return [shots] * shots.looks.number
-    late = np.arange(shots.looks.number) - (shots.looks.number - 1) / 2
+    looks_from_middle = np.arange(shots.looks.number) - (shots.looks.number - 1) / 2
     return [
         replace(
-            shots, look_drift=0.0, starts=tuple(s + k * shots.look_period for s in shots.starts)
+            shots,
+            line_drift_per_look=0.0,
+            segment_starts=tuple(
+                start + look_offset * shots.look_period for start in shots.segment_starts
+            ),
         )
-        for k in late
-    ]  # fmt: skip
+        for look_offset in looks_from_middle
+    ]
 
 
 SEGMENT_MOTION = Effect(
     name="segment_motion",
-    about="range and velocity that change from segment to segment",
+    description="range and velocity that change from segment to segment",
     stage="lines",
-    size=size,
-    act=act,
+    error_bound=error_bound,
+    apply=apply,
 )

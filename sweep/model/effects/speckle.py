@@ -24,10 +24,11 @@ It acts on the lines' amplitudes alone; the mean echo, and so its shot noise, st
 complex Gaussian amplitudes is one itself, in every bin; its mean power is what beamlets make that
 add as powers. A bin then crosses the threshold with Swerling's first probability, and two segments'
 bins as two correlated ones do. Their correlation falls with the Doppler shifts and the ranges that
-differ over the beam, by :mod:`sweep.model.speckle_correlation`. It is in
+differ over the beam, by :mod:`sweep.model.detection.speckle_correlation`. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
 the detection, and on leakage: what an echo leaks fades with it, in closed form
-(:mod:`sweep.model.leakage`) as where false peaks are drawn (:mod:`sweep.model.leaked_peaks`). Of
+(:mod:`sweep.model.spectrum.leakage`) as where false peaks are drawn
+(:mod:`sweep.model.pointcloud.leaked_peaks`). Of
 several looks it is a mean over the mean power of all.
 """
 
@@ -39,28 +40,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
-from sweep.model.effects.points import Points
-from sweep.model.ground import Cast, Ground, Plane, Slopes
-from sweep.model.preparation import Shots
-from sweep.model.speckle_correlation import (
-    NARROW,
+from sweep.model.detection.speckle_correlation import (
+    LINE_SHIFT_MIN_BINS,
     SEGMENT_PAIRS,
-    LineSpread,
-    SpeckleLines,
-    bin_correlation,
-    middle_moved,
+    LineGradients,
+    LinePairGradients,
+    centroid_delay,
+    peak_bin_correlation,
     window_transform,
 )
+from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.ground import BeamGradients, FlatGround, Ground, RayTracedGround
+from sweep.model.preparation import Shots
 
-_ROUGHNESS = "target.roughness"
-_LAW = "footprint.speckle"
-_FURTHEST = 5.0
+_ROUGHNESS_PATH = "target.roughness"
+_SPECKLE_PATH = "footprint.speckle"
+_DIFFUSE_RATIO_MAX = 5.0
 """Bound on a bin's diffuse amplitude over its root mean square; exceeded in one of a million
 draws."""
 
 
-def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
+def coherent_power_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
     """Return the fraction kappa of the mean echo power that keeps its phase, 0 .. 1.
 
     ``roughness`` [m] is the standard deviation of the surface's height along the line of sight: for
@@ -71,18 +72,22 @@ def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray
     return np.asarray(np.exp(-(phase**2)))
 
 
-def factors(
-    realisation: Realisation, *, beamlets: int, coherent_share: np.ndarray, random_phases: bool
+def draw_speckle_factors(
+    draw_addresses: DrawAddresses,
+    *,
+    n_beamlets: int,
+    coherent_fraction: np.ndarray,
+    random_phases: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the factors g_b on beamlet amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
 
     Parameters
     ----------
-    realisation
+    draw_addresses
         Random keys and draw numbers of n points.
-    beamlets
+    n_beamlets
         Number of beamlets.
-    coherent_share
+    coherent_fraction
         Fraction kappa, (n,) or scalar.
     random_phases
         True if u_b has a uniform phase; else it is 1.
@@ -92,30 +97,37 @@ def factors(
     A factor depends on key, draw and beamlet alone: pair b of ``STREAM_SPECKLE`` makes z_b, number
     b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b.
     """
-    from sweep.model import philox
+    from sweep.model.sampling import philox
 
-    share = np.asarray(coherent_share, float) + np.zeros(realisation.draw.size)
-    keys, draw = realisation.keys, realisation.draw
-    drawn = philox.uniforms(keys, draw, philox.STREAM_SPECKLE, 2 * beamlets)
+    point_fraction = np.asarray(coherent_fraction, float) + np.zeros(
+        draw_addresses.draw_numbers.size
+    )
+    point_keys, draw_numbers = draw_addresses.point_keys, draw_addresses.draw_numbers
+    uniform_draws = philox.uniforms(point_keys, draw_numbers, philox.STREAM_SPECKLE, 2 * n_beamlets)
     # In one piece each: bits do not depend on how many draws there are.
-    chance, cycles = (np.ascontiguousarray(drawn[:, lane::2]) for lane in range(2))
-    steady, diffuse = np.sqrt(share)[:, None], np.sqrt(1.0 - share)[:, None]
-    radius = diffuse * np.sqrt(-np.log(chance))
-    if not steady.any():
+    exceedance, cycles = (np.ascontiguousarray(uniform_draws[:, lane::2]) for lane in range(2))
+    coherent_amplitude, diffuse_amplitude = (
+        np.sqrt(point_fraction)[:, None],
+        np.sqrt(1.0 - point_fraction)[:, None],
+    )
+    radius = diffuse_amplitude * np.sqrt(-np.log(exceedance))
+    if not coherent_amplitude.any():
         return radius, cycles
     angle = np.zeros(())
     if random_phases:
-        phases = philox.uniforms(keys, draw, philox.STREAM_FOOTPRINT_PHASE, beamlets)
+        phases = philox.uniforms(
+            point_keys, draw_numbers, philox.STREAM_FOOTPRINT_PHASE, n_beamlets
+        )
         angle = 2.0 * np.pi * np.ascontiguousarray(phases)
-    re = radius * np.cos(2.0 * np.pi * cycles) + steady * np.cos(angle)
-    im = radius * np.sin(2.0 * np.pi * cycles) + steady * np.sin(angle)
+    re = radius * np.cos(2.0 * np.pi * cycles) + coherent_amplitude * np.cos(angle)
+    im = radius * np.sin(2.0 * np.pi * cycles) + coherent_amplitude * np.sin(angle)
     return (
-        np.where(steady > 0, np.hypot(re, im), radius),
-        np.where(steady > 0, np.arctan2(im, re) / (2.0 * np.pi), cycles),
+        np.where(coherent_amplitude > 0, np.hypot(re, im), radius),
+        np.where(coherent_amplitude > 0, np.arctan2(im, re) / (2.0 * np.pi), cycles),
     )
 
 
-def size(points: Points) -> Size | None:
+def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
     """Upper bound on the output change if speckle is omitted, in all but 1e-6 of draws.
 
     A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa)
@@ -123,29 +135,37 @@ def size(points: Points) -> Size | None:
     lambda). In incoherent footprints the coherent part has random phases. If a sum of amplitudes
     may cancel, the bound is relative to the sum of powers.
     """
-    if not points.has(_ROUGHNESS):
+    if not points.any_nonzero(_ROUGHNESS_PATH):
         return None
-    kappa = coherent_share(
-        roughness=points[_ROUGHNESS], wavelength=points["instrument.laser.wavelength"]
+    kappa = coherent_power_fraction(
+        roughness=points[_ROUGHNESS_PATH], wavelength=points["instrument.laser.wavelength"]
     )
-    scattered = _FURTHEST * np.sqrt(1 - kappa)
+    diffuse_change = _DIFFUSE_RATIO_MAX * np.sqrt(1 - kappa)
     if not points.adds_amplitudes:
-        near = points.near_image | (points.number > 1)
-        return Size(magnitude=np.where(near & (kappa < 1), 1.0, 1 - np.sqrt(kappa) + scattered))
-    cancelling = points.may_cancel
-    return Size(
-        magnitude=1 - np.sqrt(kappa) + np.where(cancelling, 0.0, scattered),
-        added=np.where(cancelling, math.sqrt(2) * scattered / points.lobe.worst, 0.0),
+        is_near_image = points.is_near_image | (points.n_beamlets > 1)
+        return ErrorBound(
+            magnitude_change=np.where(
+                is_near_image & (kappa < 1), 1.0, 1 - np.sqrt(kappa) + diffuse_change
+            )
+        )
+    may_cancel = points.may_cancel
+    return ErrorBound(
+        magnitude_change=1 - np.sqrt(kappa) + np.where(may_cancel, 0.0, diffuse_change),
+        coherent_sum_change=np.where(
+            may_cancel,
+            math.sqrt(2) * diffuse_change / points.window_response.scalloping_gain_min,
+            0.0,
+        ),
     )
 
 
-_SMOOTH = 1e-6
+_DECORRELATED_KAPPA_MAX = 1e-6
 """Coherent fraction kappa of coherent footprints below which segments' speckles are decorrelated
 here."""
-_SMALLEST = 1e-300
+_TINY = 1e-300
 
 
-def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
+def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
     """Give each point its own footprint with speckled beamlet amplitudes.
 
     Raises
@@ -159,163 +179,224 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
             "speckle is simulated for homodyne and heterodyne receivers: what direct detection "
             "sees depends on how many speckles its aperture averages, of which nothing is known"
         )
-    share = coherent_share(
-        roughness=scene.parameters[_ROUGHNESS],
-        wavelength=scene.parameters["instrument.laser.wavelength"],
+    coherent_fraction = coherent_power_fraction(
+        roughness=context.parameters[_ROUGHNESS_PATH],
+        wavelength=context.parameters["instrument.laser.wavelength"],
     )
-    magnitude, cycles = factors(
-        realisation,
-        beamlets=shots.amplitude.shape[1],
-        coherent_share=share,
-        random_phases=shots.incoherent and shots.amplitude.shape[1] > 1,
+    magnitude, cycles = draw_speckle_factors(
+        draw_addresses,
+        n_beamlets=shots.relative_amplitude.shape[1],
+        coherent_fraction=coherent_fraction,
+        random_phases=shots.adds_powers and shots.relative_amplitude.shape[1] > 1,
     )
-    offset, doppler, steady = (v[shots.row] for v in (shots.offset, shots.doppler, shots.amplitude))
-    amplitude = steady * magnitude
+    offset, doppler, mean_amplitude = (
+        values[shots.footprint_row]
+        for values in (
+            shots.relative_range_offset,
+            shots.doppler_ratio_offset,
+            shots.relative_amplitude,
+        )
+    )
+    amplitude = mean_amplitude * magnitude
     # The steady share of a smooth shape is at the start of each segment what it is in the others.
-    turning = shots.incoherent | (share < _SMOOTH)
-    turning &= not shots.moves_on  # else their lines have it
+    is_decorrelated = shots.adds_powers | (coherent_fraction < _DECORRELATED_KAPPA_MAX)
+    is_decorrelated &= not shots.target_moves_between_segments  # else their lines have it
     phase = np.empty((3, *cycles.shape))
-    for s, (carrier, start) in enumerate(zip(shots.carriers, shots.schedule, strict=True)):
-        turned = np.where(turning, np.asarray(carrier, float) * start, 0.0) + np.zeros(shots.size)
-        np.add(cycles, turned[:, None] * doppler, out=phase[s])
-    brighter = (amplitude**2).sum(axis=1) / np.maximum((steady**2).sum(axis=1), _SMALLEST)
+    for segment_index, (carrier, start) in enumerate(
+        zip(shots.carriers, shots.scheduled_segment_starts, strict=True)
+    ):
+        turned_cycles = np.where(
+            is_decorrelated, np.asarray(carrier, float) * start, 0.0
+        ) + np.zeros(shots.size)
+        np.add(cycles, turned_cycles[:, None] * doppler, out=phase[segment_index])
+    power_ratio = (amplitude**2).sum(axis=1) / np.maximum((mean_amplitude**2).sum(axis=1), _TINY)
     return replace(
         shots,
-        row=np.arange(shots.size),
-        offset=offset,
-        doppler=doppler,
-        amplitude=amplitude,
-        phase=phase,
-        incoherent=False,
-        pedestal=shots.pedestal * brighter,
-        pedestal_beside=shots.pedestal_beside * brighter,
+        footprint_row=np.arange(shots.size),
+        relative_range_offset=offset,
+        doppler_ratio_offset=doppler,
+        relative_amplitude=amplitude,
+        beamlet_phase_cycles=phase,
+        adds_powers=False,
+        pedestal_variance_under_lines=shots.pedestal_variance_under_lines * power_ratio,
+        pedestal_variance_beside_lines=shots.pedestal_variance_beside_lines * power_ratio,
     )
 
 
-def fading_size(points: Points) -> Size | None:
+def fading_bound(points: PlannerInputs) -> ErrorBound | None:
     """Error in pd from using mean instead of fluctuating power (Swerling); None if inactive."""
-    smooth = points.by_roots or points.architecture == "direct"
-    return None if smooth or points.word(_LAW) == "none" else Size(magnitude=1.0)
-
-
-def fade(shots: Shots, scene: Scene) -> Shots:
-    """Set up detection in developed speckle, if the spec asks for it and beamlets add as powers."""
-    from sweep.model.detection import Fading
-
-    law = str(scene.parameters[_LAW])
-    if law == "none" or shots.architecture == "direct" or not shots.incoherent:
-        return shots
-    ground = _ground_spread(shots, scene.ground)
-    spread = _line_deviation(shots, ground.moments)
-    correlations = [
-        ground.correlation(shots, pair, phase)
-        for pair, phase in zip(SEGMENT_PAIRS, segment_phases(shots), strict=True)
-    ]
-    drawn_lines = _speckle_lines(shots, scene.ground)
-    shots = replace(
-        shots, fading=Fading(*correlations), line_spread=spread, speckle_lines=drawn_lines
+    is_smooth = points.adds_field_amplitudes or points.architecture == "direct"
+    return (
+        None
+        if is_smooth or points.option(_SPECKLE_PATH) == "none"
+        else ErrorBound(magnitude_change=1.0)
     )
-    return shots if shots.looks.number == 1 else _fade_in_looks(shots, ground)
 
 
-def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
+def apply_fading(shots: Shots, context: EffectContext) -> Shots:
+    """Set up detection in developed speckle, if the spec asks for it and beamlets add as powers."""
+    from sweep.model.detection.echo_detection import SegmentCorrelations
+
+    speckle_law = str(context.parameters[_SPECKLE_PATH])
+    if speckle_law == "none" or shots.architecture == "direct" or not shots.adds_powers:
+        return shots
+    beam_spread = _beam_spread(shots, context.ground)
+    line_deviation = _line_deviation_bins(shots, beam_spread.moments)
+    correlations = [
+        beam_spread.correlation(shots, pair, phase)
+        for pair, phase in zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
+    ]
+    line_gradients = _line_gradients(shots, context.ground)
+    shots = replace(
+        shots,
+        segment_correlations=SegmentCorrelations(*correlations),
+        line_deviation_bins=line_deviation,
+        line_gradients=line_gradients,
+    )
+    return shots if shots.looks.number == 1 else _set_look_speckle(shots, beam_spread)
+
+
+def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
     """Return the standard deviation of the beamlets' lines [bins of fs/N], (segments, n)."""
-    bins = shots.fft_size / shots.sample_rate
+    bins_per_hertz = shots.fft_size / shots.sample_rate
     delay = 2 * shots.range / SPEED_OF_LIGHT
     weights = np.array(
         [
-            [bins * segment.carrier + 0 * delay, -bins * segment.chirp_rate * delay]
-            for segment in shots.waveform
+            [
+                bins_per_hertz * segment.carrier + 0 * delay,
+                -bins_per_hertz * segment.chirp_rate * delay,
+            ]
+            for segment in shots.waveform_segments
         ]
     )
     variance = np.einsum("sin,ijn,sjn->sn", weights, moments.covariance, weights)
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-_NODES, _DEVIATIONS_MAX = 81, 4.0
+_N_LINE_NODES, _LINE_DEVIATIONS_MAX = 81, 4.0
 """Lines of a footprint, evenly spaced: few would be a comb where they spread over bins."""
-_ALIKE = 1e-9
+_DECORRELATION_MIN = 1e-9
 """Loss of correlation between looks below which all looks share one speckle."""
 
 
-def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
+def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     """Set the correlation of the speckle between the looks of a shot, from the motion between them.
 
     Looks that are added coherently get a smaller amplitude (``beat_scale``) instead.
     """
     looks = shots.looks
-    number, size = looks.number, shots.size
-    frequencies, _ = _echo_frequencies(shots)
-    turns = [np.broadcast_to(f * shots.look_period, size) for f in frequencies]
-    if looks.several:
-        shots = replace(shots, look_turns=np.stack(turns) * shots.beta)
-    if not looks.moving:
-        return shots
-    nothing = np.zeros(size)
-    by_lag = np.ones((3, size, number), complex)
-    for segment in map(int, np.flatnonzero(shots.segments)):
-        for lag in range(1, number):
-            phase = PhaseDifference(turns[segment] * lag, nothing)
-            by_lag[segment, :, lag] = ground.correlation(shots, (segment, segment), phase)
-    if looks.added > 1:
-        # Added amplitudes of speckles that differ are, on the mean, a smaller amplitude.
-        lags = np.arange(1, number)
-        steady = np.exp(-1j * np.angle(by_lag[0, :, 1]))[:, None] ** lags
-        shared = (2 * (number - lags) * (by_lag[0, :, 1:] * steady).real).sum(axis=1)
-        gain = np.sqrt(np.maximum(number + shared, 0.0)) / number
-        return replace(shots, beat_scale=shots.beat_scale * gain)
-    power = _power_of_looks(shots, ground.slopes)
-    if np.abs(by_lag - 1).max() < _ALIKE and np.abs(power - 1).max() < _ALIKE:
-        return shots
-    between = np.abs(np.array(shots.fading))
-    weight = number - np.abs(np.arange(1 - number, number))
-    strength = [
-        (weight * np.abs(np.concatenate([by_lag[s, :, :0:-1], by_lag[s]], axis=1)) ** 2).sum(axis=1)
-        for s in range(3)
+    n_looks, n_points = looks.number, shots.size
+    echo_frequencies, _ = _echo_frequencies(shots)
+    cycles_per_look = [
+        np.broadcast_to(echo_frequency * shots.look_period, n_points)
+        for echo_frequency in echo_frequencies
     ]
-    for k, (pair, phase) in enumerate(zip(SEGMENT_PAIRS, segment_phases(shots), strict=True)):
-        if not shots.segments[list(pair)].all() or (k != 1 and not shots.any_two):
+    if looks.is_noncoherent:
+        shots = replace(
+            shots, phase_cycles_per_look=np.stack(cycles_per_look) * shots.doppler_ratio
+        )
+    if not looks.has_moving_speckle:
+        return shots
+    zeros = np.zeros(n_points)
+    correlation_by_lag = np.ones((3, n_points, n_looks), complex)
+    for segment in map(int, np.flatnonzero(shots.has_segment)):
+        for lag in range(1, n_looks):
+            phase = PhaseDifference(cycles_per_look[segment] * lag, zeros)
+            correlation_by_lag[segment, :, lag] = beam_spread.correlation(
+                shots, (segment, segment), phase
+            )
+    if looks.n_coherent > 1:
+        # Added amplitudes of speckles that differ are, on the mean, a smaller amplitude.
+        lags = np.arange(1, n_looks)
+        unwinding = np.exp(-1j * np.angle(correlation_by_lag[0, :, 1]))[:, None] ** lags
+        squared_sum = (2 * (n_looks - lags) * (correlation_by_lag[0, :, 1:] * unwinding).real).sum(
+            axis=1
+        )
+        gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
+        return replace(shots, beat_amplitude_scale=shots.beat_amplitude_scale * gain)
+    look_power = _look_powers(shots, beam_spread.slopes)
+    if (
+        np.abs(correlation_by_lag - 1).max() < _DECORRELATION_MIN
+        and np.abs(look_power - 1).max() < _DECORRELATION_MIN
+    ):
+        return shots
+    segment_correlation = np.abs(np.array(shots.segment_correlations))
+    lag_weight = n_looks - np.abs(np.arange(1 - n_looks, n_looks))
+    squared_sum_by_segment = [
+        (
+            lag_weight
+            * np.abs(
+                np.concatenate(
+                    [
+                        correlation_by_lag[segment_index, :, :0:-1],
+                        correlation_by_lag[segment_index],
+                    ],
+                    axis=1,
+                )
+            )
+            ** 2
+        ).sum(axis=1)
+        for segment_index in range(3)
+    ]
+    for pair_index, (pair, phase) in enumerate(
+        zip(SEGMENT_PAIRS, segment_phase_differences(shots), strict=True)
+    ):
+        if not shots.has_segment[list(pair)].all() or (pair_index != 1 and not shots.any_two):
             continue
-        shared = nothing
-        for lag in range(1 - number, number):
-            turned = PhaseDifference(phase.turn + lag * turns[pair[1]], phase.delay_cycles)
-            of_lag = np.abs(ground.correlation(shots, pair, turned)) ** 2
-            shared = shared + (number - abs(lag)) * of_lag
-        between[k] = np.sqrt(shared) / (strength[pair[0]] * strength[pair[1]]) ** 0.25
-    from sweep.model.look_speckle import LookSpeckle  # kernels, which specs need not
+        squared_sum = zeros
+        for lag in range(1 - n_looks, n_looks):
+            turned_phase = PhaseDifference(
+                phase.doppler_cycles + lag * cycles_per_look[pair[1]], phase.delay_cycles
+            )
+            squared_correlation = np.abs(beam_spread.correlation(shots, pair, turned_phase)) ** 2
+            squared_sum = squared_sum + (n_looks - abs(lag)) * squared_correlation
+        segment_correlation[pair_index] = (
+            np.sqrt(squared_sum)
+            / (squared_sum_by_segment[pair[0]] * squared_sum_by_segment[pair[1]]) ** 0.25
+        )
+    from sweep.model.detection.look_speckle import LookSpeckle  # kernels, which specs need not
 
-    speckle = LookSpeckle.of(by_lag, power, np.minimum(between, 1.0))
-    return replace(shots, look_speckle=speckle)
+    look_speckle = LookSpeckle.from_correlations(
+        correlation_by_lag, look_power, np.minimum(segment_correlation, 1.0)
+    )
+    return replace(shots, look_speckle=look_speckle)
 
 
-def _power_of_looks(shots: Shots, slopes: Slopes) -> np.ndarray:
+def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
     """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
 
     It differs between looks because lines drift out of the bin.
     """
-    number = shots.looks.number
-    power = np.ones((3, shots.size, number))
-    if not np.any(shots.look_drift):
-        return power
-    nothing = PhaseDifference(np.zeros(shots.size), np.zeros(shots.size))
-    padding = shots.fft_size / shots.window.length
-    late = np.arange(number) - (number - 1) / 2
-    node = np.linspace(-_DEVIATIONS_MAX, _DEVIATIONS_MAX, _NODES)
+    n_looks = shots.looks.number
+    look_power = np.ones((3, shots.size, n_looks))
+    if not np.any(shots.line_drift_per_look):
+        return look_power
+    zero_phase = PhaseDifference(np.zeros(shots.size), np.zeros(shots.size))
+    padding_factor = shots.fft_size / shots.window.length
+    looks_from_middle = np.arange(n_looks) - (n_looks - 1) / 2
+    node = np.linspace(-_LINE_DEVIATIONS_MAX, _LINE_DEVIATIONS_MAX, _N_LINE_NODES)
     weight = np.exp(-0.5 * node * node)
-    drift = np.broadcast_to(shots.look_drift, (len(shots.waveform), shots.size)) / padding
-    for segment in map(int, np.flatnonzero(shots.segments)):
-        lines = _line_spread(shots, (segment, segment), nothing, slopes)
-        place = lines.distance[0][:, None] - drift[segment][:, None] * late
-        apart = place[..., None] - lines.spread[0][:, None, None] * node
-        power[segment] = (window_transform(shots.window, apart) ** 2 * weight).sum(axis=-1)
-    return power / np.maximum(power.mean(axis=-1, keepdims=True), _SMALLEST)
+    drift = (
+        np.broadcast_to(shots.line_drift_per_look, (len(shots.waveform_segments), shots.size))
+        / padding_factor
+    )
+    for segment in map(int, np.flatnonzero(shots.has_segment)):
+        gradients = _line_pair_gradients(shots, (segment, segment), zero_phase, slopes)
+        line_position = (
+            gradients.bin_distance[0][:, None] - drift[segment][:, None] * looks_from_middle
+        )
+        line_distance = line_position[..., None] - gradients.line_shift[0][:, None, None] * node
+        look_power[segment] = (window_transform(shots.window, line_distance) ** 2 * weight).sum(
+            axis=-1
+        )
+    return look_power / np.maximum(look_power.mean(axis=-1, keepdims=True), _TINY)
 
 
-class GroundSpread(NamedTuple):
+class BeamSpread(NamedTuple):
     """Spread of ranges and Doppler ratios over the beam on the ground."""
 
-    slopes: Slopes
-    plane: Plane | None
+    slopes: BeamGradients
+    plane: FlatGround | None
     """The plane; None for ray-traced ground."""
     moments: "BeamletMoments"
 
@@ -327,82 +408,108 @@ class GroundSpread(NamedTuple):
         ``pair``: segments of the two records; ``phase``: phase difference between the records.
         """
         if self.plane is not None:
-            found = self.plane.mean_phasor(*phase).astype(complex)
-            across = np.zeros(shots.size)
+            correlations = self.plane.mean_phasor(*phase).astype(complex)
+            variance_across = np.zeros(shots.size)
         else:
             (mean,), (variance,) = _phase_moments(self.moments, [phase])
-            found = np.exp(1j * mean - 0.5 * variance)
-            across = np.maximum(variance - phase.along(self.slopes) ** 2, 0.0)
-        lines = _line_spread(shots, pair, phase, self.slopes)
-        wide = np.flatnonzero(lines.widest > NARROW)
-        if wide.size:
-            of_bins = bin_correlation(shots.window, lines.at(wide))
-            found[wide] = of_bins * np.exp(-0.5 * across[wide])
-        return found
+            correlations = np.exp(1j * mean - 0.5 * variance)
+            variance_across = np.maximum(
+                variance - phase.phase_per_deviation(self.slopes) ** 2, 0.0
+            )
+        gradients = _line_pair_gradients(shots, pair, phase, self.slopes)
+        wide_points = np.flatnonzero(gradients.line_shift_max > LINE_SHIFT_MIN_BINS)
+        if wide_points.size:
+            bin_correlations = peak_bin_correlation(shots.window, gradients.select(wide_points))
+            correlations[wide_points] = bin_correlations * np.exp(
+                -0.5 * variance_across[wide_points]
+            )
+        return correlations
 
 
-def _ground_spread(shots: Shots, ground: Ground) -> GroundSpread:
+def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
     """Return the spread over the beam, of a plane or of ray-traced beamlets."""
     moments = _beamlet_moments(shots, ground)
-    if isinstance(ground, Plane):
-        return GroundSpread(ground.slopes, ground, moments)
-    return GroundSpread(_cast_slopes(moments), None, moments)
+    if isinstance(ground, FlatGround):
+        return BeamSpread(ground.gradients, ground, moments)
+    return BeamSpread(_ray_traced_slopes(moments), None, moments)
 
 
-def _speckle_lines(shots: Shots, ground: Plane | Cast) -> SpeckleLines:
+def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineGradients:
     """Return gradients of line position and phase across the beam, along the slope and across it.
 
     Across the slope only Doppler ratios change. The gradients are set even where the effects of the
     footprint are too small to change probabilities, because peak positions wander with them.
     """
-    if isinstance(ground, Plane):
-        slopes, across = ground.slopes, np.zeros(shots.size)
+    if isinstance(ground, FlatGround):
+        slopes, doppler_across = ground.gradients, np.zeros(shots.size)
     else:
         row, offset, doppler, echo = ground.beamlets
-        moments = _moments_by_surface(echo, np.array([doppler, offset]), ground.beside, row)
-        slopes = _cast_slopes(moments)
-        left = moments.covariance[0, 0] - slopes.beta**2
-        across = np.sqrt(np.maximum(left, 0.0))
-    width = shots.sample_rate / shots.fft_size
-    spread = np.zeros((3, 2, shots.size))
-    for s, segment in enumerate(shots.waveform):
-        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
-        moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
-        spread[s] = moved / width, segment.carrier * across / width
-    turn = np.zeros((3, 2, shots.size))
-    for (_, second), phase in zip(SEGMENT_PAIRS[:2], segment_phases(shots)[:2], strict=True):
-        turn[second] = phase.along(slopes), 2 * np.pi * phase.turn * across
-    return SpeckleLines(np.moveaxis(spread, -1, 0), np.moveaxis(turn, -1, 0))
+        moments = _moments_by_surface(
+            echo, np.array([doppler, offset]), ground.off_axis_surface, row
+        )
+        slopes = _ray_traced_slopes(moments)
+        variance_across = moments.covariance[0, 0] - slopes.doppler_ratio**2
+        doppler_across = np.sqrt(np.maximum(variance_across, 0.0))
+    bin_width = shots.sample_rate / shots.fft_size
+    line_shift = np.zeros((3, 2, shots.size))
+    for segment_index, segment in enumerate(shots.waveform_segments):
+        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
+        shift_hertz = (
+            segment.carrier * slopes.doppler_ratio
+            - segment.chirp_rate * delay * slopes.relative_range
+        )
+        line_shift[segment_index] = (
+            shift_hertz / bin_width,
+            segment.carrier * doppler_across / bin_width,
+        )
+    phase_gradient = np.zeros((3, 2, shots.size))
+    for (_, second), phase in zip(
+        SEGMENT_PAIRS[:2], segment_phase_differences(shots)[:2], strict=True
+    ):
+        phase_gradient[second] = (
+            phase.phase_per_deviation(slopes),
+            2 * np.pi * phase.doppler_cycles * doppler_across,
+        )
+    return LineGradients(np.moveaxis(line_shift, -1, 0), np.moveaxis(phase_gradient, -1, 0))
 
 
 class PhaseDifference(NamedTuple):
     """Coefficients of a scatterer's phase difference between two segments, (n,) each."""
 
-    turn: np.ndarray
+    doppler_cycles: np.ndarray
     """Cycles per unit of the Doppler ratio beta."""
     delay_cycles: np.ndarray
     """Cycles per unit of relative range, with the sign reversed."""
 
-    def along(self, slopes: Slopes) -> np.ndarray:
+    def phase_per_deviation(self, slopes: BeamGradients) -> np.ndarray:
         """Return the phase difference per standard deviation of the beam [rad], (n,)."""
-        return 2 * np.pi * (self.turn * slopes.beta - self.delay_cycles * slopes.range)
+        return (
+            2
+            * np.pi
+            * (
+                self.doppler_cycles * slopes.doppler_ratio
+                - self.delay_cycles * slopes.relative_range
+            )
+        )
 
 
-def segment_phases(shots: Shots) -> list[PhaseDifference]:
+def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
     """Return the phase differences of the pairs in SEGMENT_PAIRS, second segment less first.
 
-    Equation (1) of :mod:`sweep.model.speckle_correlation`.
+    Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
-    echo_frequency, middles = _echo_frequencies(shots)
+    echo_frequencies, record_middles = _echo_frequencies(shots)
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    turned = [
+    phase_cycles = [
         frequency * (start + middle)
-        for frequency, start, middle in zip(echo_frequency, shots.schedule, middles, strict=True)
+        for frequency, start, middle in zip(
+            echo_frequencies, shots.scheduled_segment_starts, record_middles, strict=True
+        )
     ]
     return [
         PhaseDifference(
-            np.broadcast_to(turned[second] - turned[first], shots.size),
-            delay * (echo_frequency[second] - echo_frequency[first]),
+            np.broadcast_to(phase_cycles[second] - phase_cycles[first], shots.size),
+            delay * (echo_frequencies[second] - echo_frequencies[first]),
         )
         for first, second in SEGMENT_PAIRS
     ]
@@ -415,73 +522,103 @@ def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
     is that of the line, to first order in their distance.
     """
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    later = 0.0 if shots.first_sample is None else middle_moved(shots.window)[shots.first_sample]
-    later = np.broadcast_to(later, (len(shots.carriers), shots.size)) / shots.sample_rate
-    middles = shots.acquisition_delay + shots.record_duration / 2 + later
+    middle_shift = (
+        0.0
+        if shots.n_samples_before_echo is None
+        else centroid_delay(shots.window)[shots.n_samples_before_echo]
+    )
+    middle_shift = (
+        np.broadcast_to(middle_shift, (len(shots.carriers), shots.size)) / shots.sample_rate
+    )
+    record_middles = shots.acquisition_delay + shots.record_duration / 2 + middle_shift
     return [
         carrier + slope * shots.chirp_rate * (middle - delay)
-        for carrier, slope, middle in zip(shots.carriers, shots.slopes, middles, strict=True)
-    ], middles
+        for carrier, slope, middle in zip(
+            shots.carriers, shots.chirp_slopes, record_middles, strict=True
+        )
+    ], record_middles
 
 
-def _line_spread(
-    shots: Shots, pair: tuple[int, int], phase: PhaseDifference, slopes: Slopes
-) -> LineSpread:
+def _line_pair_gradients(
+    shots: Shots, pair: tuple[int, int], phase: PhaseDifference, slopes: BeamGradients
+) -> LinePairGradients:
     """Return the gradients of two segments' lines, and the distance of their strongest bins."""
-    bin_width = shots.sample_rate / shots.window.length
-    padding = shots.fft_size / shots.window.length
-    distances, spreads = [], []
-    for segment in (shots.waveform[s] for s in pair):
-        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
-        beat = segment.carrier * segment.beta - segment.chirp_rate * delay * (1 + segment.beta)
-        place = beat / bin_width * padding
+    window_bin_width = shots.sample_rate / shots.window.length
+    padding_factor = shots.fft_size / shots.window.length
+    distances, line_shifts = [], []
+    for segment in (shots.waveform_segments[segment_index] for segment_index in pair):
+        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease)
+        beat = segment.carrier * segment.doppler_ratio - segment.chirp_rate * delay * (
+            1 + segment.doppler_ratio
+        )
+        bin_position = beat / window_bin_width * padding_factor
         # Any bins of two echoes may detect them: of these the middles stand for all.
-        moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
-        spreads.append(np.broadcast_to(moved / bin_width, shots.size))
-        place = np.broadcast_to(place, shots.size)
-        nearest = place
+        shift_hertz = (
+            segment.carrier * slopes.doppler_ratio
+            - segment.chirp_rate * delay * slopes.relative_range
+        )
+        line_shifts.append(np.broadcast_to(shift_hertz / window_bin_width, shots.size))
+        bin_position = np.broadcast_to(bin_position, shots.size)
+        nearest_bin = bin_position
         if shots.detection == "peak_bin":
-            nearest = _strongest_bins(shots, place, spreads[-1] * padding)
-        distances.append((nearest - place) / padding)
-    return LineSpread(
-        (distances[0], distances[1]), (spreads[0], spreads[1]), phase.along(slopes),
-        np.broadcast_to(slopes.echo, shots.size),
-    )  # fmt: skip
+            nearest_bin = _strongest_bins_with_images(
+                shots, bin_position, line_shifts[-1] * padding_factor
+            )
+        distances.append((nearest_bin - bin_position) / padding_factor)
+    return LinePairGradients(
+        (distances[0], distances[1]),
+        (line_shifts[0], line_shifts[1]),
+        phase.phase_per_deviation(slopes),
+        np.broadcast_to(slopes.relative_echo, shots.size),
+    )
 
 
-_END_REACH = 2.0
+_IMAGE_REACH_BINS = 2.0
 """Distance from DC or Nyquist [bins], and deviations of lines, within which the image of an echo
 may make another bin the strongest."""
 
 
-def _strongest_bins(shots: Shots, place: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _strongest_bins_with_images(
+    shots: Shots, line_positions: np.ndarray, line_deviation_bins: np.ndarray
+) -> np.ndarray:
     """Return the strongest bins of echoes at a place, with its sign and folds [bins], (n,).
 
     That is the nearest one, unless a line near DC or Nyquist of a real record has its image there:
-    of bins 0 and 1 that at DC then has the light of both. ``spread`` is that of the lines [bins].
+    of bins 0 and 1 that at DC then has the light of both. ``line_deviation_bins`` is that of the
+    lines [bins].
     """
-    nearest = np.rint(place)
-    if not shots.real_ends or not shots.image:
-        return nearest
-    half = shots.fft_size // 2
-    end = np.rint(place / half) * half
-    padding = shots.fft_size / shots.window.length
-    near = np.flatnonzero(np.abs(place - end) < _END_REACH * (padding + np.abs(spread)))
-    if not near.size:
-        return nearest
-    place, end = place[near, None], end[near]
-    node = np.linspace(-_DEVIATIONS_MAX, _DEVIATIONS_MAX, _NODES)
-    weight, lines = np.exp(-0.5 * node * node), place + spread[near, None] * node
-    side = np.where(place[:, 0] < end, -1.0, 1.0)
-    first = np.maximum(side * (nearest[near] - end) - 1, 0.0)
-    power = []
-    for further in range(3):  # the nearest bin and those beside it, on this side of the end
-        bin_ = (end + side * (first + further))[:, None]
-        line = window_transform(shots.window, (bin_ - lines) / padding)
-        image = window_transform(shots.window, (bin_ - 2 * end[:, None] + lines) / padding)
-        power.append(((line**2 + image**2) * weight).sum(axis=-1))
-    nearest[near] = end + side * (first + np.argmax(power, axis=0))
-    return nearest
+    nearest_bins = np.rint(line_positions)
+    if not shots.real_fft_size or not shots.sums_images:
+        return nearest_bins
+    nyquist_bin = shots.fft_size // 2
+    spectrum_ends = np.rint(line_positions / nyquist_bin) * nyquist_bin
+    padding_factor = shots.fft_size / shots.window.length
+    near_end = np.flatnonzero(
+        np.abs(line_positions - spectrum_ends)
+        < _IMAGE_REACH_BINS * (padding_factor + np.abs(line_deviation_bins))
+    )
+    if not near_end.size:
+        return nearest_bins
+    line_positions, spectrum_ends = line_positions[near_end, None], spectrum_ends[near_end]
+    node_deviations = np.linspace(-_LINE_DEVIATIONS_MAX, _LINE_DEVIATIONS_MAX, _N_LINE_NODES)
+    node_weights, node_positions = (
+        np.exp(-0.5 * node_deviations * node_deviations),
+        line_positions + line_deviation_bins[near_end, None] * node_deviations,
+    )
+    inward_sign = np.where(line_positions[:, 0] < spectrum_ends, -1.0, 1.0)
+    first_distance = np.maximum(inward_sign * (nearest_bins[near_end] - spectrum_ends) - 1, 0.0)
+    powers = []
+    for extra_distance in range(3):  # the nearest bin and those beside it, on this side of the end
+        bin_ = (spectrum_ends + inward_sign * (first_distance + extra_distance))[:, None]
+        line_transform = window_transform(shots.window, (bin_ - node_positions) / padding_factor)
+        image_transform = window_transform(
+            shots.window, (bin_ - 2 * spectrum_ends[:, None] + node_positions) / padding_factor
+        )
+        powers.append(((line_transform**2 + image_transform**2) * node_weights).sum(axis=-1))
+    nearest_bins[near_end] = spectrum_ends + inward_sign * (
+        first_distance + np.argmax(powers, axis=0)
+    )
+    return nearest_bins
 
 
 class BeamletMoments(NamedTuple):
@@ -499,27 +636,30 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     The covariance is about the mean of each surface: surfaces at different ranges, as a roof and
     the ground below, are echoes of their own, each of which fades as a whole.
     """
-    values = np.array([shots.doppler, shots.offset])
-    return _moments_by_surface(shots.amplitude**2, values, ground.beside, shots.row)
+    values = np.array([shots.doppler_ratio_offset, shots.relative_range_offset])
+    return _moments_by_surface(
+        shots.relative_amplitude**2, values, ground.off_axis_surface, shots.footprint_row
+    )
 
 
 def _moments_by_surface(
-    power: np.ndarray, values: np.ndarray, beside: np.ndarray | None, row: np.ndarray
+    power: np.ndarray, values: np.ndarray, off_axis_surface: np.ndarray | None, row: np.ndarray
 ) -> BeamletMoments:
     """Return power-weighted moments of values (2, rows, beamlets), for points with the given rows.
 
-    ``beside`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or is None.
+    ``off_axis_surface`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or
+    is None.
     """
-    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
-    mean = (share * values).sum(axis=-1)
+    power_fraction = power / np.maximum(power.sum(axis=1), _TINY)[:, None]
+    mean = (power_fraction * values).sum(axis=-1)
     centred = values - mean[:, :, None]
-    if beside is not None and beside.any():
-        for surface in (beside, ~beside):
-            weight = np.where(surface, share, 0.0)
-            whole = np.maximum(weight.sum(axis=1), _SMALLEST)
-            own_mean = (weight * values).sum(axis=-1) / whole
-            centred = np.where(surface, values - own_mean[:, :, None], centred)
-    covariance = (share * centred[:, None] * centred[None]).sum(axis=-1)
+    if off_axis_surface is not None and off_axis_surface.any():
+        for surface in (off_axis_surface, ~off_axis_surface):
+            weight = np.where(surface, power_fraction, 0.0)
+            surface_power = np.maximum(weight.sum(axis=1), _TINY)
+            surface_mean = (weight * values).sum(axis=-1) / surface_power
+            centred = np.where(surface, values - surface_mean[:, :, None], centred)
+    covariance = (power_fraction * centred[:, None] * centred[None]).sum(axis=-1)
     return BeamletMoments(mean[:, row], covariance[:, :, row])
 
 
@@ -532,29 +672,32 @@ def _phase_moments(
     the phase is normal. A sum of phasors over few rays would recur where their phases are whole
     cycles apart.
     """
-    weights = 2 * np.pi * np.array([[phase.turn, -phase.delay_cycles] for phase in phases])
+    weights = (
+        2 * np.pi * np.array([[phase.doppler_cycles, -phase.delay_cycles] for phase in phases])
+    )
     variance = np.einsum("pin,ijn,pjn->pn", weights, moments.covariance, weights)
     return (weights * moments.mean).sum(axis=1), variance
 
 
-def _cast_slopes(moments: BeamletMoments) -> Slopes:
+def _ray_traced_slopes(moments: BeamletMoments) -> BeamGradients:
     """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
-    along = moments.covariance[0, 1] / np.maximum(deviation, _SMALLEST)
-    return Slopes(along, deviation, np.zeros(deviation.shape))
+    doppler_along = moments.covariance[0, 1] / np.maximum(deviation, _TINY)
+    return BeamGradients(doppler_along, deviation, np.zeros(deviation.shape))
 
 
 FADING = Effect(
     name="fading",
-    about="developed speckle of a rough surface, in closed form",
+    description="developed speckle of a rough surface, in closed form",
     stage="detection",
-    size=fading_size,
-    act=fade,
-    needs=("footprint", "doppler_spread"),
+    error_bound=fading_bound,
+    apply=apply_fading,
+    required_effects=("footprint", "doppler_spread"),
     parameters=(
         Parameter(
-            path=_LAW,
-            about="Echo of surfaces that are rough against the wavelength: developed, it fades as "
+            path=_SPECKLE_PATH,
+            description="Echo of surfaces that are rough against the wavelength: developed, it "
+            "fades as "
             "speckle does, or none, it has its mean power. Coherent phases are those of a smooth "
             "surface and do not fade; where target.roughness says how rough, take none",
             default="developed",
@@ -566,15 +709,15 @@ FADING = Effect(
 
 SPECKLE = Effect(
     name="speckle",
-    about="amplitudes of a rough surface, at random",
+    description="amplitudes of a rough surface, at random",
     stage="draws",
-    size=size,
-    draw=draw,
-    needs=("footprint", "doppler_spread"),  # by them the segments' speckles differ
+    error_bound=speckle_bound,
+    perturb_shots=perturb_shots,
+    required_effects=("footprint", "doppler_spread"),  # by them the segments' speckles differ
     parameters=(
         Parameter(
-            path=_ROUGHNESS,
-            about="Standard deviation of the surface's height along the line of sight",
+            path=_ROUGHNESS_PATH,
+            description="Standard deviation of the surface's height along the line of sight",
             example="10 um",
             limits=("0 m", "1 km"),
         ),

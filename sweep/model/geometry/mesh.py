@@ -15,13 +15,13 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceMaterial:
     """Optical properties of one kind of surface."""
 
     name: str
     reflectance: float
-    """Reflectance as its law takes it, one of :data:`sweep.model.ground.LAWS`; 0..1."""
-    law: str = "lambert"
+    """Reflectance as its law takes it, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`; 0..1."""
+    reflectance_law: str = "lambert"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,55 +35,59 @@ class Mesh:
     """(n, 3) float64 [m], relative to `origin`."""
     faces: np.ndarray
     """(m, 3) int32: vertices of each triangle; either winding, since both sides are seen."""
-    surface: np.ndarray
+    surface_index: np.ndarray
     """(m,) int16: which of the scene's surfaces each triangle belongs to."""
     origin: np.ndarray
     """(3,) float64 [m]: where the vertices' zero lies in the frame of the scene or the body."""
 
     def __post_init__(self):
-        require_shapes(self.vertices, self.faces, self.surface)
+        require_shapes(self.vertices, self.faces, self.surface_index)
         if len(self.faces) == 0:
             raise ValueError("a mesh needs at least one triangle")
         if not np.isfinite(self.vertices).all():
             raise ValueError("a mesh's vertices are finite")
         if np.shape(self.origin) != (3,) or not np.isfinite(self.origin).all():
             raise ValueError("a mesh's origin is three finite coordinates")
-        kinds = {"vertices": np.float64, "faces": np.int32, "surface": np.int16}
-        for name, kind in (kinds | {"origin": np.float64}).items():
-            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=kind))
+        dtype_by_name = {"vertices": np.float64, "faces": np.int32, "surface_index": np.int16}
+        for name, dtype in (dtype_by_name | {"origin": np.float64}).items():
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
 
 
-def merge(meshes: Sequence[Mesh]) -> Mesh:
+def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of several meshes of one frame as one mesh, in the order given."""
-    corners = [m.origin + f(m.vertices, axis=0) for m in meshes for f in (np.min, np.max)]
-    origin = round_centre(np.array(corners))
+    corners = [
+        mesh.origin + corner_function(mesh.vertices, axis=0)
+        for mesh in meshes
+        for corner_function in (np.min, np.max)
+    ]
+    origin = exact_centre(np.array(corners))
     if len(meshes) == 1 and np.array_equal(meshes[0].origin, origin):
         return meshes[0]
-    vertices = np.empty((sum(len(m.vertices) for m in meshes), 3))
-    faces = np.empty((sum(len(m.faces) for m in meshes), 3), np.int32)
+    vertices = np.empty((sum(len(mesh.vertices) for mesh in meshes), 3))
+    faces = np.empty((sum(len(mesh.faces) for mesh in meshes), 3), np.int32)
     n_vertices = n_faces = 0
-    for m in meshes:  # copies of all, one after the other, would take twice the memory
-        part = slice(n_faces, n_faces + len(m.faces))
-        np.add(m.faces, n_vertices, out=faces[part])
-        part = slice(n_vertices, n_vertices + len(m.vertices))
-        np.add(m.vertices, m.origin - origin, out=vertices[part])
-        n_vertices, n_faces = n_vertices + len(m.vertices), n_faces + len(m.faces)
-    return Mesh(vertices, faces, np.concatenate([m.surface for m in meshes]), origin)
+    for mesh in meshes:  # copies of all, one after the other, would take twice the memory
+        rows = slice(n_faces, n_faces + len(mesh.faces))
+        np.add(mesh.faces, n_vertices, out=faces[rows])
+        rows = slice(n_vertices, n_vertices + len(mesh.vertices))
+        np.add(mesh.vertices, mesh.origin - origin, out=vertices[rows])
+        n_vertices, n_faces = n_vertices + len(mesh.vertices), n_faces + len(mesh.faces)
+    return Mesh(vertices, faces, np.concatenate([mesh.surface_index for mesh in meshes]), origin)
 
 
-def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> None:
+def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.ndarray) -> None:
     """Refuse arrays of a mesh that do not fit each other, and faces without their vertices."""
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices are of shape (n, 3), not {vertices.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"faces are integers of shape (m, 3), not {faces.dtype} {faces.shape}")
-    if surface.shape != faces.shape[:1]:
-        raise ValueError(f"{len(faces)} faces need as many surfaces, not {surface.shape}")
+    if surface_index.shape != faces.shape[:1]:
+        raise ValueError(f"{len(faces)} faces need as many surfaces, not {surface_index.shape}")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(f"a face names a vertex outside 0..{len(vertices) - 1}")
 
 
-def round_centre(vertices: np.ndarray) -> np.ndarray:
+def exact_centre(vertices: np.ndarray) -> np.ndarray:
     """Middle of the bounding box, chosen so that subtracting it from any vertex is exact.
 
     Zero along an axis where zero is no farther off than the mesh is large, since small numbers
@@ -100,109 +104,126 @@ def round_centre(vertices: np.ndarray) -> np.ndarray:
     return np.where(np.abs(middle) > extent, middle, 0.0)
 
 
-Pair = tuple[np.ndarray, np.ndarray]
+DoubleDouble = tuple[np.ndarray, np.ndarray]
 """Numbers as sums of two float64, high and low; of vectors, components along the first axis."""
 
-_HALVES = 2.0**27 + 1
+_SPLIT_FACTOR = 2.0**27 + 1
 """Factor that parts a float64 into two of half as many digits."""
 
-_FLAT = 1e-6
+_GRAZING_SINE_MAX = 1e-6
 """Sine of the angle to a facet under which its plane may run through it within rounding."""
 
 
-def exact(values: np.ndarray) -> Pair:
+def to_double_double(values: np.ndarray) -> DoubleDouble:
     """Pair of numbers that float64 holds."""
     return values, np.zeros_like(values)
 
 
-def _two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
+def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
     """Sum and what its rounding left."""
-    s = a + b
-    part = s - a
-    return s, (a - (s - part)) + (b - part)
+    total = a + b
+    virtual_b = total - a
+    return total, (a - (total - virtual_b)) + (b - virtual_b)
 
 
-def _quick_two_sum(a: np.ndarray, b: np.ndarray) -> Pair:
+def _quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
     """Sum and what its rounding left, for abs(a) >= abs(b)."""
-    s = a + b
-    return s, b - (s - a)
+    total = a + b
+    return total, b - (total - a)
 
 
-def _halves(a: np.ndarray) -> Pair:
-    wide = a * _HALVES
-    high = wide - (wide - a)
+def _split(a: np.ndarray) -> DoubleDouble:
+    scaled = a * _SPLIT_FACTOR
+    high = scaled - (scaled - a)
     return high, a - high
 
 
-def product(a: Pair, b: Pair) -> Pair:
+def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Product of two pairs."""
-    p = a[0] * b[0]
-    (ah, al), (bh, bl) = _halves(a[0]), _halves(b[0])
-    rest = ((ah * bh - p) + ah * bl + al * bh) + al * bl
-    return _quick_two_sum(p, rest + (a[0] * b[1] + a[1] * b[0]))
+    high_product = a[0] * b[0]
+    (ah, al), (bh, bl) = _split(a[0]), _split(b[0])
+    low_product = ((ah * bh - high_product) + ah * bl + al * bh) + al * bl
+    return _quick_two_sum(high_product, low_product + (a[0] * b[1] + a[1] * b[0]))
 
 
-def add(a: Pair, b: Pair) -> Pair:
+def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Sum of two pairs, accurate also where the high parts cancel."""
-    s, e = _two_sum(a[0], b[0])
-    t, f = _two_sum(a[1], b[1])
-    s, e = _quick_two_sum(s, e + t)
-    return _quick_two_sum(s, e + f)
+    high_sum, high_error = _two_sum(a[0], b[0])
+    low_sum, low_error = _two_sum(a[1], b[1])
+    high_sum, high_error = _quick_two_sum(high_sum, high_error + low_sum)
+    return _quick_two_sum(high_sum, high_error + low_error)
 
 
-def less(a: Pair, b: Pair) -> Pair:
+def subtract(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Difference of two pairs."""
     return add(a, (-b[0], -b[1]))
 
 
-def dot(a: Pair, b: Pair) -> Pair:
+def dot(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Scalar product of two vectors; of a vector (3, 1, n) and a matrix (3, 3, n), a vector."""
-    x, y, z = zip(*product(a, b), strict=True)
+    x, y, z = zip(*multiply(a, b), strict=True)
     return add(add(x, y), z)
 
 
-def _cross(a: Pair, b: Pair) -> Pair:
+def _cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Vector product."""
     (ay, az), (by, bz) = (
-        [(v[0][turn], v[1][turn]) for turn in ([1, 2, 0], [2, 0, 1])] for v in (a, b)
+        [(v[0][axes], v[1][axes]) for axes in ([1, 2, 0], [2, 0, 1])] for v in (a, b)
     )
-    return less(product(ay, bz), product(az, by))
+    return subtract(multiply(ay, bz), multiply(az, by))
 
 
-def normals(corners: np.ndarray) -> Pair:
+def facet_normals(corners: np.ndarray) -> DoubleDouble:
     """Compute normals (3, n) of facets by their winding, twice their areas long.
 
     `corners` (3, 3, n) are first, second and third corner; their x, y, z.
     """
-    a, b, c = (exact(corner) for corner in corners)
-    return _cross(less(b, a), less(c, a))
+    a, b, c = (to_double_double(corner) for corner in corners)
+    return _cross(subtract(b, a), subtract(c, a))
 
 
-def distances(corners: np.ndarray, normal: Pair, height: Pair, o: Pair, d: Pair) -> Pair:
-    """Distances of facets' planes along rays from `o` along `d` (3, n), in lengths of `d`.
+def plane_distances(
+    corners: np.ndarray,
+    facet_normal: DoubleDouble,
+    plane_height: DoubleDouble,
+    ray_origin: DoubleDouble,
+    ray_direction: DoubleDouble,
+) -> DoubleDouble:
+    """Distances of facets' planes along rays, in lengths of `ray_direction` (3, n).
 
-    `height` (n,) is the product of the normals with a corner less the origin. A plane seen so
+    `plane_height` (n,) is the product of the normals with a corner less the origin. A plane seen so
     flatly that it runs through the facet within rounding is met somewhere on the facet: the
     distance stays between those of its corners.
     """
-    along = dot(normal, d)
+    normal_speed = dot(facet_normal, ray_direction)
     with np.errstate(all="ignore"):  # parallel to a plane
-        high = height[0] / along[0]
-        rest, low = less(height, product(exact(high), along))
-        high, low = _quick_two_sum(high, (rest + low) / along[0])
-    x, y, z = np.abs(normal[0])
-    flat = np.flatnonzero(~(np.abs(along[0]) > _FLAT * (x + y + z)))
-    if flat.size:
-        origin, ray = (o[0][:, flat], o[1][:, flat]), d[0][:, flat]
-        length = ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2
-        reach = []
-        for corner in corners[:, :, flat]:
-            x, y, z = less(exact(corner), origin)[0] * ray
-            reach.append((x + y + z) / length)
-        nearest, farthest = np.min(reach, axis=0), np.max(reach, axis=0)
-        outside = ~((high[flat] >= nearest) & (high[flat] <= farthest))
-        low[flat[outside]] = 0.0
-        high[flat] = np.where(
-            outside, np.where(high[flat] < nearest, nearest, farthest), high[flat]
+        distance_high = plane_height[0] / normal_speed[0]
+        remainder, distance_low = subtract(
+            plane_height, multiply(to_double_double(distance_high), normal_speed)
         )
-    return high, low
+        distance_high, distance_low = _quick_two_sum(
+            distance_high, (remainder + distance_low) / normal_speed[0]
+        )
+    x, y, z = np.abs(facet_normal[0])
+    grazing_facets = np.flatnonzero(~(np.abs(normal_speed[0]) > _GRAZING_SINE_MAX * (x + y + z)))
+    if grazing_facets.size:
+        grazing_origin, grazing_direction = (
+            (ray_origin[0][:, grazing_facets], ray_origin[1][:, grazing_facets]),
+            ray_direction[0][:, grazing_facets],
+        )
+        length = grazing_direction[0] ** 2 + grazing_direction[1] ** 2 + grazing_direction[2] ** 2
+        corner_distances = []
+        for corner in corners[:, :, grazing_facets]:
+            x, y, z = subtract(to_double_double(corner), grazing_origin)[0] * grazing_direction
+            corner_distances.append((x + y + z) / length)
+        nearest, farthest = np.min(corner_distances, axis=0), np.max(corner_distances, axis=0)
+        outside = ~(
+            (distance_high[grazing_facets] >= nearest) & (distance_high[grazing_facets] <= farthest)
+        )
+        distance_low[grazing_facets[outside]] = 0.0
+        distance_high[grazing_facets] = np.where(
+            outside,
+            np.where(distance_high[grazing_facets] < nearest, nearest, farthest),
+            distance_high[grazing_facets],
+        )
+    return distance_high, distance_low

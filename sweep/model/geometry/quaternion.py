@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_SMALL = 1e-4
+_SMALL_HALF_ANGLE = 1e-4
 """Half angle [rad] under which sin(x)/x is its series, good to 1e-18 there."""
 
 
@@ -43,18 +43,18 @@ def normalise(q: np.ndarray) -> np.ndarray:
 def rotate(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Vectors turned by unit quaternions: body to world, (..., 3)."""
     q, vector = np.asarray(q, float), np.asarray(vector, float)
-    twice = 2 * np.cross(q[..., 1:], vector)
-    return np.asarray(vector + q[..., :1] * twice + np.cross(q[..., 1:], twice))
+    doubled_cross = 2 * np.cross(q[..., 1:], vector)
+    return np.asarray(vector + q[..., :1] * doubled_cross + np.cross(q[..., 1:], doubled_cross))
 
 
 def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     """Rotation about `vector` by its length [rad], (..., 4)."""
     vector = np.asarray(vector, float)
-    half = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
-    small = half < _SMALL
-    safe = np.where(small, 1.0, half)
-    sinc = np.where(small, 1 - half**2 / 6, np.sin(safe) / safe)
-    return np.concatenate([np.cos(half), 0.5 * sinc * vector], axis=-1)
+    half_angle = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
+    is_small = half_angle < _SMALL_HALF_ANGLE
+    safe_half_angle = np.where(is_small, 1.0, half_angle)
+    sinc = np.where(is_small, 1 - half_angle**2 / 6, np.sin(safe_half_angle) / safe_half_angle)
+    return np.concatenate([np.cos(half_angle), 0.5 * sinc * vector], axis=-1)
 
 
 def to_rotation_vector(q: np.ndarray) -> np.ndarray:
@@ -62,18 +62,20 @@ def to_rotation_vector(q: np.ndarray) -> np.ndarray:
     q = np.asarray(q, float)
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    half = np.arctan2(sine, q[..., :1])
-    small = half < _SMALL
-    safe = np.where(small, 1.0, sine)
-    return np.asarray(np.where(small, 2 + half**2 / 3, 2 * half / safe) * q[..., 1:])
+    half_angle = np.arctan2(sine, q[..., :1])
+    is_small = half_angle < _SMALL_HALF_ANGLE
+    safe_sine = np.where(is_small, 1.0, sine)
+    return np.asarray(
+        np.where(is_small, 2 + half_angle**2 / 3, 2 * half_angle / safe_sine) * q[..., 1:]
+    )
 
 
-def about(axis: int, angle: np.ndarray | float) -> np.ndarray:
+def axis_angle(axis: int, angle: np.ndarray | float) -> np.ndarray:
     """Right-handed rotation by `angle` [rad] about axis 0 (x), 1 (y) or 2 (z), (..., 4)."""
-    half = 0.5 * np.asarray(angle, float)
-    q = np.zeros((*half.shape, 4))
-    q[..., 0] = np.cos(half)
-    q[..., 1 + axis] = np.sin(half)
+    half_angle = 0.5 * np.asarray(angle, float)
+    q = np.zeros((*half_angle.shape, 4))
+    q[..., 0] = np.cos(half_angle)
+    q[..., 1 + axis] = np.sin(half_angle)
     return q
 
 
@@ -89,5 +91,5 @@ def from_heading(
     the pitch lifts the nose, a right-handed turn about -y; last the roll lifts the left side, one
     about x.
     """
-    turned = multiply(about(2, heading), about(1, -np.asarray(pitch, float)))
-    return multiply(turned, about(0, roll))
+    heading_and_pitch = multiply(axis_angle(2, heading), axis_angle(1, -np.asarray(pitch, float)))
+    return multiply(heading_and_pitch, axis_angle(0, roll))

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
 from sweep.model.effects.segment_motion import SEGMENT_MOTION
-from sweep.model.ground import powers_add
+from sweep.model.ground import beamlets_add_as_powers
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.fields import OFF
 from sweep.tasks.studies.study_loading import AnySpec, apply_changes
@@ -176,7 +176,7 @@ def build_ladder(spec: AnySpec) -> SettingLadder:
     settings += () if why_beamlets_are_fixed else _beamlet_settings(isinstance(spec, SceneSpec))
     settings += _thesis_settings(
         {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: THESIS_BEAMLETS},
-        powers_add(spec.parameters()),
+        beamlets_add_as_powers(spec.parameters()),
     )
     settings.append(
         AccuracySetting(
@@ -208,7 +208,7 @@ def add_fixed_effect_settings(
             kind=FIXED_EFFECTS_KIND,
             overrides={
                 f"effects.{effect_name}": "on" if effect_name in effect_names else "off"
-                for effect_name in NAMES
+                for effect_name in EFFECT_NAMES
             }
             | _beamlets_overrides(spec, tolerance)
             | {_TOLERANCE_FIELD: tolerance},

@@ -27,17 +27,30 @@ from scipy import fft
 from scipy.stats import qmc
 
 from sweep.kernel_cache import njit
-from sweep.model import shot, truth
+from sweep.model import evaluation, time_domain_truth
 from sweep.model import window as windows
-from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import detect_rows
-from sweep.model.effects.catalogue import EFFECTS, NAMES, flags_of, names_of
-from sweep.model.eyepoints import Eyepoints, seen_ground
-from sweep.model.lines import BLOCK, IM, PLACE, RE, add_images, fold_lines, place_lines
+from sweep.model.detection.echo_detection import detect_in_spectra
+from sweep.model.effects.catalogue import (
+    EFFECT_NAMES,
+    EFFECTS,
+    pack_effect_flags,
+    unpack_effect_flags,
+)
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
+from sweep.model.pointcloud.ray_error import estimate_ray_error
 from sweep.model.preparation import Shots
-from sweep.model.ray_error import ray_error
-from sweep.model.waveform import SEGMENTS
+from sweep.model.spectrum.lines import (
+    BLOCK,
+    IM,
+    PLACE,
+    RE,
+    add_image_lines,
+    compute_lines,
+    fold_lines,
+)
+from sweep.model.waveform import SEGMENT_NAMES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Axis, GridSpec, SceneSpec
 from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting, AnySpec
@@ -47,7 +60,7 @@ from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_points
 
 PeakFinder = Callable[[Shots], np.ndarray]
-"""A way to the largest bins of each segment's spectrum, as :func:`sweep.model.shot.find`."""
+"""A way to the largest bins of each segment's spectrum, as :func:`sweep.model.evaluation.find`."""
 
 PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
 """Values of points and their attributes, by name."""
@@ -55,7 +68,7 @@ PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
 
 def _flags_of_effects(effect_names: Collection[str]) -> np.uint32:
     """Return the flags of some effects."""
-    return np.uint32(sum(1 << NAMES.index(effect_name) for effect_name in effect_names))
+    return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
 LINE_EFFECT_FLAGS = _flags_of_effects(
@@ -97,9 +110,9 @@ class SampleResults(NamedTuple):
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
     """Results in the outputs of points; ``n_draws``: in so many draws, 0 for means of them."""
-    segments_and_shot = (*SEGMENTS, "shot")
+    segments_and_shot = (*SEGMENT_NAMES, "shot")
 
-    def stack_outputs(form: str, names: Iterable[str] = SEGMENTS) -> np.ndarray:
+    def stack_outputs(form: str, names: Iterable[str] = SEGMENT_NAMES) -> np.ndarray:
         return np.stack([outputs[form.format(name)] for name in names], axis=1)
 
     if n_draws:
@@ -191,7 +204,7 @@ class StudySample(ABC):
         effect_flags = [
             np.bitwise_or.reduce(self._plan_flags(setting, indices)[0]) for indices in parts
         ]
-        return frozenset(names_of(int(np.bitwise_or.reduce(effect_flags))))
+        return frozenset(unpack_effect_flags(int(np.bitwise_or.reduce(effect_flags))))
 
     def compare_with_time_domain(
         self, setting: AccuracySetting, sample_row: int
@@ -204,7 +217,10 @@ class StudySample(ABC):
             self._collect_results(
                 setting, 1, self._iter_outputs(setting, point_index, effect_flags, find_peaks)
             )
-            for find_peaks in (truth.find, shot.find)
+            for find_peaks in (
+                time_domain_truth.evaluate_segments_in_time_domain,
+                evaluation.evaluate_segments,
+            )
         )
         return time_domain, simulated
 
@@ -362,7 +378,7 @@ class GridSample(StudySample):
         effect_flags = np.empty(tiles.size, np.uint32)
         start = thread_time()
         for members, effect_plan in effect_planner.iter_plans(tiles):
-            effect_flags[members] = flags_of(effect_plan.kept)
+            effect_flags[members] = pack_effect_flags(effect_plan.is_kept)
         seconds = thread_time() - start if setting.plans_effects else 0.0
         return effect_flags[tile_of_point], seconds / sum(
             map(effect_planner.tiles.block_size, tiles.tolist())
@@ -383,7 +399,10 @@ class GridSample(StudySample):
             if find_peaks is None:
                 yield rows, evaluate_points(study.spec, parameters, rows.size, effect_names)
             else:
-                yield rows, shot.evaluate(parameters, effect_names, look=find_peaks)
+                yield (
+                    rows,
+                    evaluation.evaluate(parameters, effect_names, segment_evaluator=find_peaks),
+                )
 
     def _points_computed_next(
         self, setting: AccuracySetting, point_index: int, n_points: int
@@ -498,7 +517,7 @@ class FlightSample(StudySample):
         eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
         start = thread_time()
         if setting.has_line_effects_only:
-            effect_flags = np.where(eyepoints.seen, self._line_effect_flags, 0)
+            effect_flags = np.where(eyepoints.has_target, self._line_effect_flags, 0)
         else:
             effect_flags = (
                 self.study_with(setting)
@@ -522,9 +541,11 @@ class FlightSample(StudySample):
         eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
         selected_effects, hitting_rows = (
             SelectedEffects(effect_flags, np.zeros(effect_flags.size)),
-            np.flatnonzero(eyepoints.seen),
+            np.flatnonzero(eyepoints.has_target),
         )
-        simulate_group = partial(_shot_statistics, study, flight_block, find_peaks or shot.find)
+        simulate_group = partial(
+            _shot_statistics, study, flight_block, find_peaks or evaluation.evaluate_segments
+        )
         yield from study.iter_clouds(
             flight_block.scanner,
             eyepoints,
@@ -558,7 +579,7 @@ class FlightSample(StudySample):
         # in a world that all share, as building one can take seconds
         study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
         if setting.rays_error_max:
-            study.ray_accuracy = Accuracy(setting.rays_error_max, least_rays_tolerance=0.0)
+            study.ray_accuracy = ErrorBudget(setting.rays_error_max, rays_tolerance_min=0.0)
         return study
 
     def _cast_shots(
@@ -598,16 +619,20 @@ def _shot_statistics(
     effect_flags: np.ndarray,
 ) -> Results:
     """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
-    hitting_shots, n_rays = eyepoints.seen.nonzero()[0], eyepoints.weight.size
-    shot_parameters, ground = seen_ground(
-        eyepoints.some(hitting_shots), study.parameters_at(flight_block), study.surfaces
+    hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
+    shot_parameters, ground = parameters_and_ground_of_eyepoints(
+        eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces
     )
-    shots = shot.prepare_cast(shot_parameters, ground, effect_names, effect_flags[hitting_shots])
+    shots = evaluation.prepare_ray_traced_shots(
+        shot_parameters, ground, effect_names, effect_flags[hitting_shots]
+    )
     peaks = find_peaks(shots)
-    outputs = shot.statistics(shots, peaks) | {"beamlets": np.full(shots.size, n_rays)}
+    outputs = evaluation.shot_statistics(shots, peaks) | {"beamlets": np.full(shots.size, n_rays)}
     if study.ray_accuracy is not None:
         peak_bins = peaks[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
-        outputs["beamlets_error"] = ray_error(shots, ground.beamlets, peak_bins, peaks[:, 2].T)
+        outputs["beamlets_error"] = estimate_ray_error(
+            shots, ground.beamlets, peak_bins, peaks[:, 2].T
+        )
     all_outputs = {name: np.full(shot_numbers.size, np.nan) for name in outputs}
     for name, values in outputs.items():
         all_outputs[name][hitting_shots] = values
@@ -635,7 +660,7 @@ def find_peaks_on_grid(
     real: bool = False,
     folded: bool = False,
 ) -> np.ndarray:
-    """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.shot.find`.
+    """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.evaluation.find`.
 
     A line is shared out by a polynomial of a ``degree`` of 0, to the nearest cell, or 9, among
     ten. A grid has ``size`` cells at the least, a power of two, and more where a point's lines
@@ -644,12 +669,12 @@ def find_peaks_on_grid(
     """
     peaks = np.full((3, 6, shots.size), np.nan)
     point_table, n_cells_of_point, grid_options = (
-        shots.point_table(),
+        shots.point_parameter_table(),
         cells_per_point(shots, size),
         (degree, real, folded),
     )
     first_bin_and_width = shots.fft_size // 2, 1.0 / shots.fft_size
-    segments = np.flatnonzero(shots.segments).tolist()
+    segments = np.flatnonzero(shots.has_segment).tolist()
     for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
         members = np.flatnonzero(n_cells_of_point == cells)
         for points in np.split(
@@ -659,13 +684,13 @@ def find_peaks_on_grid(
                 shots, point_table, points, segment, cells, grid_options
             )
             peak_rows = np.empty((6, points.size))
-            bin_levels = shots.bin_levels[:, points]
-            speckle = shots.speckle_table.at(segment, points)
-            detect_rows(
+            bin_levels = shots.bin_threshold_table[:, points]
+            speckle = shots.speckle_table.select(segment, points)
+            detect_in_spectra(
                 magnitude,
                 first_bin,
                 first_bin_and_width,
-                shots.echo_rule,
+                shots.detection_rule,
                 bin_levels,
                 speckle,
                 peak_rows,
@@ -679,8 +704,8 @@ def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray
     """Cells of each point's grid, (n,) int64: the lines in its middle, and room on both sides."""
     beat_per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
     carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.carriers])
-    offset_max = np.abs(shots.offset).max(axis=1)[shots.row]
-    doppler_max = np.abs(shots.doppler).max(axis=1)[shots.row]
+    offset_max = np.abs(shots.relative_range_offset).max(axis=1)[shots.footprint_row]
+    doppler_max = np.abs(shots.doppler_ratio_offset).max(axis=1)[shots.footprint_row]
     line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
     line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
     cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
@@ -700,17 +725,17 @@ def grid_magnitudes(
     ``grid_options``: `degree`, `real` and `folded` of :func:`find_peaks_on_grid`.
     """
     degree, real, folded = grid_options
-    adds_powers, record_length = shots.incoherent, shots.window.length
+    adds_powers, record_length = shots.adds_powers, shots.window.length
     real = real and adds_powers
     grid = np.zeros((points.size, n_cells), float if real else complex)
     centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
     _deposit_lines(
         np.ascontiguousarray(point_table[:, points]),
-        shots.row[points],
-        shots.footprint,
+        shots.footprint_row[points],
+        shots.beamlet_table,
         segment,
         np.array([shots.fft_size, record_length, 0, 0, adds_powers, 0]),
-        shots.image,
+        shots.sums_images,
         np.array(
             [
                 1 / np.prod(np.delete(node - polynomial_nodes, node_number))
@@ -764,7 +789,7 @@ def _window_transform(
 ) -> np.ndarray:
     """Transform of the window's own, of mid-record, on a grid of cells; no closed form is used."""
     cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
-    transform = fft.fft(windows.samples(window_name, length), CELLS_PER_BIN * fft_size)[
+    transform = fft.fft(windows.window_samples(window_name, length), CELLS_PER_BIN * fft_size)[
         cell_offsets
     ]
     transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / CELLS_PER_BIN))
@@ -788,7 +813,7 @@ def _deposit_lines(
         (-0.5, n_cells - 1.0) if node_weights.size == 1 else (5.0, n_cells - 6.0)
     )
     for point in range(footprint_row.size):
-        signed_centre_bin = place_lines(
+        signed_centre_bin = compute_lines(
             point_table[:, point].copy(),
             segment,
             footprint,
@@ -804,7 +829,7 @@ def _deposit_lines(
                     -line_scratch[IM, beamlet],
                 )
         if image:
-            add_images(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
+            add_image_lines(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
             fold_lines(line_scratch[:, n_beamlets:], n_beamlets, sizes)
         for beamlet in range(n_beamlets):
             for line in range(beamlet, n_lines, n_beamlets):

@@ -29,7 +29,7 @@ import numpy as np
 from sweep.spec.rules import Mistake, SpecError
 
 if TYPE_CHECKING:
-    from sweep.model.outputs import Output
+    from sweep.model.outputs import OutputVariable
     from sweep.spec import GridSpec, SceneSpec
 
 Results = dict[str, np.ndarray]
@@ -217,7 +217,7 @@ class BlockGrid:
     def make_layout(
         self,
         name: str,
-        output: Output,
+        output: OutputVariable,
         dims: tuple[str, ...],
         sizes: Mapping[str, int],
         attributes: Mapping[str, Any] | None = None,

@@ -15,16 +15,23 @@ import numpy as np
 
 from sweep.model import beam, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.effects.points import missing_of
-from sweep.model.estimators import ESTIMATOR
-from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, RECORD, categories
-from sweep.model.shot import MISREAD_BINS
-from sweep.model.window import canonical_name, window
+from sweep.model.detection.estimators import ESTIMATOR_PREFIX
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.effects.planner_inputs import missing_sample_bounds
+from sweep.model.evaluation import MISREAD_TOLERANCE_BINS
+from sweep.model.preparation import (
+    CHIRP_PREFIX,
+    LASER_PREFIX,
+    PROCESSING_PREFIX,
+    RECEIVER_PREFIX,
+    RECORD_PATH,
+    split_by_category,
+)
+from sweep.model.window import canonical_window_name, get_window
 from sweep.tasks.studies.flight_study import FlightStudy
 
 if TYPE_CHECKING:
-    from sweep.model.eyepoints import Eyepoints
+    from sweep.model.pointcloud.eyepoints import Eyepoints
     from sweep.tasks.studies.grid_study import GridStudy
 
 ECHO_LOSS_WARNING_DB = 3.0
@@ -45,15 +52,36 @@ EDGE_SPREAD_BINS_MIN, EDGE_DISTANCE_BINS, EDGE_DISTANCE_DEVIATIONS = 0.2, 4.0, 3
 one line. With the bins and deviations within which such an echo lies across DC or Nyquist."""
 
 ECHO_PARAMETERS = (
-    "target.range", "target.radial_velocity", LASER + "wavelength", CHIRP + "bandwidth",
-    CHIRP + "duration", CHIRP + "start_frequency", waveform.ORDER, waveform.DOPPLER_SLOPE,
-    waveform.DOWN_SLOPE, PROCESSING + "acquisition_delay", PROCESSING + "sample_rate",
-    PROCESSING + "fft_size", PROCESSING + "window", waveform.TWO_BEATS, RECORD,
-    RECEIVER + "architecture", LASER + "line_width", LASER + "line_shape",
-    PROCESSING + "detection", "footprint.speckle", "footprint.phases", "target.grazing_angle",
-    "target.transverse_velocity", beam.WAIST, beam.RECEIVED_WAIST, beam.DIVERGENCE, beam.QUALITY,
-    beam.FOCUS, beam.COUPLING,
-)  # fmt: skip
+    "target.range",
+    "target.radial_velocity",
+    LASER_PREFIX + "wavelength",
+    CHIRP_PREFIX + "bandwidth",
+    CHIRP_PREFIX + "duration",
+    CHIRP_PREFIX + "start_frequency",
+    waveform.SEGMENT_ORDER_PATH,
+    waveform.DOPPLER_SLOPE_PATH,
+    waveform.DOWN_SLOPE_PATH,
+    PROCESSING_PREFIX + "acquisition_delay",
+    PROCESSING_PREFIX + "sample_rate",
+    PROCESSING_PREFIX + "fft_size",
+    PROCESSING_PREFIX + "window",
+    waveform.TWO_BEATS_PATH,
+    RECORD_PATH,
+    RECEIVER_PREFIX + "architecture",
+    LASER_PREFIX + "line_width",
+    LASER_PREFIX + "line_shape",
+    PROCESSING_PREFIX + "detection",
+    "footprint.speckle",
+    "footprint.phases",
+    "target.grazing_angle",
+    "target.transverse_velocity",
+    beam.WAIST_PATH,
+    beam.OSCILLATOR_WAIST_PATH,
+    beam.DIVERGENCE_PATH,
+    beam.QUALITY_PATH,
+    beam.FOCUS_PATH,
+    beam.COUPLING_PATH,
+)
 """Parameters by which echoes arrive and are read."""
 
 
@@ -98,7 +126,7 @@ class FootprintDeviations(NamedTuple):
     def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
         """Return the widths of footprints on the plane of points of one category."""
         with np.errstate(all="ignore"):
-            places, directions = beam.angles(p, range_)
+            places, directions = beam.footprint_angles(p, range_)
             range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
         velocity_deviation = np.abs(p["target.transverse_velocity"]) * directions / 4
         return cls(*(np.nan_to_num(v + 0 * range_) for v in (range_deviation, velocity_deviation)))
@@ -135,27 +163,31 @@ def diagnose_echoes(
     }
     n_points = max((np.size(value) for value in relevant.values()), default=1)
     relevant["target.range"] = np.broadcast_to(relevant["target.range"], (n_points,))
-    relevant |= {path: DEFAULTS[path] for path in DEFAULTS if path not in relevant}
+    relevant |= {
+        path: PARAMETER_DEFAULTS[path] for path in PARAMETER_DEFAULTS if path not in relevant
+    }
     relevant |= {"footprint.beamlets": 1}
     diagnosis = EchoDiagnosis(*np.zeros((2, n_points)), *np.zeros((5, n_points), bool))
-    for index, p in categories(relevant):
-        record_window = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
+    for index, p in split_by_category(relevant):
+        record_window = get_window(
+            canonical_window_name(str(p[PROCESSING_PREFIX + "window"])), int(p["record"])
+        )
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
-        first_echo_sample = waveform.samples_before_echo(
-            delay=2 / SPEED_OF_LIGHT * range_, beta=0.0,
-            start=p[PROCESSING + "acquisition_delay"],
-            sample_rate=p[PROCESSING + "sample_rate"], length=record_window.length,
+        first_echo_sample = waveform.count_samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * range_, doppler_ratio=0.0,
+            record_start=p[PROCESSING_PREFIX + "acquisition_delay"],
+            sample_rate=p[PROCESSING_PREFIX + "sample_rate"], length=record_window.length,
         )  # fmt: skip
         diagnosis.range[index] = range_
         diagnosis.window_fraction_lost[index] = np.where(
             first_echo_sample >= record_window.length,
             1.0,
-            np.minimum(missing_of(record_window, first_echo_sample).lost, 1.0),
+            np.minimum(missing_sample_bounds(record_window, first_echo_sample).lost_fraction, 1.0),
         )
         velocity = np.asarray(velocity)
         diagnosis.is_misread[index] = _is_misread(p, range_, velocity)
-        if str(p[RECORD]) != "complex":
-            assumption = str(p[waveform.TWO_BEATS])
+        if str(p[RECORD_PATH]) != "complex":
+            assumption = str(p[waveform.TWO_BEATS_PATH])
             (other_assumption,) = {waveform.FAR_TARGET, waveform.FAST_TARGET} - {assumption}
             is_misread_by = {
                 name: _is_misread(p, range_, velocity, name)
@@ -174,12 +206,12 @@ def diagnose_echoes(
             record_window.length,
             None if footprint is None else footprint.select(index),
         )
-        if str(p[LASER + "line_shape"]) == "lorentzian":
+        if str(p[LASER_PREFIX + "line_shape"]) == "lorentzian":
             delay, record = (
                 2 / SPEED_OF_LIGHT * range_,
-                record_window.length / p[PROCESSING + "sample_rate"],
+                record_window.length / p[PROCESSING_PREFIX + "sample_rate"],
             )
-            variance = 2 * np.pi * p[LASER + "line_width"] * np.minimum(delay, record)
+            variance = 2 * np.pi * p[LASER_PREFIX + "line_width"] * np.minimum(delay, record)
             diagnosis.has_phase_walk[index] = (delay > PHASE_WALK_DELAY_RATIO_MIN * record) & (
                 variance > PHASE_WALK_VARIANCE_MAX
             )
@@ -192,28 +224,32 @@ def _crosses_spectrum_edge(
 ) -> np.ndarray:  # fmt: skip
     """Mark echoes of the kind of :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
-    is_speckled &= str(p[RECEIVER + "architecture"]) != "direct"
+    is_speckled &= str(p[RECEIVER_PREFIX + "architecture"]) != "direct"
     if (
-        str(p[RECORD]) == "complex"
-        or str(p[PROCESSING + "detection"]) != "any_bin"
+        str(p[RECORD_PATH]) == "complex"
+        or str(p[PROCESSING_PREFIX + "detection"]) != "any_bin"
         or not is_speckled
     ):
         return np.zeros(range_.shape, bool)
     footprint = FootprintDeviations.on_plane(p, range_) if footprint is None else footprint
     chirp_rate, bin_width = (
-        p[CHIRP + "bandwidth"] / p[CHIRP + "duration"],
-        p[PROCESSING + "sample_rate"] / record_length,
+        p[CHIRP_PREFIX + "bandwidth"] / p[CHIRP_PREFIX + "duration"],
+        p[PROCESSING_PREFIX + "sample_rate"] / record_length,
     )
-    segment_order = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    segment_order = waveform.existing_segments(
+        str(p[RECEIVER_PREFIX + "architecture"]), str(p[waveform.SEGMENT_ORDER_PATH])
+    )
     crosses = np.zeros(range_.shape, bool)
-    segments = zip(waveform.SEGMENTS, waveform.slopes_of(p), waveform.carriers_of(p), strict=True)
+    segments = zip(
+        waveform.SEGMENT_NAMES, waveform.chirp_slopes(p), waveform.segment_carriers(p), strict=True
+    )
     for name, slope, carrier in segments:
         if name not in segment_order:
             continue
         beat = waveform.beat_frequency(
             slope, carrier=carrier, chirp_rate=chirp_rate, range=range_, radial_velocity=velocity
         )
-        beat_over_nyquist = 2 * beat / p[PROCESSING + "sample_rate"]
+        beat_over_nyquist = 2 * beat / p[PROCESSING_PREFIX + "sample_rate"]
         distance_bins = np.abs(beat_over_nyquist - np.rint(beat_over_nyquist)) * record_length / 2
         spread_bins = 2 / SPEED_OF_LIGHT * carrier * footprint.radial_velocity
         spread_bins = (
@@ -232,11 +268,13 @@ def _is_misread(
 
     All its beats, or up and down beat alone, read by the assumption ``assumption``.
     """
-    carriers, slopes = waveform.carriers_of(p), waveform.slopes_of(p)
-    chirp_rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
-    sample_rate, is_signed = p[PROCESSING + "sample_rate"], str(p[RECORD]) == "complex"
-    bin_width = sample_rate / int(p[PROCESSING + "fft_size"])
-    segment_order = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    carriers, slopes = waveform.segment_carriers(p), waveform.chirp_slopes(p)
+    chirp_rate = p[CHIRP_PREFIX + "bandwidth"] / p[CHIRP_PREFIX + "duration"]
+    sample_rate, is_signed = p[PROCESSING_PREFIX + "sample_rate"], str(p[RECORD_PATH]) == "complex"
+    bin_width = sample_rate / int(p[PROCESSING_PREFIX + "fft_size"])
+    segment_order = waveform.existing_segments(
+        str(p[RECEIVER_PREFIX + "architecture"]), str(p[waveform.SEGMENT_ORDER_PATH])
+    )
     if assumption is not None:
         segment_order = tuple(name for name in segment_order if name != "doppler")
     peaks = []
@@ -246,38 +284,38 @@ def _is_misread(
         )
         folded_beat = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
         peaks.append((folded_beat if is_signed else np.abs(folded_beat)) + 0 * range_)
-    reading_assumption = assumption or str(p[waveform.TWO_BEATS])
-    if slopes == waveform.SIGNS:
-        reading = waveform.resolve(
+    reading_assumption = assumption or str(p[waveform.TWO_BEATS_PATH])
+    if slopes == waveform.DEFAULT_CHIRP_SLOPES:
+        reading = waveform.resolve_range_velocity(
             up=peaks[0],
             doppler=peaks[1] if "doppler" in segment_order else None,
             down=peaks[2],
             carrier=carriers[0],
-            bandwidth=p[CHIRP + "bandwidth"],
-            duration=p[CHIRP + "duration"],
+            bandwidth=p[CHIRP_PREFIX + "bandwidth"],
+            duration=p[CHIRP_PREFIX + "duration"],
             sample_rate=sample_rate,
             bin_width=bin_width,
-            signed=is_signed,
-            assumed=reading_assumption,
+            has_signs=is_signed,
+            two_beat_assumption=reading_assumption,
         )
     else:
         table_shape = 3, range_.size
-        weights = [float(name in segment_order) for name in waveform.SEGMENTS]
+        weights = [float(name in segment_order) for name in waveform.SEGMENT_NAMES]
         columns = [np.broadcast_to(carrier, range_.shape) for carrier in carriers]
         rates = [np.broadcast_to(slope * chirp_rate, range_.shape) for slope in slopes]
-        reading = waveform.fit(
+        reading = waveform.fit_range_velocity(
             np.array(peaks),
             weights=np.broadcast_to(np.reshape(weights, (3, 1)), table_shape),
             carriers=np.array(columns),
-            rates=np.array(rates),
+            chirp_rates=np.array(rates),
             sample_rate=np.broadcast_to(sample_rate, range_.shape),
             bin_width=np.broadcast_to(bin_width, range_.shape),
-            signed=is_signed,
-            assumed=reading_assumption,
+            has_signs=is_signed,
+            two_beat_assumption=reading_assumption,
         )
-    range_tolerance = MISREAD_BINS * bin_width / (2 / SPEED_OF_LIGHT * chirp_rate)
+    range_tolerance = MISREAD_TOLERANCE_BINS * bin_width / (2 / SPEED_OF_LIGHT * chirp_rate)
     with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
-        velocity_tolerance = MISREAD_BINS * bin_width * SPEED_OF_LIGHT / carriers[0]
+        velocity_tolerance = MISREAD_TOLERANCE_BINS * bin_width * SPEED_OF_LIGHT / carriers[0]
     is_off = np.abs(reading.range - range_) > range_tolerance
     return np.asarray(is_off | (np.abs(reading.radial_velocity - velocity) > velocity_tolerance))
 
@@ -382,7 +420,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
     """List the estimators of a study that places of late echoes are wrong by."""
-    path = f"{ESTIMATOR}kind"
+    path = f"{ESTIMATOR_PREFIX}kind"
     values = [
         member.values
         for axis in study.spec.axes
@@ -396,14 +434,14 @@ def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
 def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
     """Return true if up and down beat alone tell range and velocity, always or now and then."""
     spec = study.spec
-    p = DEFAULTS | dict(spec.parameters())
-    has_no_doppler = "doppler" not in waveform.order_of(
-        str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER])
+    p = PARAMETER_DEFAULTS | dict(spec.parameters())
+    has_no_doppler = "doppler" not in waveform.existing_segments(
+        str(p[RECEIVER_PREFIX + "architecture"]), str(p[waveform.SEGMENT_ORDER_PATH])
     )
     return (
         has_no_doppler
         or isinstance(study, FlightStudy)
-        or p[waveform.SHOT_DETECTION] == waveform.ANY_TWO
+        or p[waveform.SHOT_DETECTION_PATH] == waveform.ANY_TWO
     )
 
 
@@ -422,7 +460,8 @@ def _exchanged_warning(
         diagnosis.is_exchanged_by_other & ~is_absent,
     )
     assumes_far = (
-        str((DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS]) == waveform.FAR_TARGET
+        str((PARAMETER_DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS_PATH])
+        == waveform.FAR_TARGET
     )
     if not is_exchanged.any() or (not assumes_far and is_exchanged_by_other.any()):
         return
@@ -494,7 +533,7 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
 
 
 def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
-    from sweep.model.eyepoints import seen_ground
+    from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
     diagnoses = []
@@ -507,14 +546,16 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
             eyepoints.cast_shots(eyepoints.sample_tiles(SAMPLED_TILES_PER_SCANNER)),
             eyepoints.beamlet_weights,
         )
-        hitting_shots = eyepoints_of_sample.seen.nonzero()[0]
+        hitting_shots = eyepoints_of_sample.has_target.nonzero()[0]
         if not hitting_shots.size:
             continue
         for corner in sorted(axis_corners):
             flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
-            parameters = DEFAULTS | dict(study.parameters_at(flight_block))
-            hitting_eyepoints = eyepoints_of_sample.some(hitting_shots)
-            shot_parameters, _ = seen_ground(hitting_eyepoints, parameters, study.surfaces)
+            parameters = PARAMETER_DEFAULTS | dict(study.parameters_at(flight_block))
+            hitting_eyepoints = eyepoints_of_sample.select(hitting_shots)
+            shot_parameters, _ = parameters_and_ground_of_eyepoints(
+                hitting_eyepoints, parameters, study.surfaces
+            )
             diagnoses.append(
                 diagnose_echoes(shot_parameters, FootprintDeviations.on_ground(hitting_eyepoints))
             )

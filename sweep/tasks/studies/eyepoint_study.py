@@ -14,9 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.accuracy import Accuracy
-from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
-from sweep.model.resolution import more_rays
+from sweep.model.beamlet_counts import next_ray_counts
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.outputs import (
+    BEAMLET_VARIABLES,
+    BEAMLET_WEIGHT_VARIABLE,
+    CYCLE_VARIABLES,
+    SHOT_VARIABLES,
+)
 from sweep.storage.store_format import MAP_GROUP
 from sweep.tasks.engine.blocks import (
     FILL_VALUE_BY_KIND,
@@ -29,7 +34,7 @@ from sweep.tasks.engine.blocks import (
 )
 
 if TYPE_CHECKING:
-    from sweep.model.eyepoints import Eyepoints
+    from sweep.model.pointcloud.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
@@ -114,11 +119,13 @@ class EyepointStudy(BlockStudy):
 
     def constant_arrays(self) -> list[ArrayLayout]:
         """Weights of the beamlets."""
-        weight_attributes = cf_attributes(WEIGHT.units, WEIGHT.long_name)
+        weight_attributes = cf_attributes(
+            BEAMLET_WEIGHT_VARIABLE.units, BEAMLET_WEIGHT_VARIABLE.long_name
+        )
         return [
             ArrayLayout.from_values(
                 "weight",
-                WEIGHT.dims,
+                BEAMLET_WEIGHT_VARIABLE.dims,
                 self.beamlet_weights,
                 weight_attributes,
                 fill_value=FILL_VALUE_BY_KIND["f"],
@@ -128,16 +135,16 @@ class EyepointStudy(BlockStudy):
     @cached_property
     def beamlet_weights(self) -> np.ndarray:
         """Power fractions of the beamlets, (beamlets,)."""
-        from sweep.model.footprint import beamlets
+        from sweep.model.beamlets import place_beamlets
 
-        return beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
+        return place_beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
 
     def output_layouts(self) -> list[ArrayLayout]:
         """Shots, beamlets and cycles."""
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
             self._grid.make_layout(name, output, output.dims, sizes)
-            for name, output in (SHOTS | BEAMLETS | CYCLES).items()
+            for name, output in (SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES).items()
         ]
 
     def evaluate(self, block: int) -> Results:
@@ -189,11 +196,14 @@ class EyepointStudy(BlockStudy):
 
     def cast_eyepoints(self, shot_numbers: np.ndarray) -> Eyepoints:
         """Eyepoints of any shots, by number (n,): all their rays are cast at once."""
-        from sweep.model.eyepoints import observe
+        from sweep.model.pointcloud.eyepoints import observe_eyepoints
 
         world = self.world
-        return observe(
-            shot_numbers, caster=world.caster, bodies=world.body_flights, **self._observe_keywords
+        return observe_eyepoints(
+            shot_numbers,
+            caster=world.caster,
+            body_motions=world.body_flights,
+            **self._observe_keywords,
         )
 
     def _cycle_arrays(self, shot_arrays: Results) -> Results:
@@ -216,16 +226,16 @@ class EyepointStudy(BlockStudy):
 
     @cached_property
     def _observe_keywords(self) -> dict[str, Any]:
-        """Arguments of :func:`sweep.model.eyepoints.observe` that say what looks at the scene."""
+        """Arguments of :func:`observe_eyepoints` that describe the instrument and its flight."""
         return {
             "flight": self.spec.build_flight(),
             "scanner": self.spec.scan_pattern(self.scanner),
             "beam_divergence": float(self.spec.instrument.laser.beam_divergence),
-            "number": self.n_beamlets,
+            "n_beamlets": self.n_beamlets,
             "pattern": self.spec.beamlet_pattern,
             "jitter": self.spec.pointing_jitter(),
-            "angles": self.spec.footprint_angles(),
-            "rotation": self.spec.effect_modes()["rotation"] != "off",
+            "footprint_angles": self.spec.footprint_angles(),
+            "bodies_rotate": self.spec.effect_modes()["rotation"] != "off",
         }
 
 
@@ -240,7 +250,9 @@ def height_above_surface(
 ) -> np.ndarray:
     """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
-    return np.asarray(world.caster.bundle(position, down, poses=_body_poses(world, time)).range)
+    return np.asarray(
+        world.caster.cast_bundles(position, down, poses=_body_poses(world, time)).range
+    )
 
 
 def below_surface_warning(spec: SceneSpec) -> str:
@@ -249,14 +261,14 @@ def below_surface_warning(spec: SceneSpec) -> str:
     time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLES)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
-    hits_above = world.caster.bundle(position, up, poses=_body_poses(world, time))
+    hits_above = world.caster.cast_bundles(position, up, poses=_body_poses(world, time))
     # Whoever stands on the ground may be told, by rounding, that it lies above.
     is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_MAX)
     is_low = is_covered & np.isinf(height_above_surface(world, position, time))
     if not is_low.any():
         return ""
     times_below, depth = time[is_low], np.where(is_low, hits_above.range, 0.0)
-    surface = world.surfaces[hits_above.surface[depth.argmax(), 0]].name
+    surface = world.surfaces[hits_above.surface_index[depth.argmax(), 0]].name
     return (
         f"the platform is beneath {surface} from time {times_below[0]:.4g} to "
         f"{times_below[-1]:.4g} s, by "
@@ -267,7 +279,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
 
 def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
     """Place and attitude of each body at a time, or at one for each ray; None of those at rest."""
-    from sweep.model.geometry.rays import Pose
+    from sweep.model.geometry.ray_casting import Pose
 
     states = [
         None if body is None else body.state(np.atleast_1d(time)) for body in world.body_flights
@@ -278,7 +290,7 @@ def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
 def refine_rays(
     n_rays: int,
     ray_errors: np.ndarray,
-    accuracy: Accuracy,
+    accuracy: ErrorBudget,
     cast_more_rays: Callable[[np.ndarray, int], np.ndarray],
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
@@ -286,13 +298,13 @@ def refine_rays(
     The ``n_rays`` of each shot leave an ``ray_errors`` so far, (n,); ``cast_more_rays`` looks at
     shots, by place, with more, and says what these leave.
     """
-    rays_needed = more_rays(n_rays, ray_errors, accuracy)
-    for n_rays_now in accuracy.rays:  # rising, and so are the needs of each shot
+    rays_needed = next_ray_counts(n_rays, ray_errors, accuracy)
+    for n_rays_now in accuracy.ray_counts:  # rising, and so are the needs of each shot
         shot_rows = np.flatnonzero(rays_needed == n_rays_now)
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // n_rays_now)
         for start in range(0, len(shot_rows), shots_per_cast):
             batch_rows = shot_rows[start : start + shots_per_cast]
-            rays_needed[batch_rows] = more_rays(
+            rays_needed[batch_rows] = next_ray_counts(
                 n_rays_now, cast_more_rays(batch_rows, n_rays_now), accuracy
             )
 
@@ -344,7 +356,7 @@ def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.n
     direction = rotate(state.attitude, scan.direction)
     # Bodies that move are looked at where they are as the flight begins: it is only a map.
     poses = _body_poses(world, flight.start)
-    hits = world.caster.bundle(state.position, direction[:, None], poses=poses)
+    hits = world.caster.cast_bundles(state.position, direction[:, None], poses=poses)
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
     return np.concatenate([state.position, ground])

@@ -10,20 +10,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.accuracy import Accuracy
-from sweep.model.effects.catalogue import DEFAULTS, flag_attributes, flags_of
-from sweep.model.effects.points import Points
-from sweep.model.ground import of_rays
-from sweep.model.outputs import (
-    BEAMLETS,
-    CYCLES,
-    NAVIGATION,
-    POINTS,
-    SHOTS,
-    SIMULATED,
-    STATISTICS,
+from sweep.model.beamlet_counts import effects_tolerance, is_set_by_tolerance
+from sweep.model.effects.catalogue import (
+    PARAMETER_DEFAULTS,
+    effect_flag_attributes,
+    pack_effect_flags,
 )
-from sweep.model.resolution import by_tolerance, effects_tolerance
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.ground import extent_of_ray_traced_ground
+from sweep.model.outputs import (
+    BEAMLET_VARIABLES,
+    CYCLE_VARIABLES,
+    EFFECT_VARIABLES,
+    NAVIGATION_VARIABLES,
+    POINT_VARIABLES,
+    SHOT_STATISTIC_VARIABLES,
+    SHOT_VARIABLES,
+)
 from sweep.spec.rules import Mistake, SpecError
 from sweep.spec.scene_sections import scene_projection
 from sweep.storage.locations import Location, eyepoints_path
@@ -53,11 +57,11 @@ from sweep.tasks.studies.grid_study import (
 )
 
 if TYPE_CHECKING:
-    from sweep.model.effects.planning import Plan
-    from sweep.model.error_floor import ErrorFloor
-    from sweep.model.eyepoints import Eyepoints
-    from sweep.model.geometry.mesh import Surface
-    from sweep.model.own_motion import MotionPriors
+    from sweep.model.effects.planning import EffectPlan
+    from sweep.model.geometry.mesh import SurfaceMaterial
+    from sweep.model.pointcloud.ego_motion import MotionPriors
+    from sweep.model.pointcloud.error_floor import ErrorFloor
+    from sweep.model.pointcloud.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
@@ -72,22 +76,30 @@ FLIGHT_KEY_DOMAIN = "sweep.flight"
 NAVIGATION_SHOTS_MIN = 3
 
 #: Geometry of shots and cycles, the same at every place along a study's axes.
-GEOMETRY_OUTPUTS = SHOTS | CYCLES
+GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
 
 
 @cache
 def flag_array_attributes() -> dict[str, dict[str, Any]]:
     """Attributes of the arrays that hold flags or one of some values, as the CF conventions say."""
-    from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
-    from sweep.model.pairing import FLAGS
+    from sweep.model.pointcloud.navigation import (
+        STATUS_EXCLUDED,
+        STATUS_SOLVED,
+        STATUS_UNDETERMINED,
+        STATUS_WITHHELD,
+    )
+    from sweep.model.pointcloud.pairing import FLAG_BITS
 
     status_attributes = {
-        "flag_values": [SOLVED, EXCLUDED, WITHHELD, UNDETERMINED],
+        "flag_values": [STATUS_SOLVED, STATUS_EXCLUDED, STATUS_WITHHELD, STATUS_UNDETERMINED],
         "flag_meanings": "solved one_beam_excluded withheld undetermined",
     }
-    point_attributes = {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)}
+    point_attributes = {
+        "flag_masks": list(FLAG_BITS.values()),
+        "flag_meanings": " ".join(FLAG_BITS),
+    }
     return {
-        EFFECTS_ARRAY: flag_attributes(), "flags": point_attributes,
+        EFFECTS_ARRAY: effect_flag_attributes(), "flags": point_attributes,
         "velocity_status": status_attributes, "altitude_status": status_attributes,
     }  # fmt: skip
 
@@ -206,7 +218,7 @@ class FlightStudy(ExtendableStudy):
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
         """Tell whether a tighter tolerance computes shots more closely, effects apart."""
         return bool(
-            self.spec.is_ray_number_set_by_tolerance or by_tolerance(self.spec.parameters())
+            self.spec.is_ray_number_set_by_tolerance or is_set_by_tolerance(self.spec.parameters())
         )
 
     def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
@@ -268,8 +280,10 @@ class FlightStudy(ExtendableStudy):
         sizes = VECTOR_DIM_SIZES | {"return_number": int(self.spec.draws.returns)}
         layouts = []
         for scanner_grid in self.grids:
-            outputs = GEOMETRY_OUTPUTS | STATISTICS | SIMULATED | POINTS
-            outputs = outputs | NAVIGATION if scanner_grid.has_navigation else outputs
+            outputs = (
+                GEOMETRY_OUTPUTS | SHOT_STATISTIC_VARIABLES | EFFECT_VARIABLES | POINT_VARIABLES
+            )
+            outputs = outputs | NAVIGATION_VARIABLES if scanner_grid.has_navigation else outputs
             for name, output in outputs.items():
                 dims = output.dims if name in GEOMETRY_OUTPUTS else axis_names + output.dims
                 layouts.append(
@@ -302,9 +316,9 @@ class FlightStudy(ExtendableStudy):
             flight_block, eyepoints, np.arange(first_tile_shot, tiles_end)
         ).subset(block_rows)
         shot_arrays = {name: values[block_rows] for name, values in shot_arrays.items()}
-        eyepoints = eyepoints.some(block_rows)
+        eyepoints = eyepoints.select(block_rows)
         results = shot_arrays | self._read_eyepoint_arrays(
-            flight_block.scanner, CYCLES, flight_block.cycles
+            flight_block.scanner, CYCLE_VARIABLES, flight_block.cycles
         )
         results |= {
             EFFECTS_ARRAY: selected_effects.effect_flags,
@@ -395,7 +409,11 @@ class FlightStudy(ExtendableStudy):
 
     def _empty_cloud(self, scanner_grid: ScannerGrid, n_shots: int, n_draws: int) -> ReusedCloud:
         """Room for the results of some shots."""
-        outputs = STATISTICS | POINTS | (NAVIGATION if scanner_grid.has_navigation else {})
+        outputs = (
+            SHOT_STATISTIC_VARIABLES
+            | POINT_VARIABLES
+            | (NAVIGATION_VARIABLES if scanner_grid.has_navigation else {})
+        )
         sizes = VECTOR_DIM_SIZES | {
             "shot": n_shots, "cycle": n_shots // scanner_grid.shots_per_cycle, "draw": n_draws,
             "return_number": int(self.spec.draws.returns),
@@ -418,7 +436,7 @@ class FlightStudy(ExtendableStudy):
         ).iter_joint_groups():
             group_rows, simulate_group = rows[members], partial(simulate_cloud, effect_names)
             results = simulate_group(
-                eyepoints.some(group_rows), shot_numbers[group_rows], effect_flags
+                eyepoints.select(group_rows), shot_numbers[group_rows], effect_flags
             )
             if self.ray_accuracy is not None:
                 n_rays = eyepoints.weight.size
@@ -437,9 +455,9 @@ class FlightStudy(ExtendableStudy):
         effect_flags: np.ndarray,
     ) -> Results:
         """Points of eyepoints, of shots with these numbers and flags."""
-        from sweep.model.clouds import cloud
-        from sweep.model.error_floor import stray
-        from sweep.model.philox import point_keys
+        from sweep.model.pointcloud.error_floor import apply_error_floor
+        from sweep.model.pointcloud.point_cloud import simulate_cloud
+        from sweep.model.sampling.philox import point_keys
         from sweep.tasks.studies.user_functions import spectrum_methods
 
         draws_spectra = self.spec.draws.draws_whole_spectra
@@ -448,7 +466,7 @@ class FlightStudy(ExtendableStudy):
         )
         seed, first_draw = int(self.spec.seed), flight_block.draws.start + draw_slice.start
         keys = point_keys(shot_numbers[:, None].astype(float), domain=FLIGHT_KEY_DOMAIN, seed=seed)
-        results = cloud(
+        results = simulate_cloud(
             eyepoints,
             parameters=self.parameters_at(flight_block),
             surfaces=self.surfaces,
@@ -457,15 +475,15 @@ class FlightStudy(ExtendableStudy):
             draws=draw_slice.stop - draw_slice.start,
             method=self.spec.draws.method,
             **method_keywords,
-            returns=int(self.spec.draws.returns),
+            returns_max=int(self.spec.draws.returns),
             effects=effect_names,
-            flags=effect_flags,
-            estimates_rays=self.ray_accuracy is not None,
-            priors=self.motion_priors,
+            effect_flags=effect_flags,
+            estimates_ray_error=self.ray_accuracy is not None,
+            motion_priors=self.motion_priors,
         )
         if not any(self.error_floor):
             return results
-        return stray(
+        return apply_error_floor(
             results, eyepoints, self.error_floor, keys=keys, seed=seed, first_draw=first_draw
         )
 
@@ -503,19 +521,23 @@ class FlightStudy(ExtendableStudy):
         draw_slice: slice,
     ) -> Results:
         """Navigation of cycles, of so many shots each, from the points of these in some draws."""
-        from sweep.model.navigation import solve
+        from sweep.model.pointcloud.navigation import solve_navigation
 
         row_index = slice(None) if rows.size == len(results["flags"]) else rows
-        return solve(
-            {name: values[row_index] for name, values in shot_arrays.items() if name in SHOTS},
-            {name: results[name][row_index, draw_slice] for name in POINTS},
-            shots_a_cycle=shots_per_cycle,
+        return solve_navigation(
+            {
+                name: values[row_index]
+                for name, values in shot_arrays.items()
+                if name in SHOT_VARIABLES
+            },
+            {name: results[name][row_index, draw_slice] for name in POINT_VARIABLES},
+            shots_per_cycle=shots_per_cycle,
             test_level=self.spec.navigation.test_level,
             ground_slope=self.spec.navigation.ground_slope,
             relief=self.spec.navigation.relief,
-            jitter=self.spec.platform.jitter,
-            floor=self.error_floor,
-            priors=self.motion_priors,
+            pointing_jitter=self.spec.platform.jitter,
+            error_floor=self.error_floor,
+            motion_priors=self.motion_priors,
         )
 
     def _reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
@@ -563,14 +585,18 @@ class FlightStudy(ExtendableStudy):
                 source_results[EFFECTS_ARRAY][source_rows]
                 == selected_effects.effect_flags[shot_rows]
             )
-            part_results = {name: source_results[name][source_rows] for name in STATISTICS}
+            part_results = {
+                name: source_results[name][source_rows] for name in SHOT_STATISTIC_VARIABLES
+            }
             part_results |= {
-                name: source_results[name][source_rows, source_draw_column] for name in POINTS
+                name: source_results[name][source_rows, source_draw_column]
+                for name in POINT_VARIABLES
             }
             _insert_results(results, shot_rows, draw_column, part_results)
             if scanner_grid.has_navigation:
                 part_results = {
-                    name: source_results[name][source_cycle, source_draw] for name in NAVIGATION
+                    name: source_results[name][source_cycle, source_draw]
+                    for name in NAVIGATION_VARIABLES
                 }
                 _insert_results(results, cycle_index, draw_index, part_results)
         reuse_source.reused_points_by_block[block] = int(is_reused.sum())
@@ -590,7 +616,7 @@ class FlightStudy(ExtendableStudy):
     @cached_property
     def error_floor(self) -> ErrorFloor:
         """Errors of the instrument that no echo lowers."""
-        from sweep.model.error_floor import ErrorFloor
+        from sweep.model.pointcloud.error_floor import ErrorFloor
 
         stated = self.spec.error_floor
         return ErrorFloor(
@@ -601,21 +627,21 @@ class FlightStudy(ExtendableStudy):
     @cached_property
     def motion_priors(self) -> MotionPriors:
         """Deviations of motion that the instrument does not measure, as the spec states them."""
-        from sweep.model.own_motion import MotionPriors
+        from sweep.model.pointcloud.ego_motion import MotionPriors
 
         stated = self.spec.navigation
         return MotionPriors(stated.terrain_slope, stated.target_speed, stated.target_acceleration)
 
     @cached_property
-    def surfaces(self) -> tuple[Surface, ...]:
+    def surfaces(self) -> tuple[SurfaceMaterial, ...]:
         """Surfaces by their numbers."""
         return tuple(self.spec.surfaces())
 
     @cached_property
-    def ray_accuracy(self) -> Accuracy | None:
+    def ray_accuracy(self) -> ErrorBudget | None:
         """Says how many rays a shot needs; None where their number is given."""
         return (
-            Accuracy.of(self.spec.parameters())
+            ErrorBudget.from_parameters(self.spec.parameters())
             if self.spec.is_ray_number_set_by_tolerance
             else None
         )
@@ -623,7 +649,9 @@ class FlightStudy(ExtendableStudy):
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
         group = open_array_group(eyepoints_path(self.store_path, self.spec.geometry_id(scanner)))
-        arrays: dict[str, Any] = {name: group[name] for name in SHOTS | BEAMLETS | CYCLES}
+        arrays: dict[str, Any] = {
+            name: group[name] for name in SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES
+        }
         return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
 
     def _read_eyepoint_arrays(
@@ -641,8 +669,8 @@ class FlightStudy(ExtendableStudy):
         """Arrays of some shots, and their eyepoints."""
         from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
-        shot_arrays = self._read_eyepoint_arrays(scanner, SHOTS, shot_range)
-        beamlet_arrays = self._read_eyepoint_arrays(scanner, BEAMLETS, shot_range)
+        shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_VARIABLES, shot_range)
+        beamlet_arrays = self._read_eyepoint_arrays(scanner, BEAMLET_VARIABLES, shot_range)
         return shot_arrays, eyepoints_from_arrays(
             shot_arrays | beamlet_arrays, self._get_eyepoint_arrays(scanner)["weight"]
         )
@@ -667,7 +695,7 @@ def _insert_results(
 ) -> None:
     """Put results of some rows and draws into those of all."""
     for name, values in part_results.items():
-        results[name][rows if name in STATISTICS else (rows, draw_index)] = values
+        results[name][rows if name in SHOT_STATISTIC_VARIABLES else (rows, draw_index)] = values
 
 
 class ShotEffectPlan(NamedTuple):
@@ -675,13 +703,15 @@ class ShotEffectPlan(NamedTuple):
 
     hitting_shots: np.ndarray  # places of the shots that see something
     tile_index: np.ndarray  # index of the tile of each of these
-    plan: Plan  # Of the tiles
+    plan: EffectPlan  # Of the tiles
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
         """Effects simulated at that many shots; none where nothing is seen."""
         selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
-        selected.effect_flags[self.hitting_shots] = flags_of(self.plan.kept)[self.tile_index]
-        selected.error_bound[self.hitting_shots] = self.plan.error[self.tile_index]
+        selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.plan.is_kept)[
+            self.tile_index
+        ]
+        selected.error_bound[self.hitting_shots] = self.plan.total_error[self.tile_index]
         return selected
 
 
@@ -689,7 +719,7 @@ def plan_shot_effects(
     eyepoints: Eyepoints,
     tile_of_shot: np.ndarray,
     parameters: Mapping[str, Any],
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SurfaceMaterial],
     *,
     modes: Mapping[str, str],
     rotating: bool,
@@ -699,18 +729,20 @@ def plan_shot_effects(
 
     ``tile_of_shot``: the number of the tile of each shot, rising.
     """
-    from sweep.model.effects.planning import plan
-    from sweep.model.eyepoints import seen_ground
+    from sweep.model.effects.planning import plan_effects
+    from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
 
-    hitting_shots = eyepoints.seen.nonzero()[0]
+    hitting_shots = eyepoints.has_target.nonzero()[0]
     if not hitting_shots.size:
         return None
     hitting_eyepoints = (
-        eyepoints if hitting_shots.size == len(tile_of_shot) else eyepoints.some(hitting_shots)
+        eyepoints if hitting_shots.size == len(tile_of_shot) else eyepoints.select(hitting_shots)
     )
     run_edges, tile_index = _tile_runs(tile_of_shot[hitting_shots])
-    shots, ground = seen_ground(hitting_eyepoints, DEFAULTS | dict(parameters), surfaces)
-    points = Points(shots, of_rays(ground), rotating=rotating)
+    shots, ground = parameters_and_ground_of_eyepoints(
+        hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
+    )
+    points = PlannerInputs(shots, extent_of_ray_traced_ground(ground), has_rotating_body=rotating)
 
     def max_per_tile(values: np.ndarray) -> np.ndarray:
         return np.maximum.reduceat(
@@ -718,7 +750,7 @@ def plan_shot_effects(
         )
 
     n_rays = 0 if rays_by_tolerance else hitting_eyepoints.offset.shape[1]
-    effect_plan = plan(points, max_per_tile, modes, effects_tolerance(parameters, n_rays))
+    effect_plan = plan_effects(points, max_per_tile, modes, effects_tolerance(parameters, n_rays))
     return ShotEffectPlan(hitting_shots, tile_index, effect_plan)
 
 

@@ -18,34 +18,34 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.accuracy import Accuracy
+from sweep.model.beamlet_counts import BEAMLETS_PATH, effects_tolerance, is_set_by_tolerance
+from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.effects.catalogue import (
-    DEFAULTS,
-    FLAGS_APART,
-    SHARED,
-    flag_attributes,
-    flags_of,
-    names_of,
+    EFFECT_CATEGORY_PATHS,
+    OWN_BATCH_FLAGS,
+    PARAMETER_DEFAULTS,
+    effect_flag_attributes,
+    pack_effect_flags,
+    unpack_effect_flags,
 )
 from sweep.model.effects.catalogue import EFFECTS as EFFECT_CATALOGUE
-from sweep.model.effects.points import Points
-from sweep.model.looks import NUMBER, VOTES
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.error_budget import ErrorBudget
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
-    RUNNING,
-    RUNNING_COLUMNS,
-    RUNNING_OUTPUTS,
-    SIMULATED,
+    DRAW_COUNT_OUTPUTS,
+    EFFECT_VARIABLES,
+    GRID_OUTPUTS,
+    N_RUNNING_SUMS,
+    RUNNING_SUM_OUTPUTS,
+    RUNNING_SUMS,
     SPECTRA_OUTPUTS,
-    STRONGEST_OUTPUTS,
-    Output,
+    STANDARD_ERROR_OUTPUTS,
+    STRONGEST_PEAK_OUTPUTS,
+    OutputVariable,
 )
-from sweep.model.resolution import BEAMLETS, by_tolerance, effects_tolerance
-from sweep.model.unsupported import UnsupportedShot
-from sweep.model.waveform import PEAKS
+from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.waveform import PEAKS_PATH
 from sweep.tasks.engine.blocks import (
     CHUNK_READ_ERRORS,
     NO_RESULTS,
@@ -65,8 +65,8 @@ from sweep.tasks.engine.blocks import (
 )
 
 if TYPE_CHECKING:
-    from sweep.model.effects.planning import Plan
-    from sweep.model.sampling import Before
+    from sweep.model.effects.planning import EffectPlan
+    from sweep.model.sampling.samplers import PriorDraws
     from sweep.spec import Axis, GridSpec
 
 
@@ -114,8 +114,8 @@ CONSTANT_IN_TILE = (
     "instrument.processing.acquisition_delay",
     "instrument.chirp.duration",
     "footprint.beamlets",
-    NUMBER,
-    VOTES,
+    LOOKS_NUMBER_PATH,
+    LOOKS_VOTES_PATH,
     TOLERANCE_PARAMETER,
 )
 
@@ -133,15 +133,18 @@ class SelectedEffects(NamedTuple):
     def iter_equal_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
         """Points with the same effects, and these."""
         for group_flags in np.unique(self.effect_flags):
-            yield np.flatnonzero(self.effect_flags == group_flags), names_of(int(group_flags))
+            yield (
+                np.flatnonzero(self.effect_flags == group_flags),
+                unpack_effect_flags(int(group_flags)),
+            )
 
     def iter_joint_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
         """Points that are computed together, the effects of all of them, and their flags."""
-        separating_flags = self.effect_flags & FLAGS_APART
+        separating_flags = self.effect_flags & OWN_BATCH_FLAGS
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
             group_flags = self.effect_flags[index]
-            yield index, names_of(int(np.bitwise_or.reduce(group_flags))), group_flags
+            yield index, unpack_effect_flags(int(np.bitwise_or.reduce(group_flags))), group_flags
 
 
 class TileGroup(NamedTuple):
@@ -203,7 +206,7 @@ class TileGrid(BlockGrid):
 
     def _is_constant_in_tile(self, axis: int) -> bool:
         return any(
-            values.dtype.kind in "UO" or path in CONSTANT_IN_TILE or path in SHARED
+            values.dtype.kind in "UO" or path in CONSTANT_IN_TILE or path in EFFECT_CATEGORY_PATHS
             for path, values in self.grid.values_by_axis[axis].items()
         )
 
@@ -277,9 +280,9 @@ class EffectPlanner:
             np.int64,
         )
         for members, plan in self.iter_plans(unplanned_tiles):
-            flags_of_tiles = flags_of(plan.kept)
+            flags_of_tiles = pack_effect_flags(plan.is_kept)
             for tile, flag, error in zip(
-                unplanned_tiles[members], flags_of_tiles, plan.error, strict=True
+                unplanned_tiles[members], flags_of_tiles, plan.total_error, strict=True
             ):
                 self._plan_by_tile[int(tile)] = int(flag), float(error)
         planned = [self._plan_by_tile[tile_number] for tile_number in tiles.tolist()]
@@ -294,11 +297,11 @@ class EffectPlanner:
         """Return the flags of effects absent from points, whatever their tiles have."""
         inactive_bits = np.zeros(n_points, np.uint32)
         for bit, effect in enumerate(EFFECT_CATALOGUE):
-            is_inactive = effect.absent(DEFAULTS | dict(parameters))
+            is_inactive = effect.is_absent(PARAMETER_DEFAULTS | dict(parameters))
             inactive_bits |= np.where(is_inactive, np.uint32(1 << bit), np.uint32(0))
         return inactive_bits
 
-    def iter_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, Plan]]:
+    def iter_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
         """Plans of some tiles: places among them, and the plan of these.
 
         A few points are looked at first: if these need all effects, the others can't need
@@ -322,16 +325,20 @@ class EffectPlanner:
                 for tile_group in self.tiles.group_tiles(tiles[batch], stride):
                     plan = self._plan_group(tile_group)
                     is_settled = (
-                        np.full(len(tile_group.requested_indices), stride == 1) | plan.all_kept
+                        np.full(len(tile_group.requested_indices), stride == 1)
+                        | plan.keeps_all_optional
                     )
                     if is_settled.any():
-                        yield batch[tile_group.requested_indices[is_settled]], plan.some(is_settled)
+                        yield (
+                            batch[tile_group.requested_indices[is_settled]],
+                            plan.select(is_settled),
+                        )
                     unsettled.append(batch[tile_group.requested_indices[~is_settled]])
             remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
 
-    def _plan_group(self, tile_group: TileGroup) -> Plan:
+    def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
         """Return the plan of tiles that share words and sizes."""
-        from sweep.model.effects.planning import plan
+        from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
         point_axes = tuple(range(1, len(self.tiles.shape) + 1))
@@ -340,37 +347,42 @@ class EffectPlanner:
             tile_max = np.max(values, axis=point_axes) if values.ndim else values
             return np.broadcast_to(tile_max, (n_tiles,))
 
-        tolerance = effects_tolerance(parameters, int(parameters[BEAMLETS]))  # type: ignore[arg-type]
-        return plan(Points(DEFAULTS | parameters), max_over_tile, self._effect_modes, tolerance)
+        tolerance = effects_tolerance(parameters, int(parameters[BEAMLETS_PATH]))  # type: ignore[arg-type]
+        return plan_effects(
+            PlannerInputs(PARAMETER_DEFAULTS | parameters),
+            max_over_tile,
+            self._effect_modes,
+            tolerance,
+        )
 
 
 #: Dimension of the batches of draws.
 BATCH_DIM = "batch"
 
 
-def block_outputs(spec: GridSpec) -> dict[str, Output]:
+def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
     """Arrays that blocks of a study write, sorted by name, with dimensions besides the axes."""
     error_output = replace(
-        SIMULATED[EFFECTS_ERROR_ARRAY],
+        EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
         comment="sum over the effects left out of what each may change: of pd in all three "
         "segments, of log10 of the probability of a false alarm, or of a relative magnitude, "
         "whichever is most",
     )
     outputs = {
-        EFFECTS_ARRAY: replace(SIMULATED[EFFECTS_ARRAY], dims=()),
+        EFFECTS_ARRAY: replace(EFFECT_VARIABLES[EFFECTS_ARRAY], dims=()),
         EFFECTS_ERROR_ARRAY: replace(error_output, dims=()),
     }
-    draw_outputs = ACCURACY_OUTPUTS | DRAW_OUTPUTS
+    draw_outputs = ACCURACY_OUTPUTS | DRAW_COUNT_OUTPUTS
     if not spec.draws.has_draws:
-        outputs |= OUTPUTS | (STRONGEST_OUTPUTS if spec.reports_strongest_peak else {})
+        outputs |= GRID_OUTPUTS | (STRONGEST_PEAK_OUTPUTS if spec.reports_strongest_peak else {})
     elif spec.draws.draws_whole_spectra:
         outputs |= SPECTRA_OUTPUTS | draw_outputs
     else:
-        running_outputs = RUNNING_OUTPUTS if spec.has_random_effects else {}
-        outputs |= OUTPUTS | ERROR_OUTPUTS | draw_outputs | running_outputs
-    extra_dims = {RUNNING: ("sum",)}
+        running_outputs = RUNNING_SUM_OUTPUTS if spec.has_random_effects else {}
+        outputs |= GRID_OUTPUTS | STANDARD_ERROR_OUTPUTS | draw_outputs | running_outputs
+    extra_dims = {RUNNING_SUMS: ("sum",)}
     if not spec.draws.is_adaptive:
-        extra_dims |= dict.fromkeys(DRAW_OUTPUTS, (BATCH_DIM,))
+        extra_dims |= dict.fromkeys(DRAW_COUNT_OUTPUTS, (BATCH_DIM,))
     return {name: replace(outputs[name], dims=extra_dims.get(name, ())) for name in sorted(outputs)}
 
 
@@ -389,7 +401,7 @@ class GridStudy(ExtendableStudy):
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
         """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
-        return by_tolerance(self.grid.parameters(block))
+        return is_set_by_tolerance(self.grid.parameters(block))
 
     def store_attributes(self) -> dict[str, Any]:
         """Title, question, spec and the blocks' shape."""
@@ -424,7 +436,7 @@ class GridStudy(ExtendableStudy):
 
     def output_layouts(self) -> list[ArrayLayout]:
         """Return an array for each output of the model, and for the effects simulated."""
-        sizes = {BATCH_DIM: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
+        sizes = {BATCH_DIM: len(batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
         off_axes = self.spec.parameters_off_axes()
         promised_accuracy = {  # that half-widths are held against
             name: float(off_axes[f"accuracy.{name}"])
@@ -436,7 +448,7 @@ class GridStudy(ExtendableStudy):
             layout = self.grid.make_layout(name, output, self.grid.dims + output.dims, sizes)
             layout_attributes = dict(layout.attributes)
             if name == EFFECTS_ARRAY:
-                layout_attributes |= flag_attributes()
+                layout_attributes |= effect_flag_attributes()
             elif name in ACCURACY_OUTPUTS and output.dtype != "int64":
                 layout_attributes |= promised_accuracy
             layouts.append(replace(layout, attributes=layout_attributes))
@@ -537,11 +549,11 @@ class GridStudy(ExtendableStudy):
             for effect in EFFECT_CATALOGUE
             if effect_modes[effect.name] != "off" and not effect.is_random
         ]
-        first_point_effects = names_of(
+        first_point_effects = unpack_effect_flags(
             int(self.effect_planner.select_for_block(0, np.zeros(1, np.int64)).effect_flags[0])
         )
         for effects in ({*possible_effects, *first_point_effects}, ()):
-            with suppress(UnsupportedShot):
+            with suppress(UnsupportedShotError):
                 evaluate_points(
                     single_draw_spec, self.grid.parameters_at(np.zeros(1, np.int64)), 1, effects
                 )
@@ -571,7 +583,7 @@ COUNTS_PER_CALL_MAX = 1 << 19
 
 #: Parameters that change how draws are looked at, and not what is drawn.
 NON_PHYSICAL_PREFIXES = (
-    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS
+    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
 
 #: Domain of the keys of draws, so that no other use of the same seed meets their streams.
@@ -617,7 +629,7 @@ def iter_block_results(
             results = evaluate_points(
                 spec, subset, len(local_indices), effects, prior_draws, deadline
             )
-        except UnsupportedShot:  # costs the point that is beyond the model, and no other
+        except UnsupportedShotError:  # costs the point that is beyond the model, and no other
             if len(local_indices) > 1:
                 pending.extendleft(
                     (effects, half) for half in np.array_split(local_indices, 2)[::-1]
@@ -645,7 +657,7 @@ def evaluate_points(
     parameters: Mapping[str, ParameterValue],
     n_points: int,
     effects: Collection[str],
-    prior_draws: Before | None = None,
+    prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
@@ -655,8 +667,8 @@ def evaluate_points(
     """
     if spec.draws.has_draws:
         return _simulate_draws(spec, parameters, n_points, effects, prior_draws, should_stop)
-    from sweep.model.realisations import random_effects
-    from sweep.model.shot import evaluate
+    from sweep.model.evaluation import evaluate
+    from sweep.model.sampling.realisations import random_effects
 
     if random_effect_names := [effect.name for effect in random_effects(effects)]:
         raise ValueError(
@@ -690,7 +702,7 @@ def draw_keys(
     spec: GridSpec, parameters: Mapping[str, ParameterValue], n_points: int
 ) -> np.ndarray:
     """Random keys (count, 2) uint64 of points, however closely these are looked at."""
-    from sweep.model.philox import point_keys
+    from sweep.model.sampling.philox import point_keys
 
     physical = {
         path: value
@@ -704,9 +716,9 @@ def draw_keys(
 
 def previous_draws(
     spec: GridSpec, previous: PartialResults, local_indices: np.ndarray
-) -> Before | None:
+) -> PriorDraws | None:
     """Draws that there are of some points of a block; None where there are none."""
-    from sweep.model.sampling import Before
+    from sweep.model.sampling.samplers import PriorDraws
 
     _, previous_rows, rows = np.intersect1d(
         previous.local_indices, local_indices, return_indices=True
@@ -721,14 +733,16 @@ def previous_draws(
         return spread
 
     counts = np.stack(
-        [spread_over_points(name).reshape(len(local_indices), -1) for name in DRAW_OUTPUTS]
+        [spread_over_points(name).reshape(len(local_indices), -1) for name in DRAW_COUNT_OUTPUTS]
     )
     n_missing_batches = max(1, len(batch_sizes(spec))) - counts.shape[-1]
     counts = np.pad(counts, ((0, 0), (0, 0), (0, n_missing_batches)))
     means = {
-        name: spread_over_points(name) for name in (*OUTPUTS, RUNNING) if name in previous.results
+        name: spread_over_points(name)
+        for name in (*GRID_OUTPUTS, RUNNING_SUMS)
+        if name in previous.results
     }
-    return Before(spread_over_points("n_draws"), counts, means)
+    return PriorDraws(spread_over_points("n_draws"), counts, means)
 
 
 def _simulate_draws(
@@ -736,33 +750,33 @@ def _simulate_draws(
     parameters: Mapping[str, ParameterValue],
     n_points: int,
     effects: Collection[str],
-    prior_draws: Before | None,
+    prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
-    from sweep.model.sampling import never, simulate
+    from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods
 
     draws = spec.draws
     keywords: dict[str, Any] = {
         "keys": draw_keys(spec, parameters, n_points),
-        "before": prior_draws,
-        "stop": should_stop or never,
+        "prior_draws": prior_draws,
+        "should_stop": should_stop or never_stop,
         "method": draws.method,
-        "accuracy": Accuracy.of(parameters, interval=draws.interval),
+        "error_budget": ErrorBudget.from_parameters(parameters, interval=draws.interval),
     }
     if draws.is_adaptive:
         keywords |= {"batch": draws.batch, "limit": draws.limit}
     else:
         keywords |= {"batch_sizes": batch_sizes(spec)}
     if draws.draws_whole_spectra:
-        return simulate(parameters, effects, methods=spectrum_methods(parameters), **keywords)
-    return empty_running_sums(spec, n_points) | simulate(parameters, effects, **keywords)
+        return simulate_draws(parameters, effects, methods=spectrum_methods(parameters), **keywords)
+    return empty_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)
 
 
 def empty_running_sums(spec: GridSpec, n_points: int) -> Results:
     """Return empty running sums, if any point of the study may have some."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
-    return {RUNNING: np.zeros((n_points, RUNNING_COLUMNS))} if has_running_sums else {}
+    return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.messages import option_text
-from sweep.model.detectors import taper
-from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
-from sweep.model.looks import NUMBER, Looks
+from sweep.model.detection.detectors import cached_window_samples
+from sweep.model.detection.looks import LOOKS_NUMBER_PATH, Looks
+from sweep.model.effects.catalogue import EFFECTS, PARAMETER_DEFAULTS
 from sweep.storage.locations import atomic_path, is_free
 from sweep.storage.size_checks import SingleWriterLocalStore
 from sweep.tasks.engine.progress import StoreError
@@ -42,24 +42,31 @@ def point_spectra(
     Every effect is there that is not off and that the point has anything of. The draws begin at
     ``first_draw``.
     """
-    from sweep.model.noisy_spectra import drawn_of, noise_of, signal_of, speckle_of
-    from sweep.model.realisations import random_effects, realise
+    from sweep.model.sampling.noisy_spectra import (
+        draw_bin_speckle,
+        draw_noise_spectra,
+        draw_signal_spectra,
+        noiseless_signal,
+    )
+    from sweep.model.sampling.realisations import iter_realisations, random_effects
 
-    if Looks.of(parameters).number > 1:
+    if Looks.from_parameters(parameters).number > 1:
         raise ValueError(
-            f"a file of spectra holds one record of each segment, and {NUMBER} takes "
-            f"{Looks.of(parameters).number}: export a point of one look"
+            f"a file of spectra holds one record of each segment, and {LOOKS_NUMBER_PATH} takes "
+            f"{Looks.from_parameters(parameters).number}: export a point of one look"
         )
     effect_modes, key = spec.effect_modes(), draw_keys(spec, parameters, 1)
-    arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}
+    arrays = {
+        path: np.asarray(value) for path, value in (PARAMETER_DEFAULTS | dict(parameters)).items()
+    }
     effect_names = [
-        e.name for e in EFFECTS if effect_modes[e.name] != "off" and not e.absent(arrays).all()
+        e.name for e in EFFECTS if effect_modes[e.name] != "off" and not e.is_absent(arrays).all()
     ]
     draw_numbers, has_random_effects = (
         np.arange(first_draw, first_draw + n_draws),
         bool(random_effects(effect_names)),
     )
-    realisations = realise(
+    realisations = iter_realisations(
         parameters,
         effect_names,
         keys=key,
@@ -69,14 +76,14 @@ def point_spectra(
     drawn_spectra, signals_by_draw, shots = [], [], None
     for realisation in realisations:
         shots = realisation.shots
-        for shot, draw in enumerate(realisation.draw):
-            segments = list(map(int, np.flatnonzero(shots.segments)))
-            signals = [signal_of(shots, shot, segment) for segment in segments]
+        for shot, draw in enumerate(realisation.draw_numbers):
+            segments = list(map(int, np.flatnonzero(shots.has_segment)))
+            signals = [noiseless_signal(shots, shot, segment) for segment in segments]
             draws = np.array([draw]) if has_random_effects else draw_numbers
             drawn_spectra.append(np.stack([
-                drawn_of(shots, shot, segment, signal, key=key[0], draws=draws)
-                * speckle_of(shots, shot, segment, signal, key=key[0], draws=draws)
-                + noise_of(shots, shot, segment, key=key[0], draws=draws)
+                draw_signal_spectra(shots, shot, segment, signal, key=key[0], draws=draws)
+                * draw_bin_speckle(shots, shot, segment, signal, key=key[0], draws=draws)
+                + draw_noise_spectra(shots, shot, segment, key=key[0], draws=draws)
                 for segment, signal in zip(segments, signals, strict=True)
             ], axis=1))  # fmt: skip
             signals_by_draw.append(signals)
@@ -118,7 +125,7 @@ def _spectra_dataset(
 
     bin_width = float(shots.sample_rate[0]) / shots.fft_size
     segment_names = [
-        name for name, is_there in zip(SEGMENT_NAMES, shots.segments, strict=True) if is_there
+        name for name, is_there in zip(SEGMENT_NAMES, shots.has_segment, strict=True) if is_there
     ]
     signal_dims = ("draw", "segment") if len(signals_by_draw) > 1 else ("segment",)
 
@@ -134,10 +141,10 @@ def _spectra_dataset(
         "signal": ((*signal_dims, "frequency"), signal_values("spectrum")),
         "noise_power": ((), float(shots.window.energy * shots.noise_variance[-1])),
         "threshold": ((), float(shots.threshold[-1])),
-        "window": (("sample",), taper(shots.window)),
+        "window": (("sample",), cached_window_samples(shots.window)),
         "true_frequency": (signal_dims, signal_values("frequency") * bin_width),
-        "first_bin": (signal_dims, signal_values("first")),
-        "last_bin": (signal_dims, signal_values("last")),
+        "first_bin": (signal_dims, signal_values("first_bin")),
+        "last_bin": (signal_dims, signal_values("last_bin")),
         "cnr": (signal_dims, signal_values("cnr")),
         "line_frequency": (("segment", "line"), line_frequency),
         "line_amplitude": (("line",), line_amplitude),
@@ -145,7 +152,7 @@ def _spectra_dataset(
         "radial_velocity": ((), float(shots.radial_velocity[-1])),
         "draw": (("draw",), draw_numbers),
         "segment": (("segment",), np.array(segment_names, dtype=object)),
-        "frequency": (("frequency",), shots.signed_bins * bin_width),
+        "frequency": (("frequency",), shots.all_signed_bins * bin_width),
     }
     variables = {
         name: (
@@ -166,11 +173,11 @@ def _spectra_dataset(
 
 def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies of the beamlets' lines [Hz], (segments, lines), and their amplitudes [V]."""
-    from sweep.model.returns import beamlet_lines
+    from sweep.model.pointcloud.returns import beamlet_line_positions
 
-    line_bins = beamlet_lines(shots)[-1, list(shots.segments)]
-    scale = np.broadcast_to(shots.beat_scale, shots.size)[-1]
-    return line_bins * bin_width, shots.amplitude[int(shots.row[-1])] * scale
+    line_bins = beamlet_line_positions(shots)[-1, list(shots.has_segment)]
+    scale = np.broadcast_to(shots.beat_amplitude_scale, shots.size)[-1]
+    return line_bins * bin_width, shots.relative_amplitude[int(shots.footprint_row[-1])] * scale
 
 
 def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.model.accuracy import Accuracy
-from sweep.model.outputs import PROMISED
-from sweep.model.unsupported import UnsupportedShot
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.outputs import PD_OUTPUTS
+from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.storage.locations import PACKED_ATTRIBUTE, Location, file_sizes_below, parse_location
 from sweep.storage.store_format import read_receipt_totals
 from sweep.storage.verified_store import open_array_group
@@ -139,7 +139,7 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
     try:
         parameters = select_parameters(study.grid.parameters(block), local_index)
         evaluate_points(limit_draws(study.spec, 1), parameters, 1, effects)
-    except UnsupportedShot as error:
+    except UnsupportedShotError as error:
         return str(error)
     return "it is not any more"
 
@@ -204,19 +204,19 @@ class ScannerRow:
 
     def add(self, block_arrays: Mapping[str, np.ndarray]) -> None:
         """Count a block, by its part of each array."""
-        from sweep.model.navigation import EXCLUDED
-        from sweep.model.pairing import TRUE
+        from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
+        from sweep.model.pointcloud.pairing import TRUE_FLAG
 
         point_flags = block_arrays["flags"]
         self.n_shots += point_flags[..., 0].size
-        self.shots_with_true_return += int(((point_flags & TRUE) > 0).any(axis=-1).sum())
-        self.false_points += int(((point_flags > 0) & ((point_flags & TRUE) == 0)).sum())
+        self.shots_with_true_return += int(((point_flags & TRUE_FLAG) > 0).any(axis=-1).sum())
+        self.false_points += int(((point_flags > 0) & ((point_flags & TRUE_FLAG) == 0)).sum())
         if "pd_shot" in block_arrays:  # with the first draws alone
             self.pd_of_shots.append(block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])])
         if "velocity_status" in block_arrays:
             status = block_arrays["velocity_status"]
             self.n_cycles += status.size
-            self.solved_cycles += int((status <= EXCLUDED).sum())
+            self.solved_cycles += int((status <= STATUS_EXCLUDED).sum())
 
 
 def scene_summary(store: str | Location) -> list[ScannerRow]:
@@ -338,7 +338,7 @@ def draw_accuracy_rows(
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
         return []
-    error_arrays = {name: f"{name}_half_width" for name in PROMISED}
+    error_arrays = {name: f"{name}_half_width" for name in PD_OUTPUTS}
     return [
         row
         for row in _accuracy_rows(
@@ -356,7 +356,8 @@ def ray_accuracy_rows(
     _, study = study_loading.read_study(store_path)
     if isinstance(study, GridStudy):
         tolerance_limit = np.maximum(
-            Accuracy(_tolerance_over_grid(study)).for_beamlets, Accuracy.least_rays_tolerance
+            ErrorBudget(_tolerance_over_grid(study)).allowed_beamlets_error,
+            ErrorBudget.rays_tolerance_min,
         )
         rows = _accuracy_rows(
             store_path, study, done_blocks, {"": "beamlets_error"}, "beamlets", tolerance_limit

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import psutil
 
-from sweep.model.effects.catalogue import EFFECTS, NAMES
-from sweep.model.outputs import SHOTS
+from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
+from sweep.model.outputs import SHOT_VARIABLES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoints_path
 from sweep.tasks.engine import cluster_connection
@@ -40,7 +40,7 @@ from sweep.tasks.studies.memory_limits import (
 from sweep.tasks.studies.study_loading import make_study
 
 if TYPE_CHECKING:
-    from sweep.model.eyepoints import Eyepoints
+    from sweep.model.pointcloud.eyepoints import Eyepoints
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.blocks import Results
 
@@ -394,9 +394,9 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
     change_bounds, error_bounds = np.empty(is_kept.shape), np.empty(len(tiles))
     for members, effect_plan in effect_planner.iter_plans(tiles):
         is_kept[:, members], change_bounds[:, members], error_bounds[members] = (
-            effect_plan.kept,
-            effect_plan.change,
-            effect_plan.error,
+            effect_plan.is_kept,
+            effect_plan.omission_error,
+            effect_plan.total_error,
         )
     points_by_tile = [_tile_grid_indices(effect_planner, tile) for tile in tiles.tolist()]
     n_points_by_tile = np.array([len(tile_points) for tile_points in points_by_tile])
@@ -452,7 +452,9 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
                 effect_plan, n_hitting_by_tile = shot_plan.plan, np.bincount(shot_plan.tile_index)
                 tile_effects.append(
                     _TileEffects(
-                        effect_plan.kept * n_hitting_by_tile, effect_plan.change, effect_plan.error
+                        effect_plan.is_kept * n_hitting_by_tile,
+                        effect_plan.omission_error,
+                        effect_plan.total_error,
                     )
                 )
                 first_shots = np.searchsorted(
@@ -558,7 +560,7 @@ def _make_tile_sampler(
     @cache
     def sample_tile(tile: int) -> _PointSample:
         ((_, effect_plan),) = effect_planner.iter_plans(np.array([tile]))
-        effect_names = tuple(compress(NAMES, effect_plan.kept[:, 0]))
+        effect_names = tuple(compress(EFFECT_NAMES, effect_plan.is_kept[:, 0]))
         sampled_indices, single_index = (
             _tile_grid_indices(effect_planner, tile, n_points) for n_points in (COST_POINTS_MAX, 1)
         )
@@ -655,13 +657,13 @@ class _ShotSample(NamedTuple):
 
     def subset(self, rows: np.ndarray, *, removed_flags: np.uint32) -> _ShotSample:
         """Select shots, without the effects of some flags."""
-        shot_arrays = {name: self.shot_arrays[name][rows] for name in SHOTS}
+        shot_arrays = {name: self.shot_arrays[name][rows] for name in SHOT_VARIABLES}
         effect_flags = self.selected_effects.effect_flags[rows] & ~removed_flags
         selected_effects = SelectedEffects(effect_flags, self.selected_effects.error_bound[rows])
         return _ShotSample(
             self.flight_block,
             shot_arrays,
-            self.eyepoints.some(rows),
+            self.eyepoints.select(rows),
             selected_effects,
             self.shot_numbers[rows],
         )
@@ -696,7 +698,7 @@ def _flight_effect_cost(
     study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
 ) -> float:
     """Share of the time of shots that an effect takes, from cycles with it and without."""
-    no_flags, effect_flag = np.uint32(0), np.uint32(1 << NAMES.index(effect_name))
+    no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
 
     def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
         shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle

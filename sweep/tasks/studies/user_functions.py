@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.messages import option_text
-from sweep.model.detectors import DETECTORS, Setting
-from sweep.model.estimators import ESTIMATORS
-from sweep.model.window import window
+from sweep.model.detection.detectors import DETECTORS, SpectrumSettings
+from sweep.model.detection.estimators import ESTIMATORS
+from sweep.model.window import get_window
 from sweep.tasks.engine.blocks import SPECTRUM_METHOD_PARAMETERS, user_functions
 from sweep.tasks.engine.progress import CodeError
 
 if TYPE_CHECKING:
-    from sweep.model.noisy_spectra import Methods
+    from sweep.model.sampling.noisy_spectra import SpectrumMethods
     from sweep.spec import GridSpec, SceneSpec
 
 ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
@@ -109,12 +109,12 @@ def allow_same_module(module: str, digest: str) -> None:
         )
 
 
-def spectrum_methods(parameters: Mapping[str, Any]) -> Methods:
+def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
     """Detectors and estimators by the names in the parameters of some points.
 
     As :func:`check_user_functions`.
     """
-    from sweep.model.noisy_spectra import Methods
+    from sweep.model.sampling.noisy_spectra import SpectrumMethods
 
     user_functions_by_role = {
         role: {
@@ -124,7 +124,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> Methods:
         }
         for role, path in SPECTRUM_METHOD_PARAMETERS.items()
     }
-    return Methods(
+    return SpectrumMethods(
         {**DETECTORS, **user_functions_by_role[DETECTOR_ROLE]},
         {**ESTIMATORS, **user_functions_by_role[ESTIMATOR_ROLE]},
     )
@@ -136,11 +136,13 @@ def checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
     function = _import_user_function(name)
     definition = f"{name}{_definition_text(function)}"
 
-    def detect(power: np.ndarray, setting: Setting) -> np.ndarray:
+    def detect(power: np.ndarray, setting: SpectrumSettings) -> np.ndarray:
         answer = _call_user_function(name, function, _read_only_view(power), setting)
         return _checked_answer(definition, answer, power.shape, np.dtype(bool))
 
-    def estimate(spectrum: np.ndarray, peak_bins: np.ndarray, setting: Setting) -> np.ndarray:
+    def estimate(
+        spectrum: np.ndarray, peak_bins: np.ndarray, setting: SpectrumSettings
+    ) -> np.ndarray:
         answer = _call_user_function(
             name, function, _read_only_view(spectrum), _read_only_view(peak_bins), setting
         )
@@ -253,10 +255,10 @@ def _checked_answer(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dt
 def _try_user_function(role: str, name: str) -> None:
     """One call on three spectra of a tone at bin 40.25 of 128, in a little noise."""
     n_samples, generator = 256, np.random.default_rng(1)
-    setting = Setting(
+    setting = SpectrumSettings(
         fft_size=n_samples,
         sample_rate=1e6,
-        window=window("hann", n_samples),
+        window=get_window("hann", n_samples),
         noise_power=0.375 * n_samples,
         threshold=50.0,
         training=16,

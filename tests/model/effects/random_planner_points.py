@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
-from sweep.model.effects.planning import plan
-from sweep.model.effects.points import Points
-from sweep.model.shot import find, prepare
+from sweep.model.effects.catalogue import EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.effects.planning import plan_effects
+from sweep.model.evaluation import evaluate_segments, prepare_shots
 
 FFT_SIZES = (2**12, 2**13, 2**14, 2**15, 2**16, 2**17, 2**18)
 CLOSED_FORM_WINDOWS = ("hamming", "hann", "rectangular", "flattop")
@@ -37,13 +37,17 @@ def random_parameters(table_4_1, n_points, seed, **fixed):
         is_slanted, np.radians(rng.uniform(1, 90, n_points)), values["grazing_angle"]
     )
     transverse_velocity = fixed.pop("across", transverse_velocity)
-    return DEFAULTS | table_4_1(**values | fixed) | {TRANSVERSE_VELOCITY: transverse_velocity}
+    return (
+        PARAMETER_DEFAULTS
+        | table_4_1(**values | fixed)
+        | {TRANSVERSE_VELOCITY: transverse_velocity}
+    )
 
 
 def planner_inputs(parameters, footprint=None, **options):
     """Points as the planner looks at them."""
     texts = {path: str(v) for path, v in parameters.items() if np.asarray(v).dtype.kind in "UO"}
-    return Points(DEFAULTS | dict(parameters) | texts, footprint, **options)
+    return PlannerInputs(PARAMETER_DEFAULTS | dict(parameters) | texts, footprint, **options)
 
 
 def plan_points(points, modes, tolerance, effects=EFFECTS, tile_edges=None):
@@ -58,24 +62,24 @@ def plan_points(points, modes, tolerance, effects=EFFECTS, tile_edges=None):
             else np.maximum.reduceat(value_by_point, tile_edges[:-1])
         )
 
-    return plan(points, maximum_by_tile, modes, tolerance, effects)
+    return plan_effects(points, maximum_by_tile, modes, tolerance, effects)
 
 
 def effects_kept_in_tile(effect_plan, tile):
     """Effects that are simulated in a tile."""
     return tuple(
         n
-        for n, is_kept in zip(effect_plan.names, effect_plan.kept[:, tile], strict=True)
+        for n, is_kept in zip(effect_plan.effect_names, effect_plan.is_kept[:, tile], strict=True)
         if is_kept
     )
 
 
 def prepare_single_category(parameters, effects):
     """Shots of points of one category."""
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
 def find_spectra(parameters, effects):
-    """What the spectra of the points hold, :func:`sweep.model.shot.find`."""
-    return find(prepare_single_category(parameters, effects))
+    """What the spectra of the points hold, :func:`sweep.model.evaluation.find`."""
+    return evaluate_segments(prepare_single_category(parameters, effects))

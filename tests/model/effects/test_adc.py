@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from sweep.model.effects.saturation import clipping
-from sweep.model.link import rounding_variance
+from sweep.model.effects.saturation import clipping_gains
+from sweep.model.receiver_chain import quantisation_variance
 
 
 def truth_quantise(voltage: np.ndarray, *, full_scale: float, bits: int) -> np.ndarray:
@@ -24,7 +24,7 @@ def test_rounding_a_tone_with_noise_of_a_step_adds_white_noise(bits):
     tone = min(0.7, 1 - 6 * lsb) * np.cos(2 * np.pi * 17321 * np.arange(number) / number + 0.3)
     record = truth_quantise(tone + noise, full_scale=1.0, bits=bits)
     error = abs(np.fft.rfft(record - tone - noise)[1:-1]) ** 2 / number
-    white = float(rounding_variance(full_scale=1.0, bits=bits))
+    white = float(quantisation_variance(full_scale=1.0, bits=bits))
     assert error.mean() / white == pytest.approx(1, abs=5 / np.sqrt(error.size))
     for band in np.array_split(error, 8):
         assert band.mean() / white == pytest.approx(1, abs=5 / np.sqrt(band.size))
@@ -52,7 +52,7 @@ def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude
         )
         for _ in range(2)
     ]
-    found = clipping(amplitude=amplitude, deviation=s, full_scale=full_scale)
+    found = clipping_gains(amplitude=amplitude, deviation=s, full_scale=full_scale)
     line = ((records[0] + records[1]) * np.cos(turn)).mean()
     bend = lsb**2 / 24 * 0.4 / s * 4 / np.pi
     assert line == pytest.approx(found.signal_gain * amplitude, abs=5 * s / np.sqrt(number) + bend)
@@ -64,5 +64,5 @@ def test_a_quantised_record_past_full_scale_shows_gain_and_noise(bits, amplitude
 
 
 def test_the_gain_of_next_to_nothing_is_the_share_of_unclipped_noise():
-    found = clipping(amplitude=[1e-4, 1e-9, 1e-30], deviation=1.0, full_scale=1.5).signal_gain
+    found = clipping_gains(amplitude=[1e-4, 1e-9, 1e-30], deviation=1.0, full_scale=1.5).signal_gain
     np.testing.assert_allclose(found, erf(1.5 / np.sqrt(2)), rtol=1e-8)

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 from random_planner_points import planner_inputs
 
-from sweep.model import shot
-from sweep.model.effects.amplifier import BOTH, current_variance, emission, emission_size
-from sweep.model.effects.catalogue import CORE
+from sweep.model import evaluation
+from sweep.model.effects.amplifier import (
+    SENT_AND_OSCILLATOR_LIGHT,
+    beat_noise_current_variance,
+    error_bound,
+    spontaneous_emission_density,
+)
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 
 RATE, NUMBER = 600e6, 2**18
 GAIN, RESPONSIVITY, OSCILLATOR = 3.0, 1.1, 1e-3
@@ -32,8 +37,8 @@ def _variance():
     }  # fmt: skip
     given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
     given |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
-    isolation = {"instrument.telescope.isolation": emission(given) / DENSITY}
-    return current_variance(given | isolation, "sent")
+    isolation = {"instrument.telescope.isolation": spontaneous_emission_density(given) / DENSITY}
+    return beat_noise_current_variance(given | isolation, "sent")
 
 
 def test_emission_beats_with_the_local_oscillator_on_both_diodes_of_a_receiver():
@@ -53,7 +58,7 @@ def test_emission_that_comes_with_the_local_oscillator_is_rejected_as_its_fluctu
     assert current.var() == pytest.approx(expected, rel=5 * np.sqrt(2 / NUMBER) + 6e-4)
 
 
-@pytest.mark.parametrize("amplified", ["sent", BOTH])
+@pytest.mark.parametrize("amplified", ["sent", SENT_AND_OSCILLATOR_LIGHT])
 def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1, amplified):
     """By hand: h nu = 1.2816e-19 J; a diode's shot noise 2 q Re P_lo B_e, of which the beat is
     2 Re N / q; the rest of the receiver's noise is known from what the shot has without."""
@@ -66,27 +71,36 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
         "instrument.receiver.common_mode_rejection": rejection,
     }
     density = 6.62607015e-34 * 299792458.0 / 1550e-9 * inversion * (gain - 1)
-    assert emission(LIGHT | {"instrument.laser.amplifier_gain": gain}) == pytest.approx(density)
+    assert spontaneous_emission_density(
+        LIGHT | {"instrument.laser.amplifier_gain": gain}
+    ) == pytest.approx(density)
     on_detector = density / isolation  # and 1 mW of the local oscillator, of 1 W sent
-    on_detector += density * 1e-3 / 1.0 / rejection if amplified == BOTH else 0.0
-    (_, bare), (_, noisy) = (
-        next(shot.prepare(parameters, effects))
-        for effects in (CORE, (*CORE, "spontaneous_emission"))
+    on_detector += (
+        density * 1e-3 / 1.0 / rejection if amplified == SENT_AND_OSCILLATOR_LIGHT else 0.0
     )
-    own_shot = bare.noise_sources["local_oscillator_shot"]
-    more = noisy.noise_sources["spontaneous_emission"]
+    (_, bare), (_, noisy) = (
+        next(evaluation.prepare_shots(parameters, effects))
+        for effects in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "spontaneous_emission"))
+    )
+    own_shot = bare.noise_variances["local_oscillator_shot"]
+    more = noisy.noise_variances["spontaneous_emission"]
     assert more / own_shot == pytest.approx(2 * 1.1 * on_detector / 1.602176634e-19, rel=1e-9)
-    assert noisy.quiet_variance == pytest.approx(bare.quiet_variance + more)
-    size = emission_size(planner_inputs(parameters))
-    assert size.noise == pytest.approx(more / sum(
-        value for name, value in bare.noise_sources.items() if name != "signal_shot"
+    assert noisy.noise_variance_without_echo == pytest.approx(
+        bare.noise_variance_without_echo + more
+    )
+    size = error_bound(planner_inputs(parameters))
+    assert size.noise_variance_change == pytest.approx(more / sum(
+        value for name, value in bare.noise_variances.items() if name != "signal_shot"
     ))  # fmt: skip
-    assert size.threshold_follows
-    seen = [shot.evaluate(parameters, e)["snr_up"] for e in (CORE, (*CORE, "spontaneous_emission"))]
+    assert size.threshold_follows_noise
+    seen = [
+        evaluation.evaluate(parameters, e)["snr_up"]
+        for e in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "spontaneous_emission"))
+    ]
     assert seen[0] / seen[1] == pytest.approx(noisy.noise_variance / bare.noise_variance)
 
 
 def test_nothing_is_there_without_an_amplifier_or_a_local_oscillator(table_4_1):
-    assert emission_size(planner_inputs(table_4_1())) is None
+    assert error_bound(planner_inputs(table_4_1())) is None
     amplified = {"instrument.laser.spontaneous_emission": 1.6}
-    assert emission_size(planner_inputs(table_4_1(architecture="direct") | amplified)) is None
+    assert error_bound(planner_inputs(table_4_1(architecture="direct") | amplified)) is None

@@ -6,12 +6,12 @@ from scipy.integrate import quad
 from scipy.special import exp1
 
 from sweep.model.effects.atmosphere import (
-    PROFILES,
-    Profile,
-    exponential,
-    layer,
+    EXTINCTION_PROFILES,
+    ExtinctionProfile,
+    backscatter_integral,
+    exponential_profile,
+    layer_profile,
     optical_depth,
-    returned,
 )
 
 AREA = np.pi * 0.0125**2
@@ -21,11 +21,11 @@ NEAR = 500.0
 
 def power(profile, near=NEAR, **path):
     """Of 1 W, 0.8 of which passes the optics, with a lidar ratio of 50 sr."""
-    return 0.8 * AREA / 50 * returned(profile, near=near, **path)
+    return 0.8 * AREA / 50 * backscatter_integral(profile, near_range=near, **path)
 
 
 def even(extinction):
-    return layer(optical_depth=extinction * 1e5, depth=1e5)
+    return layer_profile(optical_depth=extinction * 1e5, depth=1e5)
 
 
 @pytest.mark.parametrize(
@@ -57,10 +57,10 @@ def test_diffraction_limited_overlap_is_that_of_the_coherent_lidar():
 def scenes(number=150):
     rng = np.random.default_rng(6)
     drawn = [
-        *PROFILES.values(),
-        layer(optical_depth=2.0, depth=40.0),
-        exponential(surface_extinction=1e-3, scale_height=50.0),
-        Profile((0.0, 200.0, 200.0, 350.0), (1e-5, 1e-5, 2e-3, 1e-3)),
+        *EXTINCTION_PROFILES.values(),
+        layer_profile(optical_depth=2.0, depth=40.0),
+        exponential_profile(surface_extinction=1e-3, scale_height=50.0),
+        ExtinctionProfile((0.0, 200.0, 200.0, 350.0), (1e-5, 1e-5, 2e-3, 1e-3)),
     ]
     for _ in range(number):
         profile = drawn[rng.integers(len(drawn))]

@@ -5,8 +5,8 @@ import pytest
 from random_planner_points import planner_inputs, prepare_single_category
 
 from sweep.model.effects import phase_errors
-from sweep.model.effects.sweep_table import sweep_table
-from sweep.model.segments import spectrum
+from sweep.model.effects.sweep_error_table import fit_sweep_error
+from sweep.model.spectrum.segment_spectra import segment_spectrum
 
 LIGHT = 299792458.0
 CHIRP, START, RECORD = 500e-6, 3e-5, 300e-6
@@ -38,7 +38,7 @@ def error_of(sign, *, quadratic=0.0, cubic=0.0, sinusoidal=0.0, periods=1.0, **s
 def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks, range_, velocity):
     scene = error_of(sign, **peaks, range=np.array([range_]), radial_velocity=np.array([velocity]))
     x = np.linspace(-1, 1, 7)
-    found = phase_errors.sweep_phase(x, **scene)[0]
+    found = phase_errors.chirp_nonlinearity_phase(x, **scene)[0]
     nodes, weights = np.polynomial.legendre.leggauss(20)
     shape = {k: scene[k] for k in ("quadratic", "cubic", "sinusoidal", "periods")}
     for value, t in zip(found, START + RECORD * (x + 1) / 2, strict=True):
@@ -53,9 +53,9 @@ def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks,
 def test_no_delay_no_sweep_no_error():
     x = np.linspace(-1, 1, 5)
     some = {"quadratic": 1e6, "cubic": 1e6, "sinusoidal": 1e6}
-    none = phase_errors.sweep_phase(x, **error_of(1, **some, range=np.array([0.0])))
+    none = phase_errors.chirp_nonlinearity_phase(x, **error_of(1, **some, range=np.array([0.0])))
     assert not none.any()
-    assert not phase_errors.sweep_phase(x, **error_of(0, **some)).any()
+    assert not phase_errors.chirp_nonlinearity_phase(x, **error_of(0, **some)).any()
 
 
 def table_of(error, *, first=0.0, last=CHIRP, rows=401):
@@ -72,19 +72,21 @@ def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocit
     place = {"range": np.array([range_]), "radial_velocity": np.array([velocity])}
     scene = error_of(sign, quadratic=2e5, **place)
     x, names = np.linspace(-1, 1, 9), ("sign", "chirp_duration", "start", "duration")
-    table = sweep_table(text)
-    assert table.series.size == 3
-    found = phase_errors.table_phase(x, table=table, **place, **{n: scene[n] for n in names})
-    expected = phase_errors.sweep_phase(x, **scene)
+    table = fit_sweep_error(text)
+    assert table.chebyshev_coefficients.size == 3
+    found = phase_errors.error_table_phase(x, table=table, **place, **{n: scene[n] for n in names})
+    expected = phase_errors.chirp_nonlinearity_phase(x, **scene)
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_a_table_is_held_beyond_its_ends():
-    table = sweep_table("0.0 -1.0, 1.0 0.0, 2.0 1.0")
+    table = fit_sweep_error("0.0 -1.0, 1.0 0.0, 2.0 1.0")
     # From -1 to 3: -1 a second long, 0 over the table, 1 a second long; from 1.5 to 3.5 by hand.
-    np.testing.assert_allclose(table.integral(np.array([-1.0]), np.array([3.0])), 0, atol=1e-15)
-    np.testing.assert_allclose(table.integral(np.array([1.5]), np.array([3.5])), 0.375 + 1.5)
-    np.testing.assert_allclose(table.integral(np.array([-3.0]), np.array([-1.0])), -2.0)
+    np.testing.assert_allclose(
+        table.integrate_error(np.array([-1.0]), np.array([3.0])), 0, atol=1e-15
+    )
+    np.testing.assert_allclose(table.integrate_error(np.array([1.5]), np.array([3.5])), 0.375 + 1.5)
+    np.testing.assert_allclose(table.integrate_error(np.array([-3.0]), np.array([-1.0])), -2.0)
 
 
 RIPPLE, CYCLES = 2e4, 6.3
@@ -96,7 +98,7 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
     turn, range_ = 2 * np.pi * CYCLES / CHIRP, 2500.0
     text = table_of(lambda t: (RIPPLE * np.sin(turn * t + 0.3)).tolist())
     p = table_4_1(range=range_, acquisition_delay=delayed, fft_size=2**17, window="hann")
-    p = p | {phase_errors.ERROR_TABLE: text}
+    p = p | {phase_errors.ERROR_TABLE_PATH: text}
     shots = prepare_single_category(p, ("chirp_nonlinearity",))
     delay, rate, length = 2 * range_ / LIGHT, 6e8, shots.window.length
     t = delayed + np.arange(length) / rate
@@ -119,7 +121,7 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
         plain = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * beat * t)
         peak = int(np.argmax(abs(np.fft.fft(plain, 2**17))))
         near = (peak + np.arange(-60, 61)) % 2**17
-        bins, magnitude = spectrum(shots, 0, segment)
+        bins, magnitude = segment_spectrum(shots, 0, segment)
         mine = magnitude[np.searchsorted(bins, np.where(near > 2**16, 2**17 - near, near))]
         scale = mine.max() / expected[near].max()
         # The series leaves 1e-3 of the span 2 RIPPLE at the most, over the delay.
@@ -132,16 +134,18 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
 def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
     text = table_of(lambda t: (2e3 + RIPPLE * np.sin(4e4 * t)).tolist())
     p = table_4_1(range=np.array([100.0, 3000.0]), radial_velocity=30.0)
-    smear = phase_errors.sweep_smear(planner_inputs(p | {phase_errors.ERROR_TABLE: text}))
+    smear = phase_errors.chirp_nonlinearity_phase_bound(
+        planner_inputs(p | {phase_errors.ERROR_TABLE_PATH: text})
+    )
     x, t = np.linspace(-1, 1, 4001), 2**17 / 6e8
-    psi = phase_errors.table_phase(
-        x, table=sweep_table(text), sign=1, chirp_duration=CHIRP,
+    psi = phase_errors.error_table_phase(
+        x, table=fit_sweep_error(text), sign=1, chirp_duration=CHIRP,
         range=np.array([100.0, 3000.0]), radial_velocity=np.array([30.0, 30.0]), start=0.0,
         duration=t,
     )  # fmt: skip
-    most = (smear.constant + smear.rest + smear.powers[0])[0]
+    most = (smear.constant + smear.non_polynomial + smear.coefficients[0])[0]
     slope = 2 * np.abs(np.gradient(psi, x, axis=1)).max(axis=1)  # bins of fs/L
     assert (np.abs(psi).max(axis=1) <= most).all()
     assert (np.abs(psi).max(axis=1) > 0.8 * most).all()
-    assert (slope <= np.asarray(smear.bins)[0]).all()
-    assert (slope > 0.5 * np.asarray(smear.bins)[0]).all()
+    assert (slope <= np.asarray(smear.shift_window_bins)[0]).all()
+    assert (slope > 0.5 * np.asarray(smear.shift_window_bins)[0]).all()

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from random_planner_points import prepare_single_category
 
-from sweep.model import shot
+from sweep.model import evaluation
+from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects import circulator_leak as leak
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.marcum import marcum_q1
-from sweep.model.segments import runs_of
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.spectrum.segment_spectra import iter_spans
 
 LIGHT, CHARGE = 299792458.0, 1.602176634e-19
 PATH, ISOLATION = 3.0, 1e5
-WITH = (*CORE, "circulator_leak")
+WITH = (*DEFAULT_EFFECTS, "circulator_leak")
 
 
 @pytest.fixture
@@ -20,8 +20,8 @@ def leaking(table_4_1):
     """Parameters of Table 4.1 with leaked light."""
 
     def parameters(path=PATH, isolation=ISOLATION, further=None, **changes):
-        own = {leak.PATH: path, leak.ISOLATION: isolation}
-        return DEFAULTS | table_4_1(**changes) | own | (further or {})
+        own = {leak.LEAK_LENGTH_PATH: path, leak.ISOLATION_PATH: isolation}
+        return PARAMETER_DEFAULTS | table_4_1(**changes) | own | (further or {})
 
     return parameters
 
@@ -33,7 +33,7 @@ def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
     shots = prepare_single_category(
         leaking(path=40.0, further=further, range=1500.0, fft_size=2**14), WITH
     )
-    scale, line = leak.line_of(shots, 0, segment)
+    scale, line = leak.leak_line_of_point(shots, 0, segment)
     # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
     beat = -sign * 1e9 / 500e-6 * 40.0 / LIGHT
     amplitude = 2 * 1.1 * np.sqrt(1e-3 * 1.0 / ISOLATION) * 7e3 / (1 + (beat / 4e8) ** 2)
@@ -47,9 +47,9 @@ def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
             seen = np.abs(np.fft.fft(window * tone / 2))
         powers, most = powers + seen**2 / 64, np.maximum(most, seen)
     floor = 1e-9 * amplitude * 2**14
-    np.testing.assert_allclose(scale * line.rms, np.sqrt(powers), rtol=1e-9, atol=floor)
-    assert (scale * line.most >= most - floor).all()
-    np.testing.assert_allclose(scale * line.most, most, rtol=2e-3, atol=floor)
+    np.testing.assert_allclose(scale * line.magnitude_rms, np.sqrt(powers), rtol=1e-9, atol=floor)
+    assert (scale * line.magnitude_max >= most - floor).all()
+    np.testing.assert_allclose(scale * line.magnitude_max, most, rtol=2e-3, atol=floor)
 
 
 def test_the_beats_noise_is_that_of_simulated_records():
@@ -75,13 +75,16 @@ def test_the_beats_noise_is_that_of_simulated_records():
         "receiver.amplifier_bandwidth": 1.0,
     }  # fmt: skip
     given = {f"instrument.{name}": value for name, value in given.items()}
-    given |= {leak.PATH: steps / rate * LIGHT, leak.ISOLATION: 1.0}
-    law = leak.excess(given, "homodyne", "lorentzian")
+    given |= {leak.LEAK_LENGTH_PATH: steps / rate * LIGHT, leak.ISOLATION_PATH: 1.0}
+    law = leak.beat_noise_current_variance(given, "homodyne", "lorentzian")
     # A bin's power has a relative variance of 1.
     spread = 1 / np.sqrt(records * (last - first) / 2)  # of records with all of either noise
     assert density.mean() == pytest.approx(law, rel=5 * spread)
     quiet = given | {"instrument.laser.relative_intensity_noise": 0.0}
-    parts = leak.excess(given, "homodyne", "gaussian"), leak.excess(quiet, "homodyne", "lorentzian")
+    parts = (
+        leak.beat_noise_current_variance(given, "homodyne", "gaussian"),
+        leak.beat_noise_current_variance(quiet, "homodyne", "lorentzian"),
+    )
     assert min(parts) > 0.2 * law  # both are seen
     # All the light of a laser fluctuates together, by what a balanced receiver rejects.
     rejecting = given | {
@@ -90,7 +93,9 @@ def test_the_beats_noise_is_that_of_simulated_records():
     }
     leaked = beat**2 / 4
     more = rin * ((1.0 + leaked) ** 2 - 1.0) / 50.0
-    assert leak.excess(rejecting, "homodyne", "gaussian") == pytest.approx(more, rel=1e-12)
+    assert leak.beat_noise_current_variance(rejecting, "homodyne", "gaussian") == pytest.approx(
+        more, rel=1e-12
+    )
 
 
 def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
@@ -99,7 +104,7 @@ def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
         "instrument.laser.relative_intensity_noise": 1e-15,
         "instrument.receiver.common_mode_rejection": 300.0,
     }  # fmt: skip
-    sources = prepare_single_category(leaking(further=laser), WITH).noise_sources
+    sources = prepare_single_category(leaking(further=laser), WITH).noise_variances
     light, volts = 1 / ISOLATION, 7e3**2
     assert sources["leak_shot"] == pytest.approx(2 * CHARGE * 1.1 * light * 4e8 * volts)
     power = (2 * 1.1) ** 2 * 1e-3 * light / 2  # of the beat [A^2]
@@ -116,33 +121,37 @@ def test_an_echo_that_fades_beside_a_line_crosses_as_drawn(own, line):
     echo = own * np.sqrt(0.5) * (normal[0] + 1j * normal[1])
     phase = np.exp(2j * np.pi * rng.random(number))
     crosses = np.mean(np.abs(echo + line * phase + normal[2] + 1j * normal[3]) >= level)
-    m = leak.raised(np.array([own]), np.array([line]), deviation=1.0, level=level, fades=True)[0]
+    m = leak.raised_magnitude(
+        np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=True
+    )[0]
     law = np.exp(-(level**2) / (2 + m**2))
     assert crosses == pytest.approx(law, abs=5 * np.sqrt(law / number))
 
 
 def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypatch):
-    monkeypatch.setattr(leak, "MASKED_FROM", 0.8)  # for many more alarms than noise makes
+    monkeypatch.setattr(
+        leak, "MASK_THRESHOLD_FRACTION", 0.8
+    )  # for many more alarms than noise makes
     p = leaking(
         path=7.3, isolation=10**9.3, window="rectangular", fft_size=2**12, tnr=8.0,
         reflectance=1e-12, range=2000.0,
     )  # fmt: skip
     shots = prepare_single_category(p, WITH)
-    scale, line = leak.line_of(shots, 0, 0)
-    level, sigma = float(shots.threshold[0]), float(shots.bin_deviation[0])
+    scale, line = leak.leak_line_of_point(shots, 0, 0)
+    level, sigma = float(shots.threshold[0]), float(shots.bin_noise_sigma[0])
     rng, number, size = np.random.default_rng(8), 5_000, 2**12
-    (runs,) = runs_of(shots)
-    masked = scale * line.most >= 0.8 * level
+    (runs,) = iter_spans(shots)
+    masked = scale * line.magnitude_max >= 0.8 * level
     looked = ~masked
     looked[[0, -1]] = False
-    looked[runs.low[0, 0] + np.flatnonzero(runs.exempt[: runs.bins[0, 0]])] = False
+    looked[runs.first_bin[0, 0] + np.flatnonzero(runs.is_exempt[: runs.n_bins[0, 0]])] = False
     beat = 1e9 / 500e-6 * 7.3 / LIGHT
     n, alarms = np.arange(size), 0
     for phase in 2 * np.pi * rng.random(number):
         noise = rng.normal(size=size) * np.sqrt(shots.noise_variance[0])
         tone = 2 * scale * np.cos(2 * np.pi * beat * n / 6e8 + phase)
         alarms += (np.abs(np.fft.rfft(noise + tone))[looked] >= level).any()
-    found = shot.statistics(shots)
+    found = evaluation.shot_statistics(shots)
     none = 1 - np.exp(-(level**2) / 2 / sigma**2)
     expected = 1 - (1 - found["p_leakage_up"][0]) * none ** looked.sum()
     assert 0.02 < expected < 0.9
@@ -156,7 +165,9 @@ def test_a_steady_echo_beside_a_line_crosses_nearly_as_drawn():
     phase = np.exp(2j * np.pi * rng.random(number))
     noise = rng.normal(size=number) + 1j * rng.normal(size=number)
     crosses = np.mean(np.abs(own + line * phase + noise) >= level)
-    m = leak.raised(np.array([own]), np.array([line]), deviation=1.0, level=level, fades=False)
+    m = leak.raised_magnitude(
+        np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=False
+    )
     # Powers add, in place of the mean of the crossings over the phase: within 0.03.
     assert crosses == pytest.approx(float(marcum_q1(m, level).q[0]), abs=0.03)
     assert crosses > float(marcum_q1(own, level).q) + 0.05
@@ -166,10 +177,10 @@ def test_near_echoes_are_hidden_and_far_ones_are_not(leaking):
     far, near = (
         {"range": r, "radial_velocity": 0.0, "tnr": 8.0, "window": "hann"} for r in (2000.0, 8.0)
     )
-    hidden = shot.evaluate(leaking(**near), WITH)
+    hidden = evaluation.evaluate(leaking(**near), WITH)
     assert hidden["pd_up"] == 0 and hidden["miss_up"] == 1
-    assert shot.evaluate(leaking(**near), CORE)["pd_up"] > 0.999
-    seen, alone = (shot.evaluate(leaking(**far), e) for e in (WITH, CORE))
+    assert evaluation.evaluate(leaking(**near), DEFAULT_EFFECTS)["pd_up"] > 0.999
+    seen, alone = (evaluation.evaluate(leaking(**far), e) for e in (WITH, DEFAULT_EFFECTS))
     assert seen["pd_up"] == pytest.approx(alone["pd_up"], abs=1e-3)
     assert seen["pd_up"] > 0.9
     # Masked bins are not searched.

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from sweep.model.effects.atmosphere import (
-    PROFILES,
-    Profile,
-    exponential,
-    layer,
+    EXTINCTION_PROFILES,
+    ExtinctionProfile,
+    exponential_profile,
+    extinction_from_visibility,
+    layer_profile,
     optical_depth,
-    visibility_extinction,
 )
 
 HEIGHT = st.floats(0, 20e3)
@@ -21,7 +21,7 @@ HEIGHT = st.floats(0, 20e3)
 @given(HEIGHT, HEIGHT, st.floats(1, 3), st.floats(200, 20e3))
 def test_slant_paths_through_an_exponential_atmosphere(start, end, stretch, scale):
     """alpha_0 H (e^(-h0/H) - e^(-h1/H)) R / (h1 - h0); a level path has alpha(h) R."""
-    profile = exponential(surface_extinction=3e-4, scale_height=scale)
+    profile = exponential_profile(surface_extinction=3e-4, scale_height=scale)
     length = stretch * max(abs(end - start), 1.0)
     found = optical_depth(profile, start_height=start, end_height=end, range=length)
     x = (end - start) / scale
@@ -31,7 +31,9 @@ def test_slant_paths_through_an_exponential_atmosphere(start, end, stretch, scal
 
 
 def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
-    profile = Profile((0.0, 100.0, 100.0, 400.0, 600.0, 900.0), (2e-4, 1e-4, 5e-5, 0.0, 0.0, 3e-5))
+    profile = ExtinctionProfile(
+        (0.0, 100.0, 100.0, 400.0, 600.0, 900.0), (2e-4, 1e-4, 5e-5, 0.0, 0.0, 3e-5)
+    )
 
     def local(h):
         if h >= 900:
@@ -63,14 +65,14 @@ def test_a_table_with_a_step_a_gap_and_an_end_is_integrated_row_by_row():
 )  # fmt: skip
 def test_attenuation_at_1550_nm_is_that_published_for_the_visibility(visibility, decibels):
     """dB/km of Kim, McArthur and Korevaar's table (2001), which prints one or two digits."""
-    extinction = visibility_extinction(visibility=visibility, wavelength=1550e-9)
+    extinction = extinction_from_visibility(visibility=visibility, wavelength=1550e-9)
     found = 10 * np.log10(np.e) * extinction * 1e3
     digit = 10.0 if decibels > 50 else 10 ** np.floor(np.log10(decibels))
     assert abs(found - decibels) <= max(0.5 * digit, 0.005 * decibels)
 
 
 def test_visibility_is_where_green_contrast_falls_to_two_percent():
-    seen = visibility_extinction(visibility=7e3, wavelength=0.55e-6)
+    seen = extinction_from_visibility(visibility=7e3, wavelength=0.55e-6)
     assert np.exp(-seen * 7e3) == pytest.approx(0.02, rel=1e-12)
 
 
@@ -78,9 +80,11 @@ def test_the_tables_have_their_optical_depths():
     """Seen from straight above; the Mars of usual seasons lets 61 % of sunlight through."""
     for name, depth in (("mars_clear", 0.5), ("mars_dusty", 1.0), ("mars_storm", 5.0),
                         ("earth_clear", 0.0530), ("earth_haze", 0.289)):  # fmt: skip
-        found = optical_depth(PROFILES[name], start_height=0.0, end_height=4e5, range=4e5)
+        found = optical_depth(
+            EXTINCTION_PROFILES[name], start_height=0.0, end_height=4e5, range=4e5
+        )
         assert found == pytest.approx(depth, rel=5e-3), name
-    dust = layer(optical_depth=1.2, depth=30.0)
+    dust = layer_profile(optical_depth=1.2, depth=30.0)
     seen = [(1000.0, 0.0, 1000.0), (15.0, 0.0, 15.0), (10.0, 10.0, 50.0), (1000.0, 40.0, 2000.0)]
     depths = [optical_depth(dust, start_height=a, end_height=b, range=r) for a, b, r in seen]
     assert depths == pytest.approx([1.2, 0.6, 2.0, 0.0], rel=1e-12)
@@ -89,7 +93,7 @@ def test_the_tables_have_their_optical_depths():
 def test_paths_are_worked_out_together_as_one_by_one():
     start = np.linspace(0, 9e3, 7)[:, None]
     end = np.linspace(0, 2e3, 5)
-    profile = PROFILES["earth_haze"]
+    profile = EXTINCTION_PROFILES["earth_haze"]
     table = optical_depth(profile, start_height=start, end_height=end, range=1e4)
     for i, j in np.ndindex(table.shape):
         one = optical_depth(profile, start_height=start[i, 0], end_height=end[j], range=1e4)
@@ -99,6 +103,8 @@ def test_paths_are_worked_out_together_as_one_by_one():
 @pytest.mark.parametrize("height", [1e15, -1e15, 1e25])
 def test_paths_so_high_that_float64_knows_no_difference_have_a_depth(height):
     found = optical_depth(
-        PROFILES["earth_haze"], start_height=height, end_height=height + 1e-3, range=10.0
+        EXTINCTION_PROFILES["earth_haze"], start_height=height, end_height=height + 1e-3, range=10.0
     )
-    assert found == pytest.approx(0.0 if height > 0 else PROFILES["earth_haze"].extinction[0] * 10)
+    assert found == pytest.approx(
+        0.0 if height > 0 else EXTINCTION_PROFILES["earth_haze"].extinction[0] * 10
+    )

@@ -5,30 +5,41 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.model import philox, window
-from sweep.model.detection import (
-    STEADY,
-    BinLevels,
+from sweep.model import window
+from sweep.model.beamlets import plane_footprint
+from sweep.model.detection.echo_detection import (
+    NO_SPECKLE,
+    BinThreshold,
     DetectionRule,
-    Fading,
-    fading_together,
-    found_pair,
+    SegmentCorrelations,
+    joint_pd_in_speckle,
+    pd_and_miss,
 )
-from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_factors
-from sweep.model.effects.catalogue import CORE
-from sweep.model.footprint import plane_footprint
-from sweep.model.ground import Cast, Footprints
-from sweep.model.groups import groups
-from sweep.model.marcum import marcum_q1
-from sweep.model.outputs import DRAW_OUTPUTS
-from sweep.model.realisations import realise
-from sweep.model.returns import draw_returns
-from sweep.model.shot import find, prepare, prepare_cast, statistics
-from sweep.model.speckle_correlation import SEGMENT_PAIRS
-from sweep.model.speckle_modes import NO_MODES
+from sweep.model.detection.marcum import marcum_q1
+from sweep.model.detection.speckle_correlation import SEGMENT_PAIRS
+from sweep.model.detection.speckle_modes import NO_MODES
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import (
+    evaluate_segments,
+    prepare_ray_traced_shots,
+    prepare_shots,
+    shot_statistics,
+)
+from sweep.model.ground import BeamletTable, RayTracedGround
+from sweep.model.outputs import DRAW_COUNT_OUTPUTS
+from sweep.model.pointcloud.bin_groups import list_bin_groups
+from sweep.model.pointcloud.returns import draw_returns
+from sweep.model.sampling import philox
+from sweep.model.sampling.draws import (
+    DrawRanges,
+    count_by_probability,
+    count_in_noise,
+    speckle_factors,
+)
+from sweep.model.sampling.realisations import iter_realisations
 
-FADING = (*CORE, "fading")
-COUNTS = list(DRAW_OUTPUTS)
+FADING = (*DEFAULT_EFFECTS, "fading")
+COUNTS = list(DRAW_COUNT_OUTPUTS)
 
 
 def amplitudes(rng, size):
@@ -40,8 +51,8 @@ def of_one_bin(magnitude, level):
     """Chances of a bin in noise of power 1 to be found, and to be missed."""
     rule = DetectionRule(0, 0, np.empty((3, 0)), 0.0, 0, np.empty(0), NO_MODES)
     noise = np.sqrt(0.5)
-    levels, one = BinLevels(noise, level, noise, noise), np.ones(1, bool)
-    return found_pair(np.array([magnitude]), one, 0, 5, rule, levels, STEADY)
+    levels, one = BinThreshold(noise, level, noise, noise), np.ones(1, bool)
+    return pd_and_miss(np.array([magnitude]), one, 0, 5, rule, levels, NO_SPECKLE)
 
 
 def db(value):
@@ -58,7 +69,7 @@ def test_closed_forms_are_the_mean_over_draws(snr, alike):
     up = np.abs(root * first + amplitudes(rng, number)) > level
     down = np.abs(0.7 * root * second + amplitudes(rng, number)) > level
     pd, weaker = of_one_bin(root, level)[0], of_one_bin(0.7 * root, level)[0]
-    both = fading_together(pd, weaker, np.sqrt(2) * level, np.asarray(alike))
+    both = joint_pd_in_speckle(pd, weaker, np.sqrt(2) * level, np.asarray(alike))
     for found, told in ((up.mean(), pd), ((up & down).mean(), both)):
         assert abs(found - told) < 5 * np.sqrt(told * (1 - told) / number)
 
@@ -78,7 +89,7 @@ def test_printed_values_without_fading(snr, pd):
 
 
 def prepared(parameters, effects=FADING):
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
@@ -95,13 +106,13 @@ def sloping(table_4_1):
 def test_it_is_what_drawn_speckle_comes_to(sloping):
     """The random effect draws each beamlet's amplitude, and has a spectrum for each draw."""
     shots = prepared(sloping)
-    assert 0.2 < abs(shots.fading.over[0]) < 0.98
-    outputs = statistics(shots)
+    assert 0.2 < abs(shots.segment_correlations.up_down[0]) < 0.98
+    outputs = shot_statistics(shots)
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
     rough = sloping | {"target.roughness": np.inf}
     drawn = [
-        statistics(each.shots)
-        for each in realise(rough, (*CORE, "speckle"), keys=key, draws=number)
+        shot_statistics(each.shots)
+        for each in iter_realisations(rough, (*DEFAULT_EFFECTS, "speckle"), keys=key, draws=number)
     ]
     for name in ("pd_up", "pd_shot"):
         values = np.concatenate([each[name] for each in drawn])
@@ -116,23 +127,27 @@ def beamlet_correlation(shots, first, second):
     Amplitudes count by the window's transform about its middle at each beamlet's line.
     """
     samples = np.arange(shots.window.length)
-    w = window.samples(shots.window.name, shots.window.length)
+    w = window.window_samples(shots.window.name, shots.window.length)
     middle = float(shots.acquisition_delay + shots.record_duration[0] / 2)
     delay = 2 * float(shots.range[0]) / 299792458
     fields = []
     for s in (first, second):
-        segment = shots.waveform[s]
+        segment = shots.waveform_segments[s]
         rate, carrier = float(segment.chirp_rate), float(segment.carrier)
-        start = float(np.ravel(shots.schedule[s])[0])
-        apart = delay * shots.offset[0] - shots.doppler[0] * (start + middle)  # of delays, then
+        start = float(np.ravel(shots.scheduled_segment_starts[s])[0])
+        apart = delay * shots.relative_range_offset[0] - shots.doppler_ratio_offset[0] * (
+            start + middle
+        )  # of delays, then
         cycles = -(carrier + rate * (middle - delay)) * apart
-        line = (carrier * shots.doppler[0] - rate * delay * shots.offset[0]) / shots.sample_rate[0]
-        axis = carrier * float(np.ravel(segment.beta)[0]) - rate * delay
+        line = (
+            carrier * shots.doppler_ratio_offset[0] - rate * delay * shots.relative_range_offset[0]
+        ) / shots.sample_rate[0]
+        axis = carrier * float(np.ravel(segment.doppler_ratio)[0]) - rate * delay
         place = axis / shots.sample_rate[0] * shots.fft_size
         off = (np.rint(place) - place) / shots.fft_size
         turns = (off - line)[:, None] * (samples - shots.window.length / 2)
         fields.append((w * np.cos(2 * np.pi * turns)).sum(axis=1) * np.exp(2j * np.pi * cycles))
-    power = shots.amplitude[0] ** 2
+    power = shots.relative_amplitude[0] ** 2
     strength = [(power * np.abs(field) ** 2).sum() for field in fields]
     return (power * fields[1] * fields[0].conj()).sum() / np.sqrt(np.prod(strength))
 
@@ -158,7 +173,7 @@ def test_correlations_are_the_sum_over_many_beamlets(order, changed, near, slopi
     }  # fmt: skip
     shots = prepared(several | changed | {"footprint.beamlets": 2})
     fine = prepared(several | changed | {"footprint.beamlets": 1024, "footprint.pattern": "square"})
-    for found, pair in zip(shots.fading, SEGMENT_PAIRS, strict=True):
+    for found, pair in zip(shots.segment_correlations, SEGMENT_PAIRS, strict=True):
         assert found[0] == pytest.approx(beamlet_correlation(fine, *pair), abs=near)
 
 
@@ -167,13 +182,17 @@ def test_segments_of_a_cast_footprint_do_not_agree_by_few_rays(transverse, slopi
     """Nineteen rays of a hexagon repeat themselves where the Doppler shifts turn by 5 rad."""
     p = sloping | {"target.radial_velocity": 30.0}
     offset, cosine, weight, closing = plane_footprint(
-        grazing_angle=np.array([np.pi / 2]), beam_divergence=np.array([50e-6]), number=19,
-        radial=30.0, transverse=transverse,
+        grazing_angle=np.array([np.pi / 2]), beam_divergence=np.array([50e-6]), n_beamlets=19,
+        radial_velocity=30.0, transverse_velocity=transverse,
     )  # fmt: skip
-    cast = Cast(Footprints(np.zeros(1, int), offset, 2 * closing / 299792458, weight * cosine))
-    shots = prepare_cast(p, cast, FADING)
+    cast = RayTracedGround(
+        BeamletTable(np.zeros(1, int), offset, 2 * closing / 299792458, weight * cosine)
+    )
+    shots = prepare_ray_traced_shots(p, cast, FADING)
     turn = 2 * np.pi * 2 / 1550e-9 * transverse * 12.5e-6 * 1e-3
-    assert abs(shots.fading.over[0]) == pytest.approx(np.exp(-0.5 * turn**2), abs=1e-4)
+    assert abs(shots.segment_correlations.up_down[0]) == pytest.approx(
+        np.exp(-0.5 * turn**2), abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("angle", [np.pi / 2, np.pi / 4])
@@ -187,16 +206,16 @@ def test_drawn_speckle_has_as_many_beamlets_as_its_segments_need(divergence, ang
     }  # fmt: skip
     drawn = prepared(p | {"target.roughness": np.inf})
     share = abs(beamlet_correlation(drawn, 0, 2)) ** 2
-    assert share == pytest.approx(abs(prepared(p).fading.over[0]) ** 2, abs=2e-3)
+    assert share == pytest.approx(abs(prepared(p).segment_correlations.up_down[0]) ** 2, abs=2e-3)
 
 
 @pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])
 def test_drawn_factors_have_the_correlations(near):
     number = 50_000
     far = 0.1 - 0.4j if near != 1.0 else 1.0
-    fading = Fading(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
-    key, mixing = (np.uint64(3), np.uint64(4)), fading.mixing()[:, 0]
-    found = [fading_factors(key, draw, 0, mixing) for draw in np.arange(number)]
+    fading = SegmentCorrelations(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
+    key, mixing = (np.uint64(3), np.uint64(4)), fading.cholesky_factors()[:, 0]
+    found = [speckle_factors(key, draw, 0, mixing) for draw in np.arange(number)]
     power = np.array(found).T ** 2
     assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
     pairs = np.corrcoef(power)[[0, 1, 0], [1, 2, 2]]  # of powers, |mu|^2
@@ -209,13 +228,13 @@ def test_drawn_factors_have_the_correlations(near):
 def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping, noisy, rule):
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=7)
     shots = prepared(sloping | {"instrument.processing.detection": rule})
-    outputs = statistics(shots)
-    rows = Rows(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
+    outputs = shot_statistics(shots)
+    rows = DrawRanges(np.zeros(1, np.int64), key, np.array([0]), np.array([number]))
     counts = np.zeros((len(COUNTS), 1, 1), np.int64)
     if noisy:
         count_in_noise(rows, np.array([0, number]), shots, counts)
     else:
-        count_by_chance(rows, np.array([0, number]), outputs, counts)
+        count_by_probability(rows, np.array([0, number]), outputs, counts)
     told = [outputs[f"pd_{name}"][0] for name in ("up", "down", "shot")]
     share = counts[[0, 1, 3], 0, 0] / number
     assert np.all(
@@ -223,7 +242,7 @@ def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping
     )
     assert told[2] > told[0] * told[1] + 0.02
     method = "noise" if noisy else "probabilities"
-    drawn = draw_returns(shots, groups(shots), keys=key, draws=number, method=method)
+    drawn = draw_returns(shots, list_bin_groups(shots), keys=key, draws=number, method=method)
     paired = ((drawn.group[0, :, :, 0] == 0) & (drawn.group[0, :, :, 2] == 0)).any(axis=1)
     # Flights draw the lines of footprints, which grids do not.
     spread = np.sqrt(2 * told[2] * (1 - told[2]) / number)
@@ -238,14 +257,14 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
     turn = np.array([0.0, 20.0, 40.0])[:, None] + np.zeros((1, 3, 2))
     shots = replace(
         shots,
-        fading=Fading(apart, apart, apart),
-        speckle_lines=shots.speckle_lines._replace(turn=turn),
+        segment_correlations=SegmentCorrelations(apart, apart, apart),
+        line_gradients=shots.line_gradients._replace(phase=turn),
     )
     method = "noise" if noisy else "probabilities"
-    found = groups(shots)
+    found = list_bin_groups(shots)
     drawn = draw_returns(shots, found, keys=key, draws=number, method=method)
     there = (drawn.group[0, :, 0, 0] == 0) & (drawn.group[0, :, 0, 2] == 0)
-    sigma, level = shots.line_deviation[0], shots.threshold[0]
+    sigma, level = shots.line_noise_sigma[0], shots.threshold[0]
     up, down = found.magnitude[0, 0, 0], found.magnitude[0, 2, 0]
     loud = drawn.snr[0, there, 0] > (level / sigma) ** 2  # of the weaker one: twice the least
     told, higher = (
@@ -258,5 +277,8 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
 
 def test_a_smooth_surface_does_not_fade(sloping):
     coherent = sloping | {"footprint.phases": "coherent"}
-    assert prepared(coherent).fading is None
-    assert np.array_equal(find(prepared(coherent)), find(prepared(coherent, CORE)))
+    assert prepared(coherent).segment_correlations is None
+    assert np.array_equal(
+        evaluate_segments(prepared(coherent)),
+        evaluate_segments(prepared(coherent, DEFAULT_EFFECTS)),
+    )

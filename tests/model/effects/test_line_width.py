@@ -5,9 +5,9 @@ import pytest
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import line_width
-from sweep.model.shot import evaluate, prepare
-from sweep.model.truth import analytic_record
-from sweep.model.window import samples, transform, window
+from sweep.model.evaluation import evaluate, prepare_shots
+from sweep.model.time_domain_truth import analytic_record
+from sweep.model.window import direct_transform, get_window, window_samples
 
 WINDOWS = ("rectangular", "hann", "hamming", "flattop", "kaiser(8.6)")
 LENGTH = 256
@@ -19,7 +19,7 @@ DURATION = LENGTH / RATE
 
 def by_lags(name, y, correlation):
     """Mean |W|^2-like power at y bins from the line, from the beat's autocorrelation at lags."""
-    w = samples(name, LENGTH)
+    w = window_samples(name, LENGTH)
     r = np.correlate(w, w, "full")[LENGTH - 1 :]
     j = np.arange(1, LENGTH)
     turns = np.cos(2 * np.pi * np.outer(y, j) / LENGTH)
@@ -28,9 +28,11 @@ def by_lags(name, y, correlation):
 
 def gaussian_power(name, y, fwhm):
     """The module's mean power of a single line, from its shifts."""
-    shifts = line_width.gaussian_shifts(fwhm=np.array([fwhm]), duration=np.array([DURATION]))
-    form = window(name, LENGTH)
-    each = np.abs(transform(form, (y[:, None] - shifts.offset[0]).ravel())) ** 2
+    shifts = line_width.gaussian_frequency_shifts(
+        fwhm=np.array([fwhm]), duration=np.array([DURATION])
+    )
+    form = get_window(name, LENGTH)
+    each = np.abs(direct_transform(form, (y[:, None] - shifts.offset_window_bins[0]).ravel())) ** 2
     return each.reshape(y.size, -1) @ shifts.weight[0]
 
 
@@ -45,7 +47,7 @@ def test_records_of_normal_frequencies_have_the_gaussian_lines_mean_power(name, 
     # Further out the mean is made by lines so rare that their spread can not be estimated.
     bins = BINS[np.abs(BINS - PLACE) < 2.5 * deviation + 2]
     expected = gaussian_power(name, bins - PLACE, bins_fwhm / DURATION)
-    w = samples(name, LENGTH)
+    w = window_samples(name, LENGTH)
     power = np.abs(np.fft.fft(records * w, axis=1)[:, bins]) ** 2
     error = power.std(axis=0, ddof=1) / np.sqrt(len(power))
     assert (np.abs(power.mean(axis=0) - expected) < 5 * error + 1e-12 * w.sum() ** 2).all()
@@ -63,16 +65,16 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
     lag = np.arange(LENGTH) / LENGTH
     expected = by_lags(name, y, np.exp(-2 * (np.pi * deviation * lag) ** 2))
     found = gaussian_power(name, y, bins_fwhm / DURATION)
-    top = samples(name, LENGTH).sum() ** 2
-    assert np.abs(found - expected).max() < 10 * line_width.TOLERANCE * top
+    top = window_samples(name, LENGTH).sum() ** 2
+    assert np.abs(found - expected).max() < 10 * line_width.MEAN_POWER_TOLERANCE * top
 
 
 def lorentzian_power(name, laser_width, delay):
     """The module's mean power of a single line in its bin: pure line and pedestal."""
     laser = {"line_width": np.array([laser_width]), "delay": np.array([delay]),
              "duration": np.array([DURATION])}  # fmt: skip
-    pedestal = line_width.power_under_line(window=window(name, LENGTH), **laser)
-    pure = line_width.coherent_share(**laser) * samples(name, LENGTH).sum() ** 2
+    pedestal = line_width.pedestal_power_under_line(window=get_window(name, LENGTH), **laser)
+    pure = line_width.coherent_power_fraction(**laser) * window_samples(name, LENGTH).sum() ** 2
     return pure + pedestal, pedestal
 
 
@@ -96,15 +98,17 @@ def test_pure_line_and_pedestal_are_the_autocorrelation_at_every_lag(name, laser
 def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
     """Sums over all pairs of samples, of phases less their mean under the window."""
     length = 1024
-    n, w, delay = np.arange(length), samples(name, length), length / delays
+    n, w, delay = np.arange(length), window_samples(name, length), length / delays
     covariance = g * np.maximum(1 - np.abs(n[:, None] - n) / delay, 0.0)
     shared = covariance @ w / w.sum()
     rest = covariance - shared[:, None] - shared + w @ shared / w.sum()
     line = w * np.exp(-np.diag(rest) / 2)
     expected = line @ (np.cosh(rest) - 1) @ line
     laser = {"line_width": np.array([g / (2 * np.pi * delay)]), "delay": np.array([delay])}
-    form = window(name, length)
-    share, in_phase = line_width.seen_line(duration=np.array([float(length)]), window=form, **laser)
+    form = get_window(name, length)
+    share, in_phase = line_width.apparent_line_and_pedestal(
+        duration=np.array([float(length)]), window=form, **laser
+    )
     np.testing.assert_allclose(share * form.sum**2, line.sum() ** 2, rtol=1e-4)
     np.testing.assert_allclose(in_phase, expected, rtol=2e-3)
 
@@ -113,11 +117,15 @@ def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
 def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(delay):
     """Of what differs by u samples the variance is 2 Gamma min(u, tau), to 5 sigma."""
     rng, per_sample, number = np.random.default_rng(5), 1e-3, 2000
-    steps = line_width.walk_steps(delay=delay, length=LENGTH)
-    phases = np.array([
-        line_width.walked_phase(rng.standard_normal(steps), per_sample=per_sample, delay=delay)
-        for _ in range(number)
-    ])  # fmt: skip
+    steps = line_width.n_phase_walk_steps(delay=delay, length=LENGTH)
+    phases = np.array(
+        [
+            line_width.phase_walk(
+                rng.standard_normal(steps), variance_per_sample=per_sample, delay=delay
+            )
+            for _ in range(number)
+        ]
+    )
     assert phases.shape == (number, LENGTH)
     for u in (1, 10, 19, 21, 200):
         expected = 2 * per_sample * min(u, delay)
@@ -135,8 +143,8 @@ def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1
         "target.radial_velocity": 0.0,
         "footprint.beamlets": 1,
     }
-    ((_, shots),) = prepare(point, ("doppler",))
-    record = samples("hamming", length) * analytic_record(shots, 0, 0, 0) / 2
+    ((_, shots),) = prepare_shots(point, ("doppler",))
+    record = window_samples("hamming", length) * analytic_record(shots, 0, 0, 0) / 2
     peak = np.abs(np.fft.fft(record)).argmax()
     record *= np.exp(-2j * np.pi * peak * np.arange(length) / length)
     walk = rng.standard_normal((number, length + delay)).cumsum(axis=1) * np.sqrt(g / delay)
@@ -144,7 +152,7 @@ def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1
     noise = rng.standard_normal(number) + 1j * rng.standard_normal(number)
     for line in (0.7, 1.0, 1.3):  # over the threshold, by the pure line's power
         factor = line * shots.threshold[0] * np.exp(g / 2) / abs(record.sum())
-        drawn = np.abs(factor * seen + shots.bin_deviation[0] * noise) >= shots.threshold[0]
+        drawn = np.abs(factor * seen + shots.bin_noise_sigma[0] * noise) >= shots.threshold[0]
         changes = {
             "instrument.laser.power": 1e-4 * factor**2,
             "instrument.laser.line_width": g * rate / (2 * np.pi * delay),

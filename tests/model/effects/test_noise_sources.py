@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from random_planner_points import planner_inputs
 
-from sweep.model import shot, window
-from sweep.model.effects.noise_sources import current_variance, echo_size, sun_size
-from sweep.model.link import bin_deviation
+from sweep.model import evaluation, window
+from sweep.model.effects.noise_sources import (
+    intensity_noise_current_variance,
+    signal_shot_noise_bound,
+    solar_background_bound,
+)
+from sweep.model.receiver_chain import bin_noise_sigma
 
 OTHERS = 1.53715e-13
 """Current variance of Table 4.1 [A^2]: 1.40992e-13 of it shot noise of 1 mW."""
@@ -22,7 +26,9 @@ def fluctuating(density, power, *, rejection=1.0, apd_gain=1.0, responsivity=1.1
         "amplifier_bandwidth": bandwidth,
     }  # fmt: skip
     given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
-    return current_variance(given | {"instrument.laser.relative_intensity_noise": density})
+    return intensity_noise_current_variance(
+        given | {"instrument.laser.relative_intensity_noise": density}
+    )
 
 
 def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
@@ -38,9 +44,9 @@ def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
         solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024,
         optical_efficiency=0.8,
     )  # fmt: skip
-    found = sun_size(planner_inputs(scene))
-    assert found.threshold_follows
-    assert found.noise == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
+    found = solar_background_bound(planner_inputs(scene))
+    assert found.threshold_follows_noise
+    assert found.noise_variance_change == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
 
 
 def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
@@ -50,12 +56,12 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     """
     distance = np.array([1.0, 2.0, 5.0, 20.0])
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
-    found = echo_size(planner_inputs(parameters))
+    found = signal_shot_noise_bound(planner_inputs(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
-    np.testing.assert_allclose(found.noise, share, rtol=1e-4)
-    assert not found.threshold_follows
-    predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + found.noise))
-    np.testing.assert_allclose(shot.evaluate(parameters)["pfa_bin"], predicted, rtol=1e-5)
+    np.testing.assert_allclose(found.noise_variance_change, share, rtol=1e-4)
+    assert not found.threshold_follows_noise
+    predicted = np.exp(-(4 - np.pi) / 4 * 100 / (1 + found.noise_variance_change))
+    np.testing.assert_allclose(evaluation.evaluate(parameters)["pfa_bin"], predicted, rtol=1e-5)
     rise = predicted / np.exp(-(4 - np.pi) / 4 * 100) - 1
     assert rise == pytest.approx([0.166, 0.0392, 0.00617, 3.8e-4], rel=0.02)
 
@@ -75,9 +81,9 @@ def test_two_diodes_that_do_not_match_see_what_is_left_of_a_fluctuating_laser():
         rin, power, rejection=81.0, apd_gain=3.0, responsivity=0.9 * 1.1, bandwidth=rate / 2
     )
     assert current.var() == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
-    hann = window.samples("hann", number)
+    hann = window.window_samples("hann", number)
     bins = np.fft.rfft(hann * (current - current.mean()))[4:-4:4]  # every fourth is independent
-    sigma = bin_deviation(noise_variance=expected, window_energy=(hann**2).sum())
+    sigma = bin_noise_sigma(noise_variance=expected, window_energy=(hann**2).sum())
     assert (abs(bins) ** 2).mean() / 2 / sigma**2 == pytest.approx(1, abs=5 / np.sqrt(bins.size))
 
 

@@ -4,35 +4,39 @@ import numpy as np
 import pytest
 from random_planner_points import effects_kept_in_tile, plan_points, planner_inputs
 
-from sweep.model import sampling, segments, shot, truth
+from sweep.model import evaluation, time_domain_truth
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import overlap, segment_motion
-from sweep.model.effects.catalogue import CORE, DEFAULTS
-from sweep.model.effects.phase_errors import drift_time
-from sweep.model.line_shape import COSINE_SUMS
-from sweep.model.philox import point_keys
-from sweep.model.preparation import RECORD
-from sweep.model.window import last_part, window
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.effects.phase_errors import chirp_drift_time
+from sweep.model.preparation import RECORD_PATH
+from sweep.model.sampling import samplers
+from sweep.model.sampling.philox import point_keys
+from sweep.model.spectrum import segment_spectra
+from sweep.model.spectrum.line_shape import COSINE_SUM_COEFFICIENTS
+from sweep.model.window import get_window, zero_first_samples
 
 AGREEMENT = 1e-9
 """Largest difference of a bin from the truth, relative to a lone line's peak in a whole record."""
-WINDOWS = (*COSINE_SUMS, "kaiser(8.6)", "chebwin(100)", "tukey(0.3)", "bartlett")
-WITH_OVERLAP = (*CORE, "overlap")
+WINDOWS = (*COSINE_SUM_COEFFICIENTS, "kaiser(8.6)", "chebwin(100)", "tukey(0.3)", "bartlett")
+WITH_OVERLAP = (*DEFAULT_EFFECTS, "overlap")
 
 
 def shots_of(parameters, *further):
-    ((_, shots),) = shot.prepare(DEFAULTS | parameters, (*WITH_OVERLAP, *further))
+    ((_, shots),) = evaluation.prepare_shots(
+        PARAMETER_DEFAULTS | parameters, (*WITH_OVERLAP, *further)
+    )
     return shots
 
 
 def difference(shots, i, segment, **how):
     """Largest difference from the truth of any bin, over the peak of all lines in a record."""
-    bins, fast = segments.spectrum(shots, i, segment)
-    exact = truth.spectrum(shots, i, segment, **how)
+    bins, fast = segment_spectra.segment_spectrum(shots, i, segment)
+    exact = time_domain_truth.time_domain_spectrum(shots, i, segment, **how)
     if shots.complex_record:
         exact = np.roll(exact, -(shots.fft_size // 2))[bins % shots.fft_size]
-    scale = shots.window.sum * float(np.broadcast_to(shots.beat_scale, shots.size)[i]) / 2
-    return np.abs(fast - exact).max() / (scale * np.sqrt(shots.relative_echo[i]))
+    scale = shots.window.sum * float(np.broadcast_to(shots.beat_amplitude_scale, shots.size)[i]) / 2
+    return np.abs(fast - exact).max() / (scale * np.sqrt(shots.total_relative_echo[i]))
 
 
 def drawn_scene(table, number):
@@ -53,19 +57,19 @@ def drawn_scene(table, number):
         range=SPEED_OF_LIGHT / 2 * (start + late * record),
         radial_velocity=float(rng.choice([0.0, 30.0, -300.0])),
         bandwidth=1e9 * duration / 500e-6,
-    ) | ({RECORD: "complex"} if number % 4 == 1 else {})  # fmt: skip
+    ) | ({RECORD_PATH: "complex"} if number % 4 == 1 else {})  # fmt: skip
 
 
 @pytest.mark.parametrize("number", range(44))
 def test_lines_are_those_of_the_samples_that_the_echo_has(table_4_1, number):
     scene = drawn_scene(table_4_1, number)
-    if scene.get(RECORD) == "complex":
+    if scene.get(RECORD_PATH) == "complex":
         scene["instrument.receiver.architecture"] = "homodyne"
     moving = () if number % 3 else ("range_walk", "segment_motion")
     shots = shots_of(scene, *moving)
-    assert shots.first_sample is not None
-    for segment in np.flatnonzero(shots.segments).tolist():
-        off = difference(shots, 0, segment, range_walk=bool(moving))
+    assert shots.n_samples_before_echo is not None
+    for segment in np.flatnonzero(shots.has_segment).tolist():
+        off = difference(shots, 0, segment, with_range_walk=bool(moving))
         assert off < (1e-7 if moving else AGREEMENT), scene
 
 
@@ -83,21 +87,21 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
     ) | {"target.acceleration": 2e6}  # fmt: skip
     shots = shots_of(scene, "doppler", "range_walk", "acceleration", "segment_motion")
     for segment in range(3):
-        assert difference(shots, 0, segment, acceleration=True) < 1e-7
+        assert difference(shots, 0, segment, with_acceleration=True) < 1e-7
     bent = scene | {
         "instrument.chirp.quadratic_error": 3e5, "instrument.chirp.sinusoidal_error": 1e5,
     }  # fmt: skip
     whole = shots_of(bent, "chirp_nonlinearity")
     (error,) = whole.phase_errors
-    first = int(whole.first_sample[0, 0]) if whole.first_sample is not None else 0
+    first = int(whole.n_samples_before_echo[0, 0]) if whole.n_samples_before_echo is not None else 0
     length = 2**16 - first
-    values = error.chosen(0, np.array([0]))
+    values = error.select_arguments(0, np.array([0]))
     psi = error.phase(2 * np.arange(length) / length - 1, sign=1, **values)[0]
     plain = shots_of(bent)
-    record = truth.analytic_record(plain, 0, 0, 0, range_walk=False)
+    record = time_domain_truth.analytic_record(plain, 0, 0, 0, with_range_walk=False)
     record[first:] *= np.exp(2j * np.pi * psi)
-    exact = np.abs(np.fft.rfft(window(name, 2**16).samples() * record.real))
-    _, fast = segments.spectrum(whole, 0, 0)
+    exact = np.abs(np.fft.rfft(get_window(name, 2**16).samples() * record.real))
+    _, fast = segment_spectra.segment_spectrum(whole, 0, 0)
     assert np.abs(fast - exact).max() < 1e-9 * 2**16 * np.abs(record).max()
 
 
@@ -116,8 +120,8 @@ def triangle(table, **changes):
 def test_an_echo_in_the_last_part_of_a_record_has_what_is_left_of_the_window(table_4_1):
     """750 m of a chirp of 10 us: Hann's last half has half its sum; at 1,125 m a 25th."""
     ranges = np.array([1.0, 750.0, 1125.0, 1400.0])
-    found = shot.evaluate(triangle(table_4_1, range=ranges), WITH_OVERLAP)
-    ignored = shot.evaluate(triangle(table_4_1, range=ranges), CORE)
+    found = evaluation.evaluate(triangle(table_4_1, range=ranges), WITH_OVERLAP)
+    ignored = evaluation.evaluate(triangle(table_4_1, range=ranges), DEFAULT_EFFECTS)
     loss = 10 * np.log10(found["snr_up"] / ignored["snr_up"])
     n = np.arange(6000)
     w = 0.5 - 0.5 * np.cos(2 * np.pi * n / 6000)
@@ -125,10 +129,10 @@ def test_an_echo_in_the_last_part_of_a_record_has_what_is_left_of_the_window(tab
     # Off a bin the shorter echo's wider line loses less by scalloping, up to Hann's 1.42 dB.
     assert loss == pytest.approx(20 * np.log10(left), abs=1.43)
     shots = shots_of(triangle(table_4_1, range=ranges))
-    exact = truth.find(shots, range_walk=False)
+    exact = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
     for row, name in enumerate(("pd_up", "miss_up")):
         assert found[name] == pytest.approx(exact[0, row], abs=1e-9)
-    assert np.sqrt(2 * found["snr_up"]) * shots.bin_deviation == pytest.approx(exact[0, 2])
+    assert np.sqrt(2 * found["snr_up"]) * shots.bin_noise_sigma == pytest.approx(exact[0, 2])
     assert loss[1] == pytest.approx(-6.0, abs=1.0) and loss[2] < -18
 
 
@@ -136,7 +140,7 @@ def test_nothing_is_detected_where_no_echo_arrives_in_time(table_4_1):
     """Neither in probabilities nor in draws, and nothing is nan that should not be."""
     ranges = np.array([300.0, 1490.0, 1501.0, 5000.0])
     scene = triangle(table_4_1, range=ranges, tnr=3.0)
-    found = shot.evaluate(scene, WITH_OVERLAP)
+    found = evaluation.evaluate(scene, WITH_OVERLAP)
     assert (found["pd_shot"][2:] == 0).all() and (found["miss_shot"][2:] == 1).all()
     assert (found["snr_up"][2:] == 0).all() and (found["p_leakage_up"][2:] == 0).all()
     assert np.isnan(found["range_error"][2:]).all() and np.isnan(found["misread"][2:]).all()
@@ -148,14 +152,16 @@ def test_nothing_is_detected_where_no_echo_arrives_in_time(table_4_1):
         assert found[name] == pytest.approx(np.full(4, found[name][0]), rel=1e-3)
     keys = point_keys(ranges[:, None], domain="test", seed=1)
     for method in ("probabilities", "noise"):
-        drawn = sampling.simulate(scene, WITH_OVERLAP, keys=keys, method=method, batch_sizes=[500])
+        drawn = samplers.simulate_draws(
+            scene, WITH_OVERLAP, keys=keys, method=method, batch_sizes=[500]
+        )
         assert (drawn["n_detected_shot"][2:] == 0).all() and (drawn["n_detected_up"][2:] == 0).all()
         assert drawn["n_detected_shot"][0, 0] == 500
 
 
 def test_noise_and_threshold_are_those_of_the_whole_record(table_4_1):
     scene = triangle(table_4_1, range=np.array([10.0, 700.0, 1490.0]))
-    with_it, without = (shot.evaluate(scene, e) for e in (WITH_OVERLAP, CORE))
+    with_it, without = (evaluation.evaluate(scene, e) for e in (WITH_OVERLAP, DEFAULT_EFFECTS))
     for name in ("noise_variance", "pfa_bin", "log10_pfa_bin"):
         assert (with_it[name] == without[name]).all()
 
@@ -166,8 +172,11 @@ def test_points_whose_echo_fills_the_record_keep_their_bits(table_4_1):
     scene = table_4_1(range=ranges, acquisition_delay=3e-6, fft_size=2**14, beamlets=7)
     early = 2 * ranges / SPEED_OF_LIGHT < 3e-6
     assert 5 < early.sum() < 35
-    for effects in (CORE, (*CORE, "range_walk", "segment_motion")):
-        on, off = shot.evaluate(scene, (*effects, "overlap")), shot.evaluate(scene, effects)
+    for effects in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "range_walk", "segment_motion")):
+        on, off = (
+            evaluation.evaluate(scene, (*effects, "overlap")),
+            evaluation.evaluate(scene, effects),
+        )
         for name in on:
             assert np.array_equal(on[name][early], off[name][early], equal_nan=True), name
         assert (on["snr_up"][~early] != off["snr_up"][~early]).all()
@@ -177,9 +186,9 @@ def test_a_points_bits_do_not_depend_on_the_points_beside_it(table_4_1):
     ranges = np.linspace(100.0, 4000.0, 60)
     scene = table_4_1(range=ranges, fft_size=2**14, beamlets=7, radial_velocity=20.0)
     effects = (*WITH_OVERLAP, "range_walk", "segment_motion")
-    together = shot.evaluate(scene, effects)
+    together = evaluation.evaluate(scene, effects)
     for i in (3, 30, 59):
-        alone = shot.evaluate(scene | {"target.range": ranges[i : i + 1]}, effects)
+        alone = evaluation.evaluate(scene | {"target.range": ranges[i : i + 1]}, effects)
         for name in together:
             assert np.array_equal(alone[name][0], together[name][i], equal_nan=True), name
 
@@ -194,7 +203,7 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
         rng = np.random.default_rng((seed, 8))
         number = 8
         start = float(rng.choice([0.0, 1e-6]))
-        scene = DEFAULTS | table_4_1(
+        scene = PARAMETER_DEFAULTS | table_4_1(
             window=str(rng.choice(["hann", "hamming", "rectangular", "flattop"])),
             fft_size=4096, duration=20e-6, acquisition_delay=start, phases="incoherent",
             beamlets=7, grazing_angle=1.4, reflectance_law="lambert",
@@ -204,16 +213,18 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
         ) | {"footprint.speckle": "none"}  # fmt: skip
         modes = {"range_walk": "off", "acceleration": "off"}
         made = plan_points(planner_inputs(scene), modes, tolerance)
-        row = made.names.index("overlap")
-        kept, dropped = kept + made.kept[row].sum(), dropped + (~made.kept[row]).sum()
+        row = made.effect_names.index("overlap")
+        kept, dropped = kept + made.is_kept[row].sum(), dropped + (~made.is_kept[row]).sum()
         for i in range(number):
             one = {path: v[i : i + 1] if np.ndim(v) else v for path, v in scene.items()}
             shots = shots_of(one, "segment_motion")
-            exact = truth.find(shots, range_walk=False)
-            found = shot.find(*(s for _, s in shot.prepare(one, effects_kept_in_tile(made, i))))
-            allowed = tolerance + made.error[i]
+            exact = time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False)
+            found = evaluation.evaluate_segments(
+                *(s for _, s in evaluation.prepare_shots(one, effects_kept_in_tile(made, i)))
+            )
+            allowed = tolerance + made.total_error[i]
             assert np.nansum(abs(found[:, 0] - exact[:, 0])) <= allowed + 1e-9
-            off = abs(found[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_deviation)
+            off = abs(found[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_noise_sigma)
             assert np.nanmax(off) <= allowed + 1e-9
     # A sample at the start of the chirp never has an echo: 2e-4 of a rectangular record of 4096.
     assert kept > 5 and (dropped > 5 or tolerance < 1e-4)
@@ -222,19 +233,22 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
 def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
     """A beam of 5 mrad on ground at 6 deg, whose echo arrives within 3 us."""
     ranges = np.linspace(200.0, 900.0, 8)
-    scene = DEFAULTS | table_4_1(
+    scene = PARAMETER_DEFAULTS | table_4_1(
         range=ranges, grazing_angle=0.1, beam_divergence=5e-3, fft_size=4096, duration=20e-6,
         phases="incoherent", beamlets=19, bandwidth=1e7, power=1e-3, tnr=5.0, window="hann",
         reflectance_law="lambert", radial_velocity=0.0,
     )  # fmt: skip
     shots = shots_of(scene)
-    fast, exact = shot.find(shots), truth.find(shots, range_walk=False)
+    fast, exact = (
+        evaluation.evaluate_segments(shots),
+        time_domain_truth.evaluate_segments_in_time_domain(shots, with_range_walk=False),
+    )
     made = plan_points(planner_inputs(scene), {}, 0.0)
-    left = overlap.left(planner_inputs(scene))
-    assert (left > 0).any() and (made.error > 0).any()
-    off = abs(fast[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_deviation)
-    assert (np.nanmax(off, axis=0) <= made.error + 1e-9).all()
-    assert (np.nansum(abs(fast[:, 0] - exact[:, 0]), axis=0) <= made.error + 1e-9).all()
+    left = overlap.residual_bound(planner_inputs(scene))
+    assert (left > 0).any() and (made.total_error > 0).any()
+    off = abs(fast[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_noise_sigma)
+    assert (np.nanmax(off, axis=0) <= made.total_error + 1e-9).all()
+    assert (np.nansum(abs(fast[:, 0] - exact[:, 0]), axis=0) <= made.total_error + 1e-9).all()
 
 
 @pytest.mark.parametrize("number", range(24))
@@ -246,7 +260,7 @@ def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, n
     rng = np.random.default_rng((50, number))
     rate, size = float(rng.choice([250e6, 600e6])), int(rng.choice([1024, 4096]))
     duration = float(rng.uniform(0.8, 2.0)) * size / rate
-    scene = DEFAULTS | table_4_1(
+    scene = PARAMETER_DEFAULTS | table_4_1(
         window=str(rng.choice(["hann", "rectangular", "kaiser(8.6)", "flattop"])),
         range=SPEED_OF_LIGHT / 2 * duration * np.sort(rng.uniform(0.05, 0.9, 4)),
         grazing_angle=np.radians(rng.uniform(2, 30)), beam_divergence=10 ** rng.uniform(-3, -2),
@@ -254,25 +268,25 @@ def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, n
         sample_rate=rate, duration=duration, reflectance_law="lambert",
         bandwidth=10 ** rng.uniform(7, 8), power=1.0, tnr=5.0, radial_velocity=0.0,
     )  # fmt: skip
-    shots, bound = shots_of(scene), np.atleast_2d(overlap.left(planner_inputs(scene)))
+    shots, bound = shots_of(scene), np.atleast_2d(overlap.residual_bound(planner_inputs(scene)))
     for i in range(shots.size):
-        for row, segment in enumerate(np.flatnonzero(shots.segments).tolist()):
-            off = difference(shots, i, segment, range_walk=False)
+        for row, segment in enumerate(np.flatnonzero(shots.has_segment).tolist()):
+            off = difference(shots, i, segment, with_range_walk=False)
             assert off <= np.broadcast_to(bound, (3, shots.size))[row, i] + AGREEMENT
 
 
 def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
     """16 looks towards a target at 3 km/s, whose first look has its own number of samples."""
-    scene = DEFAULTS | table_4_1(
+    scene = PARAMETER_DEFAULTS | table_4_1(
         range=np.array([400.0]), fft_size=2048, sample_rate=250e6, duration=10e-6,
         window="rectangular", phases="incoherent", beamlets=1, bandwidth=1e7,
         radial_velocity=3000.0,
     ) | {"instrument.looks.number": 16}  # fmt: skip
-    ((_, shots),) = shot.prepare(scene, (*WITH_OVERLAP, "segment_motion"))
-    bound = float(np.ravel(overlap.left(planner_inputs(scene)))[0])
-    first = segment_motion.looks_of(shots)[0]
+    ((_, shots),) = evaluation.prepare_shots(scene, (*WITH_OVERLAP, "segment_motion"))
+    bound = float(np.ravel(overlap.residual_bound(planner_inputs(scene)))[0])
+    first = segment_motion.split_looks(shots)[0]
     assert 0 < bound < 0.05
-    assert difference(first, 0, 0, range_walk=False) <= bound + AGREEMENT
+    assert difference(first, 0, 0, with_range_walk=False) <= bound + AGREEMENT
 
 
 def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1):
@@ -280,17 +294,19 @@ def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1
     rng = np.random.default_rng(5)
     noticed = 0
     for name in ("hann", "hamming", "flattop", "blackman"):
-        scene = DEFAULTS | table_4_1(
+        scene = PARAMETER_DEFAULTS | table_4_1(
             window=name, fft_size=2**13, phases="incoherent", beamlets=1, duration=20e-6,
             range=rng.uniform(30.0, 2000.0, 30), power=10 ** rng.uniform(-6, 1, 30),
             tnr=rng.uniform(3, 9, 30), radial_velocity=0.0,
         )  # fmt: skip
         made = plan_points(planner_inputs(scene), {}, 0.0)
-        most = made.change[made.names.index("leakage")]
-        found = shot.find(shots_of(scene))
+        most = made.omission_error[made.effect_names.index("leakage")]
+        found = evaluation.evaluate_segments(shots_of(scene))
         extra = np.nansum(found[:, 5], axis=0)
         assert (np.minimum(extra, 1) <= most * (1 + 1e-9) + 1e-12).all()
-        whole = shot.find(*(s for _, s in shot.prepare(scene, CORE)))
+        whole = evaluation.evaluate_segments(
+            *(s for _, s in evaluation.prepare_shots(scene, DEFAULT_EFFECTS))
+        )
         assert np.nansum(found[:, 5]) > np.nansum(whole[:, 5])
         noticed += ((most < 0.5) & (most > 1e-9)).sum()
     assert noticed > 10
@@ -303,11 +319,11 @@ def test_draws_of_noise_and_of_whole_spectra_detect_as_often_as_pd_says(table_4_
     ranges = np.array([400.0, 700.0, 850.0, 950.0])
     scene = triangle(table_4_1, range=ranges, power=2.0, fft_size=4096, tnr=5.0)
     scene |= {"footprint.speckle": "none"}
-    pd = shot.evaluate(scene, WITH_OVERLAP)["pd_up"]
+    pd = evaluation.evaluate(scene, WITH_OVERLAP)["pd_up"]
     assert pd[0] > 0.9 and pd[-1] < 0.5
     keys = point_keys(ranges[:, None], domain="test", seed=2)
-    for method, number in (("noise", 4000), (sampling.SPECTRA, 400)):
-        drawn = sampling.simulate(
+    for method, number in (("noise", 4000), (samplers.SPECTRA_METHOD, 400)):
+        drawn = samplers.simulate_draws(
             scene, WITH_OVERLAP, keys=keys, method=method, batch_sizes=[number]
         )
         share = drawn["n_detected_up"][:, 0] / number
@@ -322,11 +338,11 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         "footprint.speckle": "none",
     }  # fmt: skip
     shots, plain = shots_of(scene, "line_width"), shots_of(scene)
-    first = int(shots.first_sample[0, 0])
-    share = float((shots.beat_scale / plain.beat_scale)[0] ** 2)
+    first = int(shots.n_samples_before_echo[0, 0])
+    share = float((shots.beat_amplitude_scale / plain.beat_amplitude_scale)[0] ** 2)
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
-    w, n = window("hann", 6000).samples(), np.arange(6000)
+    w, n = get_window("hann", 6000).samples(), np.arange(6000)
     lag, steps = round(delay * rate), 6000 + round(delay * rate)
     power = []
     for _ in range(3000):
@@ -334,21 +350,23 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         phase = walk[lag:] - walk[: steps - lag]
         power.append(abs((w * np.exp(1j * phase) * (n >= first)).sum()) ** 2)
     line = (w * (n >= first)).sum() ** 2
-    pedestal = float(np.ravel(shots.pedestal)[0])
-    amplitude = float(np.ravel(plain.beat_scale)[0]) ** 2 * plain.relative_echo[0] / 4
-    told = share + pedestal * window("hann", 6000).energy / amplitude / line
+    pedestal = float(np.ravel(shots.pedestal_variance_under_lines)[0])
+    amplitude = (
+        float(np.ravel(plain.beat_amplitude_scale)[0]) ** 2 * plain.total_relative_echo[0] / 4
+    )
+    told = share + pedestal * get_window("hann", 6000).energy / amplitude / line
     assert np.mean(power) / line == pytest.approx(told, rel=0.15)
     assert share < 0.9
 
 
 def test_the_window_with_samples_that_lack_has_their_sums():
-    whole = window("hamming", 6400)
-    part = last_part(whole, 3200)
+    whole = get_window("hamming", 6400)
+    part = zero_first_samples(whole, 3200)
     w = whole.samples()
     w[:3200] = 0
     assert np.array_equal(part.samples(), w) and part.length == whole.length
     assert part.sum == pytest.approx(w.sum()) and part.energy == pytest.approx((w**2).sum())
-    assert last_part(whole, 0) is whole and last_part(whole, 3200) is part
+    assert zero_first_samples(whole, 0) is whole and zero_first_samples(whole, 3200) is part
 
 
 # What is measured
@@ -362,17 +380,17 @@ def test_range_walk_is_put_right_for_the_part_of_the_record_that_the_echo_has(ta
             range=far, radial_velocity=velocity, beamlets=1, fft_size=2**15, duration=110e-6,
             window="hann", sample_rate=300e6, wavelength=1e-3,
         )  # fmt: skip
-        ((_, still),) = shot.prepare(scene, WITH_OVERLAP)
-        ((_, walking),) = shot.prepare(scene, (*WITH_OVERLAP, "range_walk"))
+        ((_, still),) = evaluation.prepare_shots(scene, WITH_OVERLAP)
+        ((_, walking),) = evaluation.prepare_shots(scene, (*WITH_OVERLAP, "range_walk"))
         padded = 2**19
-        w = window("hann", still.window.length).samples()
+        w = get_window("hann", still.window.length).samples()
         place = []
         for walk in (False, True):
-            record = truth.analytic_record(still, 0, 0, 0, range_walk=walk)
+            record = time_domain_truth.analytic_record(still, 0, 0, 0, with_range_walk=walk)
             place.append(np.argmax(abs(np.fft.fft(w * record, padded))) * 300e6 / padded)
         drift = (place[1] - place[0] + 150e6) % 300e6 - 150e6
         per_second = float(still.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
-        told = np.ravel(drift_time(walking))[0]
+        told = np.ravel(chirp_drift_time(walking))[0]
         assert drift / per_second == pytest.approx(told, abs=3 * 300e6 / padded / per_second)
 
 
@@ -381,8 +399,8 @@ def test_beats_that_fold_are_flagged_as_misread(table_4_1, record):
     """Beats of Table 4.1 lie within half the sample rate up to 22.5 km."""
     ranges = np.linspace(1e3, 60e3, 60)
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6)
-    scene |= {RECORD: record, "footprint.speckle": "none"}
-    found = shot.evaluate(scene, CORE)
+    scene |= {RECORD_PATH: record, "footprint.speckle": "none"}
+    found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
     rate = 1e9 / 500e-6 * 2 / SPEED_OF_LIGHT  # Hz a metre
     wrong = ranges * rate > 300e6
     assert np.array_equal(found["misread"] == 1, wrong)
@@ -395,7 +413,7 @@ def test_peaks_of_the_echo_that_are_misread_have_a_wrong_range(table_4_1):
     ranges = np.array([5e3, 30e3])
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6, power=100.0)
     scene |= {"footprint.speckle": "none", "instrument.processing.peaks": "strongest"}
-    found = shot.evaluate(scene, CORE)
+    found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
     assert found["misread"].tolist() == [0.0, 1.0]
     assert found["pd_shot"][1] > 0.5
     assert found["p_wrong_range_shot"][1] >= found["pd_shot"][1]
@@ -404,11 +422,13 @@ def test_peaks_of_the_echo_that_are_misread_have_a_wrong_range(table_4_1):
 
 def test_a_slope_and_motion_are_no_misreading(table_4_1):
     ranges = np.geomspace(3.0, 9e3, 40)
-    scene = DEFAULTS | table_4_1(
+    scene = PARAMETER_DEFAULTS | table_4_1(
         range=ranges, grazing_angle=np.radians(5.0), beam_divergence=1e-3, phases="incoherent",
         radial_velocity=120.0, fft_size=2**14,
     ) | {"target.acceleration": 100.0, "target.transverse_velocity": 100.0}  # fmt: skip
-    found = shot.evaluate(scene, (*CORE, "range_walk", "acceleration", "segment_motion"))
+    found = evaluation.evaluate(
+        scene, (*DEFAULT_EFFECTS, "range_walk", "acceleration", "segment_motion")
+    )
     assert (found["misread"] == 0).all()
 
 
@@ -419,5 +439,5 @@ def test_a_carrier_of_zero_makes_no_velocity_a_misread_one(table_4_1):
         "target.radial_velocity": 0.0,
     }  # fmt: skip
     with np.errstate(divide="raise"):
-        found = shot.evaluate(scene, CORE)
+        found = evaluation.evaluate(scene, DEFAULT_EFFECTS)
     assert found["misread"] == 0

@@ -8,10 +8,16 @@ import pytest
 from shot_helpers import make_point_keys
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detectors import main_lobe
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.sampling import simulate
-from sweep.model.shot import CORE, evaluate, find, prepare, statistics
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.evaluation import (
+    DEFAULT_EFFECTS,
+    evaluate,
+    evaluate_segments,
+    prepare_shots,
+    shot_statistics,
+)
+from sweep.model.sampling.samplers import simulate_draws
 
 DRAWS, FINER = 3_000, 2
 WIDTH, SHAPE = (f"instrument.laser.line_{name}" for name in ("width", "shape"))
@@ -19,18 +25,18 @@ PROCESSING = "instrument.processing."
 
 
 def shots_of(parameters, effects):
-    ((_, shots),) = prepare(parameters, effects)
+    ((_, shots),) = prepare_shots(parameters, effects)
     return shots
 
 
 def effects_of(law):
-    return (*CORE, "line_width", "image", *(["fading"] if law == "developed" else []))
+    return (*DEFAULT_EFFECTS, "line_width", "image", *(["fading"] if law == "developed" else []))
 
 
 def parameters_of(table_4_1, width, distance, law, rule, ratio, **changes):
     """A scene in which the power of the line's bin, pedestal included, is Th^2 ratio^2."""
     delay = 2 * distance / SPEED_OF_LIGHT
-    p = DEFAULTS | table_4_1() | {
+    p = PARAMETER_DEFAULTS | table_4_1() | {
         PROCESSING + "fft_size": 2048, PROCESSING + "sample_rate": 50e6,
         PROCESSING + "acquisition_delay": delay + 2e-6, "instrument.chirp.duration": 50e-6 + delay,
         "instrument.chirp.bandwidth": 1e8, PROCESSING + "noise_bins": "correlated",
@@ -41,8 +47,8 @@ def parameters_of(table_4_1, width, distance, law, rule, ratio, **changes):
     } | changes  # fmt: skip
     for _ in range(3):
         shots = shots_of(p, effects_of(law))
-        power = float(find(shots)[0, 2, 0]) ** 2
-        power += 2 * float(shots.line_deviation[0] ** 2 - shots.bin_deviation[0] ** 2)
+        power = float(evaluate_segments(shots)[0, 2, 0]) ** 2
+        power += 2 * float(shots.line_noise_sigma[0] ** 2 - shots.bin_noise_sigma[0] ** 2)
         p["instrument.laser.power"] *= (float(shots.threshold[0]) * ratio) ** 2 / power
     return p
 
@@ -54,14 +60,14 @@ def drawn_spectra(shots, plain, draws=DRAWS, seed=1):
     """
     rng, length, w = np.random.default_rng(seed), shots.window.length, shots.window.samples()
     rate, delay = float(shots.sample_rate[0]), 2 * float(shots.range[0]) / SPEED_OF_LIGHT
-    per_step = 2 * np.pi * float(shots.laser_width[0]) / (FINER * rate)
+    per_step = 2 * np.pi * float(shots.lorentzian_line_width[0]) / (FINER * rate)
     later, size = round(delay * rate * FINER), shots.fft_size
-    beat = float(plain.beats[0][0]) / rate
+    beat = float(plain.beat_frequencies[0][0]) / rate
     beat = beat if shots.complex_record else abs(beat)
     tone, line = np.exp(2j * np.pi * beat * np.arange(length)), round(beat * size) % size
-    amplitude = float(find(plain)[0, 2, 0]) / abs(np.fft.fft(w * tone, size)[line])
-    fades = shots.fading is not None
-    deviation = float(shots.bin_deviation[0]) / np.sqrt(shots.window.energy)
+    amplitude = float(evaluate_segments(plain)[0, 2, 0]) / abs(np.fft.fft(w * tone, size)[line])
+    fades = shots.segment_correlations is not None
+    deviation = float(shots.bin_noise_sigma[0]) / np.sqrt(shots.window.energy)
     echoes, noisy = [], []
     for _ in range(draws // 250):
         theta = np.cumsum(rng.normal(size=(250, FINER * length + later)), axis=1)
@@ -81,12 +87,12 @@ def echo_bins(shots, echo, line):
     size = shots.fft_size
     power = np.roll((abs(echo) ** 2).mean(axis=0), size // 2 - line)  # the line in the middle
     bins, middle = np.arange(size), size // 2
-    lobe = np.ceil(main_lobe(shots.window) * size / shots.window.length)
+    lobe = np.ceil(main_lobe_half_width(shots.window) * size / shots.window.length)
     strong = np.flatnonzero(power >= power.max() / 4)
     near = np.abs(bins[:, None] - strong).min(axis=1) <= lobe
     beyond = 4 * lobe  # where no sidelobe is
     smooth = np.convolve(power, np.ones(5) / 5, "same")
-    above = np.flatnonzero(smooth >= 2 * float(shots.bin_deviation[0]) ** 2)
+    above = np.flatnonzero(smooth >= 2 * float(shots.bin_noise_sigma[0]) ** 2)
     reach = np.abs(above - middle).max(initial=0)
     if reach > beyond:
         near |= np.abs(bins - middle) <= reach
@@ -128,7 +134,7 @@ def test_a_pedestal_fades_with_its_line_and_detects(
     p = parameters_of(table_4_1, width, distance, law, rule, ratio, **changes)
     shots = shots_of(p, effects)
     plain = shots_of(p, [name for name in effects if name != "line_width"])
-    drawn, expected = drawn_pd(shots, plain, rule), float(statistics(shots)["pd_up"][0])
+    drawn, expected = drawn_pd(shots, plain, rule), float(shot_statistics(shots)["pd_up"][0])
     assert abs(drawn - expected) < 0.02 + 3 * np.sqrt(drawn * (1 - drawn) / DRAWS)
 
 
@@ -140,7 +146,7 @@ def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
     for method, draws, slack in (
         ("probabilities", 20_000, 0.0), ("noise", 20_000, 0.02), ("spectra", 1000, 0.02)
     ):  # fmt: skip
-        found = simulate(p, chosen, batch_sizes=[draws], method=method, **given)
+        found = simulate_draws(p, chosen, batch_sizes=[draws], method=method, **given)
         share = found["n_detected_up"].sum() / draws
         error = np.sqrt(expected * (1 - expected) / draws)
         assert abs(share - expected) < 4 * error + slack, method
@@ -149,9 +155,9 @@ def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
 def test_weak_phase_noise_gives_an_echo_no_more_bins(table_4_1):
     for width, rule in ((1e3, "any_bin"), (300e3, "peak_bin")):
         p = parameters_of(table_4_1, width, 150.0, "none", rule, 1.5)
-        assert shots_of(p, effects_of("none")).bin_levels[4] == 0
+        assert shots_of(p, effects_of("none")).bin_threshold_table[4] == 0
     p = parameters_of(table_4_1, 300e3, 150.0, "none", "any_bin", 1.5)
     wide = shots_of(p, effects_of("none"))
-    assert wide.bin_levels[4] > 10
+    assert wide.bin_threshold_table[4] > 10
     narrow = [name for name in effects_of("none") if name != "line_width"]
-    assert find(wide)[0, 4, 0] > find(shots_of(p, narrow))[0, 4, 0] + 10
+    assert evaluate_segments(wide)[0, 4, 0] > evaluate_segments(shots_of(p, narrow))[0, 4, 0] + 10

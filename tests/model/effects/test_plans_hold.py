@@ -12,15 +12,15 @@ from random_planner_points import (
     random_parameters,
 )
 
-from sweep.model import shot
+from sweep.model import evaluation
 from sweep.model.effects import saturation
-from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
-from sweep.model.ground import Cast, Footprints, of_rays
-from sweep.model.shot import find, prepare_cast
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots
+from sweep.model.ground import BeamletTable, RayTracedGround, extent_of_ray_traced_ground
 
 POINTS = 30
-CHOICE = [effect for effect in EFFECTS if effect.name in CORE]
-WITHIN = {effect.name: effect.within for effect in CHOICE}
+CHOICE = [effect for effect in EFFECTS if effect.name in DEFAULT_EFFECTS]
+WITHIN = {effect.name: effect.parent for effect in CHOICE}
 KINDS = (
     {"phases": "incoherent"},
     {"phases": "coherent"},
@@ -40,8 +40,8 @@ STILL = {"doppler": "off"}
 
 def some_of(rng, name):
     """Any of the other effects, with what they need, but for those within this one."""
-    chosen = {n for n in CORE if n != name and rng.random() < 0.6}
-    chosen -= {n for n in CORE if name and WITHIN[n] == name}
+    chosen = {n for n in DEFAULT_EFFECTS if n != name and rng.random() < 0.6}
+    chosen -= {n for n in DEFAULT_EFFECTS if name and WITHIN[n] == name}
     return {n for n in chosen if not WITHIN[n] or WITHIN[n] in chosen} | {WITHIN.get(name, "")} - {
         ""
     }
@@ -80,23 +80,25 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
         )  # fmt: skip
         inner = counted(parameters, seed)
         moving, still = (
-            plan_points(planner_inputs(parameters), modes, 1.0, CHOICE).change
+            plan_points(planner_inputs(parameters), modes, 1.0, CHOICE).omission_error
             for modes in ({}, STILL)
         )
-        for name in CORE:
+        for name in DEFAULT_EFFECTS:
             others = some_of(rng, name)
             changes = moving if "doppler" in others | {name} else still
-            most = dict(zip(CORE, changes, strict=True))
+            most = dict(zip(DEFAULT_EFFECTS, changes, strict=True))
             on, off = find_spectra(inner, others | {name}), find_spectra(inner, others)
             assert (np.minimum(changed(on, off), 1) <= most[name] + ROUNDING).all(), (name, others)
-            moved = magnitudes_moved(on, off, prepare_single_category(inner, others).bin_deviation)
+            moved = magnitudes_moved(
+                on, off, prepare_single_category(inner, others).bin_noise_sigma
+            )
             assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all(), (name, others)
             if name == "leakage":
                 extra = np.nansum(on[:, 5], axis=0)
                 assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
                 seen = [
-                    shot.statistics(prepare_single_category(inner, e))
+                    evaluation.shot_statistics(prepare_single_category(inner, e))
                     for e in (others | {name}, others)
                 ]
                 for alarm in ("pfa_segment", "log10_pfa_segment", "log10_pfa_shot"):
@@ -158,10 +160,12 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
         others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
         others = (others | ({"overlap"} if seed > 1 else set())) - {name}
         made = plan_points(planner_inputs(parameters), {}, 1.0)
-        most = made.change[made.names.index(name)]
+        most = made.omission_error[made.effect_names.index(name)]
         on, off = find_spectra(parameters, others | {name}), find_spectra(parameters, others)
         assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-        moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_deviation)
+        moved = magnitudes_moved(
+            on, off, prepare_single_category(parameters, others).bin_noise_sigma
+        )
         assert (np.minimum(moved, 1) <= most + ROUNDING).all()
         noticed += (most < 1).sum()
     assert noticed > 10
@@ -177,24 +181,26 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
         )
         made = plan_points(planner_inputs(parameters), {}, tolerance, CHOICE)
         inner = counted(parameters, seed)
-        truth = shot.evaluate(inner)
-        assert (made.error <= tolerance).all()
-        for column in np.unique(made.kept, axis=1).T:
-            names = [name for name, there in zip(made.names, column, strict=True) if there]
-            here = (made.kept == column[:, None]).all(axis=0)
-            of_kept = shot.evaluate(inner, names)
+        truth = evaluation.evaluate(inner)
+        assert (made.total_error <= tolerance).all()
+        for column in np.unique(made.is_kept, axis=1).T:
+            names = [name for name, there in zip(made.effect_names, column, strict=True) if there]
+            here = (made.is_kept == column[:, None]).all(axis=0)
+            of_kept = evaluation.evaluate(inner, names)
             error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
             assert (error <= tolerance + ROUNDING).all(), names
             whole, part = (
-                prepare_single_category(inner, CORE),
+                prepare_single_category(inner, DEFAULT_EFFECTS),
                 prepare_single_category(inner, names),
             )
-            moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
+            moved = magnitudes_moved(
+                evaluate_segments(whole), evaluate_segments(part), part.bin_noise_sigma
+            )
             assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
             if "leakage" not in names:
                 extra = truth["p_leakage_up"] + truth["p_leakage_down"]
                 assert (extra[here] <= tolerance).all()
-        kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+        kept, dropped = kept + made.is_kept.sum(), dropped + (~made.is_kept).sum()
     assert kept > 30 and dropped > 30
 
 
@@ -209,7 +215,7 @@ def cast_scene(rng, shots, beamlets, beside_chance):
     doppler = rng.normal(0, 1, (shots, beamlets)) * 10 ** rng.uniform(-12, -8, (shots, 1))
     doppler[:, 0] = 0.0
     echo = rng.random((shots, beamlets)) / beamlets / 6
-    footprints = Footprints(np.arange(shots), offset, doppler, echo)
+    footprints = BeamletTable(np.arange(shots), offset, doppler, echo)
     return footprints, surface if beside_chance else None
 
 
@@ -222,44 +228,55 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
         chance = [0.0, 0.3][seed % 2]
         footprints, beside = cast_scene(rng, POINTS, 7, chance)
         order = np.sort(10 ** rng.uniform(0.5, 3, POINTS))
-        parameters = DEFAULTS | table_4_1(
+        parameters = PARAMETER_DEFAULTS | table_4_1(
             range=order, radial_velocity=np.sort(rng.normal(0, 30, POINTS)), beamlets=7,
             fft_size=2**13, phases=phases, power=10 ** rng.uniform(-3, 0), window="hann",
         )  # fmt: skip
         edges = np.arange(0, POINTS + 1, stretch)
         tile = np.repeat(np.arange(len(edges) - 1), stretch)
-        ground = Cast(footprints, beside)
+        ground = RayTracedGround(footprints, beside)
         made, still = (
-            plan_points(planner_inputs(parameters, of_rays(ground)), modes, 0.05, CHOICE, edges)
+            plan_points(
+                planner_inputs(parameters, extent_of_ray_traced_ground(ground)),
+                modes,
+                0.05,
+                CHOICE,
+                edges,
+            )
             for modes in ({}, STILL)
         )
-        for place, name in enumerate(CORE):
+        for place, name in enumerate(DEFAULT_EFFECTS):
             others = some_of(rng, name)
-            changes = (made if "doppler" in others | {name} else still).change
+            changes = (made if "doppler" in others | {name} else still).omission_error
             most = changes[place, tile]
-            on, off = (find(prepare_cast(parameters, ground, e)) for e in (others | {name}, others))
+            on, off = (
+                evaluate_segments(prepare_ray_traced_shots(parameters, ground, e))
+                for e in (others | {name}, others)
+            )
             assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
-        truth = find(prepare_cast(parameters, ground))
+        truth = evaluate_segments(prepare_ray_traced_shots(parameters, ground))
         for i in range(len(edges) - 1):
-            of_kept = find(prepare_cast(parameters, ground, effects_kept_in_tile(made, i)))
+            of_kept = evaluate_segments(
+                prepare_ray_traced_shots(parameters, ground, effects_kept_in_tile(made, i))
+            )
             error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
-        has_beside = made.change[CORE.index("several_returns")].any()
+        has_beside = made.omission_error[DEFAULT_EFFECTS.index("several_returns")].any()
         assert has_beside == (beside is not None)
-        kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+        kept, dropped = kept + made.is_kept.sum(), dropped + (~made.is_kept).sum()
     assert kept > 30 and dropped > 30
 
 
 def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     footprints, _ = cast_scene(np.random.default_rng(1), 4, 7, 0.0)
-    parameters = DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
-    seen = of_rays(Cast(footprints))
+    parameters = PARAMETER_DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
+    seen = extent_of_ray_traced_ground(RayTracedGround(footprints))
     turning, still = (
-        plan_points(planner_inputs(parameters, seen, rotating=turns), {}, 0.5,
+        plan_points(planner_inputs(parameters, seen, has_rotating_body=turns), {}, 0.5,
                 [effect for effect in EFFECTS if effect.name == "rotation"])
         for turns in (True, False)
     )  # fmt: skip
-    assert turning.kept.all() and not still.kept.any() and not still.error.any()
+    assert turning.is_kept.all() and not still.is_kept.any() and not still.total_error.any()
 
 
 STRONG_NOISE = {
@@ -284,7 +301,7 @@ STRONG_NOISE = {
 
 def test_saturation_knows_every_effect_that_adds_noise():
     adding = {effect.name for effect in EFFECTS if effect.stage == "noise"}
-    assert adding == {effect.name for effect in saturation.NOISE} | {"signal_shot_noise"}
+    assert adding == {effect.name for effect in saturation.NOISE_EFFECTS} | {"signal_shot_noise"}
     assert adding == set(STRONG_NOISE)
 
 
@@ -300,9 +317,9 @@ def test_noise_of_any_source_that_saturates_an_adc_is_in_the_bound_of_saturation
         deviation = np.sqrt(prepare_single_category(parameters, {name}).noise_variance)
         parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1.5, 5, POINTS)
     made = plan_points(planner_inputs(parameters), {}, 1.0)
-    most = made.change[made.names.index("saturation")]
+    most = made.omission_error[made.effect_names.index("saturation")]
     on, off = find_spectra(parameters, {name, "saturation"}), find_spectra(parameters, {name})
-    moved = magnitudes_moved(on, off, prepare_single_category(parameters, {name}).bin_deviation)
+    moved = magnitudes_moved(on, off, prepare_single_category(parameters, {name}).bin_noise_sigma)
     assert (np.minimum(moved, 1) <= most + ROUNDING).all()
     assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
     assert moved.max() > 1e-3
@@ -328,9 +345,9 @@ def test_steps_of_an_adc_are_compared_with_the_noise_that_filters_leave_at_the_l
     deviation = np.sqrt(prepare_single_category(parameters, others).noise_variance)
     parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1, 100, POINTS)
     made = plan_points(planner_inputs(parameters), {}, 1.0)
-    most = made.change[made.names.index("quantisation")]
+    most = made.omission_error[made.effect_names.index("quantisation")]
     on, off = find_spectra(parameters, others | {"quantisation"}), find_spectra(parameters, others)
     assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-    moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_deviation)
+    moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_noise_sigma)
     assert (np.minimum(moved, 1) <= most + ROUNDING).all()
     assert (most < 1).any() and changed(on, off).max() > 1e-3 and moved.max() > 1e-3

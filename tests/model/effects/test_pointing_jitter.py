@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from shot_helpers import intersect_level_plane, make_point_keys
 
-from sweep.model.effects.effect import Realisation
-from sweep.model.effects.pointing_jitter import angles, turned
+from sweep.model.effects.effect import DrawAddresses
+from sweep.model.effects.pointing_jitter import draw_jitter_angles, perturb_geometry
 
 
 def angles_of(draws, sigma):
     """Angles of one point's draws."""
-    realisation = Realisation(np.repeat(make_point_keys(1), draws, axis=0), np.arange(draws))
-    return angles(realisation, np.full(draws, sigma))
+    realisation = DrawAddresses(np.repeat(make_point_keys(1), draws, axis=0), np.arange(draws))
+    return draw_jitter_angles(realisation, np.full(draws, sigma))
 
 
 @pytest.mark.parametrize("grazing", [0.05, 0.4, 1.2, np.pi / 2])
 def test_turned_beams_meet_the_plane_where_rays_do(grazing):
     off = angles_of(2000, 3e-3)
-    seen = turned(
-        range=1500.0, grazing_angle=grazing, radial_velocity=80.0, angles=off,
-        velocity_across=(30.0, -20.0),
+    seen = perturb_geometry(
+        range=1500.0, grazing_angle=grazing, radial_velocity=80.0, jitter_angles=off,
+        transverse_velocity=(30.0, -20.0),
     )  # fmt: skip
     far, angle, direction = intersect_level_plane(1500.0, grazing, off)
     np.testing.assert_allclose(seen.range, far, rtol=1e-12)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from random_planner_points import planner_inputs
 
-from sweep.model import shot, truth
+from sweep.model import evaluation, time_domain_truth
 from sweep.model.effects import phase_errors
-from sweep.model.effects.catalogue import CORE
-from sweep.model.segments import spectrum
-from sweep.model.shot import prepare
-from sweep.model.waveform import SIGNS
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import prepare_shots
+from sweep.model.spectrum.segment_spectra import segment_spectrum
+from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
 
 WINDOWS = (
     "rectangular", "hann", "hamming", "blackman", "nuttall", "blackmanharris", "flattop",
@@ -21,7 +21,9 @@ AGREEMENT = 1e-8
 
 
 def prepared(parameters, *, walks=False):
-    ((_, shots),) = prepare(parameters, (*CORE, "range_walk") if walks else CORE)
+    ((_, shots),) = prepare_shots(
+        parameters, (*DEFAULT_EFFECTS, "range_walk") if walks else DEFAULT_EFFECTS
+    )
     return shots
 
 
@@ -29,7 +31,7 @@ def motion(shots, segment):
     """What range walk needs to know of point 0."""
     rate = float(shots.sample_rate[0])
     return {
-        "sign": SIGNS[segment],
+        "sign": DEFAULT_CHIRP_SLOPES[segment],
         "chirp_rate": np.array([float(shots.chirp_rate)]),
         "radial_velocity": shots.radial_velocity[:1],
         "start": np.array([float(shots.acquisition_delay)]),
@@ -48,10 +50,11 @@ def test_the_phase_is_what_the_truth_keeps_beyond_the_line(table_4_1, segment, v
         )
     )  # fmt: skip
     kept, dropped = (
-        truth.analytic_record(shots, 0, segment, 0, range_walk=walk) for walk in (True, False)
+        time_domain_truth.analytic_record(shots, 0, segment, 0, with_range_walk=walk)
+        for walk in (True, False)
     )
     x = 2 * np.arange(kept.size) / kept.size - 1
-    walk = phase_errors.walk_phase(x, **motion(shots, segment))[0]
+    walk = phase_errors.range_walk_phase(x, **motion(shots, segment))[0]
     # The truth rounds f tau: 1e10 cycles of 1e-16 at 10 km/s.
     assert np.abs(kept / dropped - np.exp(2j * np.pi * walk)).max() < 2e-5 * abs(velocity) / 1e4
 
@@ -68,9 +71,11 @@ def test_lines_are_the_truth_for_two_milliseconds_at_up_to_ten_kilometres_a_seco
                 wavelength=1e-3,
             ), walks=True,
         )  # fmt: skip
-        exact = truth.spectrum(shots, 0, segment)
-        _, fast = spectrum(shots, 0, segment)
-        peak = truth.spectrum(shots, 0, segment, range_walk=False).max()
+        exact = time_domain_truth.time_domain_spectrum(shots, 0, segment)
+        _, fast = segment_spectrum(shots, 0, segment)
+        peak = time_domain_truth.time_domain_spectrum(
+            shots, 0, segment, with_range_walk=False
+        ).max()
         assert np.abs(fast - exact).max() < AGREEMENT * peak
 
 
@@ -83,10 +88,11 @@ def test_the_phase_of_the_beams_axis_serves_all_beamlets(table_4_1):
         )
     )  # fmt: skip
     x = 2 * np.arange(shots.window.length) / shots.window.length - 1
-    factor = np.exp(2j * np.pi * phase_errors.walk_phase(x, **motion(shots, 0))[0])
+    factor = np.exp(2j * np.pi * phase_errors.range_walk_phase(x, **motion(shots, 0))[0])
     for beamlet in (0, 50, 108):
         kept, dropped = (
-            truth.analytic_record(shots, 0, 0, beamlet, range_walk=walk) for walk in (True, False)
+            time_domain_truth.analytic_record(shots, 0, 0, beamlet, with_range_walk=walk)
+            for walk in (True, False)
         )
         assert np.abs(kept - dropped * factor).max() < 5e-6 * np.abs(kept).max()
 
@@ -96,15 +102,17 @@ def test_a_target_that_starts_from_rest_walks_in_the_down_segment(table_4_1, acc
     """By a velocity of a t there; the size is no less than what leaving it out changes."""
     parameters = table_4_1(fft_size=2**14, sample_rate=100e6, beamlets=1, radial_velocity=0.0)
     parameters |= {"target.acceleration": acceleration, "target.range": 50.0}
-    effects = *CORE, "segment_motion", "acceleration"
+    effects = *DEFAULT_EFFECTS, "segment_motion", "acceleration"
     found = [
-        shot.find(*(shots for _, shots in prepare(parameters, some)))[:, 2, 0]
+        evaluation.evaluate_segments(*(shots for _, shots in prepare_shots(parameters, some)))[
+            :, 2, 0
+        ]
         for some in (effects, (*effects, "range_walk"))
     ]
     changed = np.abs(found[0] / found[1] - 1)
     points = planner_inputs(parameters)
-    points.smears["range_walk"] = phase_errors.walk_smear(points)
-    size = phase_errors.RANGE_WALK.size(points)
-    told = np.broadcast_to(np.ravel(size.magnitude + size.added), 3)
+    points.phase_error_bounds["range_walk"] = phase_errors.range_walk_phase_bound(points)
+    size = phase_errors.RANGE_WALK.error_bound(points)
+    told = np.broadcast_to(np.ravel(size.magnitude_change + size.coherent_sum_change), 3)
     assert changed[0] < 1e-9 and changed[2] > 1e-7
     assert (changed <= told + 1e-9).all()

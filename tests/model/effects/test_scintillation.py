@@ -6,17 +6,17 @@ from scipy import special, stats
 from scipy.integrate import quad
 from shot_helpers import make_point_keys
 
-from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.effects.effect import Realisation
+from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
+from sweep.model.effects.effect import DrawAddresses
 from sweep.model.effects.scintillation import (
     HUFNAGEL_VALLEY,
-    LogVariances,
-    Turbulence,
-    both_ways,
-    factors,
-    log_variances,
+    LogIrradianceVariances,
+    TurbulenceProfile,
+    draw_scintillation_factors,
+    log_irradiance_variances,
     rytov_variance,
     structure_constant,
+    two_way_log_variances,
 )
 
 WAVENUMBER = 2 * np.pi / 1.55e-6
@@ -24,11 +24,11 @@ WAVENUMBER = 2 * np.pi / 1.55e-6
 
 def index(legs):
     """Variance of the whole factor of unit mean, exp(sum of log variances) - 1, for either law."""
-    return np.expm1(sum(each.large + each.small for each in legs))
+    return np.expm1(sum(each.large_eddies + each.small_eddies for each in legs))
 
 
 def leg(large, small=0.0):
-    return LogVariances(np.asarray(large, float), np.asarray(small, float))
+    return LogIrradianceVariances(np.asarray(large, float), np.asarray(small, float))
 
 
 def test_hufnagel_and_valley_have_five_centimetres_and_seven_microradians():
@@ -88,11 +88,11 @@ def test_weak_twinkling_through_an_aperture_is_the_integral_over_kolmogorovs_spe
     total = np.trapezoid(q[:, 0] ** (-8 / 3) * inner * q[:, 0], np.log(q[:, 0]))
     exact = 8 * np.pi**2 * k**2 * 0.033e-17 * length * total
     rytov = rytov_variance(
-        wave, Turbulence(uniform=1e-17), wavelength=1.55e-6, range=length, start_height=0.0,
+        wave, TurbulenceProfile(uniform=1e-17), wavelength=1.55e-6, range=length, start_height=0.0,
         end_height=0.0,
     )  # fmt: skip
     found = index(
-        [log_variances(wave, rytov_variance=rytov, wavelength=1.55e-6, range=length,
+        [log_irradiance_variances(wave, rytov_variance=rytov, wavelength=1.55e-6, range=length,
                        aperture=aperture)]
     )  # fmt: skip
     assert 0.995 < found / exact < excess
@@ -106,9 +106,12 @@ def test_strong_twinkling_saturates_as_theory_has_it():
     for wave, share, factor in (("plane", 1.0, 0.86), ("spherical", 0.4065, 2.73)):
         strong = np.array([1e4, 1e9])
         found = index(
-            [log_variances(wave, rytov_variance=strong * share, wavelength=1.55e-6, range=1e3,
-                           aperture=0.0)]
-        )  # fmt: skip
+            [
+                log_irradiance_variances(
+                    wave, rytov_variance=strong * share, wavelength=1.55e-6, range=1e3, aperture=0.0
+                )
+            ]
+        )
         assert found[1] == pytest.approx(1, abs=0.005)
         slope = (found[0] - found[1]) / (strong[0] ** -0.4 - strong[1] ** -0.4)
         assert slope == pytest.approx(factor, rel=0.035)
@@ -118,10 +121,11 @@ def draws_of(law, legs, points, draws, first=0):
     """Factors (points, draws)."""
     number = np.tile(np.arange(first, first + draws), points)
     spread = [
-        LogVariances(*(np.repeat(np.broadcast_to(v, points), draws) for v in one)) for one in legs
+        LogIrradianceVariances(*(np.repeat(np.broadcast_to(v, points), draws) for v in one))
+        for one in legs
     ]
-    return factors(
-        law, spread, Realisation(np.repeat(make_point_keys(points), draws, axis=0), number)
+    return draw_scintillation_factors(
+        law, spread, DrawAddresses(np.repeat(make_point_keys(points), draws, axis=0), number)
     ).reshape(points, draws)
 
 
@@ -171,11 +175,11 @@ def test_two_ways_take_the_footprint_out_and_the_aperture_back():
         place = {"atmosphere.target_height": 0.0, "atmosphere.path": "slant",
                  "target.grazing_angle": np.arcsin(0.75)}  # fmt: skip
         given = {f"instrument.{name}": value for name, value in beam.items()}
-        given = DEFAULTS | given | place
-        return both_ways(HUFNAGEL_VALLEY, given, np.array(2000.0))
+        given = PARAMETER_DEFAULTS | given | place
+        return two_way_log_variances(HUFNAGEL_VALLEY, given, np.array(2000.0))
 
     (out, back), (wide_out, wide_back) = ways(25e-3, 50e-6), ways(25e-3, 5e-3)
-    assert wide_out.large < out.large and wide_out.small < out.small
+    assert wide_out.large_eddies < out.large_eddies and wide_out.small_eddies < out.small_eddies
     assert wide_back == back
     _, large_back = ways(0.2, 50e-6)
-    assert large_back.small < 0.2 * back.small
+    assert large_back.small_eddies < 0.2 * back.small_eddies

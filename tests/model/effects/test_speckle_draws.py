@@ -6,19 +6,19 @@ from mean_over_draws import mean_statistics
 from scipy.integrate import quad
 from shot_helpers import make_point_keys, prepare_single_category
 
-from sweep.model import truth, window
+from sweep.model import time_domain_truth, window
+from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects import speckle
-from sweep.model.effects.catalogue import CORE
-from sweep.model.effects.effect import Realisation
-from sweep.model.marcum import marcum_q1
-from sweep.model.realisations import realise
-from sweep.model.shot import evaluate as evaluate_without
-from sweep.model.shot import find, statistics
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.effects.effect import DrawAddresses
+from sweep.model.evaluation import evaluate as evaluate_without
+from sweep.model.evaluation import evaluate_segments, shot_statistics
+from sweep.model.sampling.realisations import iter_realisations
 
 AGREEMENT = 1e-9
 """Largest difference from the truth over the peak: the truth's own floor is 1e-11."""
 
-SPECKLED = (*CORE, "speckle")
+SPECKLED = (*DEFAULT_EFFECTS, "speckle")
 STILL = tuple(effect for effect in SPECKLED if effect != "doppler_spread")
 """Beamlets with one velocity: their own turn speckles apart."""
 ROUGH = {"target.roughness": 1e-5}
@@ -36,22 +36,23 @@ def with_share(parameters, share):
 def factors(draws, beamlets, share=0.0, random_phases=False, seeded=None):
     """Factors g of draws of a point, (draws, beamlets)."""
     chosen = np.repeat(make_point_keys(1) if seeded is None else seeded, draws, axis=0)
-    magnitude, cycles = speckle.factors(
-        Realisation(chosen, np.arange(draws)), beamlets=beamlets,
-        coherent_share=np.full(draws, share), random_phases=random_phases,
+    magnitude, cycles = speckle.draw_speckle_factors(
+        DrawAddresses(chosen, np.arange(draws)), n_beamlets=beamlets,
+        coherent_fraction=np.full(draws, share), random_phases=random_phases,
     )  # fmt: skip
     return magnitude * np.exp(2j * np.pi * cycles)
 
 
 def true_spectra(shots, segment):
     """Analytic spectra at k and -k, k = 0..N/2, (2, beamlets, bins), of each beamlet alone."""
-    w = window.samples(shots.window.name, shots.window.length)
+    w = window.window_samples(shots.window.name, shots.window.length)
     half = np.arange(shots.fft_size // 2 + 1)
     both = [
         np.fft.fft(
-            w * truth.analytic_record(shots, 0, segment, b, range_walk=False), shots.fft_size
+            w * time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False),
+            shots.fft_size,
         )
-        for b in range(shots.offset.shape[1])
+        for b in range(shots.relative_range_offset.shape[1])
     ]
     return np.array([[x[half] / 2 for x in both], [x[-half].conj() / 2 for x in both]])
 
@@ -79,10 +80,12 @@ def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     """The same factors for all segments, conjugated where the beat folds."""
     parameters = table_4_1(**{"fft_size": 4096} | scene)
     shots, share = prepare_single_category(parameters, STILL[:-1]), 0.2
-    number = shots.offset.shape[1]
-    g = factors(20, number, share, random_phases=shots.incoherent)
-    (drawn,) = realise(with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20)
-    found = find(drawn.shots)
+    number = shots.relative_range_offset.shape[1]
+    g = factors(20, number, share, random_phases=shots.adds_powers)
+    (drawn,) = iter_realisations(
+        with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20
+    )
+    found = evaluate_segments(drawn.shots)
     for segment in range(3):
         exact = true_magnitudes(true_spectra(shots, segment), g).max(axis=1)
         np.testing.assert_allclose(found[segment, 2], exact, rtol=AGREEMENT)
@@ -97,13 +100,13 @@ def test_detection_over_several_bins_is_that_of_plain_sums(table_4_1):
     shots, draws = prepare_single_category(parameters, STILL[:-1]), 400
     g = factors(draws, 19)
     means = mean_statistics(parameters | ROUGH, STILL, keys=make_point_keys(1), draws=draws)
-    beta, pd = shots.threshold[0] / shots.bin_deviation[0], {}
+    beta, pd = shots.threshold[0] / shots.bin_noise_sigma[0], {}
     spectra = {name: true_spectra(shots, s) for s, name in ((0, "up"), (2, "down"))}
     lines = (abs(spectra["up"]) ** 2).sum(axis=(0, 1))
     assert (lines > lines.max() / 4).sum() > 5
     for name, values in spectra.items():
         peaks = true_magnitudes(values, g).max(axis=1)
-        pd[name] = marcum_q1(peaks / shots.bin_deviation[0], beta).q
+        pd[name] = marcum_q1(peaks / shots.bin_noise_sigma[0], beta).q
         assert 0.05 < pd[name].mean() < 0.95
         assert means[f"pd_{name}"][0] == pytest.approx(pd[name].mean(), rel=1e-7)
     both = pd["up"] * pd["down"]
@@ -131,7 +134,7 @@ def in_one_bin(parameters, steady=0.0, diffuse=1.0):
     return {
         s: marcum_q1(
             np.sqrt(2 * steady * plain[f"snr_{s}"]) / deviation,
-            shots.threshold / shots.bin_deviation / deviation,
+            shots.threshold / shots.bin_noise_sigma / deviation,
         ).q
         for s in ("up", "doppler", "down")
         for deviation in [np.sqrt(1 + diffuse * powers[f"snr_{s}"])]
@@ -142,7 +145,7 @@ def test_speckled_beamlets_in_a_bin_are_a_swerling_1_target(table_4_1):
     parameters, draws = at_snrs(table_4_1, SNRS), 10_000
     means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(3), draws=draws)
     shots = prepare_single_category(parameters)
-    swerling = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2 / (1 + SNRS))
+    swerling = np.exp(-0.5 * (shots.threshold / shots.bin_noise_sigma) ** 2 / (1 + SNRS))
     closed = in_one_bin(parameters)
     np.testing.assert_allclose(closed["up"], swerling, rtol=1e-5)
     for segment, exact in closed.items():
@@ -176,7 +179,7 @@ def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
     exact = joint_detection(
-        powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_deviation
+        powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_noise_sigma
     )
     means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(3), draws=10_000)
     assert (abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1e-6).all()
@@ -206,10 +209,12 @@ def test_the_coherent_share_is_that_of_a_sum_over_random_heights():
     for roughness in (0.02, 0.08, 0.15):
         heights = rng.normal(scale=roughness * wavelength, size=number)
         mean = np.exp(4j * np.pi * heights / wavelength).mean()
-        share = speckle.coherent_share(roughness=roughness * wavelength, wavelength=wavelength)
+        share = speckle.coherent_power_fraction(
+            roughness=roughness * wavelength, wavelength=wavelength
+        )
         assert abs(abs(mean) - np.sqrt(share)) < 5 / np.sqrt(number)
-    assert speckle.coherent_share(roughness=np.inf, wavelength=wavelength) == 0
-    assert speckle.coherent_share(roughness=0.0, wavelength=wavelength) == 1
+    assert speckle.coherent_power_fraction(roughness=np.inf, wavelength=wavelength) == 0
+    assert speckle.coherent_power_fraction(roughness=0.0, wavelength=wavelength) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
@@ -256,7 +261,7 @@ def joint(parameters, phase):
     return joint_detection(
         powers,
         np.exp(-0.5 * phase**2) * np.sqrt(powers[0] * powers[1]),
-        shots.threshold / shots.bin_deviation,
+        shots.threshold / shots.bin_noise_sigma,
     )
 
 
@@ -314,10 +319,13 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
         "instrument.laser.line_width": 20e3, "instrument.laser.line_shape": "lorentzian"
     }  # fmt: skip
     effects = (*SPECKLED, "line_width")
-    (stretch,) = realise(parameters, effects, keys=make_point_keys(1), draws=50)
-    ratio = stretch.shots.pedestal / statistics(stretch.shots)["snr_up"]
+    (stretch,) = iter_realisations(parameters, effects, keys=make_point_keys(1), draws=50)
+    ratio = stretch.shots.pedestal_variance_under_lines / shot_statistics(stretch.shots)["snr_up"]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # the image's phase moves with it
-    assert np.ptp(stretch.shots.pedestal) > 0.5 * stretch.shots.pedestal.mean()
+    assert (
+        np.ptp(stretch.shots.pedestal_variance_under_lines)
+        > 0.5 * stretch.shots.pedestal_variance_under_lines.mean()
+    )
 
 
 def test_direct_detection_is_refused(table_4_1):

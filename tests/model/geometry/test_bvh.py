@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sweep.model.geometry import bvh
-from sweep.model.geometry.bvh import LEAF, build, nearest
+from sweep.model.geometry.bvh import LEAF_TRIANGLES_MAX, build_tree, find_nearest_triangles
 from sweep.scenes.rasters import BYTES_PER_CELL
 from sweep.scenes.terrain import Terrain
 
@@ -61,7 +61,7 @@ def walk(tree, origins, directions):
     """Nearest distances and faces of bundles, nothing known before."""
     shape = directions.shape[:2]
     distance, face = np.full(shape, np.inf), np.full(shape, -1)
-    nearest(tree, origins, directions, distance, face)
+    find_nearest_triangles(tree, origins, directions, distance, face)
     return distance, face
 
 
@@ -79,7 +79,7 @@ def fan(rng, towards, b, spread):
 def test_walks_find_what_testing_every_triangle_finds(kind):
     rng = np.random.default_rng(7)
     vertices, faces = soup(rng, 400, kind)
-    tree = build(vertices, faces)
+    tree = build_tree(vertices, faces)
     origins = rng.uniform(-14, 14, (300, 3))
     directions = unit(inside_points(rng, vertices, faces, 300) - origins)
     directions[:30] = np.eye(3)[rng.integers(0, 3, 30)] * rng.choice([-1.0, 1.0], (30, 1))
@@ -101,7 +101,7 @@ def test_a_bundle_finds_what_its_rays_find_alone_bit_for_bit(kind, spread):
     """Narrow, wider than what one walk takes on, and about every axis at once."""
     rng = np.random.default_rng(11)
     vertices, faces = soup(rng, 3000, kind)
-    tree = build(vertices, faces)
+    tree = build_tree(vertices, faces)
     origins = rng.uniform(-12, 12, (60, 3))
     directions = fan(rng, inside_points(rng, vertices, faces, 60) - origins, 19, spread)
     directions[0] = np.eye(3)[0]
@@ -114,10 +114,10 @@ def test_a_bundle_finds_what_its_rays_find_alone_bit_for_bit(kind, spread):
 
 def test_what_is_known_to_lie_nearer_stays():
     vertices = np.array([[-1, -1, 5], [3, -1, 5], [-1, 3, 5]], dtype=float)
-    tree = build(vertices, np.array([[0, 1, 2]], np.int32))
+    tree = build_tree(vertices, np.array([[0, 1, 2]], np.int32))
     origins, directions = np.zeros((3, 3)), np.tile([0.0, 0.0, 1.0], (3, 1))
     distance, face = np.array([4.0, 5.0, 6.0]), np.array([-1, -1, -1])
-    nearest(tree, origins, directions[:, None], distance[:, None], face[:, None])
+    find_nearest_triangles(tree, origins, directions[:, None], distance[:, None], face[:, None])
     assert distance.tolist() == [4.0, 5.0, 5.0]
     assert face.tolist() == [-1, -1, 0]
 
@@ -125,7 +125,7 @@ def test_what_is_known_to_lie_nearer_stays():
 def test_of_equally_near_triangles_the_first_in_the_mesh_counts():
     triangle = np.array([[-1, -1, 5], [3, -1, 5], [-1, 3, 5]], dtype=float)
     vertices = np.tile(triangle, (50, 1))
-    tree = build(vertices, np.arange(150, dtype=np.int32).reshape(50, 3))
+    tree = build_tree(vertices, np.arange(150, dtype=np.int32).reshape(50, 3))
     _, face = walk_alone(tree, np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
     assert face[0] == 0
 
@@ -140,13 +140,13 @@ def leaves(tree):
 def test_every_triangle_lies_in_just_one_leaf_and_inside_its_box():
     rng = np.random.default_rng(3)
     vertices, faces = soup(rng, 5000, "sizes")
-    tree = build(vertices, faces)
+    tree = build_tree(vertices, faces)
     np.testing.assert_array_equal(np.sort(tree.order), np.arange(5000))
     np.testing.assert_array_equal(tree.vertices[tree.faces], vertices[faces[tree.order]])
     seen = 0
     for box, which in leaves(tree):
         corners = tree.vertices[tree.faces[which]].reshape(-1, 3)
-        assert corners.size <= 9 * LEAF
+        assert corners.size <= 9 * LEAF_TRIANGLES_MAX
         assert (box[:3] < corners).all() and (box[3:] > corners).all()
         seen += which.stop - which.start
     assert seen == 5000
@@ -160,7 +160,7 @@ def test_triangles_that_no_plane_can_part_are_still_divided():
     size = 10.0 ** -np.linspace(0, 12, 3000)[:, None, None]
     cascade = size * np.array([[1, 0, 0], [1, 1, 0], [1, 0, 1]])
     for corners in (concentric, cascade):
-        tree = build(corners.reshape(-1, 3), np.arange(9000).reshape(3000, 3))
+        tree = build_tree(corners.reshape(-1, 3), np.arange(9000).reshape(3000, 3))
         np.testing.assert_array_equal(np.sort(tree.order), np.arange(3000))
         origin = corners[1234].mean(axis=0) + np.array([2.0, 0.01, 0.02])
         towards = unit(corners[1234].mean(axis=0) - origin)
@@ -174,14 +174,14 @@ def test_a_tree_is_built_in_little_memory(n, monkeypatch):
 
     363^2 heights have twice as many triangles, just above a power of two: the emptiest leaves.
     """
-    monkeypatch.setattr(bvh, "_AT_ONCE", 4096)
+    monkeypatch.setattr(bvh, "_TRIANGLES_PER_BATCH", 4096)
     terrain = Terrain(np.random.default_rng(3).random((n, n)), (1.0, 1.0), np.zeros(3))
     mesh, _ = terrain.to_facets().to_mesh()
-    build(mesh.vertices, mesh.faces)
+    build_tree(mesh.vertices, mesh.faces)
     tracemalloc.start()
-    tree = build(mesh.vertices, mesh.faces)
+    tree = build_tree(mesh.vertices, mesh.faces)
     peak = tracemalloc.get_traced_memory()[1] / n**2
     tracemalloc.stop()
-    of_mesh = sum(array.nbytes for array in (mesh.vertices, mesh.faces, mesh.surface)) / n**2
+    of_mesh = sum(array.nbytes for array in (mesh.vertices, mesh.faces, mesh.surface_index)) / n**2
     assert peak + of_mesh < BYTES_PER_CELL
     assert sum(array.nbytes for array in tree) / n**2 < 125

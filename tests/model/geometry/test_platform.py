@@ -7,19 +7,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sweep.model.geometry import quaternion as quat
-from sweep.model.geometry.platform import (
-    AlongTrack,
+from sweep.model.geometry.body_motion import (
+    AlongTrackAttitude,
+    AttitudeTrack,
     ConstantAcceleration,
-    Fixed,
-    Flight,
-    Mounted,
-    Nadir,
-    Spin,
-    Track,
+    FixedAttitude,
+    MountedAttitude,
+    MovingBody,
+    NadirAttitude,
+    SpinningAttitude,
     Waypoints,
-    straight,
+    straight_trajectory,
 )
-from sweep.model.geometry.scanner import transverse_of
+from sweep.model.geometry.scanner import transverse_axes
 
 TIMES = np.array([0.0, 2.0, 3.5, 7.0, 8.0, 11.0])
 PLACES = np.array(
@@ -37,7 +37,7 @@ def differentiated(path, t, step=STEP):
     )
 
 
-@pytest.mark.parametrize("path", [CURVE, BURN, Waypoints(TIMES, PLACES, smooth=False)])
+@pytest.mark.parametrize("path", [CURVE, BURN, Waypoints(TIMES, PLACES, is_smooth=False)])
 def test_velocity_and_acceleration_are_the_derivatives_of_the_position(path):
     t = np.linspace(path.start + 0.01, path.stop - 0.01, 57)
     t = t[np.abs(t[:, None] - TIMES).min(axis=1) > 2 * STEP]  # straight legs have corners
@@ -53,7 +53,9 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_position(path):
     [(2000, 500, 100, 32), (500, 100, 100, 30), (500, 10, 32, 0), (2000, 10, 100, 50)],
 )
 def test_a_descent_begins_and_ends_at_the_stated_heights_and_speeds(high, low, fast, slow):
-    descent = straight(begin=(5, 6, high), end=(5, 6, low), initial_speed=fast, final_speed=slow)
+    descent = straight_trajectory(
+        start_point=(5, 6, high), end_point=(5, 6, low), initial_speed=fast, final_speed=slow
+    )
     first, last = (descent.motion(np.array([t])) for t in (descent.start, descent.stop))
     np.testing.assert_allclose(first.position[0], [5, 6, high])
     np.testing.assert_allclose(last.position[0], [5, 6, low], atol=1e-9)
@@ -65,7 +67,7 @@ def test_a_descent_begins_and_ends_at_the_stated_heights_and_speeds(high, low, f
 
 
 def test_a_straight_path_at_one_speed_has_no_acceleration():
-    way = straight(begin=(0, 0, 500), end=(300, 0, 100), initial_speed=25.0)
+    way = straight_trajectory(start_point=(0, 0, 500), end_point=(300, 0, 100), initial_speed=25.0)
     assert way.stop == pytest.approx(20.0)
     motion = way.motion(np.linspace(0, 20, 5))
     assert not motion.acceleration.any()
@@ -74,7 +76,7 @@ def test_a_straight_path_at_one_speed_has_no_acceleration():
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_waypoints_are_passed_at_their_times(smooth):
-    path = Waypoints(TIMES, PLACES, smooth=smooth)
+    path = Waypoints(TIMES, PLACES, is_smooth=smooth)
     np.testing.assert_allclose(path.motion(TIMES).position, PLACES, atol=1e-10)
     assert (path.start, path.stop) == (0.0, 11.0)
 
@@ -96,7 +98,7 @@ def test_far_off_waypoints_move_like_near_ones():
 
 
 def test_an_instrument_on_an_arm_moves_with_the_body_that_turns_it():
-    flight = Flight(CURVE, AlongTrack(roll=0.2), lever_arm=(2.0, -1.0, 0.5))
+    flight = MovingBody(CURVE, AlongTrackAttitude(roll=0.2), lever_arm=(2.0, -1.0, 0.5))
     t = np.linspace(0.1, 10.9, 31)
     after, before = flight.state(t + STEP), flight.state(t - STEP)
     velocity = (after.position - before.position) / (2 * STEP)
@@ -107,10 +109,10 @@ def test_an_instrument_on_an_arm_moves_with_the_body_that_turns_it():
 
 @given(st.floats(0, 10), st.floats(0, 2 * math.pi))
 def test_a_fixed_attitude_does_not_turn(t, angle):
-    q = quat.about(1, angle)
-    state = Flight(BURN, Fixed(3 * q)).state(np.array([t]))
+    q = quat.axis_angle(1, angle)
+    state = MovingBody(BURN, FixedAttitude(3 * q)).state(np.array([t]))
     np.testing.assert_allclose(state.attitude, [q], atol=1e-15)
-    assert not state.rate.any()
+    assert not state.angular_velocity.any()
 
 
 @pytest.mark.parametrize("t", [-0.1, 10.1, math.nan])
@@ -128,9 +130,13 @@ def test_the_very_end_is_on_the_path_however_it_was_rounded():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: straight(begin=(0, 0, 1), end=(0, 0, 1), initial_speed=1),
-        lambda: straight(begin=(0, 0, 1), end=(0, 0, 2), initial_speed=0, final_speed=0),
-        lambda: straight(begin=(0, 0, 1), end=(0, 0, 2), initial_speed=-1, final_speed=5),
+        lambda: straight_trajectory(start_point=(0, 0, 1), end_point=(0, 0, 1), initial_speed=1),
+        lambda: straight_trajectory(
+            start_point=(0, 0, 1), end_point=(0, 0, 2), initial_speed=0, final_speed=0
+        ),
+        lambda: straight_trajectory(
+            start_point=(0, 0, 1), end_point=(0, 0, 2), initial_speed=-1, final_speed=5
+        ),
         lambda: ConstantAcceleration([0] * 3, [0] * 3, [0] * 3, 0.0),
         lambda: Waypoints([0, 1, 1], np.zeros((3, 3))),
         lambda: Waypoints([0], np.zeros((1, 3))),
@@ -166,7 +172,7 @@ def same_rotation(p, q, atol=1e-12):
 
 def turned(law, t):
     motion = TURNING.motion(t)
-    return law.turn(t, motion.velocity, motion.acceleration)
+    return law.attitude_and_rate(t, motion.velocity, motion.acceleration)
 
 
 def test_products_inverses_and_turned_vectors_agree_with_scipy():
@@ -200,14 +206,16 @@ def test_heading_pitch_and_roll_are_turns_about_up_right_and_forward(heading, pi
 @pytest.mark.parametrize(
     "law",
     [
-        Nadir(0.3),
-        Nadir(None),
-        AlongTrack(),
-        AlongTrack(roll=0.7),
-        Spin(rate=(0.3, -0.2, 0.9), quaternion=NODES[0], time=1.0),
-        Track(NODES_AT, NODES),
-        Mounted(AlongTrack(), quat.about(1, 0.8)),
-        Fixed(NODES[1]),
+        NadirAttitude(0.3),
+        NadirAttitude(None),
+        AlongTrackAttitude(),
+        AlongTrackAttitude(roll=0.7),
+        SpinningAttitude(
+            angular_velocity=(0.3, -0.2, 0.9), initial_quaternion=NODES[0], initial_time=1.0
+        ),
+        AttitudeTrack(NODES_AT, NODES),
+        MountedAttitude(AlongTrackAttitude(), quat.axis_angle(1, 0.8)),
+        FixedAttitude(NODES[1]),
     ],
     ids=lambda law: type(law).__name__,
 )
@@ -224,7 +232,7 @@ def test_the_rate_is_the_derivative_of_the_attitude_in_the_world_frame(law):
     np.testing.assert_allclose(rate, change / (2 * step), atol=1e-8)
 
 
-@pytest.mark.parametrize("law", [Nadir(), Nadir(1.2), Nadir(None)])
+@pytest.mark.parametrize("law", [NadirAttitude(), NadirAttitude(1.2), NadirAttitude(None)])
 def test_a_nadir_beam_points_straight_down(law):
     q, _ = turned(law, np.linspace(0, 6, 9))
     np.testing.assert_allclose(quat.rotate(q, -UP), [-UP] * 9, atol=1e-15)
@@ -232,7 +240,7 @@ def test_a_nadir_beam_points_straight_down(law):
 
 def test_along_track_the_nose_follows_the_velocity_and_the_wings_are_level():
     t = np.linspace(0, 6, 25)
-    q, _ = turned(AlongTrack(), t)
+    q, _ = turned(AlongTrackAttitude(), t)
     velocity = TURNING.motion(t).velocity
     heading = velocity / np.linalg.norm(velocity, axis=1)[:, None]
     np.testing.assert_allclose(quat.rotate(q, FORWARD), heading, atol=1e-12)
@@ -240,39 +248,45 @@ def test_along_track_the_nose_follows_the_velocity_and_the_wings_are_level():
     assert (quat.rotate(q, UP)[:, 2] > 0).all()
 
 
-@pytest.mark.parametrize("law", [AlongTrack(roll=0.3), Nadir(None)])
+@pytest.mark.parametrize("law", [AlongTrackAttitude(roll=0.3), NadirAttitude(None)])
 @pytest.mark.parametrize("power", [-200, -100, 100])
 def test_a_movement_in_slow_motion_turns_the_same_way(law, power):
     """Turns follow from ratios of velocity and acceleration: powers of two change no bit."""
     t = np.linspace(0, 6, 25)
     _, velocity, acceleration = TURNING.motion(t)[:3]
     slow = np.ldexp(velocity, power), np.ldexp(acceleration, power)
-    for one, other in zip(law.turn(t, velocity, acceleration), law.turn(t, *slow), strict=True):
+    for one, other in zip(
+        law.attitude_and_rate(t, velocity, acceleration),
+        law.attitude_and_rate(t, *slow),
+        strict=True,
+    ):
         assert np.array_equal(one, other)
-    straight = law.turn(t, slow[0], np.zeros_like(velocity))[1]
+    straight = law.attitude_and_rate(t, slow[0], np.zeros_like(velocity))[1]
     assert not straight.any()
 
 
-@pytest.mark.parametrize("law", [AlongTrack(), Nadir(None)])
+@pytest.mark.parametrize("law", [AlongTrackAttitude(), NadirAttitude(None)])
 @pytest.mark.parametrize("velocity", [[1e-320, 0.0, 0.0], [0.0, 0.0, -5.0]])
 def test_next_to_no_speed_and_a_vertical_descent_have_no_heading(law, velocity):
     with pytest.raises(ValueError, match="has no heading to follow"):
-        law.turn(np.zeros(1), np.array([velocity]), np.array([[0.0, 1.0, 0.0]]))
+        law.attitude_and_rate(np.zeros(1), np.array([velocity]), np.array([[0.0, 1.0, 0.0]]))
 
 
 def test_a_bank_lifts_the_left_wing_by_its_angle():
-    level, banked = (turned(AlongTrack(roll=r), np.array([1.0]))[0] for r in (0.0, 0.4))
+    level, banked = (turned(AlongTrackAttitude(roll=r), np.array([1.0]))[0] for r in (0.0, 0.4))
     left, lifted = quat.rotate(level, LEFT), quat.rotate(banked, LEFT)
     assert (left * lifted).sum() == pytest.approx(math.cos(0.4))
     assert lifted[0, 2] > 0
 
 
 def test_a_track_passes_its_nodes_and_rests_beyond_them():
-    track = Track(NODES_AT, NODES * np.array([1, -1, 1, -1, 1])[:, None])  # q and -q are one
+    track = AttitudeTrack(
+        NODES_AT, NODES * np.array([1, -1, 1, -1, 1])[:, None]
+    )  # q and -q are one
     zero = np.zeros((5, 3))
-    q, _ = track.turn(NODES_AT, zero, zero)
+    q, _ = track.attitude_and_rate(NODES_AT, zero, zero)
     same_rotation(q, NODES)
-    q, rate = track.turn(np.array([-5.0, 99.0]), zero[:2], zero[:2])
+    q, rate = track.attitude_and_rate(np.array([-5.0, 99.0]), zero[:2], zero[:2])
     same_rotation(q, NODES[[0, -1]])
     assert not rate.any()
 
@@ -280,7 +294,7 @@ def test_a_track_passes_its_nodes_and_rests_beyond_them():
 def test_a_track_turns_at_a_constant_rate_between_nodes():
     t = np.linspace(1.01, 2.49, 20)
     zero = np.zeros((20, 3))
-    _, rate = Track(NODES_AT, NODES).turn(t, zero, zero)
+    _, rate = AttitudeTrack(NODES_AT, NODES).attitude_and_rate(t, zero, zero)
     np.testing.assert_allclose(rate, rate[:1].repeat(20, 0), atol=1e-12)
     assert np.linalg.norm(rate[0]) == pytest.approx(
         (scipys(NODES[1]).inv() * scipys(NODES[2])).magnitude() / 1.5
@@ -288,7 +302,9 @@ def test_a_track_turns_at_a_constant_rate_between_nodes():
 
 
 def test_a_mounted_instrument_is_turned_first():
-    q, _ = turned(Mounted(Nadir(), quat.about(1, -math.pi / 4)), np.array([1.0]))
+    q, _ = turned(
+        MountedAttitude(NadirAttitude(), quat.axis_angle(1, -math.pi / 4)), np.array([1.0])
+    )
     # Tilted about -y by 45 deg, the nadir beam looks half forward.
     forward = quat.rotate(q, -UP)[0]
     np.testing.assert_allclose(forward, [math.sqrt(0.5), 0, -math.sqrt(0.5)], atol=1e-12)
@@ -296,7 +312,7 @@ def test_a_mounted_instrument_is_turned_first():
 
 def test_transverse_axes_complete_a_right_handed_frame():
     u = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8], [0.0, 0.6, 0.8]])
-    first, second = transverse_of(u)
+    first, second = transverse_axes(u)
     np.testing.assert_allclose(np.cross(first, second), u, atol=1e-15)
     np.testing.assert_allclose((first * u).sum(axis=1), 0, atol=1e-15)
     np.testing.assert_allclose(first[0], FORWARD, atol=1e-15)

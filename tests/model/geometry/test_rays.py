@@ -15,8 +15,8 @@ import pytest
 from exact_rays import error_in_ulps, intersect_triangle, nearest_triangle, to_fractions
 
 from sweep.model.geometry import quaternion
-from sweep.model.geometry.mesh import merge
-from sweep.model.geometry.rays import Caster, Pose
+from sweep.model.geometry.mesh import merge_meshes
+from sweep.model.geometry.ray_casting import Pose, RayCaster
 from sweep.scenes.meshes import clean_mesh
 from sweep.scenes.terrain import Terrain
 
@@ -43,8 +43,10 @@ def unit(v):
 
 def cast(caster, origins, directions, **poses):
     """First hits of single rays: those of bundles, without the dimension of beamlets."""
-    found = caster.bundle(origins, np.asarray(directions, float)[..., None, :], **poses)
-    of_beamlets = "offset", "valid", "cos_incidence", "surface", "face", "body"
+    found = caster.cast_bundles(origins, np.asarray(directions, float)[..., None, :], **poses)
+    of_beamlets = (
+        "range_offset", "is_hit", "cos_incidence", "surface_index", "face_index", "body_index",
+    )  # fmt: skip
     return found._replace(**{name: getattr(found, name)[:, 0] for name in of_beamlets})
 
 
@@ -106,7 +108,7 @@ def closed():
     """A bumpy sphere: vertices, faces and caster."""
     vertices, faces = bumpy_sphere(4)
     mesh, _ = clean_mesh(vertices, faces, 0)
-    return vertices, faces, Caster(mesh)
+    return vertices, faces, RayCaster(mesh)
 
 
 def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
@@ -118,17 +120,17 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
     away = unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(number) % 2]
     origins = target + 2000.0 * away
     directions = unit(target - origins)
-    hits = cast(Caster(clean_mesh(vertices, faces, 0)[0]), origins, directions)
+    hits = cast(RayCaster(clean_mesh(vertices, faces, 0)[0]), origins, directions)
     worst = 0.0
     for i in range(number):
         truth = nearest_triangle(vertices, faces, origins[i], directions[i])
         if truth is None:  # passes beside the terrain's rim
-            assert hits.face[i] == -1
+            assert hits.face_index[i] == -1
             continue
-        assert hits.face[i] == truth[1]
+        assert hits.face_index[i] == truth[1]
         assert error_in_ulps(hits.range[i], truth[0]) <= 1.0
         worst = max(worst, abs(float(Fraction(hits.range[i]) - truth[0])) * PHASE_PER_METRE)
-    assert (hits.face >= 0).sum() > 15
+    assert (hits.face_index >= 0).sum() > 15
     assert worst < 2e-6
 
 
@@ -136,7 +138,7 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
 def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offset):
     """Every ray from inside must hit, wherever it is aimed: 100,000 at vertices and edges."""
     vertices, faces = closed[:2]
-    caster = Caster(clean_mesh(vertices + offset, faces, 0)[0])
+    caster = RayCaster(clean_mesh(vertices + offset, faces, 0)[0])
     rng = np.random.default_rng(5)
     placed = vertices + offset
     at_vertices = placed[rng.integers(0, len(vertices), 50_000)]
@@ -147,12 +149,12 @@ def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offs
     origins = offset + rng.uniform(-0.4, 0.4, (100_000, 3))
     origins[:20_000] = offset
     hits = cast(caster, origins, unit(targets - origins))
-    assert (hits.face >= 0).all()
+    assert (hits.face_index >= 0).all()
     assert (hits.range < 3.0).all()
 
 
 def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
-    caster = Caster(clean_mesh(CORNERS, CUBE, np.arange(12) // 2)[0])
+    caster = RayCaster(clean_mesh(CORNERS, CUBE, np.arange(12) // 2)[0])
     rng = np.random.default_rng(9)
     outside = 10.0 * unit(rng.normal(size=(500, 3)))
     origins = np.concatenate([outside, rng.uniform(-0.9, 0.9, (500, 3))])
@@ -163,7 +165,7 @@ def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
     inside = np.arange(1000) >= 500
     is_hit = inside | (enter < leave)
     assert 100 < (is_hit & ~inside).sum() < 500
-    np.testing.assert_array_equal(hits.face >= 0, is_hit)
+    np.testing.assert_array_equal(hits.face_index >= 0, is_hit)
     expected = np.where(inside, leave, enter)
     np.testing.assert_allclose(hits.range[is_hit], expected[is_hit], rtol=1e-15, atol=4e-15)
     axis = np.where(inside, planes[1].argmin(axis=1), planes[0].argmax(axis=1))
@@ -172,13 +174,13 @@ def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
     np.testing.assert_array_equal(hits.normal[is_hit], normals[is_hit])
     np.testing.assert_allclose(hits.cos_incidence[is_hit], np.abs(along)[is_hit], rtol=1e-15)
     sides = np.abs(CORNERS[CUBE].sum(axis=1)).argmax(axis=1)
-    np.testing.assert_array_equal(sides[hits.face[is_hit]], axis[is_hit])
-    np.testing.assert_array_equal(hits.surface[is_hit], hits.face[is_hit] // 2)
+    np.testing.assert_array_equal(sides[hits.face_index[is_hit]], axis[is_hit])
+    np.testing.assert_array_equal(hits.surface_index[is_hit], hits.face_index[is_hit] // 2)
 
 
 def test_a_miss_says_so_everywhere(closed):
     hits = cast(closed[2], [[0, 0, 5.0]], [[0, 0, 1.0]])
-    assert (hits.face[0], hits.body[0], hits.surface[0]) == (-1, -1, -1)
+    assert (hits.face_index[0], hits.body_index[0], hits.surface_index[0]) == (-1, -1, -1)
     assert hits.range[0] == np.inf
     assert np.isnan(hits.cos_incidence[0])
     assert np.isnan(hits.normal[0]).all()
@@ -190,8 +192,8 @@ def test_no_ray_within_a_silhouette_by_a_billionth_of_a_metre_passes_it():
     y = np.random.default_rng(16).uniform(-4.9, 8.0, 10_000)
     targets = np.stack([np.full_like(y, 1 + 1e-9), y, 10 + 0.3 * (y + 5) / 14], axis=1)
     origins = targets + 2000.0 * unit([0.3, 0.2, 1])
-    hits = cast(Caster(merge([leaf, ground])), origins, unit(targets - origins))
-    assert (hits.surface == 7).all()
+    hits = cast(RayCaster(merge_meshes([leaf, ground])), origins, unit(targets - origins))
+    assert (hits.surface_index == 7).all()
 
 
 def test_the_order_and_the_grouping_of_rays_change_no_bit(closed):
@@ -223,25 +225,25 @@ def test_a_bundle_sees_what_its_rays_see_alone(closed, divergence):
     rng = np.random.default_rng(12)
     origins = 20.0 * unit(rng.normal(size=(300, 3)))
     directions = beam(unit(rng.uniform(-0.7, 0.7, (300, 3)) - origins), divergence)
-    bundle = closed[2].bundle(origins, directions)
+    bundle = closed[2].cast_bundles(origins, directions)
     hits = cast(closed[2], np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
     shape = (300, 19)
-    assert bundle.valid.mean() > 0.05
-    np.testing.assert_array_equal(bundle.valid, (hits.face >= 0).reshape(shape))
-    np.testing.assert_array_equal(bundle.face.ravel(), hits.face)
-    np.testing.assert_array_equal(bundle.surface.ravel(), hits.surface)
-    np.testing.assert_array_equal(bundle.body.ravel(), hits.body)
-    some = bundle.valid.any(axis=1)
-    rows, first = np.flatnonzero(some), bundle.reference[some]
+    assert bundle.is_hit.mean() > 0.05
+    np.testing.assert_array_equal(bundle.is_hit, (hits.face_index >= 0).reshape(shape))
+    np.testing.assert_array_equal(bundle.face_index.ravel(), hits.face_index)
+    np.testing.assert_array_equal(bundle.surface_index.ravel(), hits.surface_index)
+    np.testing.assert_array_equal(bundle.body_index.ravel(), hits.body_index)
+    some = bundle.is_hit.any(axis=1)
+    rows, first = np.flatnonzero(some), bundle.reference_beamlet[some]
     np.testing.assert_array_equal(bundle.range[some], hits.range.reshape(shape)[rows, first])
     np.testing.assert_array_equal(bundle.normal[some], hits.normal.reshape(300, 19, 3)[rows, first])
-    assert (bundle.offset[rows, first] == 0.0).all()
-    total = (bundle.range[:, None] + bundle.offset)[bundle.valid]
-    np.testing.assert_allclose(total, hits.range.reshape(shape)[bundle.valid], rtol=3e-16)
+    assert (bundle.range_offset[rows, first] == 0.0).all()
+    total = (bundle.range[:, None] + bundle.range_offset)[bundle.is_hit]
+    np.testing.assert_allclose(total, hits.range.reshape(shape)[bundle.is_hit], rtol=3e-16)
     cosine = hits.cos_incidence.reshape(shape)
     np.testing.assert_allclose(bundle.cos_incidence, cosine, rtol=1e-14, atol=1e-15)
-    assert np.isnan(bundle.offset[~bundle.valid]).all()
-    assert (bundle.reference[~some] == -1).all()
+    assert np.isnan(bundle.range_offset[~bundle.is_hit]).all()
+    assert (bundle.reference_beamlet[~some] == -1).all()
     assert np.isinf(bundle.range[~some]).all()
 
 
@@ -258,22 +260,22 @@ def test_ranges_within_a_bundle_keep_digits_that_their_difference_has_lost(offse
     centre = 30 * rng.integers(5, 25, 15) + rng.integers(5, 25, 15)
     origins = vertices[centre] + [[0.1, 0.2, 0.0]] + 2000.0 * unit([0.3, 0.2, 1])
     directions = beam(np.tile(unit([-0.3, -0.2, -1.0]), (15, 1)), 400e-6, 9)
-    bundle = Caster(mesh).bundle(origins, directions)
-    same = bundle.face == bundle.face[:, :1]
-    assert bundle.valid.all()
+    bundle = RayCaster(mesh).cast_bundles(origins, directions)
+    same = bundle.face_index == bundle.face_index[:, :1]
+    assert bundle.is_hit.all()
     assert 20 < same[:, 1:].sum() < 100
     for i in range(15):
         exact = [
             intersect_triangle(vertices[faces[face]], origins[i], d)[0]
-            for d, face in zip(directions[i], bundle.face[i], strict=True)
+            for d, face in zip(directions[i], bundle.face_index[i], strict=True)
         ]
         for b in range(9):
-            error = float(abs(Fraction(bundle.offset[i, b]) - (exact[b] - exact[0])))
+            error = float(abs(Fraction(bundle.range_offset[i, b]) - (exact[b] - exact[0])))
             cosine = bundle.cos_incidence[i, b]
             aside = np.linalg.norm(directions[i, b] - directions[i, 0])
             # A few roundings of n.delta, as large as R delta over the cosine.
             bound = 8 * 1.1e-16 * 2000.0 * aside / cosine**2
-            assert error <= (bound if same[i, b] else np.spacing(abs(bundle.offset[i, b])))
+            assert error <= (bound if same[i, b] else np.spacing(abs(bundle.range_offset[i, b])))
 
 
 def test_beamlets_of_one_beam_see_several_surfaces_and_may_miss():
@@ -282,18 +284,18 @@ def test_beamlets_of_one_beam_see_several_surfaces_and_may_miss():
     ground, _ = clean_mesh(
         [[-9, -9, 0], [0.5, -9, 0], [0.5, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]], 8
     )
-    caster = Caster([merge([leaf, ground])])
+    caster = RayCaster([merge_meshes([leaf, ground])])
     targets = np.array([[0.8, 0, 0], [0.4, 0, 0], [2.0, 0, 10], [0.3, 0.1, 0.0]])
     origin = np.array([[0.8, 0, 2010.0]])
     directions = unit(targets - origin)[None]
-    bundle = caster.bundle(origin, directions)
-    assert bundle.surface.tolist() == [[-1, 8, 7, 8]]
-    assert bundle.valid.tolist() == [[False, True, True, True]]
-    assert bundle.reference.tolist() == [1]
+    bundle = caster.cast_bundles(origin, directions)
+    assert bundle.surface_index.tolist() == [[-1, 8, 7, 8]]
+    assert bundle.is_hit.tolist() == [[False, True, True, True]]
+    assert bundle.reference_beamlet.tolist() == [1]
     lengths = np.linalg.norm(targets - origin, axis=1)
     np.testing.assert_allclose(bundle.range, lengths[1], rtol=1e-15)
-    np.testing.assert_allclose(bundle.offset[0, 1:], lengths[1:] - lengths[1], atol=1e-12)
-    assert bundle.offset[0, 2] < -9.0
+    np.testing.assert_allclose(bundle.range_offset[0, 1:], lengths[1:] - lengths[1], atol=1e-12)
+    assert bundle.range_offset[0, 2] < -9.0
 
 
 def placed(vertices, pose, i):
@@ -313,27 +315,27 @@ def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
     ]
     origins = 30.0 * unit(rng.normal(size=(n, 3)))
     directions = beam(unit(rng.uniform(-4, 4, (n, 3)) - origins), 0.1)
-    caster = Caster(meshes)
+    caster = RayCaster(meshes)
     hits = cast(caster, origins, directions[:, 0], poses=poses)
-    bundle = caster.bundle(origins, directions, poses=poses)
+    bundle = caster.cast_bundles(origins, directions, poses=poses)
     for i in range(n):
         moved = [placed(shapes[k][0], poses[k], i) for k in range(2)] + [shapes[2][0]]
         world = [
             clean_mesh(v, f, k)[0] for k, (v, (_, f)) in enumerate(zip(moved, shapes, strict=True))
         ]
-        still = Caster(merge(world))
-        truth = still.bundle(origins[i : i + 1], directions[i : i + 1])
-        np.testing.assert_array_equal(bundle.body[i], truth.surface[0])
-        np.testing.assert_array_equal(bundle.surface[i], truth.surface[0])
+        still = RayCaster(merge_meshes(world))
+        truth = still.cast_bundles(origins[i : i + 1], directions[i : i + 1])
+        np.testing.assert_array_equal(bundle.body_index[i], truth.surface_index[0])
+        np.testing.assert_array_equal(bundle.surface_index[i], truth.surface_index[0])
         np.testing.assert_allclose(bundle.range[i], truth.range[0], atol=1e-12)
-        np.testing.assert_allclose(bundle.offset[i], truth.offset[0], atol=2e-12)
+        np.testing.assert_allclose(bundle.range_offset[i], truth.range_offset[0], atol=2e-12)
         np.testing.assert_allclose(bundle.normal[i], truth.normal[0], atol=1e-13)
         np.testing.assert_allclose(bundle.cos_incidence[i], truth.cos_incidence[0], atol=1e-13)
-        if truth.valid[0, 0]:
+        if truth.is_hit[0, 0]:
             assert hits.range[i] == bundle.range[i]
             np.testing.assert_array_equal(hits.normal[i], bundle.normal[i])
-        assert hits.body[i] == truth.surface[0, 0]
-    assert {0, 1, 2} <= set(bundle.body.ravel().tolist())
+        assert hits.body_index[i] == truth.surface_index[0, 0]
+    assert {0, 1, 2} <= set(bundle.body_index.ravel().tolist())
 
 
 def exact_rotation(q):
@@ -357,14 +359,14 @@ def test_a_tumbling_body_at_two_kilometres_keeps_its_phase(offset):
     origins = pose.position + 2000.0 * unit(rng.normal(size=(n, 3)))
     directions = unit(pose.position + rng.uniform(-0.8, 0.8, (n, 3)) - origins)
     mesh, _ = clean_mesh(CORNERS, CUBE, 0)
-    hits = cast(Caster(mesh), origins, directions, poses=[pose])
-    assert (hits.face >= 0).sum() > 25
-    for i in np.flatnonzero(hits.face >= 0):
+    hits = cast(RayCaster(mesh), origins, directions, poses=[pose])
+    assert (hits.face_index >= 0).sum() > 25
+    for i in np.flatnonzero(hits.face_index >= 0):
         rotation = exact_rotation(pose.attitude[i])
         shift = to_fractions(pose.position[i])
         corners = [
             [dot(row, to_fractions(v)) + s for row, s in zip(rotation, shift, strict=True)]
-            for v in CORNERS[CUBE[hits.face[i]]]
+            for v in CORNERS[CUBE[hits.face_index[i]]]
         ]
         t, _ = intersect_triangle(corners, origins[i], directions[i])
         # The range's rounding, and the body's: 1e-15 m over the cosine of incidence.
@@ -378,12 +380,15 @@ def test_of_bodies_one_behind_the_other_the_nearest_is_hit_in_whatever_order_the
     straight = np.array([1.0, 0.0, 0.0, 0.0])
     poses = [Pose(np.array([x, 0.0, 0.0]), straight) for x in (50.0, 10.0, 30.0)]
     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
-        caster = Caster([mesh] * 3)
+        caster = RayCaster([mesh] * 3)
         hits = cast(caster, [[0, 0.2, 0.1]], [[1.0, 0, 0]], poses=[poses[k] for k in order])
         assert hits.range.tolist() == [9.0]
-        assert hits.body.tolist() == [order.index(1)]
+        assert hits.body_index.tolist() == [order.index(1)]
 
 
 def test_no_rays_give_no_hits(closed):
     assert cast(closed[2], np.empty((0, 3)), np.empty((0, 3))).range.shape == (0,)
-    assert closed[2].bundle(np.empty((0, 3)), np.empty((0, 5, 3))).offset.shape == (0, 5)
+    assert closed[2].cast_bundles(np.empty((0, 3)), np.empty((0, 5, 3))).range_offset.shape == (
+        0,
+        5,
+    )

@@ -1,0 +1,577 @@
+"""Number of a footprint's beamlets: as many as the accuracy asked for needs.
+
+``footprint.beamlets`` 0 leaves their number to ``accuracy.tolerance``. If powers add, the
+largest bin's magnitude r is then within a share of itself such that pd is within a quarter of the
+tolerance: with b the threshold over sigma,
+
+    |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
+
+in each of three segments. Most of the rest is the effects' (:mod:`.effects.planning`).
+If amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
+what [T] takes, 109, is then taken.
+
+In a flight each beamlet is a ray, and nothing is known of the ground before they are cast. Few are
+(:func:`initial_ray_count`), what these leave is estimated from what they hit (:mod:`.ray_error`),
+and shots of which that is too much are cast again with more (:func:`next_ray_counts`).
+
+If beamlets add as powers, the mean power of a bin is that of |W(k - f)|^2 over the beam, f being
+nearly proportional to one coordinate along the slope. The function |W|^2 is band-limited. With r
+the window's autocorrelation over lags of -1..1 records, normalised to sum 1, and s the deviation of
+f in bins of fs/L, a rule of nodes x_j and weights w_j is off by
+
+    integral |r(tau)| |sum_j w_j cos(2 pi s tau x_j) - exp(-(2 pi s tau)^2 / 2)| dtau
+
+at most, in units of the power that one line on a bin has there: by what the rule makes of cosines
+up to 2 pi s. Gauss and Hermite's rule is best for narrow spreads; for wide ones even steps are, as
+they are all but exact up to where they alias.
+
+To second order the range rises with the square of the distance from the axis, across the slope as
+along it. So f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of
+nodes at x = 1 has the mean of x^2, and misses (t c)^2 at the most. More lines lie at the positive
+nodes of a rule of twice as many:
+
+    x ^      .  .  .  .  .      3 lines of 5 nodes, weighted by the Gaussians of x and y;
+      |      .  .  .  .  .      as f is even in x, there is no need of their mirror images
+      |      .  .  .  .  .
+      +-----------------------> y, along the slope
+"""
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model import beam, ground, waveform
+from sweep.model.beamlets import (
+    GAUSS_HERMITE_NODES_MAX,
+    UNIFORM_RULE_RADIUS_SIGMA,
+    bins_per_velocity,
+    gaussian_rule,
+    plane_moments,
+)
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.looks import Looks
+from sweep.model.effects.window_response import WindowResponse, window_response
+from sweep.model.error_budget import ErrorBudget
+from sweep.model.preparation import (
+    BEAMLETS_ERROR_PATH,
+    CHIRP_PREFIX,
+    LASER_PREFIX,
+    PROCESSING_PREFIX,
+    Parameters,
+    doppler_ratio,
+    split_by_category,
+)
+from sweep.model.threshold import tnr_from_parameters
+from sweep.model.window import canonical_window_name, window_samples
+
+BEAMLETS_PATH = "footprint.beamlets"
+PATTERN_PATH = "footprint.pattern"
+
+_RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
+"""Times as many rays at the least, and at the most, as have told that they are too few."""
+
+_UNSURE_RAYS_MAX = 19
+"""Rays up to which smooth ground is taken for far rougher than it is: how much is no measure."""
+
+_N_SEGMENTS = 3
+
+NODE_COUNTS = np.array([
+    2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
+    4096,
+])  # fmt: skip
+"""Numbers of nodes to choose from; wide steps, as points of different numbers go apart."""
+
+LINE_COUNTS = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
+"""Numbers of parallel lines of nodes to choose from."""
+
+_UNIFORM_RULE_ERROR = 1e-10
+"""Error of even steps, for what lies beyond their reach."""
+_WINDOW_SAMPLES, _N_LAGS = 1024, 4096
+_CURVATURES = np.geomspace(1e-6, 100.0, 97)
+_N_CURVATURE_LAGS, _CURVATURE_PHASES = 512, np.geomspace(1e-6, 1e3, 512)
+_CURVATURE_RATIOS = np.geomspace(1e-6, 1e3, 97)
+_CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
+
+
+class LineSpreadBins(NamedTuple):
+    """Places of a footprint's lines, s y + c (x^2 + y^2), in bins of fs/L."""
+
+    deviation: np.ndarray
+    """(n,): most of |s|, steeper where the plane is, over the segments."""
+    linear: np.ndarray
+    """(rows, n): |s| of each segment, and of what turns from one to another."""
+    quadratic: np.ndarray
+    """(rows, n): |c| likewise."""
+
+    @property
+    def smoothing_deviation(self) -> np.ndarray:
+        """Deviation that smooths what lines miss across the slope, (rows, n).
+
+        |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
+        """
+        return np.asarray(self.linear / np.sqrt(1 + (4 * np.pi * self.quadratic) ** 2))
+
+
+def split_with_beamlet_counts(
+    parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
+) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Split points by category, and count the beamlets of each point.
+
+    They are counted where their number is left to the tolerance; without the effect of a footprint
+    one beamlet is all.
+    """
+    for indices, category_parameters in split_by_category(parameters, further_paths):
+        if int(category_parameters[BEAMLETS_PATH]) > 0:
+            yield indices, category_parameters
+            continue
+        n_beamlets, pattern, beamlets_error = np.asarray(1), np.asarray("line"), np.asarray(0.0)
+        if "footprint" in effects:
+            if beamlets_converge(category_parameters):
+                n_beamlets, pattern, beamlets_error = required_beamlets(
+                    category_parameters, indices.size
+                )
+            else:
+                n_beamlets, pattern = map(np.asarray, finest_beamlets(category_parameters))
+                beamlets_error = np.asarray(np.nan)  # of amplitudes that add nothing is estimated
+        beamlet_parameters = {
+            BEAMLETS_PATH: n_beamlets,
+            PATTERN_PATH: pattern,
+            BEAMLETS_ERROR_PATH: beamlets_error,
+        }
+        for subset, subset_parameters in split_by_category(
+            category_parameters | beamlet_parameters, further_paths
+        ):
+            yield indices[subset], subset_parameters
+
+
+def finest_beamlets(parameters: Mapping[str, Any]) -> tuple[int, str]:
+    """Most beamlets that points with these words may be given, and their pattern."""
+    if beamlets_converge(parameters):
+        return ErrorBudget.beamlets_max, "line"
+    return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
+
+
+def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
+    """Rays that every shot of a flight has that leaves their number to the tolerance."""
+    if not beamlets_converge(parameters):
+        return error_budget.thesis_beamlet_count
+    tolerance = float(np.asarray(error_budget.tolerance))
+    return next(
+        n_rays
+        for tolerance_min, n_rays in error_budget.min_rays_by_tolerance
+        if tolerance >= tolerance_min
+    )
+
+
+def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+    """Rays that shots are to be cast with again, (n,) int64; 0 where they have enough.
+
+    They have had `n_rays`, one of `accuracy.rays`, which leave `error` (n,)
+    (:func:`sweep.model.pointcloud.ray_error.estimate_ray_error`), falling about as one over their
+    number; nan where nothing is seen.
+    """
+    larger_counts = np.array(
+        [n for n in error_budget.ray_counts if n > _RAY_GROWTH_MIN * n_rays], np.int64
+    )
+    error_ratio = np.asarray(error, float) / error_budget.allowed_rays_error
+    if not larger_counts.size:
+        return np.zeros(error_ratio.shape, np.int64)
+    wanted_counts = n_rays * np.minimum(
+        error_ratio, _RAY_GROWTH_MAX if n_rays > _UNSURE_RAYS_MAX else 1
+    )
+    count_index = np.minimum(np.searchsorted(larger_counts, wanted_counts), larger_counts.size - 1)
+    return np.where(error_ratio > 1, larger_counts[count_index], 0)
+
+
+def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
+    """Return the part of a study's tolerance that is for skipped effects."""
+    counts_beamlets = n_beamlets == 0 and beamlets_converge(parameters)
+    return float(
+        ErrorBudget.from_parameters(parameters).allowed_effects_error(
+            counts_beamlets=counts_beamlets
+        )
+    )
+
+
+def is_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
+    """Return true where the tolerance alone sets beamlets, lines or leakage; (n,) or scalar."""
+    counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
+    return counts_beamlets | ErrorBudget.from_parameters(parameters).has_automatic_errors
+
+
+def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
+    """Return true if there is a number of beamlets that is enough."""
+    return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
+        "hexagonal",
+        "sunflower",
+    )
+
+
+def required_beamlets(
+    parameters: Mapping[str, np.ndarray], n_points: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Beamlets of points whose powers add: number, pattern, and error that is left, (n,) each.
+
+    The error is that of the probabilities of detection, summed over the segments.
+    """
+    pd_change_per_power, error_budget = (
+        _pd_change_per_power(parameters) + np.zeros(n_points),
+        ErrorBudget.from_parameters(parameters),
+    )
+    power_tolerance = error_budget.allowed_beamlets_error / pd_change_per_power
+    window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
+    spread = _line_spread(parameters, n_points, error_budget.beamlets_max)
+    n_lines, n_nodes, error = required_nodes(window_name, spread, power_tolerance, error_budget)
+    pattern = np.where(n_lines == 1, "line", np.char.add(n_lines.astype(str), " lines"))
+    return n_lines * n_nodes, pattern, np.minimum(error * pd_change_per_power, 1.0)
+
+
+def _pd_change_per_power(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Most that pd changes, summed over the segments, for the relative change of a bin's power."""
+    from sweep.model.detection import echo_detection
+
+    b = echo_detection.threshold_from_tnr(
+        tnr=tnr_from_parameters(parameters), bin_deviation=np.asarray(1.0)
+    )
+    b = Looks.from_parameters(parameters).amplitude_gain_max * b
+    a = 0.5 * (b + np.sqrt(b * b + 2))
+    slope_max = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
+    return np.asarray(_N_SEGMENTS * slope_max / 2)
+
+
+def _line_spread(
+    parameters: Mapping[str, np.ndarray], n_points: int, beamlets_max: int
+) -> LineSpreadBins:
+    """Spread of the lines of up, Doppler and down segment [bins of fs/L]."""
+    grazing_angle, radial_velocity = (
+        parameters["target.grazing_angle"],
+        np.asarray(parameters["target.radial_velocity"], float),
+    )
+    position_angles, direction_angles = beam.footprint_angles(parameters)
+    transverse_velocity = np.asarray(parameters["target.transverse_velocity"], float)
+    position_sigma, slope, direction_sigma = (
+        position_angles / 4,
+        position_angles / 4 / np.tan(grazing_angle),
+        direction_angles / 4,
+    )
+    bin_width = parameters[PROCESSING_PREFIX + "sample_rate"] / parameters["record"]
+    chirp_rate = parameters[CHIRP_PREFIX + "bandwidth"] / parameters[CHIRP_PREFIX + "duration"]
+    range_moments, velocity_moments = plane_moments(
+        transverse_velocity=transverse_velocity,
+        radial_velocity=radial_velocity,
+        grazing_angle=grazing_angle,
+        beam_divergence=position_angles,
+        n_beamlets=beamlets_max,
+        pattern="line",
+        direction_angle=direction_angles,
+    )
+    # Beyond the horizon the ranges' have no bound: there the plain one has to do.
+    range_rms = np.where(np.isfinite(range_moments.rms), range_moments.rms, slope)
+    beat_per_metre = (
+        2
+        / SPEED_OF_LIGHT
+        * np.asarray(chirp_rate, float)
+        * (1 + np.abs(doppler_ratio(radial_velocity)))
+    )
+    bins_per_range = beat_per_metre * parameters["target.range"] / bin_width
+    carrier = (
+        SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"]
+        + parameters[CHIRP_PREFIX + "bandwidth"]
+    )
+    bins_per_speed = bins_per_velocity(
+        range=parameters["target.range"],
+        carrier=carrier,
+        chirp_rate=chirp_rate,
+        bin_width=bin_width,
+    )
+    # Of ranges in the beats.
+    chirp_slopes, zeros = np.array(waveform.chirp_slopes(parameters))[:, None], np.zeros(n_points)
+    spread = LineSpreadBins(
+        deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
+        + bins_per_speed * velocity_moments.rms
+        + zeros,
+        linear=abs(
+            bins_per_speed * transverse_velocity * direction_sigma
+            + chirp_slopes * bins_per_range * slope
+        )
+        + zeros,
+        quadratic=abs(
+            bins_per_speed * radial_velocity * (direction_sigma / position_sigma) ** 2
+            + chirp_slopes * bins_per_range
+        )
+        * (position_sigma**2 / 2)
+        + zeros,
+    )
+    if "target.roughness" not in parameters or not np.any(parameters["target.roughness"]):
+        return spread
+    # Amplitudes that are drawn turn against each other from segment to segment, by Doppler shifts
+    # and, as the echoes of segments differ in optical frequency, by ranges.
+    starts = waveform.segment_starts(
+        waveform.existing_segments("", str(parameters[waveform.SEGMENT_ORDER_PATH])),
+        duration=parameters[CHIRP_PREFIX + "duration"], gap=parameters[waveform.SEGMENT_GAP_PATH],
+    )  # fmt: skip
+    last_start_bins = np.maximum.reduce(starts) * bin_width
+    delay = 2 / SPEED_OF_LIGHT * parameters["target.range"]
+    carrier_difference_cycles = _carrier_difference_max(parameters) * delay
+    # Each by twice as much, as sums over records hardly look at their ends.
+    slope = np.vstack(
+        [
+            spread.linear,
+            2 * (last_start_bins * spread.linear[1] + carrier_difference_cycles * slope),
+        ]
+    )
+    quadratic = np.vstack(
+        [
+            spread.quadratic,
+            2
+            * (
+                last_start_bins * spread.quadratic[1]
+                + carrier_difference_cycles * position_sigma**2 / 2
+            ),
+        ]
+    )
+    phase_deviation = (
+        2
+        * (
+            last_start_bins * bins_per_speed * velocity_moments.rms
+            + carrier_difference_cycles * range_rms
+        )
+        + zeros
+    )
+    return LineSpreadBins(np.maximum(spread.deviation, phase_deviation), slope, quadratic)
+
+
+def _carrier_difference_max(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Largest difference between two segments of the optical frequency in mid-record [Hz].
+
+    Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
+    """
+    chirp_rate = parameters[CHIRP_PREFIX + "bandwidth"] / parameters[CHIRP_PREFIX + "duration"]
+    record_duration = parameters["record"] / parameters[PROCESSING_PREFIX + "sample_rate"]
+    record_middle = parameters[PROCESSING_PREFIX + "acquisition_delay"] + record_duration / 2
+    time_since_echo = record_middle - 2 / SPEED_OF_LIGHT * parameters["target.range"]
+    frequencies = [
+        carrier + chirp_slope * chirp_rate * time_since_echo
+        for carrier, chirp_slope in zip(
+            waveform.segment_carriers(parameters), waveform.chirp_slopes(parameters), strict=True
+        )
+    ]
+    return np.max(frequencies, axis=0) - np.min(frequencies, axis=0)
+
+
+def required_nodes(
+    window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes with which the largest bin's power is within a tolerance, or as near as any are.
+
+    The tolerance (n,) is on the largest bin's power, over that power itself, wherever the lines
+    lie. Returns, (n,) each: parallel lines of nodes, 1 for most points; nodes of each line, 2 at
+    least; what they may be off by, 1 where they say nothing.
+    """
+    tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
+    table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider spread
+    single_line_error = _single_line_error(window_name, spread) / largest_bin_powers[table_index]
+    counts = NODE_COUNTS[: np.searchsorted(NODE_COUNTS, error_budget.beamlets_max, "right")]
+    total_error = tabulated_errors[: counts.size, table_index] + single_line_error
+    count_index, error = _cheapest_row(total_error, counts[:, None], tolerance)
+    n_lines = np.ones(count_index.shape, np.int64)
+    needs_lines = (error > tolerance) & (
+        single_line_error > error_budget.single_line_fraction * tolerance
+    )
+    if needs_lines.any():
+        some = LineSpreadBins(*(np.asarray(values)[..., needs_lines] for values in spread))
+        line_count_index, line_counts, line_errors = _choose_lines(
+            window_name, some, tolerance[needs_lines], error_budget.beamlets_max
+        )
+        is_better = line_errors < np.minimum(error[needs_lines], 1.0)
+        some = np.flatnonzero(needs_lines)[is_better]
+        count_index[some], n_lines[some], error[some] = (
+            line_count_index[is_better],
+            line_counts[is_better],
+            line_errors[is_better],
+        )
+    return n_lines, NODE_COUNTS[count_index], np.minimum(error, 1.0)
+
+
+def _cheapest_row(
+    error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Row of the cheapest (rows, n) whose error is tolerated, or of the least error; its error."""
+    allowed_cost = np.where(error <= tolerance, cost, np.inf)
+    row = np.where(
+        np.isfinite(allowed_cost).any(axis=0), allowed_cost.argmin(axis=0), error.argmin(axis=0)
+    )
+    return row, np.take_along_axis(error, row[None], axis=0)[0]
+
+
+def _choose_lines(
+    window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row of :data:`NODE_COUNTS`, lines and error for spreads that one line of nodes misses."""
+    tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
+    errors_along, errors_across = _curvature_errors(window_name)
+    quadratic_max, linear_max = spread.quadratic.max(axis=0), spread.linear.max(axis=0)
+    # Where squares alone spread the lines, what the rules make of squares is all that counts.
+    linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
+    largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
+    curvature_index = np.searchsorted(_CURVATURES, quadratic_max)
+    error_along = (
+        tabulated_errors[:, np.searchsorted(tabulated_spreads, linear_deviation)]
+        + errors_along[:, curvature_index] / largest_bin_power
+    )
+    error_across = np.zeros((LINE_COUNTS.size, quadratic_max.size))
+    for s, c in zip(spread.smoothing_deviation, spread.quadratic, strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
+            smoothed_error = _smoothed_curvature_errors()[:, ratio] * (
+                _autocorrelation_peak(window_name) / (2 * np.pi * s)
+            )
+        segment_error = np.fmin(errors_across[:, np.searchsorted(_CURVATURES, c)], smoothed_error)
+        error_across = np.maximum(error_across, segment_error / largest_bin_power)
+    total_error = error_along[:, None] + error_across
+    cost = NODE_COUNTS[:, None] * LINE_COUNTS
+    total_error = np.where((cost <= beamlets_max)[..., None], total_error, np.inf).reshape(
+        -1, quadratic_max.size
+    )
+    best, error = _cheapest_row(total_error, cost.reshape(-1, 1), tolerance)
+    return best // LINE_COUNTS.size, LINE_COUNTS[best % LINE_COUNTS.size], error
+
+
+def _single_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
+    """Error of one line of nodes by squares, over the power of a line on a bin, (n,).
+
+    As much again is for what the fewest nodes along the slope miss of them.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
+        smoothed_error = (
+            density * math.sqrt(np.pi / 2) * (spread.quadratic / spread.smoothing_deviation) ** 2
+        )
+    lobe_shape = window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES)
+    return np.asarray(
+        2 * np.fmin(lobe_shape.curvature_max * spread.quadratic**2, smoothed_error).max(axis=0)
+    )
+
+
+@lru_cache(maxsize=32)
+def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of each count by deviation, over the largest bin's power; and that power.
+
+    Deviations (m,), errors (counts, m + 1) up to each and beyond all, largest bins (m + 1,).
+    """
+    spreads = np.geomspace(1e-3, 400.0, 96)
+    largest_bin_powers = _largest_bin_power(
+        window_response(window_name, _WINDOW_SAMPLES, _WINDOW_SAMPLES), spreads
+    )
+    lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
+    weight = _window_autocorrelation(window_name, lag)
+    errors = np.empty((NODE_COUNTS.size, spreads.size + 1))
+    for row, n_nodes in zip(errors, NODE_COUNTS.tolist(), strict=True):
+        row[:] = np.append(_unbounded_error(spreads, n_nodes), np.inf)
+        for i, spread in enumerate(spreads.tolist()):
+            rule_error = (
+                weight * _cosine_rule_error(n_nodes, 2 * np.pi * spread * lag)
+            ).sum() / largest_bin_powers[i]
+            if rule_error > 1:
+                break  # wider spreads are no better
+            row[i] = rule_error
+        row[-1] = _unbounded_error(1e3, n_nodes)
+    return (
+        spreads,
+        np.maximum.accumulate(errors, axis=1),
+        np.append(largest_bin_powers, largest_bin_powers[-1]),
+    )
+
+
+def _unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
+    """Stand-in for errors without a bound, 1 or more: the nodes' distance [bins]."""
+    return np.maximum(1.0, 2 * UNIFORM_RULE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
+
+
+@lru_cache(maxsize=32)
+def _curvature_errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors by curve, over the power of a line on a bin: of counts along, of lines across."""
+    lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
+    weight = _window_autocorrelation(window_name, lag)
+    phase = 2 * np.pi * lag * _CURVATURES[:, None]
+
+    def errors_of_rule(n_nodes: int) -> np.ndarray:
+        rule_errors = (
+            weight * np.interp(phase, _CURVATURE_PHASES, _quadratic_phase_error(n_nodes))
+        ).sum(axis=1)
+        return np.append(
+            np.where(rule_errors < 1, rule_errors, _unbounded_error(_CURVATURES, n_nodes)), 1e3
+        )
+
+    along, across = NODE_COUNTS.tolist(), (2 * LINE_COUNTS).tolist()
+    return np.array([errors_of_rule(number) for number in along]), np.array(
+        [errors_of_rule(number) for number in across]
+    )
+
+
+@lru_cache(maxsize=1)
+def _smoothed_curvature_errors() -> np.ndarray:
+    """Mean of what lines miss of squares, over a Gaussian 1 / ratio wide, (lines, ratios + 1)."""
+    phase = np.linspace(0.0, 8.0, 801)[1:]
+    weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
+    errors = np.full((LINE_COUNTS.size, _CURVATURE_RATIOS.size + 1), np.inf)
+    for row, lines in zip(errors, LINE_COUNTS.tolist(), strict=True):
+        rule_errors = np.interp(
+            phase * _CURVATURE_RATIOS[:, None], _CURVATURE_PHASES, _quadratic_phase_error(2 * lines)
+        )
+        row[:-1] = (weight * rule_errors).sum(axis=1)
+    return errors
+
+
+@lru_cache(maxsize=64)
+def _quadratic_phase_error(n_nodes: int) -> np.ndarray:
+    """Largest error of a rule's mean of exp(i turn x^2), 1 / sqrt(1 - 2 i turn), up to turns."""
+    x, w = gaussian_rule(n_nodes)
+    rule_mean = np.array(
+        [(w * np.exp(1j * phase * x**2)).sum() for phase in _CURVATURE_PHASES.tolist()]
+    )
+    return np.maximum.accumulate(np.abs(rule_mean - 1 / np.sqrt(1 - 2j * _CURVATURE_PHASES)))
+
+
+def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
+    """Least power of the largest bin, over that of all lines on a bin: as of `power_range`."""
+    narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
+    wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min
+    return np.maximum(
+        narrow,
+        (wide / (2 * _CHEBYSHEV_MULTIPLES * deviation + 2 * lobe_shape.padding_factor + 1)).max(
+            axis=0
+        ),
+    )
+
+
+def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
+    """|r| at lags [records] of both signs, in shares of their sum with sign."""
+    w = window_samples(window_name, _WINDOW_SAMPLES)
+    r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]
+    at_lags = np.interp(lag * _WINDOW_SAMPLES, np.arange(_WINDOW_SAMPLES + 1), r)
+    return np.asarray(np.abs(at_lags) / at_lags.sum())
+
+
+@lru_cache(maxsize=32)
+def _autocorrelation_peak(window_name: str) -> float:
+    """Largest density of the autocorrelation over lags [1/record]."""
+    lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
+    return float(_window_autocorrelation(window_name, lag).max()) * _N_LAGS
+
+
+def _cosine_rule_error(n_nodes: int, phase: np.ndarray) -> np.ndarray:
+    """Largest error of a rule's mean of cos(turn x), which is exp(-turn^2 / 2)."""
+    if n_nodes <= GAUSS_HERMITE_NODES_MAX:
+        x, w = gaussian_rule(n_nodes)
+        rule_mean = (w * np.cos(phase[:, None] * x)).sum(axis=1)
+        return np.asarray(np.abs(rule_mean - np.exp(-0.5 * phase**2)))
+    step = 2 * UNIFORM_RULE_RADIUS_SIGMA / (n_nodes - 1)
+    excess_phase = phase - 2 * np.pi / step  # even steps repeat themselves there
+    return np.asarray(
+        np.where(excess_phase < 0, np.exp(-0.5 * excess_phase**2), 1.0) + _UNIFORM_RULE_ERROR
+    )

@@ -1,0 +1,1 @@
+"""Laws of detection: thresholds, noise, speckle, looks, detectors and estimators."""

@@ -1,0 +1,223 @@
+"""Detectors: which bins of a spectrum hold a signal, by a fixed threshold or by their neighbours.
+
+All look at the power |X|^2 of every bin (a square-law detector). A constant-false-alarm-rate (CFAR)
+detector holds each bin against ``factor`` times a level that it takes from *training* cells, half
+of them on either side, with *guard* cells between. Guard cells are left out so that the signal does
+not train its own threshold:
+
+- ``ca_cfar``, cell averaging: the mean of all training cells [Finn and Johnson, RCA Review 29, 414,
+  1968].
+- ``goca_cfar``, greatest of: the larger of the means of the two halves, against clutter edges
+  [Hansen, IEE Conf. Radar, 325, 1973].
+- ``os_cfar``, ordered statistic: the cell of a rank among all sorted training cells, against other
+  targets among them [Rohling, IEEE Trans. Aerosp. Electron. Syst. 19, 608, 1983].
+
+The factors follow from the design probability of a false alarm in closed form, for independent
+cells of exponential noise [Gandhi and Kassam, IEEE Trans. Aerosp. Electron. Syst. 24, 427, 1988;
+Richards, Fundamentals of Radar Signal Processing, 2014, chapter 6]. A tapered window or a padded
+FFT makes the noise of neighbouring bins alike: fewer independent cells stand behind the level, and
+more false alarms come than by design (docs/detectors.md has how many).
+
+The same forms give the probability of detection of a signal that fluctuates as speckle does
+(Swerling 1). A cell whose mean is 1 + snr times the noise's crosses as noise does a factor smaller
+by 1 + snr.
+
+The spectrum of a white record has no ends: training cells beyond DC are those below Nyquist, and
+the other way round; in a complex record's spectrum those beyond its last bin are its first.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import gammaln
+
+from sweep.model.window import Window, window_samples
+
+FIXED_THRESHOLD = "fixed"
+CA_CFAR, OS_CFAR, GOCA_CFAR = "ca_cfar", "os_cfar", "goca_cfar"
+
+
+@lru_cache(maxsize=8)
+def cached_window_samples(window: Window) -> np.ndarray:
+    """Return the samples (L,) of a window, computed once and read-only."""
+    samples_of_window = window_samples(window.name, window.length)
+    samples_of_window.flags.writeable = False
+    return samples_of_window
+
+
+@lru_cache(maxsize=8)
+def main_lobe_half_width(window: Window) -> float:
+    """Distance [bins of fs/L] of the first minimum of |W| below its half, to 1/8 bin."""
+    magnitude = np.abs(np.fft.rfft(cached_window_samples(window), 8 * window.length))
+    is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # a flattop's top has minima of its own
+    return float(np.argmax(is_below_half & (np.diff(magnitude) > 0))) / 8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SpectrumSettings:
+    """Settings by which spectra were made, and by which they are detected."""
+
+    fft_size: int
+    """Points N of the FFT; spectra have the bins 0..N/2, or -N/2..N/2 - 1 of a complex record."""
+    sample_rate: float
+    """[Hz]; a bin is ``sample_rate / fft_size`` wide."""
+    window: Window
+    """Its ``length`` L <= N is that of the record, which is padded with zeros to N."""
+    noise_power: float
+    """Mean |X|^2 of a bin of noise alone, by the receiver's noise budget [V^2]."""
+    threshold: float
+    """Fixed threshold on |X| [V]."""
+    training: int
+    """Training cells, half of them on either side; even."""
+    guard: int
+    """Guard cells on either side."""
+    rank: int
+    """Rank of the ordered statistic among the training cells, 1 for the least."""
+    pfa: float
+    """Design probability of a false alarm in a bin of noise alone."""
+    complex_record: bool = False
+    """True for records of I and Q: bin k stands at index k + N/2."""
+
+    @property
+    def taper(self) -> np.ndarray:
+        """Samples (L,) of the window."""
+        return cached_window_samples(self.window)
+
+
+Detector = Callable[[np.ndarray, SpectrumSettings], np.ndarray]
+"""From power |X|^2 (m, N/2 + 1) of m spectra, (m, N) of complex records, and the setting to bool of
+the same shape."""
+
+
+def cfar_crossing_probability(kind: str, factor: float, *, training: int, rank: int) -> float:
+    """Probability that a cell of exponential power exceeds its CFAR threshold.
+
+    `factor` is the threshold over the level that training cells give; where the cell's own mean is
+    1 + snr times theirs, over 1 + snr. `rank` is 1..training, and training even.
+    """
+    if kind == CA_CFAR:
+        return float((1 + factor / training) ** -training)
+    if kind == OS_CFAR:
+        # prod_{i < rank} (N - i) / (N - i + factor)
+        upper_argument, lower_argument = training + 1, training - rank + 1
+        log_probability = (gammaln(upper_argument) - gammaln(lower_argument)) - (
+            gammaln(upper_argument + factor) - gammaln(lower_argument + factor)
+        )
+        return float(np.exp(log_probability))
+    half_cells = training // 2
+    factor_per_cell = factor / half_cells
+    k = np.arange(half_cells)
+    terms = (
+        gammaln(half_cells + k)
+        - gammaln(half_cells)
+        - gammaln(k + 1)
+        - (half_cells + k) * np.log(2 + factor_per_cell)
+    )
+    return float(2 * ((1 + factor_per_cell) ** -half_cells - np.exp(terms).sum()))
+
+
+def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
+    """Factor on the level of training cells for a design probability of a false alarm in a bin."""
+    from scipy.optimize import brentq  # slow to import, and only CFAR has a factor to find
+
+    if kind == CA_CFAR:
+        return training * math.expm1(-math.log(pfa) / training)
+
+    def log_pfa_excess(log_factor: float) -> float:
+        probability = cfar_crossing_probability(
+            kind, math.exp(log_factor), training=training, rank=rank
+        )
+        return math.log(max(probability, 1e-300)) - math.log(pfa)
+
+    log_factor_max = 0.0
+    while log_pfa_excess(log_factor_max) > 0:
+        log_factor_max += 1.0
+    return math.exp(brentq(log_pfa_excess, -60.0, log_factor_max, xtol=1e-14, rtol=1e-14))
+
+
+def fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Bins at or above the threshold that follows from the TNR."""
+    return power >= settings.threshold**2
+
+
+def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Bins at or above the cell-averaging threshold."""
+    below, above = _training_sums(power, settings)
+    return _exceeds_cfar_threshold(
+        power, (below + above) / (settings.training // 2 * 2), CA_CFAR, settings
+    )
+
+
+def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Bins at or above the greatest-of cell-averaging threshold."""
+    level = np.maximum(*_training_sums(power, settings)) / (settings.training // 2)
+    return _exceeds_cfar_threshold(power, level, GOCA_CFAR, settings)
+
+
+def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Bins at or above the threshold of an ordered statistic: so many cells stay below the bin."""
+    circular_bins = _circular_bins(power, settings)
+    level_max, n_below = (
+        circular_bins / _settings_factor(OS_CFAR, settings),
+        np.zeros(circular_bins.shape, np.int64),
+    )
+    for below, above in _iter_training_pairs(power, settings):
+        n_below += below <= level_max
+        n_below += above <= level_max
+    return _pad_to_all_bins(n_below >= settings.rank, settings)
+
+
+DETECTORS: dict[str, Detector] = {
+    FIXED_THRESHOLD: fixed_threshold,
+    CA_CFAR: ca_cfar,
+    OS_CFAR: os_cfar,
+    GOCA_CFAR: goca_cfar,
+}
+
+
+def _settings_factor(kind: str, settings: SpectrumSettings) -> float:
+    return cfar_factor(kind, training=settings.training, rank=settings.rank, pfa=settings.pfa)
+
+
+def _circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Bins whose noise is circular: all but DC and Nyquist of a real record."""
+    return power if settings.complex_record else power[:, 1:-1]
+
+
+def _pad_to_all_bins(flags: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
+    """Extend flags to all bins from those of :func:`_circular_bins`."""
+    return flags if settings.complex_record else np.pad(flags, ((0, 0), (1, 1)))
+
+
+def _iter_training_pairs(
+    power: np.ndarray, settings: SpectrumSettings
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Training cells of the bins of :func:`_circular_bins`, one below and one above at a time.
+
+    The spectrum goes on at either end with its other end's bins.
+    """
+    circular_bins, half_cells = _circular_bins(power, settings), settings.training // 2
+    n_bins, reach_cells = circular_bins.shape[1], half_cells + settings.guard
+    circular_bins = circular_bins[:, np.arange(-reach_cells, n_bins + reach_cells) % n_bins]
+    for i in range(half_cells):
+        above_begin = reach_cells + settings.guard + 1 + i
+        yield circular_bins[:, i : i + n_bins], circular_bins[:, above_begin : above_begin + n_bins]
+
+
+def _training_sums(power: np.ndarray, settings: SpectrumSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Sum the training cells below and above each bin."""
+    sums = np.zeros((2, *_circular_bins(power, settings).shape))
+    for pair in _iter_training_pairs(power, settings):
+        sums += pair
+    return sums[0], sums[1]
+
+
+def _exceeds_cfar_threshold(
+    power: np.ndarray, level: np.ndarray, kind: str, settings: SpectrumSettings
+) -> np.ndarray:
+    return _pad_to_all_bins(
+        _circular_bins(power, settings) >= _settings_factor(kind, settings) * level, settings
+    )

@@ -1,0 +1,386 @@
+"""Speckle that the looks of a shot share in part, as the target or the beam moves on between them.
+
+In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s, circular complex
+Gaussian of power 1, times the root of the look's SNR, and noise of power 1. The speckles of looks
+k and l have the correlation mu(l - k), equation (2) of
+:mod:`sweep.model.detection.speckle_correlation`: with
+the turn F beta (l - k) T of a scatterer between two looks, which start T apart. If the echo spreads
+over bins it is equation (3). Looks in which the line has moved on to other bins have less power in
+this one.
+
+**Mean power.** Let x be the mean SNR, and c_j the eigenvalues of the matrix sqrt(x_k x_l) mu(l - k)
+over x, of which the sum is N. The sum of |z_k|^2 is one of independent exponential variables, of
+means 1 + x c_j. It exceeds y with
+
+    P(y) = 1 / (2 pi i) int exp(-s y) / s prod_j (1 - (1 + x c_j) s)^(-m_j) ds                 (1)
+
+along a parabola through the saddle point of the integrand, which the poles lie within. In contrast
+to partial fractions this keeps its digits where eigenvalues are alike. m_j is 1. More than
+MATRIX_LOOKS_MAX looks have the eigenvalues of as many looks that are farther apart. If their
+speckle has no memory over this distance, there is one of multiplicity M = N^2 / sum c^2: a gamma
+variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007, 4.6].
+
+**Votes.** Given the speckles, records cross independently, by Q_1. The probability that enough do
+is averaged over NODES fixed speckles, a Kronecker lattice with its second moments made exact. The
+lattice's error for looks of independent speckle, of which the binomial law is known, is taken off
+in proportion to (M - 1) / (N - 1).
+
+**Two segments.** Let r be the correlation of the segments' mean powers,
+
+    r = sum_kl |mu_12(k, l)|^2 / sqrt(sum_kl |mu_11|^2 sum_kl |mu_22|^2).
+
+If they share all their speckle, the product of both is averaged over it. Of the covariance that
+this leaves they have a part: that which two Rayleigh magnitudes have at r if M is 1, and r if M is
+large.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+from sweep.model.detection.marcum import marcum_q1_tails
+
+MATRIX_LOOKS_MAX = 64
+"""Number of looks up to which the full correlation matrix is used."""
+
+GAMMA_SHAPE_MIN = 32.0
+"""Effective number of looks from which, with more than MATRIX_LOOKS_MAX looks, the mean power is
+treated as a gamma variable."""
+
+SPECKLE_LATTICE_SIZE = 2048
+"""Number of lattice points (joint speckles of all looks) over which votes are averaged."""
+
+_CONTOUR_NODES = 40
+_CONTOUR_END = 4.6
+_BISECTION_STEPS = 60
+_CROSSING_TABLE_STEPS = 512
+_TABULATED_SPECKLE_MAX = 5.0
+"""Largest tabulated speckle magnitude, in units of its root mean square."""
+
+
+class LookSpeckle(NamedTuple):
+    """Correlation of the speckle between the N looks of a shot, by segment and point."""
+
+    eigenvalue: np.ndarray
+    """(3, n, k): eigenvalues c_j of the looks' correlation matrix."""
+    multiplicity: np.ndarray
+    """(3, n, k): multiplicities m_j, 0 for unused entries; sum_j c_j m_j = N."""
+    effective_looks: np.ndarray
+    """(3, n): effective number M of looks of independent speckle, 1 .. N."""
+    segment_correlation: np.ndarray
+    """(3, n): sqrt(r) for the pairs (up, Doppler), (up, down), (Doppler, down)."""
+    correlation_by_lag: np.ndarray
+    """(3, n, N) complex: correlation mu of two looks by their distance 0 .. N - 1."""
+    look_power: np.ndarray
+    """(3, n, N): relative power of each look in the strongest bin; mean 1."""
+
+    @classmethod
+    def from_correlations(
+        cls, correlation_by_lag: np.ndarray, look_power: np.ndarray, segment_correlation: np.ndarray
+    ) -> "LookSpeckle":
+        """Compute eigenvalues and effective number of looks from correlations and powers.
+
+        ``correlation_by_lag``, ``look_power`` and ``segment_correlation`` are as of the fields.
+        """
+        n_looks = correlation_by_lag.shape[2]
+        eigenvalue = np.maximum(
+            np.linalg.eigvalsh(look_covariances(correlation_by_lag, look_power)), 0.0
+        )
+        eigenvalue *= n_looks / eigenvalue.sum(axis=-1, keepdims=True)
+        multiplicity = np.ones(eigenvalue.shape)
+        effective_looks = n_looks**2 / np.square(eigenvalue).sum(axis=-1)
+        if n_looks > MATRIX_LOOKS_MAX:
+            lags = np.arange(n_looks)
+            n_pairs = np.where(lags > 0, 2.0, 1.0) * (n_looks - lags)
+            is_gamma = effective_looks > GAMMA_SHAPE_MIN
+            effective_of_all = n_looks**2 / (n_pairs * np.abs(correlation_by_lag) ** 2).sum(axis=-1)
+            effective_looks = np.where(
+                is_gamma, np.maximum(effective_of_all, GAMMA_SHAPE_MIN), effective_looks
+            )
+            eigenvalue[is_gamma], multiplicity[is_gamma] = 0.0, 0.0
+            eigenvalue[is_gamma, 0] = n_looks / effective_looks[is_gamma]
+            multiplicity[is_gamma, 0] = effective_looks[is_gamma]
+        return cls(
+            eigenvalue,
+            multiplicity,
+            np.clip(effective_looks, 1.0, n_looks),
+            segment_correlation,
+            correlation_by_lag,
+            look_power,
+        )
+
+    def select(self, points: np.ndarray | slice) -> "LookSpeckle":
+        """Select points by their indices."""
+        return LookSpeckle(*(column[:, points] for column in self))
+
+    def covariance_root(self, segment: int, point: int) -> np.ndarray:
+        """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle.
+
+        A z are the speckles of the N looks, each times the root of its power, if the z are
+        independent, of mean power 1.
+        """
+        correlation_by_lag = self.correlation_by_lag[segment, point]
+        covariance = look_covariances(
+            correlation_by_lag, self.look_power[segment, point], correlation_by_lag.size
+        )
+        eigenvalue, eigenvector = np.linalg.eigh(covariance)
+        return eigenvector[:, ::-1] * np.sqrt(np.maximum(eigenvalue[::-1], 0.0))
+
+    def covariance_roots(self) -> np.ndarray:
+        """Return the matrices of :meth:`covariance_root` of all segments and points, (3, n, N, k).
+
+        With as many columns as independent speckles have a share in the looks of any point.
+        """
+        n_looks = self.correlation_by_lag.shape[2]
+        eigenvalues, eigenvectors = np.linalg.eigh(
+            look_covariances(self.correlation_by_lag, self.look_power, n_looks)
+        )
+        eigenvalues = np.maximum(eigenvalues[..., ::-1], 0.0)
+        n_used = (eigenvalues > _POWER_FRACTION_MIN * n_looks).any(axis=(0, 1)).sum()
+        return (eigenvectors[..., ::-1] * np.sqrt(eigenvalues)[..., None, :])[..., :n_used]
+
+
+_POWER_FRACTION_MIN = 1e-7
+"""Share of the looks' power below which an independent speckle is left out."""
+
+
+def look_covariances(
+    correlation_by_lag: np.ndarray, look_power: np.ndarray, looks_max: int = MATRIX_LOOKS_MAX
+) -> np.ndarray:
+    """Return the covariance matrices sqrt(x_k x_l) mu(l - k) of the looks' speckle, (..., k, k).
+
+    More than ``looks_max`` looks are represented by those of :func:`representative_look_positions`.
+    """
+    n_looks = correlation_by_lag.shape[-1]
+    position = representative_look_positions(n_looks, looks_max)
+    n_kept = position.size
+    if n_kept < n_looks:
+        index = np.minimum(position.astype(int), n_looks - 2)
+        fraction = position - index
+        correlation_by_lag, look_power = (
+            values[..., index] * (1 - fraction) + values[..., index + 1] * fraction
+            for values in (correlation_by_lag, look_power)
+        )
+    lag = np.arange(n_kept) - np.arange(n_kept)[:, None]
+    covariance = correlation_by_lag[..., np.abs(lag)]
+    covariance = np.where(lag < 0, np.conj(covariance), covariance)
+    return covariance * np.sqrt(look_power[..., :, None] * look_power[..., None, :])
+
+
+def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MAX) -> np.ndarray:
+    """Return the positions of the looks, at most ``looks_max``, that represent ``n_looks`` looks.
+
+    They have the same mean square time from the middle.
+    """
+    n_kept = min(n_looks, looks_max)
+    position_step = math.sqrt((n_looks**2 - 1) / (n_kept**2 - 1)) if n_kept < n_looks else 1.0
+    return np.minimum(np.arange(n_kept) * position_step, n_looks - 1)
+
+
+def phase_rotated_look_covariances(
+    correlation_by_lag: np.ndarray, look_power: np.ndarray, cycles_per_look: np.ndarray
+) -> np.ndarray:
+    """Return :func:`look_covariances` of echoes whose phase turns from look to look, (m, k, k).
+
+    Parameters
+    ----------
+    correlation_by_lag, look_power
+        (m, N): as of :class:`LookSpeckle`.
+    cycles_per_look
+        (m,): turn of the line's phase from one look to the next [cycles].
+    """
+    positions = representative_look_positions(correlation_by_lag.shape[-1])
+    phase = 2 * np.pi * np.mod(cycles_per_look[:, None] * positions, 1.0)
+    return look_covariances(correlation_by_lag, look_power) * np.exp(
+        1j * (phase[:, None, :] - phase[:, :, None])
+    )
+
+
+def mean_power_tails(
+    look_speckle: LookSpeckle, n_looks: int, snr: np.ndarray, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return P(sum of the looks' powers > threshold), equation (1), and its complement.
+
+    Parameters
+    ----------
+    look_speckle
+        Correlation of the looks' speckle.
+    n_looks
+        Number of looks N.
+    snr
+        (..., 3, n): mean SNR of one look.
+    threshold
+        (..., 3, n): threshold on the sum, over the mean noise power of one look.
+    """
+    snr, threshold = np.broadcast_arrays(snr, threshold)
+    noise_multiplicity = n_looks - look_speckle.multiplicity.sum(axis=-1, keepdims=True)
+    multiplicity = np.concatenate(
+        [look_speckle.multiplicity, np.maximum(noise_multiplicity, 0.0)], axis=-1
+    )
+    mean_power = 1 + snr[..., None] * look_speckle.eigenvalue
+    mean_power = np.concatenate([mean_power, np.ones((*mean_power.shape[:-1], 1))], axis=-1)
+    return gamma_sum_tails(multiplicity, mean_power, threshold)
+
+
+def gamma_sum_tails(
+    gamma_shape: np.ndarray, gamma_scale: np.ndarray, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return P(sum of independent gamma variables > threshold), and its complement.
+
+    Parameters
+    ----------
+    gamma_shape
+        (..., k): shapes of the variables: 1 of an exponential one, 1/2 of a squared Gaussian one.
+    gamma_scale
+        (..., k): their means over their shapes.
+    threshold
+        (...).
+    """
+    scale_max = gamma_scale.max(axis=-1)
+    gamma_scale, scaled_threshold = gamma_scale / scale_max[..., None], threshold / scale_max
+    is_rare = scaled_threshold > (gamma_shape * gamma_scale).sum(axis=-1)
+    saddle, second_derivative, third_derivative = _saddle_point(
+        gamma_shape, gamma_scale, scaled_threshold, is_rare
+    )
+    contour_scale = 1 / np.sqrt(second_derivative)
+    contour_curvature = np.clip(
+        third_derivative / (6 * second_derivative), 0.05 / contour_scale, 2 / contour_scale
+    )[..., None]
+    step = _CONTOUR_END / _CONTOUR_NODES
+    node = (np.arange(_CONTOUR_NODES) + 0.5) * step
+    imaginary_part = contour_scale[..., None] * np.sinh(node)
+    s = (
+        saddle[..., None]
+        + 1j * imaginary_part
+        + contour_curvature * imaginary_part * imaginary_part
+    )
+    contour_step = (
+        (1j + 2 * contour_curvature * imaginary_part)
+        * contour_scale[..., None]
+        * np.cosh(node)
+        * step
+    )
+    exponent = -s * scaled_threshold[..., None]
+    for j in range(gamma_scale.shape[-1]):
+        exponent = exponent - gamma_shape[..., j, None] * np.log(1 - gamma_scale[..., j, None] * s)
+    tail = np.abs((np.exp(exponent) / s * contour_step / 1j).real.sum(axis=-1)) / np.pi
+    tail = np.minimum(tail, 1.0)
+    return np.where(is_rare, tail, 1 - tail), np.where(is_rare, 1 - tail, tail)
+
+
+def _saddle_point(
+    multiplicity: np.ndarray,
+    mean_power: np.ndarray,
+    scaled_threshold: np.ndarray,
+    is_rare: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Saddle point of the integrand of (1), and the second and third derivative of its logarithm.
+
+    It lies between 0 and the first pole for the upper tail, below 0 for the lower one.
+    """
+    low = np.where(is_rare, 1e-12, -1e12)
+    high = np.where(is_rare, 1 - 1e-12, -1e-12)
+    for _ in range(_BISECTION_STEPS):
+        middle = np.where(is_rare, 0.5 * (low + high), -np.sqrt(low * high))
+        ratio = mean_power / (1 - mean_power * middle[..., None])
+        is_left_of_saddle = (multiplicity * ratio).sum(axis=-1) - scaled_threshold - 1 / middle > 0
+        low, high = (
+            np.where(is_left_of_saddle, low, middle),
+            np.where(is_left_of_saddle, middle, high),
+        )
+    second_derivative = (multiplicity * ratio**2).sum(axis=-1) + 1 / middle**2
+    return middle, second_derivative, 2 * (multiplicity * ratio**3).sum(axis=-1) - 2 / middle**3
+
+
+@lru_cache(maxsize=8)
+def speckle_lattice(n_looks: int) -> np.ndarray:
+    """Return a fixed lattice of independent speckles, (NODES, number) complex.
+
+    Kronecker lattice of the roots of primes, standardised: mean 0, covariance the unit matrix.
+    """
+    primes = [2]
+    while len(primes) < 2 * n_looks:
+        candidate = primes[-1] + 1
+        while any(candidate % prime == 0 for prime in primes):
+            candidate += 1
+        primes.append(candidate)
+    lattice = np.mod((np.arange(SPECKLE_LATTICE_SIZE)[:, None] + 0.5) * np.sqrt(primes), 1.0)
+    lattice = np.clip(lattice, 1e-9, 1 - 1e-9)
+    speckle = np.sqrt(-np.log(lattice[:, :n_looks])) * np.exp(2j * np.pi * lattice[:, n_looks:])
+    speckle -= speckle.mean(axis=0)
+    factor = np.linalg.cholesky(speckle.conj().T @ speckle / SPECKLE_LATTICE_SIZE)
+    return speckle @ np.linalg.inv(factor).conj().T
+
+
+@njit(cache=True, error_model="numpy")
+def correlated_speckle_magnitudes(speckle, covariance_root):
+    """Return magnitudes |A z| of correlated speckles, (m, N).
+
+    ``speckle`` (m, k): independent speckles z; ``covariance_root`` (N, k): A, as of
+    :meth:`LookSpeckle.covariance_root`.
+    """
+    magnitude = np.empty((speckle.shape[0], covariance_root.shape[0]))
+    for i in range(speckle.shape[0]):
+        for k in range(covariance_root.shape[0]):
+            re, im = 0.0, 0.0
+            for j in range(covariance_root.shape[1]):
+                product = speckle[i, j] * covariance_root[k, j]
+                re += product.real
+                im += product.imag
+            magnitude[i, k] = math.hypot(re, im)
+    return magnitude
+
+
+@njit(cache=True, error_model="numpy")
+def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnitude, is_real=False):
+    """Return the probability that at least ``votes_needed`` looks cross, given their speckle, (m,).
+
+    Parameters
+    ----------
+    signal, threshold_ratio
+        Root mean square signal and threshold of one look, over the noise per quadrature.
+    votes_needed
+        Number of looks that have to cross.
+    magnitude
+        (m, N): magnitudes of the looks' speckle, of mean square 1.
+    is_real
+        The noise is real: it has the power of both quadratures in one.
+
+    Notes
+    -----
+    Looks cross independently, with Q_1(signal |s_k|, level), or the tails of a normal variable. The
+    number of crossings has a Poisson binomial distribution, summed up look by look.
+    """
+    crossing_table = np.empty(_CROSSING_TABLE_STEPS + 1)
+    step = _TABULATED_SPECKLE_MAX / _CROSSING_TABLE_STEPS
+    for k in range(_CROSSING_TABLE_STEPS + 1):
+        faded_signal = signal * k * step
+        if is_real:
+            tail_above, tail_below = (
+                math.erfc(0.5 * (threshold_ratio - faded_signal)),
+                math.erfc(0.5 * (threshold_ratio + faded_signal)),
+            )
+            crossing_table[k] = 0.5 * (tail_above + tail_below)
+        else:
+            crossing_table[k] = marcum_q1_tails(faded_signal, threshold_ratio)[0]
+    vote_probability, count_distribution = np.empty(magnitude.shape[0]), np.empty(votes_needed + 1)
+    for i in range(magnitude.shape[0]):
+        count_distribution[:] = 0.0
+        count_distribution[0] = 1.0
+        for j in range(magnitude.shape[1]):
+            table_position = min(magnitude[i, j] / step, _CROSSING_TABLE_STEPS - 1e-9)
+            k = int(table_position)
+            p_cross = crossing_table[k] + (table_position - k) * (
+                crossing_table[k + 1] - crossing_table[k]
+            )
+            count_distribution[votes_needed] += count_distribution[votes_needed - 1] * p_cross
+            for v in range(votes_needed - 1, 0, -1):
+                count_distribution[v] = (
+                    count_distribution[v] * (1.0 - p_cross) + count_distribution[v - 1] * p_cross
+                )
+            count_distribution[0] *= 1.0 - p_cross
+        vote_probability[i] = count_distribution[votes_needed]
+    return vote_probability

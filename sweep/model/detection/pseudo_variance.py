@@ -1,0 +1,312 @@
+"""Developed speckle in bins near DC and Nyquist of a real record, whose quadratures differ.
+
+A real record holds each line A e^(i phase) with its image, the conjugate at the opposite frequency.
+Bin k of the transform about the record's middle, of lines at the places nu with the window's
+transform G, real and even, is
+
+    X = sum_b (A_b G(k - nu_b) + conj(A_b) G(k + nu_b)) + noise.
+
+With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number. It has the
+mean power S + 2 sigma^2, and the pseudo-variance
+
+    E[X^2] = 2 sum_b P_b G(k - nu_b) G(k + nu_b) + 2 sigma^2 W2(2k) / W2(0),
+
+W2 the transform of the squared window. It is real, so that the quadratures are independent, of
+variances (1 +- q) / 2 of the mean power with q = E[X^2] / E[|X|^2]. At DC and Nyquist q is 1: the
+number is real. Some bins away q is 0, and the number is circular.
+
+The law of |X|^2 is in :mod:`sweep.model.detection.hoyt`.
+
+Phase errors within the record widen a line. They are left out of G here, as are the samples that
+the echo does not have. Neither changes q at DC, where it is 1.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.detection.hoyt import N_PHASE_NODES, PHASE_COSINES, hoyt_tails
+from sweep.model.detection.look_speckle import (
+    gamma_sum_tails,
+    speckle_lattice,
+    vote_probability_given_speckle,
+)
+from sweep.model.detection.looks import COMBINE_POWER, Looks
+from sweep.model.detection.speckle_correlation import window_transform
+from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet_line_positions
+from sweep.model.window import Window, window_samples
+
+RATIO_MIN = 0.05
+"""Pseudo-variance ratio |q| below which bins are treated as circular; pd changes by less than
+2e-4."""
+
+
+class SignalPseudoVariance(NamedTuple):
+    """Pseudo-variance ratio q of echoes near DC and Nyquist, which overlap their images there."""
+
+    ratio_row: np.ndarray
+    """(segments, n) int64: point's row of ``ratio`` and ``phase_factors``; row 0, in which q is 0,
+    for echoes far from DC and Nyquist."""
+    ratio: np.ndarray
+    """(rows, bins): q by bin, counted from the nearer of DC and Nyquist."""
+    phase_factors: np.ndarray
+    """(rows, ANGLES): echo power at each phase node, 1 + q cos t_j times its mean in the strongest
+    bin. With ``any_bin`` detection, of the bin that is strongest at that phase."""
+
+
+def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
+    """Compute the pseudo-variance ratios of echoes near DC and Nyquist of real records."""
+    fft_size, padding_factor = shots.fft_size, shots.fft_size / shots.window.length
+    n_bins = n_tabulated_bins(shots.window, fft_size)
+    ratio_row = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
+    ratio_rows, factor_rows = [np.zeros((1, n_bins))], [np.ones((1, N_PHASE_NODES))]
+    near_end = lines_overlap_images(shots)
+    for s in np.flatnonzero(shots.has_segment):
+        points = np.flatnonzero(near_end[s])
+        if not points.size:
+            continue
+        line_positions = beamlet_line_positions(shots, points)[:, s]
+        # About Nyquist lines and images mirror as about DC.
+        is_near_nyquist = line_positions.mean(axis=1) > fft_size / 4
+        line_positions = (
+            np.where(is_near_nyquist[:, None], fft_size / 2 - line_positions, line_positions)
+            / padding_factor
+        )
+        line_power = shots.relative_amplitude[shots.footprint_row[points]] ** 2
+        bin_positions = np.arange(n_bins) / padding_factor
+        line_transform = window_transform(shots.window, bin_positions - line_positions[..., None])
+        image_transform = window_transform(shots.window, bin_positions + line_positions[..., None])
+        mean_power = (
+            line_power[..., None]
+            * (line_transform * line_transform + image_transform * image_transform)
+        ).sum(axis=1)
+        pseudo_variance = (line_power[..., None] * 2 * line_transform * image_transform).sum(axis=1)
+        ratio_row[s, points] = sum(map(len, ratio_rows)) + np.arange(points.size)
+        ratio_rows.append(
+            np.where(mean_power > 1e-12 * mean_power.max(axis=1)[:, None], pseudo_variance, 0.0)
+        )
+        ratio_rows[-1] /= np.maximum(mean_power, 1e-300)
+        ratio_rows[-1][:, 0] = 1.0
+        power_by_phase = mean_power[..., None] * (1 + ratio_rows[-1][..., None] * PHASE_COSINES)
+        peak_power = np.take_along_axis(
+            power_by_phase, mean_power.argmax(axis=1)[:, None, None], axis=1
+        )[:, 0]
+        phase_power = peak_power if shots.detection == "peak_bin" else power_by_phase.max(axis=1)
+        peak_mean_power = mean_power.max(axis=1)[:, None]
+        factor_rows.append(
+            np.where(peak_mean_power > 0, phase_power / np.maximum(peak_mean_power, 1e-300), 1.0)
+        )
+    return SignalPseudoVariance(ratio_row, np.concatenate(ratio_rows), np.concatenate(factor_rows))
+
+
+def mean_over_phases(
+    phase_factors: np.ndarray,
+    pd_by_segment: tuple[np.ndarray, ...],
+    joint_law: Callable[..., tuple[np.ndarray, ...]],
+) -> tuple[np.ndarray, ...]:
+    """Average a joint law of detection over the phases of the segments' noncircular echoes.
+
+    Parameters
+    ----------
+    phase_factors
+        (segments, n, ANGLES): relative echo power at the phase nodes, as of
+        :class:`SignalPseudoVariance`.
+    pd_by_segment
+        For each segment (..., n): probability that it is detected.
+    joint_law
+        Function of the segments' probabilities for circular numbers; returns arrays (..., n).
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Mean over the phases of each result of ``joint_law``, (..., n).
+
+    Notes
+    -----
+    At the phase t a bin is detected like a circular number of f = 1 + q cos t times the power, with
+    exp(-A / f); A is solved for, so that the mean over t is the given probability. Phases of
+    different segments are independent.
+    """
+    pd_at_phases = [
+        _pd_at_phases(*arguments) for arguments in zip(pd_by_segment, phase_factors, strict=True)
+    ]
+    sums: list[np.ndarray] = []
+    for j in range(N_PHASE_NODES):
+        # No two segments have the same order of phases.
+        results = joint_law(
+            *(
+                segment_pd[(1 + 2 * s) * j % N_PHASE_NODES]
+                for s, segment_pd in enumerate(pd_at_phases)
+            )
+        )
+        sums = [a + b for a, b in zip(sums, results, strict=True)] if sums else list(results)
+    return tuple(value / N_PHASE_NODES for value in sums)
+
+
+def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
+    """Return detection probabilities exp(-A / f) at all phase nodes, (ANGLES, ..., n).
+
+    A is found by bisection so that their mean over the nodes is ``mean_pd`` (..., n).
+    """
+    phase_factors = phase_factors.T.reshape(N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1)
+    is_defined = np.isfinite(mean_pd)
+    target_pd = np.where(is_defined, mean_pd, 0.5)
+    low, high = np.zeros(mean_pd.shape), np.full(mean_pd.shape, 700.0)
+    for _ in range(50):
+        exponent = 0.5 * (low + high)
+        is_above_target = np.exp(-exponent / phase_factors).mean(axis=0) > target_pd
+        low, high = (
+            np.where(is_above_target, exponent, low),
+            np.where(is_above_target, high, exponent),
+        )
+    return np.where(is_defined, np.exp(-0.5 * (low + high) / phase_factors), np.nan)
+
+
+def lines_overlap_images(shots: Any) -> np.ndarray:
+    """Mark points whose lines overlap their own images at DC or Nyquist, bool (segments, n)."""
+    overlap_distance = _image_reach(shots.window) * shots.fft_size / shots.window.length
+    position = axis_line_positions(shots)
+    distance_from_end = np.minimum(position, shots.fft_size / 2 - position)
+    return np.asarray(distance_from_end - 3 * shots.line_deviation_bins < overlap_distance)
+
+
+@lru_cache(maxsize=64)
+def n_tabulated_bins(window: Window, fft_size: int) -> int:
+    """Return the number of bins, counted from DC, whose pseudo-variance is tabulated."""
+    last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
+    return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
+
+
+@lru_cache(maxsize=64)
+def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
+    """Return the pseudo-variance ratio W2(2k) / W2(0) of white noise by bin k, (bins,)."""
+    squared_window = window_samples(window.name, window.length) ** 2
+    record_position = (np.arange(window.length) - window.length / 2) / fft_size
+    bin_numbers = np.arange(n_tabulated_bins(window, fft_size))
+    ratios = [
+        (squared_window * np.cos(4 * np.pi * k * record_position)).sum() / squared_window.sum()
+        for k in bin_numbers
+    ]
+    return np.where(np.abs(ratios) > 1e-12, ratios, 0.0)
+
+
+def _image_reach(window: Window) -> float:
+    """Return the distance of a line from DC [bins of fs/L] beyond which its image is negligible."""
+    distance = window.envelope_distances[np.argmax(window.sidelobe_envelope < RATIO_MIN / 2)]
+    return 0.5 * min(float(distance), 12.0)
+
+
+_POWER_FRACTION_MIN = 1e-7
+"""Part of the looks' power below which an independent amplitude is left out."""
+
+
+def multilook_pd_and_miss_near_ends(
+    looks: Looks,
+    signal: np.ndarray,
+    threshold_ratio: np.ndarray,
+    signal_pseudo_variance: np.ndarray,
+    noise_pseudo_variance: np.ndarray,
+    look_covariance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pd and 1 - pd of a bin near DC or Nyquist for several looks in developed speckle.
+
+    Parameters
+    ----------
+    signal, threshold_ratio
+        (m,): root mean square |X| and threshold over the noise per quadrature of one look.
+    signal_pseudo_variance, noise_pseudo_variance
+        (m,): pseudo-variance ratio q of the signal, and of the noise.
+    look_covariance
+        (m, k, k) complex: that of the looks' echoes, of mean power 1, with the turn of the line's
+        phase from look to look. k = N looks, or fewer that represent them.
+
+    Notes
+    -----
+    Let g_k be the echo's amplitude in look k. Bin X_k = u_k + i v_k has the quadratures
+    ``u = sqrt(1 + q) Re g``, ``v = sqrt(1 - q) Im g`` times the root of the signal's power, for the
+    line and its image have the phases of g and of its conjugate. Their 2N numbers are Gaussian. So
+    the sum of all |X_k|^2 is one of independent squared Gaussian variables, whose variances are the
+    eigenvalues of the quadratures' covariance matrix.
+
+    Of votes the probability given the amplitudes is averaged over a fixed lattice of them, as of
+    looks far from DC. Of noise whose quadratures differ in part the probabilities of circular and
+    of real noise are averaged.
+    """
+    signal_power = np.square(signal)
+    if looks.combine == COMBINE_POWER:
+        quadrature_scales = np.stack(
+            [
+                np.sqrt(1 + signal_pseudo_variance),
+                np.sqrt(np.maximum(1 - signal_pseudo_variance, 0.0)),
+            ],
+            axis=1,
+        )
+        n_kept = look_covariance.shape[-1]
+        real_part, imaginary_part = look_covariance.real, look_covariance.imag
+        quadrature_covariance = np.block(
+            [[real_part, -imaginary_part], [imaginary_part, real_part]]
+        )
+        amplitude_scales = np.repeat(quadrature_scales, n_kept, axis=1)
+        amplitude_scales *= np.sqrt(0.5 * signal_power * looks.number / n_kept)[:, None]
+        noise_power = np.stack([1 + noise_pseudo_variance, 1 - noise_pseudo_variance], axis=1)
+        covariance_matrix = (
+            amplitude_scales[:, :, None] * amplitude_scales[:, None, :] * quadrature_covariance
+        )
+        covariance_matrix += np.repeat(noise_power, n_kept, axis=1)[:, :, None] * np.eye(2 * n_kept)
+        eigenvalues = np.concatenate([np.linalg.eigvalsh(covariance_matrix), noise_power], axis=1)
+        gamma_shape = np.full(eigenvalues.shape, 0.5)
+        gamma_shape[:, 2 * n_kept :] = 0.5 * (
+            looks.number - n_kept
+        )  # looks that others represent: noise
+        gamma_scale = 2 * np.maximum(eigenvalues, 0.0)
+        return gamma_sum_tails(gamma_shape, gamma_scale, looks.number * np.square(threshold_ratio))
+    pd = np.empty(signal.shape)
+    for bin_index, covariance_matrix in enumerate(look_covariance):
+        n_represented = covariance_matrix.shape[-1]
+
+        def mean_vote_probability(amplitudes: np.ndarray, bin_index: int = bin_index) -> float:
+            magnitudes = np.hypot(
+                math.sqrt(1 + signal_pseudo_variance[bin_index]) * amplitudes.real,
+                math.sqrt(max(1 - signal_pseudo_variance[bin_index], 0.0)) * amplitudes.imag,
+            )
+            real_fraction = abs(float(noise_pseudo_variance[bin_index]))
+            mean_probability = 0.0
+            for is_real, weight in ((True, real_fraction), (False, 1 - real_fraction)):
+                if weight > 0:
+                    vote_probabilities = vote_probability_given_speckle(
+                        signal[bin_index],
+                        threshold_ratio[bin_index],
+                        looks.votes,
+                        magnitudes,
+                        is_real,
+                    )
+                    mean_probability += weight * float(vote_probabilities.mean())
+            return mean_probability
+
+        q = (
+            signal_power[bin_index] * signal_pseudo_variance[bin_index]
+            + 2 * noise_pseudo_variance[bin_index]
+        ) / (signal_power[bin_index] + 2)
+        record_tails = np.array(
+            hoyt_tails(signal_power[bin_index] + 2, abs(q), threshold_ratio[bin_index])
+        )
+        pd[bin_index] = looks.vote_probabilities(*record_tails)[0]
+        independence = (n_represented**2 / np.square(np.abs(covariance_matrix)).sum() - 1) / max(
+            n_represented - 1, 1
+        )
+        if independence < 1 - 1e-9:
+            look_eigenvalues, look_eigenvectors = np.linalg.eigh(covariance_matrix)
+            is_used = look_eigenvalues > _POWER_FRACTION_MIN * n_represented
+            covariance_root = look_eigenvectors[:, is_used] * np.sqrt(look_eigenvalues[is_used])
+            # Less the lattice's error for independent looks, in proportion.
+            lattice_error = pd[bin_index] - mean_vote_probability(speckle_lattice(n_represented))
+            lattice_pd = mean_vote_probability(
+                speckle_lattice(int(is_used.sum())) @ covariance_root.T
+            )
+            pd[bin_index] = lattice_pd + independence * lattice_error
+    pd = np.clip(pd, 0.0, 1.0)
+    return pd, 1 - pd

@@ -1,0 +1,216 @@
+"""Correlation of the speckle that the strongest bins of two segments of a shot see.
+
+A scatterer of delay tau and Doppler ratio beta has, in the middle t_c of the record of a segment
+that starts at t_s, the beat phase
+
+    -2 pi F tau + 2 pi F beta (t_s + t_c),    F = f + S (t_c - tau_0)                            (1)
+
+with the carrier f and the signed chirp rate S of the segment, and the delay tau_0 on the beam's
+axis. F is the optical frequency of the echo in the middle of the record. If the echo fills a part
+of the record its middle is the centroid of the window there. Between two segments the phases of
+scatterers at different places turn against each other by their difference. If all scatterers lay in
+one bin the two amplitudes, circular complex Gaussian numbers both, would have the correlation
+
+    mu = E[exp(i (phase_2 - phase_1))]                                                          (2)
+
+over the beam's power. This is exp(-t^2 / 2) if the phase difference is normal with deviation t.
+
+A bin weighs scatterers by the window's transform G about its own frequency. If the footprint spans
+a good part of a bin, or more, the strongest bins of two segments weigh different parts of it. With
+the places nu_i(y) of the lines, y the coordinate along which they spread most,
+
+    mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
+    S_i = int p G(k_i - nu_i)^2 dy                                                              (3)
+
+Lines are taken to move evenly along y. (3) thus leaves out Doppler shifts that change as the square
+of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) has.
+
+The probability that both bins cross a threshold is that of two correlated Rayleigh magnitudes,
+:func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`, by |mu|.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.window import Window, window_samples
+
+SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Pairs (up, Doppler), (up, down), (Doppler, down); the order of all arrays by pair of segments."""
+
+LINE_SHIFT_MIN_BINS = 0.01
+"""Line shift per standard deviation of the beam [bins of fs/L] below which one bin holds all
+lines."""
+
+TRANSFORM_REACH_BINS = 6.0
+"""Half-width of the window transform in the integrals (3) [bins of fs/L]."""
+
+TRANSFORM_SAMPLES_PER_BIN = 64
+"""Samples of the tabulated window transform per bin of fs/L."""
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
+_BEAM_DEVIATIONS_MAX = 5.0
+"""Largest half-width of the integration interval [standard deviations of the beam]."""
+_RESOLVED_PHASE_MAX = 40.0
+"""Largest phase [rad] at the ends of the interval that the quadrature nodes resolve."""
+
+
+class LineGradients(NamedTuple):
+    """Gradients of line position and phase across the beams of n points, along two coordinates."""
+
+    line_shift: np.ndarray
+    """(n, 3, 2): line shift per standard deviation of the beam [bins of fs/N], signed as the
+    beat."""
+    phase: np.ndarray
+    """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
+
+    def select(self, points: np.ndarray) -> "LineGradients":
+        """Select points by their indices."""
+        return LineGradients(self.line_shift[points], self.phase[points])
+
+
+class LinePairGradients(NamedTuple):
+    """Gradients across the beam of the lines of two segments, arrays (n,)."""
+
+    bin_distance: tuple[np.ndarray, np.ndarray]
+    """Distance k - nu of each segment's strongest bin from the line of the axis [bins of fs/L]."""
+    line_shift: tuple[np.ndarray, np.ndarray]
+    """Line shift of each segment per standard deviation of the beam along y [bins of fs/L],
+    signed."""
+    phase_difference: np.ndarray
+    """Phase difference t between the segments per standard deviation of the beam along y [rad]."""
+    power_slope: np.ndarray
+    """Relative change of the echo's power per standard deviation of the beam along y."""
+
+    @property
+    def line_shift_max(self) -> np.ndarray:
+        """Larger of the two spreads [bins of fs/L]."""
+        return np.maximum(np.abs(self.line_shift[0]), np.abs(self.line_shift[1]))
+
+    def select(self, points: np.ndarray) -> "LinePairGradients":
+        """Select points by their indices."""
+        (distance_first, distance_second), (shift_first, shift_second) = (
+            self.bin_distance,
+            self.line_shift,
+        )
+        return LinePairGradients(
+            (distance_first[points], distance_second[points]),
+            (shift_first[points], shift_second[points]),
+            self.phase_difference[points],
+            self.power_slope[points],
+        )
+
+
+def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
+    """Return the correlation mu, equation (3), of the strongest bins of two segments, (n,) complex.
+
+    If the phase turns too fast for the quadrature, the result is |mu| for a Gaussian window
+    transform of the same half-width, which is close to 0 there.
+    """
+    from sweep.model.detection.speckle_correlation_integral import (
+        fill_peak_bin_correlation,  # a compiler is slow to import
+    )
+
+    half_interval = np.minimum(
+        _BEAM_DEVIATIONS_MAX, TRANSFORM_REACH_BINS / np.maximum(gradients.line_shift_max, 1e-300)
+    )
+    is_resolved = np.abs(gradients.phase_difference) * half_interval <= _RESOLVED_PHASE_MAX
+    correlation = _gaussian_correlation(window, gradients).astype(complex)
+    fill_peak_bin_correlation(
+        np.flatnonzero(is_resolved),
+        half_interval,
+        np.stack(gradients.bin_distance),
+        np.stack(gradients.line_shift),
+        gradients.phase_difference,
+        gradients.power_slope,
+        transform_table(window)[1],
+        TRANSFORM_SAMPLES_PER_BIN,
+        _GAUSS_NODES,
+        _GAUSS_WEIGHTS,
+        correlation,
+    )
+    return correlation
+
+
+def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
+    """Return |mu| for the Gaussian transform G(x) = exp(-x^2 / (4 v)), (n,).
+
+    v is such that G falls to 1/2 at the same distance as the window's transform. All factors of the
+    integrals (3) are then Gaussian.
+    """
+    transform_variance = _half_maximum_distance(window) ** 2 / (4 * np.log(2))
+    (shift_first, shift_second), (distance_first, distance_second) = (
+        gradients.line_shift,
+        gradients.bin_distance,
+    )
+    quadratic_coefficient = 1 + (shift_first * shift_first + shift_second * shift_second) / (
+        2 * transform_variance
+    )
+    linear_coefficient = (distance_first * shift_first + distance_second * shift_second) / (
+        2 * transform_variance
+    )
+    exponent = (linear_coefficient**2 - gradients.phase_difference**2) / (
+        2 * quadratic_coefficient
+    ) - (distance_first * distance_first + distance_second * distance_second) / (
+        4 * transform_variance
+    )
+    log_powers = sum(
+        -np.log1p(line_shift * line_shift / transform_variance) / 2
+        - bin_distance * bin_distance / (2 * (transform_variance + line_shift * line_shift))
+        for line_shift, bin_distance in (
+            (shift_first, distance_first),
+            (shift_second, distance_second),
+        )
+    )
+    return np.exp(np.minimum(exponent - np.log(quadratic_coefficient) / 2 - log_powers / 2, 0.0))
+
+
+def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
+    """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
+
+    ``distance`` is in bins of fs/L. G is set to 0 beyond 2 REACH.
+
+    >>> from sweep.model.window import get_window
+    >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
+    0.5
+    """
+    distances, transform = transform_table(window)
+    return np.interp(np.abs(distance), distances, transform, right=0.0)
+
+
+@lru_cache(maxsize=16)
+def centroid_delay(window: Window) -> np.ndarray:
+    """Return by how many samples a centroid is later without a window's first k ones, (L + 1,)."""
+    w, n = window_samples(window.name, window.length), np.arange(window.length)
+    sum_from = np.cumsum(w[::-1])[::-1]
+    moment_from = np.cumsum((w * n)[::-1])[::-1]
+    delay = np.zeros(window.length + 1)
+    is_defined = sum_from > 1e-6 * w.sum()  # of hardly a sample left nothing is detected
+    delay[:-1][is_defined] = (
+        moment_from[is_defined] / sum_from[is_defined] - moment_from[0] / sum_from[0]
+    )
+    return delay
+
+
+def _half_maximum_distance(window: Window) -> float:
+    """Return the distance [bins of fs/L] at which G falls to 1/2; at most 2 REACH."""
+    distances, transform = transform_table(window)
+    is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as of hann's two
+    first_below_half = int(np.argmax(is_below_half)) if is_below_half.any() else transform.size - 1
+    return float(
+        np.interp(-0.5, -transform[: first_below_half + 1], distances[: first_below_half + 1])
+    )
+
+
+@lru_cache(maxsize=16)
+def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate the window transform: distances 0 .. 2 REACH [bins of fs/L], and G there."""
+    distances = (
+        np.arange(int(2 * TRANSFORM_REACH_BINS * TRANSFORM_SAMPLES_PER_BIN) + 1)
+        / TRANSFORM_SAMPLES_PER_BIN
+    )
+    w = window_samples(window.name, window.length)
+    record_position = (np.arange(window.length) - window.length / 2) / window.length
+    # Sums, not products of matrices, whose order depends on the number of threads.
+    transform = np.array([(w * np.cos(2 * np.pi * y * record_position)).sum() for y in distances])
+    return distances, transform / w.sum()

@@ -1,0 +1,78 @@
+"""Quadrature of the correlation of two segments' bins in developed speckle, as a kernel.
+
+The equation is (3) of :mod:`sweep.model.detection.speckle_correlation`.
+"""
+
+import math
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_peak_bin_correlation(
+    point_indices,
+    half_interval,
+    bin_distance,
+    line_shift,
+    phase_difference,
+    power_slope,
+    transform,
+    samples_per_bin,
+    nodes,
+    weights,
+    correlation,
+):
+    """Integrate equation (3) at some points, into ``correlation`` (n,) complex.
+
+    Parameters
+    ----------
+    point_indices
+        Indices of these points.
+    half_interval
+        (n,): half-width of the interval of y [standard deviations of the beam].
+    bin_distance, line_shift, phase_difference, power_slope
+        Of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`, the first two (2,
+        n).
+    transform, samples_per_bin
+        G of :func:`sweep.model.detection.speckle_correlation.transform_table`, and its values per
+        bin.
+    nodes, weights
+        Of a rule of quadrature on -1 .. 1.
+    """
+    node_power, previous_half_interval = np.empty(nodes.size), -1.0
+    for point in point_indices:
+        if half_interval[point] != previous_half_interval:  # alike of all footprints within a bin
+            previous_half_interval = half_interval[point]
+            for node in range(nodes.size):
+                node_power[node] = weights[node] * math.exp(
+                    -0.5 * (previous_half_interval * nodes[node]) ** 2
+                )
+        re, im, power_first, power_second = 0.0, 0.0, 0.0, 0.0
+        for node in range(nodes.size):
+            y = previous_half_interval * nodes[node]
+            line_power = node_power[node] * max(1.0 + power_slope[point] * y, 0.0)
+            transform_first = _interpolate_transform(
+                bin_distance[0, point] - line_shift[0, point] * y, transform, samples_per_bin
+            )
+            transform_second = _interpolate_transform(
+                bin_distance[1, point] - line_shift[1, point] * y, transform, samples_per_bin
+            )
+            product = line_power * transform_first * transform_second
+            re += product * math.cos(phase_difference[point] * y)
+            im += product * math.sin(phase_difference[point] * y)
+            power_first += line_power * transform_first * transform_first
+            power_second += line_power * transform_second * transform_second
+        root_power_product = math.sqrt(max(power_first * power_second, 1e-300))
+        correlation[point] = complex(re / root_power_product, im / root_power_product)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _interpolate_transform(distance, transform, samples_per_bin):
+    """Interpolate G, tabulated from 0 on, at a distance [bins of fs/L]; 0 beyond the table."""
+    table_position = abs(distance) * samples_per_bin
+    if table_position >= transform.size - 1:
+        return transform[transform.size - 1] if table_position == transform.size - 1 else 0.0
+    index = int(table_position)
+    return transform[index] + (table_position - index) * (transform[index + 1] - transform[index])

@@ -1,0 +1,230 @@
+"""Strongest speckle mode of an echo: the part that fades in all of its bins as one amplitude.
+
+If the lines of a footprint spread over the bins with the density p(nu), the amplitudes of bins k
+and l in developed speckle have the covariance
+
+    C(k, l) = int p(nu) G(k - nu) G(l - nu) dnu,
+
+with the window's transform G. C is a sum of independently fading modes (its eigenvectors: a
+Karhunen-Loeve expansion [Goodman, Speckle Phenomena in Optics, 2007, 3.3]). A single line has one
+mode: all bins fade together. The strongest mode u, of the eigenvalue m, has the fraction
+m u(k)^2 / C(k, k) of the power of bin k. The other modes are treated as additional noise, whose
+correlation between neighbouring bins is what C leaves for them.
+
+p is taken to be Gaussian. The tables are over its standard deviation and the position of its centre
+between bins.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.detection.speckle_correlation import window_transform
+from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, get_window
+
+LINE_DEVIATIONS = np.array(
+    [0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0, 4.5, 7.0, 11.0]
+)
+"""Standard deviations of p in the tables, in units of a bin of fs/L, or of a quarter of the main
+lobe's width where that is more."""
+
+N_OFFSETS = 9
+"""Number of positions of p's centre in the tables, evenly spaced over -1/2 .. 1/2 bin of fs/N."""
+
+_STAND_IN_LENGTH = 1024
+_POWER_ITERATIONS = 80
+_NODES_MIN = 41
+_NODE_DISTANCE = 0.4
+"""Distance of lines that stand for a Gaussian [bins, as of SPREADS]; a wider one is a comb."""
+_NODE_DEVIATIONS_MAX = 4.5
+_TABLE_DEVIATION_MAX = 3.0
+"""Spread up to which twice the deviation is in tables; the strongest mode of wider ones is."""
+
+
+class ModeTable(NamedTuple):
+    """Power fraction of the strongest mode, and the correlation of neighbouring bins."""
+
+    line_deviation_bins: np.ndarray
+    """(s,): standard deviations of the lines' density [bins of fs/N]; empty in NO_MODES."""
+    power_fraction: np.ndarray
+    """(s, OFFSETS, k): power fraction of the strongest mode in a bin, k bins about the nearest
+    one."""
+    neighbour_correlation: np.ndarray
+    """(s, OFFSETS, k): correlation of the echo's amplitudes in a bin and in the one below it,
+    signed."""
+    asymmetry: np.ndarray
+    """(s, OFFSETS): power asymmetry of the three bins about the nearest; rises with the offset."""
+
+
+NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+
+
+@lru_cache(maxsize=32)
+def mode_table(record_window: Window, fft_size: int) -> ModeTable:
+    """Tabulate the strongest mode for a window and an FFT size (cached)."""
+    padding_factor, lobe_half_width = (
+        fft_size / record_window.length,
+        main_lobe_half_width(record_window),
+    )
+    if record_window.name in COSINE_SUM_COEFFICIENTS:
+        record_window = get_window(record_window.name, min(record_window.length, _STAND_IN_LENGTH))
+    deviations = LINE_DEVIATIONS * max(1.0, lobe_half_width / 2)
+    half_bins = math.ceil(
+        (lobe_half_width + 2 * _TABLE_DEVIATION_MAX * max(1.0, lobe_half_width / 2))
+        * padding_factor
+    )
+    bin_positions = np.arange(-half_bins, half_bins + 1) / padding_factor
+    offsets = np.linspace(-0.5, 0.5, N_OFFSETS) / padding_factor
+    power_fraction = np.empty((deviations.size, N_OFFSETS, bin_positions.size))
+    neighbour_correlation, asymmetry = (
+        np.zeros_like(power_fraction),
+        np.empty(power_fraction.shape[:2]),
+    )
+    for s, deviation in enumerate(deviations):
+        node, weight = _gaussian_nodes(LINE_DEVIATIONS[s])
+        for d, offset in enumerate(offsets):
+            line_positions = offset + deviation * node
+            bin_transforms = window_transform(
+                record_window, bin_positions[:, None] - line_positions
+            )
+            # Sums, not products of matrices, whose order depends on the number of threads.
+            power, neighbour_product = (
+                np.zeros(bin_positions.size),
+                np.zeros(bin_positions.size - 1),
+            )
+            for line_index in range(node.size):
+                power += weight[line_index] * bin_transforms[:, line_index] ** 2
+                neighbour_product += (
+                    weight[line_index]
+                    * bin_transforms[1:, line_index]
+                    * bin_transforms[:-1, line_index]
+                )
+            power = np.maximum(power, 1e-300)
+            mode = _strongest_mode(bin_transforms, weight, np.sqrt(power))
+            power_fraction[s, d] = np.minimum(mode**2 / power, 1.0)
+            asymmetry[s, d] = power_asymmetry(*np.sqrt(power[half_bins - 1 : half_bins + 2]))
+            neighbour_correlation[s, d, 1:] = neighbour_product / (
+                np.sqrt(power[1:]) * np.sqrt(power[:-1])
+            )
+    # Of a lone line, in bins where its transform is 0 as well.
+    power_fraction[0], neighbour_correlation[0] = (
+        1.0,
+        np.where(neighbour_correlation[0] < 0, -1.0, 1.0),
+    )
+    neighbour_correlation[:, :, 0] = neighbour_correlation[:, :, 1]
+    return ModeTable(
+        deviations * padding_factor,
+        power_fraction,
+        neighbour_correlation,
+        np.maximum.accumulate(asymmetry, axis=1),
+    )
+
+
+def _gaussian_nodes(deviation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return evenly spaced nodes and weights of a mean over a standard normal number."""
+    n_nodes = max(_NODES_MIN, math.ceil(2 * _NODE_DEVIATIONS_MAX * deviation / _NODE_DISTANCE))
+    node = np.linspace(-_NODE_DEVIATIONS_MAX, _NODE_DEVIATIONS_MAX, n_nodes)
+    weight = np.exp(-0.5 * node * node)
+    return node, weight / weight.sum()
+
+
+def _strongest_mode(
+    bin_transforms: np.ndarray, line_weights: np.ndarray, mode: np.ndarray
+) -> np.ndarray:
+    """Return the leading eigenvector of a covariance, times the root of its eigenvalue.
+
+    Power iteration from ``mode`` (bins,). The covariance is the sum of the amplitudes (bins, lines)
+    of each line's bins with themselves, by the weights (lines,) of the lines' powers. It is not
+    formed if there are more bins than lines: of padded spectra it has millions of elements.
+    """
+    covariance, eigenvalue = None, 1.0
+    if len(bin_transforms) <= line_weights.size:
+        covariance = np.zeros((len(bin_transforms), len(bin_transforms)))
+        for line_index in range(line_weights.size):
+            covariance += (
+                line_weights[line_index]
+                * bin_transforms[:, line_index, None]
+                * bin_transforms[None, :, line_index]
+            )
+    for _ in range(_POWER_ITERATIONS):
+        if covariance is None:
+            line_products = line_weights * (bin_transforms * mode[:, None]).sum(axis=0)
+            product = (bin_transforms * line_products).sum(axis=1)
+        else:
+            product = (covariance * mode).sum(axis=1)
+        eigenvalue = math.sqrt((product**2).sum())
+        mode = product / max(eigenvalue, 1e-300)
+    return mode * math.sqrt(eigenvalue)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def power_asymmetry(below, middle, above):
+    """Return (P_above - P_below) / (P_above + P_below) of the largest bin's neighbours; 0 if faint.
+
+    Arguments are magnitudes |X|. The ratio tells on which side of the bin the echo's centre lies.
+    """
+    neighbour_power = below * below + above * above
+    if not neighbour_power > 1e-6 * middle * middle:
+        return 0.0
+    return (above * above - below * below) / neighbour_power
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def locate_in_mode_table(table, line_deviation_bins, asymmetry):
+    """Return the cell (s, d) of a table around a spread and an asymmetry, and the weights in it.
+
+    Result: s, weight of s + 1, d, weight of d + 1; weights 0 .. 1 (bilinear interpolation).
+    """
+    deviation_index = 0
+    while (
+        deviation_index < table.line_deviation_bins.size - 2
+        and table.line_deviation_bins[deviation_index + 1] <= line_deviation_bins
+    ):
+        deviation_index += 1
+    deviation_step = (
+        table.line_deviation_bins[deviation_index + 1] - table.line_deviation_bins[deviation_index]
+    )
+    deviation_weight = min(
+        max(
+            (line_deviation_bins - table.line_deviation_bins[deviation_index]) / deviation_step, 0.0
+        ),
+        1.0,
+    )
+    offset_index = 0
+    while (
+        offset_index < N_OFFSETS - 2
+        and table.asymmetry[deviation_index, offset_index + 1] <= asymmetry
+    ):
+        offset_index += 1
+    asymmetry_step = (
+        table.asymmetry[deviation_index, offset_index + 1]
+        - table.asymmetry[deviation_index, offset_index]
+    )
+    offset_weight = (
+        (asymmetry - table.asymmetry[deviation_index, offset_index]) / asymmetry_step
+        if asymmetry_step > 0.0
+        else 0.0
+    )
+    return deviation_index, deviation_weight, offset_index, min(max(offset_weight, 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def interpolate_mode_table(values, cell, bin_offset):
+    """Interpolate a table (s, OFFSETS, bins) k bins from the bin nearest to the echo's centre.
+
+    The cell ``cell`` is a result of :func:`locate_in_mode_table`.
+    """
+    deviation_index, deviation_weight, offset_index, offset_weight = cell
+    half_bins = values.shape[2] // 2
+    bin_offset = min(max(bin_offset, -half_bins), half_bins) + half_bins
+    low = (1.0 - offset_weight) * values[
+        deviation_index, offset_index, bin_offset
+    ] + offset_weight * values[deviation_index, offset_index + 1, bin_offset]
+    high = (1.0 - offset_weight) * values[
+        deviation_index + 1, offset_index, bin_offset
+    ] + offset_weight * values[deviation_index + 1, offset_index + 1, bin_offset]
+    return (1.0 - deviation_weight) * low + deviation_weight * high

@@ -1,0 +1,474 @@
+"""Position of a tone between bins, from the magnitudes of the largest bin and its two neighbours.
+
+With the window's transform W at the spacing of the bins, a lone tone delta bins past the centre bin
+has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The way back to delta depends on
+the window:
+
+- If the neighbours of a tone on a bin still stand high (Hann, Hamming, wider ones), the measure
+  (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is delta / 2).
+  One step of least squares follows, weighted by the noise's covariance between the three bins: the
+  least error that three magnitudes allow.
+- If the neighbours vanish (rectangular) the larger of them says the side, and the measure is
+  larger / (centre + larger), for the rectangular window delta itself.
+
+The tables are made of the window's own transform, so a noise-free lone tone is placed exactly (1e-6
+bins). Three things bias the estimate: other lines within the reach of the kernel, the tone's own
+image near DC and Nyquist, and a footprint that spreads over bins. A footprint's estimate is that of
+its centre. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
+
+An echo that arrives after its record has begun lacks the first samples, and its line is that of a
+shortened window. The place that these tables give is corrected for that, as the instrument knows
+its window and, from the whole bins, the delay (:func:`late_echo_correction`): exact for a lone
+tone.
+
+A footprint whose lines add as powers and spread by s [bins, standard deviation] about their mean
+broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
+
+The error under noise follows to first order from the noise in phase with the signal, which the
+window correlates between bins. The Cramer-Rao bound (:mod:`sweep.model.detection.estimators`) is
+that of the whole record without a window; three magnitudes of a windowed spectrum do not reach it.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+from scipy.interpolate import RegularGridInterpolator
+
+from sweep.kernel_cache import njit
+from sweep.model.window import Window, window_samples
+
+_TABLE_INTERVALS = 2048
+"""Number of intervals in the tables; linear interpolation errs by some 1e-7 bins."""
+
+_N_SPREAD_POSITIONS, _SPREAD_BINS = 129, 0.05
+"""Number of places, and standard deviation [bins], at which ``widening`` is evaluated."""
+
+_TONE_DEGREE = 32
+"""Degree of the polynomial that represents a tone's complex bin within +-2 bins."""
+
+_NEIGHBOUR_HEIGHT_MIN = 0.25
+"""Relative height of a centred tone's neighbours below which TWO_BINS is used."""
+
+THREE_BINS, TWO_BINS = 0, 1
+
+
+class Interpolator(NamedTuple):
+    """Tables of one window and FFT size that convert bin magnitudes to a position between bins.
+
+    m is the number of places 0 .. 1 bin at which they are given.
+    """
+
+    measure_kind: int
+    """THREE_BINS or TWO_BINS."""
+    measure_at_centre: float
+    """Measure of a tone exactly on the centre bin."""
+    measure_step: float
+    """Spacing of the measures at which ``offset`` is tabulated."""
+    offset: np.ndarray
+    """(m,): |delta| [bins], 0 .. 1, for the measures low, low + step, .."""
+    weight: np.ndarray
+    """(3, m): least-squares weights by |delta|, on the bin away from the tone, the centre and the
+    bin on the tone's side, for magnitudes over the centre's. Zero for TWO_BINS."""
+    error_at_sigma: np.ndarray
+    """(m,): standard error [bins] by |delta| if the centre bin's magnitude equals sigma."""
+    noise_mixing: tuple[float, float, float, float]
+    """Factors m0 .. m3 that make the correlated noise of three adjacent bins, in one quadrature, of
+    independent normal numbers z0 (centre), z1, z2: above m0 z0 + m1 z1, below m0 z0 + m2 z1 + m3
+    z2."""
+    sidelobe_correlation: float
+    """Correlation of the noise of neighbouring bins in phase with a tone's sidelobes there, which
+    change sign from one to the next: once in L of N bins, for records of L samples."""
+    spread_error_factor: np.ndarray
+    """(m,): position error by |delta| over the variance of lines that add as powers [1/bins]."""
+
+
+@lru_cache(maxsize=64)
+def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
+    """Return the noise correlation of bins one and two apart, in phase with a tone's signal."""
+    squared_window = window_samples(window.name, window.length) ** 2
+    record_position = (np.arange(window.length) - window.length / 2) / fft_size
+    correlation_1, correlation_2 = (
+        float((squared_window * np.cos(2 * np.pi * d * record_position)).sum()) for d in (1, 2)
+    )
+    return correlation_1 / window.energy, correlation_2 / window.energy
+
+
+def sidelobe_correlation(window: Window, fft_size: int) -> float:
+    """Return the noise correlation of adjacent bins in phase with a tone's sidelobes there.
+
+    See :attr:`Interpolator.sidelobe_correlation`.
+    """
+    correlation_1, _ = neighbour_noise_correlations(window, fft_size)
+    return correlation_1 * (1.0 - 2.0 * window.length / fft_size)
+
+
+@lru_cache(maxsize=32)
+def interpolator(window: Window, fft_size: int) -> Interpolator:
+    """Prepare the tables for a window and FFT size (cached).
+
+    If the window's top is so flat that no measure grows with delta (flat-top windows in a padded
+    FFT), positions are not resolved: delta is 0 and its error half a bin.
+    """
+    offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
+    tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
+    neighbours_vanish = tone_magnitudes[2, 0] < _NEIGHBOUR_HEIGHT_MIN * tone_magnitudes[1, 0]
+    below, centre, above = tone_magnitudes
+    measures = (
+        above / (centre + above)
+        if neighbours_vanish
+        else (above - below) / (tone_magnitudes.sum(0) + centre)
+    )
+    correlation_1, correlation_2 = neighbour_noise_correlations(window, fft_size)
+    weight, error = _least_squares_weights(
+        tone_magnitudes, offset, correlation_1, correlation_2, two_bins=bool(neighbours_vanish)
+    )
+    if not (np.diff(measures[: _TABLE_INTERVALS // 2 + 1]) > 0).all():
+        weight, error, offset = 0 * weight, np.full_like(error, 1e30), 0 * offset
+    measures = np.maximum.accumulate(measures)
+    even_measures = np.linspace(measures[0], measures[-1], _TABLE_INTERVALS + 1)
+    interpolation = Interpolator(
+        measure_kind=TWO_BINS if neighbours_vanish else THREE_BINS,
+        measure_at_centre=float(measures[0]),
+        measure_step=max(float(even_measures[1] - even_measures[0]), 1e-12),
+        offset=np.interp(even_measures, measures, offset),
+        weight=0 * weight if neighbours_vanish else weight,
+        error_at_sigma=error,
+        noise_mixing=_noise_mixing(correlation_1, correlation_2),
+        sidelobe_correlation=sidelobe_correlation(window, fft_size),
+        spread_error_factor=np.zeros(0),
+    )
+    return interpolation._replace(
+        spread_error_factor=_spread_error_factor(window, fft_size, interpolation)
+    )
+
+
+def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
+    """Return exp(-2 pi i cycles n), n = 0 .. number - 1, from some 2 sqrt(number) exponentials."""
+    step = math.isqrt(n_values) + 1
+    angle = -2j * np.pi * cycles * np.arange(step)
+    return np.multiply.outer(np.exp(step * angle), np.exp(angle)).ravel()[:n_values]
+
+
+@lru_cache(maxsize=32)
+def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that gives the complex bin at distances -2 .. 2 [bins] from a lone tone.
+
+    The phase of half a record is removed, so that it is real for a symmetric window. It turns by at
+    most one cycle, so that a polynomial represents it to 1e-14 of the largest bin.
+    """
+    w, record_middle = window_samples(window.name, window.length), window.length / 2
+
+    def bin_values(distances: np.ndarray) -> np.ndarray:
+        values = [
+            (w * complex_exponentials(distance / fft_size, w.size)).sum() for distance in distances
+        ]
+        return np.array(values) * np.exp(2j * np.pi * record_middle / fft_size * distances)
+
+    return Chebyshev.interpolate(bin_values, _TONE_DEGREE, domain=[-2, 2])
+
+
+def _tone_magnitudes(window: Window, fft_size: int, offset: np.ndarray) -> np.ndarray:
+    """Magnitudes of three bins around lone tones delta bins past the middle one, (3, m)."""
+    return np.abs(tone_spectrum(window, fft_size)(np.array([[-1.0], [0.0], [1.0]]) - offset))
+
+
+def _least_squares_weights(
+    tone_magnitudes: np.ndarray,
+    offset: np.ndarray,
+    correlation_1: float,
+    correlation_2: float,
+    *,
+    two_bins: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return minimum-variance weights (3, m) on three bins for a small change of delta.
+
+    The weights annihilate a change of amplitude and respond with 1 to a change of delta, for a
+    centre bin of 1: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone, its slope), with the noise
+    covariance C. The standard error is (m,) [bins], at a centre bin of one sigma.
+    """
+    slope = np.gradient(tone_magnitudes, offset, axis=1)
+    used_bins = slice(1 if two_bins else 0, 3)
+    covariance = np.array(
+        [
+            [1, correlation_1, correlation_2],
+            [correlation_1, 1, correlation_1],
+            [correlation_2, correlation_1, 1],
+        ]
+    )[used_bins, used_bins]
+    inverse = np.linalg.inv(covariance + 1e-12 * np.eye(len(covariance)))
+    scale = np.maximum(tone_magnitudes[1], 1e-3 * tone_magnitudes[1, 0])
+    design = np.stack(
+        [tone_magnitudes[used_bins] / scale, slope[used_bins] / scale], axis=-1
+    ).swapaxes(0, 1)
+    solution = np.linalg.pinv(design.mT @ inverse @ design, hermitian=True)[:, :, 1]
+    weight = np.zeros_like(tone_magnitudes)
+    weight[used_bins] = (inverse @ design @ solution[:, :, None])[:, :, 0].T
+    return weight, np.sqrt(np.maximum(solution[:, 1], 0.0))
+
+
+def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
+    """Return the position error over the variance of a narrow Gaussian spread, by |delta| (m,).
+
+    The spread is represented by three lines of weights 1/6, 2/3, 1/6, which has its moments up to
+    the fifth.
+    """
+    positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
+    power = np.zeros((3, _N_SPREAD_POSITIONS))
+    for shift, weight in ((-math.sqrt(3), 1 / 6), (0.0, 2 / 3), (math.sqrt(3), 1 / 6)):
+        offset = positions + shift * _SPREAD_BINS
+        tone_magnitudes = _tone_magnitudes(window, fft_size, np.abs(offset))
+        power += weight * np.where(offset < 0, tone_magnitudes[::-1], tone_magnitudes) ** 2
+    estimates = np.array(
+        [estimate_sub_bin_offset(a, b, c, interpolation) for a, b, c in np.sqrt(power).T]
+    )
+    table_positions = np.linspace(0.0, 1.0, _TABLE_INTERVALS + 1)
+    return np.interp(table_positions, positions, np.abs(estimates - positions)) / _SPREAD_BINS**2
+
+
+def _noise_mixing(correlation_1: float, correlation_2: float) -> tuple[float, float, float, float]:
+    """Return the Cholesky factors m0 .. m3 of the noise covariance of bins 0, +1, -1."""
+    above_own = math.sqrt(max(1 - correlation_1**2, 0.0))
+    below_from_above = (correlation_2 - correlation_1**2) / above_own if above_own > 0 else 0.0
+    return (
+        correlation_1,
+        above_own,
+        below_from_above,
+        math.sqrt(max(1 - correlation_1**2 - below_from_above**2, 0.0)),
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def estimate_sub_bin_offset(below, centre, above, interpolation):
+    """Estimate a tone's offset from the centre bin [bins, -1 .. 1] from three magnitudes."""
+    offsets, weight = interpolation.offset, interpolation.weight
+    larger, smaller = max(below, above), min(below, above)
+    if not larger > 0.0:
+        return 0.0
+    if interpolation.measure_kind == THREE_BINS:
+        measure = (larger - smaller) / (smaller + 2.0 * centre + larger)
+    else:
+        measure = larger / (centre + larger)
+    offset = _interpolate_table(
+        offsets, (measure - interpolation.measure_at_centre) / interpolation.measure_step
+    )
+    if interpolation.measure_kind == THREE_BINS and centre > 0.0:
+        table_index = offset * (offsets.size - 1)
+        correction = smaller * _interpolate_table(
+            weight[0], table_index
+        ) + larger * _interpolate_table(weight[2], table_index)
+        offset = min(
+            max(offset + _interpolate_table(weight[1], table_index) + correction / centre, -1.0),
+            1.0,
+        )
+    return offset if above >= below else -offset
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _interpolate_table(values, index):
+    """Linear interpolation in a table at a fractional index, which is clipped to the table."""
+    index = min(max(index, 0.0), values.size - 1.0)
+    i = min(int(index), values.size - 2)
+    return values[i] + (index - i) * (values[i + 1] - values[i])
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def sub_bin_standard_error(offset, magnitude_ratio, interpolation):
+    """Return the standard error of :func:`estimate_sub_bin_offset` [bins], at most 1/2.
+
+    ``offset``: estimated position [bins]; ``magnitude_ratio``: magnitude of the centre bin over
+    sigma.
+    """
+    if not magnitude_ratio > 0.0:
+        return 0.5
+    return min(
+        _interpolate_table(
+            interpolation.error_at_sigma, abs(offset) * (interpolation.error_at_sigma.size - 1)
+        )
+        / magnitude_ratio,
+        0.5,
+    )
+
+
+def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size: int) -> np.ndarray:
+    """Return the error of the sub-bin offset [bins] for a tone that drifts within the record.
+
+    The tone lies ``offset`` bins from the centre bin at the record's middle, and moves at a
+    constant rate by ``drift`` bins in all.
+    """
+    error_factor = RegularGridInterpolator(
+        (_DRIFTS_BINS, _DRIFT_POSITIONS_BINS),
+        _drift_error_table(window, fft_size),
+        bounds_error=False,
+    )
+    offset, drift = np.broadcast_arrays(np.abs(offset), drift)
+    table_position = (
+        np.clip(offset, 0.0, _DRIFT_POSITIONS_BINS[-1]),
+        np.clip(drift, _DRIFTS_BINS[0], _DRIFTS_BINS[-1]),
+    )
+    return np.asarray(np.minimum(error_factor(table_position[::-1]) * drift * drift, drift / 2))
+
+
+_DRIFTS_BINS = np.array([0.5, 1.0, 2.0, 4.0])
+_DRIFT_POSITIONS_BINS = np.linspace(0.0, 1.0, 17)
+"""Drifts of a tone within the record, and its places at the record's middle, in the tables
+[bins]."""
+
+
+@lru_cache(maxsize=32)
+def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
+    """Tabulate the position error over the square of a tone's drift [1/bins], (drifts, places)."""
+    w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
+    record_position = np.arange(w.size) / w.size - 0.5
+    error_factor = np.empty((_DRIFTS_BINS.size, _DRIFT_POSITIONS_BINS.size))
+    for i, drift in enumerate(_DRIFTS_BINS):
+        drifting_window = w * np.exp(1j * np.pi * drift * w.size / fft_size * record_position**2)
+        for j, position in enumerate(_DRIFT_POSITIONS_BINS):
+            magnitudes = [
+                abs(
+                    (
+                        drifting_window * complex_exponentials((k - position) / fft_size, w.size)
+                    ).sum()
+                )
+                for k in (-1, 0, 1)
+            ]
+            estimate = estimate_sub_bin_offset(
+                magnitudes[0], magnitudes[1], magnitudes[2], interpolation
+            )
+            error_factor[i, j] = abs(estimate - position) / drift**2
+    return error_factor
+
+
+_N_LATE_POSITIONS = 65
+"""Number of places 0 .. 1 bin in the tables of late echoes."""
+_MISSING_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
+"""Fractions of the record without an echo in the tables of late echoes."""
+_SLOPE_MIN = 0.05
+_DIFFERENCE_STEP = 1e-4
+
+
+class LateEchoCorrection(NamedTuple):
+    """Correction of positions between bins for echoes that arrive after the record has begun."""
+
+    shift: np.ndarray
+    """Shift to add to the estimated position [bins]."""
+    error_factor: np.ndarray
+    """Factor on the standard error of :func:`sub_bin_standard_error`."""
+
+
+def late_echo_correction(
+    offset: np.ndarray, n_missing: np.ndarray, window: Window, fft_size: int
+) -> LateEchoCorrection:
+    """Return the correction of the sub-bin offset for an echo without the record's first samples.
+
+    Parameters
+    ----------
+    offset
+        Position that :func:`estimate_sub_bin_offset` gives, relative to the centre bin [bins].
+    n_missing
+        Number of samples at the record's start without an echo.
+    """
+    shift, error_factor = _late_echo_tables(window, fft_size)
+    offset, missing_fraction = np.broadcast_arrays(offset, np.asarray(n_missing) / window.length)
+    table_position = (
+        np.clip(missing_fraction, 0.0, _MISSING_FRACTIONS[-1]),
+        np.minimum(np.abs(offset), 1.0),
+    )
+    table_axes = _MISSING_FRACTIONS, np.linspace(0.0, 1.0, _N_LATE_POSITIONS)
+    shift_at, factor_at = (
+        RegularGridInterpolator(table_axes, values, bounds_error=False)(table_position)
+        for values in (shift, error_factor)
+    )
+    is_late = missing_fraction > 0
+    return LateEchoCorrection(
+        np.where(is_late, np.sign(offset) * shift_at, 0.0), np.where(is_late, factor_at, 1.0)
+    )
+
+
+@lru_cache(maxsize=32)
+def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate the shift [bins] and the error factor, (shares, places), of late echoes."""
+    w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
+    first_sample = np.minimum(np.rint(_MISSING_FRACTIONS * w.size).astype(int), w.size - 2)
+    positions = np.linspace(0.0, 1.0, _N_LATE_POSITIONS)
+    tone_bins = np.empty((first_sample.size, positions.size, 3), complex)
+    for j, position in enumerate(positions):
+        for k in (-1, 0, 1):
+            terms = w * complex_exponentials((k - position) / fft_size, w.size)
+            tone_bins[:, j, k + 1] = np.cumsum(terms[::-1])[::-1][first_sample]
+    record_position = np.arange(w.size) / fft_size
+    correlation_1, correlation_2 = (
+        (w**2 * np.exp(-2j * np.pi * d * record_position)).sum() / window.energy for d in (1, 2)
+    )
+    noise_covariance = np.array(
+        [
+            [1, correlation_1.conjugate(), correlation_2.conjugate()],
+            [correlation_1, 1, correlation_1.conjugate()],
+            [correlation_2, correlation_1, 1],
+        ]
+    )
+    shift, error_factor = np.zeros((2, first_sample.size, positions.size))
+    for i in range(first_sample.size):
+        magnitudes = np.abs(tone_bins[i])
+        scale = np.maximum(magnitudes[:, 1:2], 1e-300)
+        phase, magnitudes = tone_bins[i] / np.maximum(magnitudes, 1e-300), magnitudes / scale
+        estimates = np.array([estimate_sub_bin_offset(*row, interpolation) for row in magnitudes])
+        estimates = np.maximum.accumulate(np.maximum(estimates, 0.0))
+        slope = np.maximum(np.gradient(estimates, positions), _SLOPE_MIN)
+        derivatives = np.empty(magnitudes.shape)
+        for k in range(3):
+            lowered, raised = magnitudes.copy(), magnitudes.copy()
+            lowered[:, k] -= _DIFFERENCE_STEP
+            raised[:, k] += _DIFFERENCE_STEP
+            for j in range(positions.size):
+                derivatives[j, k] = (
+                    estimate_sub_bin_offset(*raised[j], interpolation)
+                    - estimate_sub_bin_offset(*lowered[j], interpolation)
+                ) / (2 * _DIFFERENCE_STEP)
+        weight = derivatives * phase
+        variance = np.einsum("jk,kl,jl->j", weight.conj(), noise_covariance, weight).real
+        error = np.sqrt(np.maximum(variance, 0.0)) / slope
+        if (
+            interpolation.measure_kind == TWO_BINS
+        ):  # on a bin either neighbour may be the larger one
+            error[0] = error[1]
+        # Of a whole echo's error at the place that is read, by which it is stated.
+        whole_echo_error = np.interp(
+            estimates,
+            np.linspace(0, 1, interpolation.error_at_sigma.size),
+            interpolation.error_at_sigma,
+        )
+        is_distinct = np.append(True, np.diff(estimates) > 1e-9)
+        shift[i] = np.interp(positions, estimates[is_distinct], positions[is_distinct]) - positions
+        error_factor[i] = np.interp(
+            positions, estimates[is_distinct], (error / whole_echo_error)[is_distinct]
+        )
+    return shift, error_factor
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def line_spread_error(offset, line_deviation_bins, adds_powers, interpolation):
+    """Return the error of the sub-bin offset [bins] for lines that spread about their mean.
+
+    Parameters
+    ----------
+    offset
+        Position relative to the centre bin [bins].
+    line_deviation_bins
+        Standard deviation of the lines [bins].
+    adds_powers
+        True if the lines add as powers. If they add as amplitudes they may cancel, and the error is
+        the whole spread.
+    """
+    if not adds_powers:
+        return line_deviation_bins
+    table_index = abs(offset) * (interpolation.spread_error_factor.size - 1)
+    return min(
+        _interpolate_table(interpolation.spread_error_factor, table_index)
+        * line_deviation_bins
+        * line_deviation_bins,
+        line_deviation_bins,
+    )

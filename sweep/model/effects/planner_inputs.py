@@ -1,0 +1,791 @@
+"""Link budget, lines and footprints of many points at once, for the sizes of effects.
+
+The formulas are those that shots are prepared with, for arrays that broadcast over the points;
+values are computed on first use. Arrays by segment have one more axis, in front, of the segments
+that exist. All points share words and the parameters that :meth:`PlannerInputs.shared_integer`
+reads.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import beam, beamlet_counts, ground, receiver_chain, waveform
+from sweep.model.beamlets import (
+    NO_SPREAD,
+    OffsetMoments,
+    bins_per_velocity,
+    place_beamlets,
+    plane_echo_ratio,
+    plane_moments,
+)
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.looks import Looks
+from sweep.model.effects.window_response import WindowResponse, window_response
+from sweep.model.ground import FootprintExtent, backscatter
+from sweep.model.preparation import (
+    CHIRP_PREFIX,
+    LASER_PREFIX,
+    PROCESSING_PREFIX,
+    RECEIVER_PREFIX,
+    RECORD_PATH,
+    approach_speed,
+    echo_power_and_beat_current,
+    relative_amplitude,
+)
+from sweep.model.threshold import tnr_from_parameters
+from sweep.model.window import Window, canonical_window_name, get_window, window_samples
+
+_CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
+_NEAR_IMAGE_WINDOW_BINS = 8.0
+"""Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
+
+
+class PhaseErrorBound(NamedTuple):
+    """Change of lines over the record by an effect: a phase, or places in their own right.
+
+    Sizes by segment, or scalars; powers are of the place x in the record, -1..1, in cycles.
+    """
+
+    coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """Of x, x^2, x^3, x^4."""
+    non_polynomial: np.ndarray | float = 0.0
+    """Of all phase that is no such power."""
+    constant: np.ndarray | float = 0.0
+    """In the record's middle, which matters to lines beside their images."""
+    extra_shift_window_bins: np.ndarray | float = 0.0
+    """Bins of fs/L that light may be moved by besides the slopes of the powers."""
+
+    @property
+    def shift_window_bins(self) -> np.ndarray | float:
+        """Bins of fs/L that light may be moved by."""
+        slope_window_bins = sum(2 * (k + 1) * value for k, value in enumerate(self.coefficients))
+        return slope_window_bins + self.extra_shift_window_bins
+
+    def plus(self, other: "PhaseErrorBound") -> "PhaseErrorBound":
+        """Both together."""
+        coefficients = tuple(
+            a + b for a, b in zip(self.coefficients, other.coefficients, strict=True)
+        )
+        return PhaseErrorBound(
+            coefficients, *(a + b for a, b in zip(self[1:], other[1:], strict=True))
+        )
+
+
+NO_PHASE_ERROR = PhaseErrorBound()
+
+
+class MissingSamples(NamedTuple):
+    """Samples of the record that are taken before the echo arrives, by segment."""
+
+    lost_fraction: np.ndarray
+    """Sum |w| over them, over sum w."""
+    step_sidelobe_factor: np.ndarray
+    """Factor on the sidelobes of a rectangular window that bounds what their lack adds to others,
+    relative to sum w."""
+    n_missing: np.ndarray
+    """Number of these samples."""
+    centroid_bound: np.ndarray
+    """Bound on the mean place, -1..1, of what is left in the record."""
+    all_missing: np.ndarray
+    """True where all samples lack."""
+
+
+def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
+    """Bounds for records of which the first samples have no echo.
+
+    The transform of the samples that lack is at most their variation over 2 sin(pi y / L), and so
+    is that of the samples that are left, which is what the sidelobes are where these are fewer.
+    """
+    lost_fraction_by_count, bound_by_missing, bound_by_remaining = _bounds_by_missing_count(window)
+    lost_fraction = lost_fraction_by_count[n_missing]
+    step_sidelobe_factor = np.minimum(
+        bound_by_missing[n_missing], bound_by_remaining[n_missing]
+    ) * (window.length / window.sum)
+    with np.errstate(divide="ignore"):
+        centroid_bound = np.minimum(lost_fraction / np.maximum(1 - lost_fraction, 1e-300), 1.0)
+    step_sidelobe_factor = np.where(n_missing > 0, step_sidelobe_factor, 0.0)
+    return MissingSamples(
+        lost_fraction, step_sidelobe_factor, n_missing, centroid_bound, n_missing >= window.length
+    )
+
+
+@lru_cache(maxsize=8)
+def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bounds of :func:`missing_sample_bounds` by the number of samples that lack, (L + 1,) each."""
+    w = window_samples(window.name, window.length)
+    magnitude = np.abs(w)
+    lost_fraction = np.append(0.0, np.cumsum(magnitude)) / window.sum
+    variation = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # up to each sample
+    bound_by_missing = 0.5 * (magnitude[0] + variation + magnitude)
+    bound_by_remaining = 0.5 * (magnitude + variation[-1] - variation + magnitude[-1])
+    bound_by_missing, bound_by_remaining = (
+        np.append(0.0, bound_by_missing),
+        np.append(bound_by_remaining, 0.0),
+    )
+    return lost_fraction, bound_by_missing, bound_by_remaining
+
+
+def window_max_near(
+    window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
+) -> np.ndarray:
+    """Largest |w| of samples less than ``reach_samples`` away from the first one, over sum w."""
+    exponents = np.ceil(np.log2(np.clip(reach_samples, 1, window.length))).astype(int)
+    window_max = np.empty(np.broadcast_shapes(first_sample.shape, exponents.shape))
+    first_sample, exponents = np.broadcast_arrays(first_sample, exponents)
+    for exponent in np.unique(exponents):
+        has_exponent = exponents == exponent
+        window_max[has_exponent] = _window_max_within(window, int(exponent))[
+            first_sample[has_exponent]
+        ]
+    return window_max
+
+
+@lru_cache(maxsize=64)
+def _window_max_within(window: Window, exponent: int) -> np.ndarray:
+    """Largest |w| within 2^power samples of each place of a record, (L + 1,), over sum w."""
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    magnitude = np.abs(window_samples(window.name, window.length))
+    magnitude = np.append(magnitude, magnitude[-1])
+    return np.asarray(maximum_filter1d(magnitude, 2 * 2**exponent + 1, mode="nearest")) / window.sum
+
+
+def magnitude_change_from_power(power_change: np.ndarray) -> np.ndarray:
+    """Relative change of a magnitude by that of its power, downwards, which is the larger one."""
+    return np.asarray(1 - np.sqrt(1 - np.minimum(power_change, 1.0)))
+
+
+class PlannerInputs:
+    """Some points that share every word.
+
+    `parameters` are words, numbers or arrays by dotted path, those that effects bring among them;
+    arrays broadcast against each other and have as many axes each. `extent` is what rays have
+    found, by default that of a flat plane; `has_rotating_body` tells whether any surface belongs to
+    a body that turns.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, np.ndarray | float | str],
+        extent: FootprintExtent | None = None,
+        *,
+        has_rotating_body: bool = False,
+    ) -> None:
+        self.parameters = {path: np.asarray(value) for path, value in parameters.items()}
+        self.ndim = max((array.ndim for array in self.parameters.values()), default=0)
+        self._given_extent, self.has_rotating_body = extent, has_rotating_body
+        self.architecture = self.option(RECEIVER_PREFIX + "architecture")
+        self.fft_size = self.shared_integer(PROCESSING_PREFIX + "fft_size")
+        self.ignores_doppler = False
+        """True where the Doppler effect is off."""
+        self.ignores_segment_motion = False
+        """True where the target stands still between segments."""
+        self.ignores_overlap = False
+        """True where the effect of overlap is off."""
+        self.phase_error_bounds: dict[str, PhaseErrorBound] = {}
+        """Of the effects that smear lines, by name."""
+        n_beamlets = self.shared_integer(beamlet_counts.BEAMLETS_PATH)
+        self.n_beamlets, self.beamlet_pattern = beamlet_counts.finest_beamlets(self.parameters)
+        if n_beamlets:
+            self.n_beamlets, self.beamlet_pattern = (
+                n_beamlets,
+                ground.beamlet_pattern(self.parameters),
+            )
+        is_direct = self.architecture == "direct"
+        self.segment_order = waveform.existing_segments(
+            self.architecture, self.option(waveform.SEGMENT_ORDER_PATH)
+        )
+        self.sample_rate = self[PROCESSING_PREFIX + "sample_rate"]
+        self.acquisition_delay = self[PROCESSING_PREFIX + "acquisition_delay"]
+        """Acquisition delay t_0 [s]."""
+        self.bin_width = self.sample_rate / self.fft_size
+        """[Hz]."""
+        self.chirp_rate = self[CHIRP_PREFIX + "bandwidth"] / self[CHIRP_PREFIX + "duration"]
+        self.range, self.radial_velocity = self["target.range"], self["target.radial_velocity"]
+        """On the beam's axis [m, m/s], positive when closing."""
+        self.delay = 2 / SPEED_OF_LIGHT * self.range
+        self.doppler_ratio = 2 * self.radial_velocity / SPEED_OF_LIGHT
+        """Doppler ratio."""
+        self.acceleration = self["target.acceleration"]
+        """[m/s^2]."""
+        self.looks = Looks.from_parameters(parameters)
+        self.relative_chirp_rates: tuple[np.ndarray | float, ...] = (
+            1.0,
+            *(
+                np.asarray(parameters.get(path, waveform.WAVEFORM_DEFAULTS[path]), float)
+                for path in (waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH)
+            ),
+        )
+        """Chirp rates of up, Doppler and down segment over :attr:`chirp_rate`, signed."""
+        self.existing_chirp_rates = self.stack_segments(
+            *self._of_existing_segments(self.relative_chirp_rates)
+        )
+        is_coherent = self.option("footprint.phases") == "coherent"
+        self.adds_amplitudes = is_coherent or is_direct
+        self.adds_field_amplitudes = is_coherent and not is_direct
+        """True where roots of echoes add."""
+
+    def __getitem__(self, path: str) -> np.ndarray:
+        """Return a parameter that is a number."""
+        return self.parameters[path]
+
+    def option(self, path: str) -> str:
+        """Return a parameter that is a word."""
+        return str(self.parameters[path])
+
+    def shared_integer(self, path: str) -> int:
+        """Return a whole number that all points share."""
+        return int(self.parameters[path].flat[0])
+
+    def any_nonzero(self, *paths: str) -> bool:
+        """Return true if any of some numbers is other than 0 anywhere."""
+        return any(bool(self.parameters[path].any()) for path in paths)
+
+    def _of_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
+        """Values of the segments that there are: up, Doppler, down."""
+        named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
+        return [value for name, value in named_values if name in self.segment_order]
+
+    def stack_segments(self, *values: np.ndarray | float) -> np.ndarray:
+        """Values by segment, one behind the other."""
+        template = np.zeros((1,) * self.ndim)
+        return np.stack(np.broadcast_arrays(template, *values)[1:]).astype(float)
+
+    # The instrument
+
+    @cached_property
+    def window(self) -> Window:
+        """Window of the record, whose length all points share."""
+        length = waveform.record_length(self.parameters)
+        return get_window(
+            canonical_window_name(self.option(PROCESSING_PREFIX + "window")), int(length.flat[0])
+        )
+
+    @cached_property
+    def window_response(self) -> WindowResponse:
+        """Its transform over the FFT's bins."""
+        return window_response(self.window.name, self.window.length, self.fft_size)
+
+    @property
+    def padding_factor(self) -> float:
+        """Bins of the FFT to one of fs/L."""
+        return self.window_response.padding_factor
+
+    @cached_property
+    def record_duration(self) -> np.ndarray:
+        """Length of the record L/fs [s]."""
+        return self.window.length / self.sample_rate
+
+    @cached_property
+    def carriers(self) -> np.ndarray:
+        """Frequency that the delay turns into phase [Hz], by segment."""
+        carriers = waveform.carrier_frequencies(
+            self.architecture,
+            wavelength=self[LASER_PREFIX + "wavelength"],
+            start_frequency=self[CHIRP_PREFIX + "start_frequency"],
+            bandwidth=self[CHIRP_PREFIX + "bandwidth"],
+            chirp_slopes=self.relative_chirp_rates,
+        )
+        return self.stack_segments(*self._of_existing_segments(carriers))
+
+    @cached_property
+    def receiver_noise(self) -> receiver_chain.ReceiverNoise:
+        """Noise at the ADC [V^2]."""
+        receiver_values = receiver_chain.receiver_parameters(self.parameters)
+        return receiver_chain.receiver_noise(
+            self.architecture, receiver_values, self.option(RECORD_PATH) == "complex"
+        )
+
+    @cached_property
+    def quantisation_variance(self) -> np.ndarray:
+        """Noise of the ADC's steps [V^2]."""
+        full_scale, bits = (self[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
+        samples_iq = self.option(RECORD_PATH) == "complex"
+        return receiver_chain.quantisation_variance(
+            full_scale=full_scale, bits=bits, samples_iq=samples_iq
+        )
+
+    @cached_property
+    def receiver_noise_variance(self) -> np.ndarray:
+        """Of the receiver alone, at the ADC [V^2]."""
+        return np.asarray(sum(self.receiver_noise.variances.values()))
+
+    @cached_property
+    def bin_noise_sigma(self) -> np.ndarray:
+        """Noise sigma of a bin, per quadrature [V]."""
+        window_energy, mean_variance = (
+            np.asarray(self.window.energy),
+            self.receiver_noise_variance / self.looks.n_coherent,
+        )
+        return receiver_chain.bin_noise_sigma(
+            noise_variance=mean_variance, window_energy=window_energy
+        )
+
+    @cached_property
+    def threshold_ratio(self) -> np.ndarray:
+        """Threshold over sigma."""
+        from sweep.model.detection import echo_detection
+
+        tnr = tnr_from_parameters(self.parameters)
+        return np.asarray(echo_detection.threshold_from_tnr(tnr=tnr, bin_deviation=np.asarray(1.0)))
+
+    @property
+    def noise_peak_ratio(self) -> float | None:
+        """Magnitude over sigma that any bin's noise exceeds with a probability of 0.001 at most.
+
+        None where segments report all peaks that cross the threshold.
+        """
+        if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
+            return None
+        return float(np.sqrt(2 * np.log(1e3 * self.shared_integer(PROCESSING_PREFIX + "fft_size"))))
+
+    # The target
+
+    @cached_property
+    def footprint_angles(self) -> beam.FootprintAngles:
+        """Full angles of the footprint [rad]."""
+        return beam.footprint_angles(self.parameters)
+
+    @cached_property
+    def footprint_extent(self) -> FootprintExtent:
+        """Extent of the footprint, as given for all beams or on a plane."""
+        if (extent := self._given_extent) is not None:
+            return extent if self.adds_field_amplitudes else extent._replace(amplitude_gain_max=1.0)
+        grazing_angle = self["target.grazing_angle"]
+        axis_echo = backscatter(self.option("target.reflectance_law"), np.sin(grazing_angle))
+        if self.n_beamlets == 1:
+            return FootprintExtent(axis_echo, 1.0, NO_SPREAD, NO_SPREAD, NO_SPREAD)
+        geometry: dict[str, Any] = {
+            "grazing_angle": grazing_angle, "beam_divergence": self.footprint_angles.positions,
+            "n_beamlets": self.n_beamlets, "pattern": self.beamlet_pattern,
+        }  # fmt: skip
+        range_moments, velocity_moments = plane_moments(
+            transverse_velocity=self["target.transverse_velocity"],
+            radial_velocity=self.radial_velocity,
+            direction_angle=self.footprint_angles.directions,
+            **geometry,
+        )
+        echo_ratio = plane_echo_ratio(self.option("target.reflectance_law"), **geometry)
+        amplitude_gain = 1.0
+        if self.adds_field_amplitudes:
+            amplitude_gain = float(
+                np.sqrt(place_beamlets(self.n_beamlets, self.beamlet_pattern)[1]).sum()
+            )
+        return FootprintExtent(
+            axis_echo,
+            echo_ratio,
+            range_moments,
+            range_moments,
+            velocity_moments,
+            amplitude_gain * np.sqrt(echo_ratio),
+        )
+
+    @cached_property
+    def echo_and_beat_scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """Echo power [W] for a relative echo of 1/sr; amplitude of the beat [V] for that of 1."""
+        echo_power, beat_current = echo_power_and_beat_current(self.architecture, self.parameters)
+        return echo_power, beat_current * self[RECEIVER_PREFIX + "transimpedance"]
+
+    @cached_property
+    def beat_amplitude(self) -> np.ndarray:
+        """Amplitude of the bare line's beat at the ADC [V], before the receiver's poles."""
+        return self.echo_and_beat_scales[1] * relative_amplitude(
+            self.architecture, self.footprint_extent.axis_echo
+        )
+
+    @cached_property
+    def echo_noise_ratio(self) -> np.ndarray:
+        """Shot noise of the whole echo over the receiver's noise variance."""
+        total_echo = self.footprint_extent.axis_echo * np.maximum(
+            self.footprint_extent.total_echo_ratio, 1.0
+        )
+        return (
+            self.echo_and_beat_scales[0]
+            * total_echo
+            * self.receiver_noise.shot_noise_variance_per_watt
+            / self.receiver_noise_variance
+        )
+
+    # Lines
+
+    @cached_property
+    def approach_speed(self) -> np.ndarray:
+        """Speed at which the range along the beam falls [m/s]."""
+        return np.asarray(approach_speed(self.parameters))
+
+    @property
+    def look_period(self) -> np.ndarray:
+        """Time from look to look [s]."""
+        return np.asarray(
+            len(self.segment_order)
+            * (self[CHIRP_PREFIX + "duration"] + self[waveform.SEGMENT_GAP_PATH])
+        )
+
+    @property
+    def middle_look_delay(self) -> np.ndarray | float:
+        """Time from the first look to the middle one [s]."""
+        return 0.5 * (self.looks.number - 1) * self.look_period if self.looks.number > 1 else 0.0
+
+    @cached_property
+    def segment_starts(self) -> np.ndarray:
+        """Time from the shot's start to each segment's, of the middle look [s]."""
+        segment_starts = waveform.segment_starts(
+            self.segment_order,
+            duration=self[CHIRP_PREFIX + "duration"],
+            gap=self[waveform.SEGMENT_GAP_PATH],
+        )
+        return self.stack_segments(
+            *self._of_existing_segments(
+                [start + self.middle_look_delay for start in segment_starts]
+            )
+        )
+
+    @cached_property
+    def doppler_ratio_growth(self) -> np.ndarray:
+        """Growth of the Doppler ratio from the shot's start to each segment's."""
+        ratio_per_speed = 0.0 if self.ignores_segment_motion else 2 / SPEED_OF_LIGHT
+        return np.asarray(ratio_per_speed * self.acceleration * self.segment_starts)
+
+    @cached_property
+    def beat_frequency(self) -> np.ndarray:
+        """Signed beat of the line on the axis [Hz], by segment."""
+        doppler_ratio = self.doppler_ratio_growth + (
+            0.0 if self.ignores_doppler else self.doppler_ratio
+        )
+        delay = self.delay
+        if not self.ignores_segment_motion:
+            delay = (
+                delay
+                - (2 / SPEED_OF_LIGHT * self.approach_speed + self.doppler_ratio_growth / 2)
+                * self.segment_starts
+            )
+        beat = self.chirp_rate * delay * (1 + doppler_ratio)
+        return self.carriers * doppler_ratio - self.existing_chirp_rates * beat
+
+    @cached_property
+    def missing_samples(self) -> MissingSamples | None:
+        """Samples of the record without an echo; None where echoes fill all records."""
+        if self.ignores_overlap:
+            return None
+        delay = self.delay
+        if not self.ignores_segment_motion:
+            delay = (
+                delay
+                - (2 / SPEED_OF_LIGHT * self.approach_speed + self.doppler_ratio_growth / 2)
+                * self.segment_starts
+            )
+        n_missing = waveform.count_samples_before_echo(
+            delay=delay,
+            doppler_ratio=self.doppler_ratio_growth
+            + (0.0 if self.ignores_doppler else self.doppler_ratio),
+            record_start=self.acquisition_delay,
+            sample_rate=self.sample_rate,
+            length=self.window.length,
+        )
+        latest_delay = delay * np.minimum(
+            self.footprint_extent.range_offsets.extreme, 1e3
+        )  # beyond the axis's
+        latest_delay = (
+            latest_delay + 2 / SPEED_OF_LIGHT * np.abs(self.approach_speed) * self.middle_look_delay
+        )
+        if not n_missing.any() and not (delay + latest_delay > self.acquisition_delay).any():
+            return None
+        return missing_sample_bounds(
+            self.window, np.broadcast_to(n_missing, self.beat_frequency.shape)
+        )
+
+    def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
+        """Largest magnitude of a bin at least ``distance`` [bins] from a line, over its peak's.
+
+        The peak is that of a whole record.
+        """
+        response_max = self.window_response.sidelobe_max(distance)
+        if self.missing_samples is None:
+            return response_max
+        rectangular_response = window_response("rectangular", self.window.length, self.fft_size)
+        step_sidelobe = (
+            self.missing_samples.step_sidelobe_factor
+            * rectangular_response.sidelobe_max(distance - self.padding_factor)
+        )
+        return np.asarray(
+            response_max + np.minimum(step_sidelobe, self.missing_samples.lost_fraction)
+        )
+
+    def power_without_missing(self, power: np.ndarray) -> np.ndarray:
+        """Least power of the largest bin, by that of a whole record, over that of all on a bin."""
+        if self.missing_samples is None:
+            return power
+        return np.asarray(np.maximum(np.sqrt(power) - self.missing_samples.lost_fraction, 0.0) ** 2)
+
+    @cached_property
+    def range_drift_max(self) -> np.ndarray:
+        """Most metres by which the target moves from the shot's start to a segment's own."""
+        end_time = self.segment_starts + self.middle_look_delay
+        return (np.abs(self.approach_speed) + np.abs(self.acceleration) * end_time / 2) * end_time
+
+    @cached_property
+    def line_drift_max_bins(self) -> np.ndarray:
+        """Most bins by which its line moves in that time."""
+        velocity_change = np.abs(self.acceleration) * (self.segment_starts + self.middle_look_delay)
+        bins_per_metre = (
+            np.abs(self.existing_chirp_rates)
+            * self.chirp_rate
+            * (2 / SPEED_OF_LIGHT)
+            / self.bin_width
+        )
+        bins_by_range = bins_per_metre * (1 + np.abs(self.doppler_ratio)) * self.range_drift_max
+        return bins_by_range + self.bins_per_velocity * velocity_change
+
+    @cached_property
+    def bin_offset(self) -> np.ndarray:
+        """Distance from the nearest bin [bins], 0..1/2."""
+        bin_position = self.beat_frequency / self.bin_width
+        return np.abs(bin_position - np.rint(bin_position))
+
+    @cached_property
+    def bins_to_edge(self) -> np.ndarray:
+        """Distance of the folded line from the nearer of DC and Nyquist [bins]."""
+        nyquist_bin = self.fft_size / 2
+        nyquist_position = self.beat_frequency / (self.bin_width * nyquist_bin)
+        return np.abs(nyquist_position - np.rint(nyquist_position)) * nyquist_bin
+
+    @cached_property
+    def transfer_gain(self) -> np.ndarray:
+        """|H| at the line over that at DC."""
+        bandwidths = [
+            self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
+        ]
+        detector_ratio, amplifier_ratio = (
+            (self.beat_frequency / bandwidth) ** 2 for bandwidth in bandwidths
+        )
+        gain = 1 / np.sqrt((1 + detector_ratio) * (1 + amplifier_ratio))
+        if self.antialias_filter:
+            gain = gain * np.sqrt(
+                receiver_chain.antialias_power_transmission(
+                    self.beat_frequency, **self.antialias_filter
+                )
+            )
+        return np.asarray(gain)
+
+    @cached_property
+    def antialias_filter(self) -> dict[str, np.ndarray]:
+        """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
+        return receiver_chain.antialias_filter_parameters(
+            receiver_chain.receiver_parameters(self.parameters)
+        )
+
+    @cached_property
+    def gain_slope_max(self) -> np.ndarray:
+        """Bound on the relative change of |H|^2 a bin [1/bin]."""
+        bandwidths = (
+            self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
+        )
+        return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.bin_width)
+
+    @cached_property
+    def line_signal_ratio(self) -> np.ndarray:
+        """Magnitude of the bare line on a bin over sigma, by segment."""
+        signal_ratio = (
+            self.beat_amplitude
+            * (0.5 * self.window.sum)
+            / self.bin_noise_sigma
+            * self.transfer_gain
+        )
+        if self.option(RECEIVER_PREFIX + "noise_shape") == "white":
+            return signal_ratio
+        relative_density = self.relative_noise_density
+        if self.antialias_filter:  # where next to no noise passes, that of the ADC is what there is
+            relative_density = (
+                relative_density + self.quantisation_variance / self.receiver_noise_variance
+            )
+        return signal_ratio / np.sqrt(relative_density)
+
+    @cached_property
+    def relative_noise_density(self) -> np.ndarray | float:
+        """Density of the receiver's noise at the line over its mean over all bins, by segment."""
+        if self.option(RECEIVER_PREFIX + "noise_shape") == "white":
+            return 1.0
+        pole_names = "detector_bandwidth", "amplifier_bandwidth"
+        filter_arguments = {
+            name: self[RECEIVER_PREFIX + name] for name in pole_names
+        } | self.antialias_filter
+        return receiver_chain.relative_noise_density(
+            self.beat_frequency, sample_rate=self.sample_rate, **filter_arguments
+        )
+
+    @cached_property
+    def peak_ratio(self) -> np.ndarray:
+        """Magnitude of the largest bin of the bare line over sigma, by segment."""
+        return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
+
+    @cached_property
+    def bins_per_relative_range(self) -> np.ndarray:
+        """Bins for a relative difference of range of 1, by segment."""
+        beat_per_relative_range = self.chirp_rate * self.delay * (1 + np.abs(self.doppler_ratio))
+        return np.abs(self.existing_chirp_rates) * (beat_per_relative_range / self.bin_width)
+
+    @cached_property
+    def bins_per_velocity(self) -> np.ndarray:
+        """Bins for 1 m/s, by segment."""
+        return bins_per_velocity(
+            range=self.range, carrier=self.carriers, chirp_rate=self.chirp_rate,
+            bin_width=self.bin_width,
+        )  # fmt: skip
+
+    @cached_property
+    def axis_surface_spread(self) -> OffsetMoments:
+        """Bins off the axis's line by the ranges of beamlets on the axis's surface."""
+        return self.footprint_extent.axis_surface_range_offsets.scaled_by(
+            self.bins_per_relative_range
+        )
+
+    @cached_property
+    def range_spread(self) -> OffsetMoments:
+        """Bins off the axis's line by the ranges of all beamlets."""
+        return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
+
+    @cached_property
+    def velocity_spread(self) -> OffsetMoments:
+        """Bins off the axis's line by the velocities of beamlets."""
+        return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
+
+    @cached_property
+    def line_spread(self) -> OffsetMoments:
+        """Bins off the axis's line by ranges and velocities of beamlets."""
+        return self.range_spread.sum_bound(self.velocity_spread)
+
+    @cached_property
+    def total_phase_error_bound(self) -> PhaseErrorBound:
+        """All that smears lines over the record."""
+        total = NO_PHASE_ERROR
+        for bound in self.phase_error_bounds.values():
+            total = total.plus(bound)
+        return total
+
+    @cached_property
+    def phase_error_shift_bins(self) -> np.ndarray | float:
+        """Bins that light may be moved by over the record."""
+        return self.total_phase_error_bound.shift_window_bins * self.padding_factor
+
+    @cached_property
+    def bins_to_image(self) -> np.ndarray:
+        """Bins from DC and Nyquist to the nearest light of a line."""
+        return self.bins_to_edge - self.line_spread.extreme - self.phase_error_shift_bins
+
+    @cached_property
+    def is_near_image(self) -> np.ndarray:
+        """True where lines and their images are so close that they may add up, or cancel."""
+        return ~(2 * self.bins_to_image >= _NEAR_IMAGE_WINDOW_BINS * self.padding_factor)
+
+    @cached_property
+    def image_bound(self) -> np.ndarray:
+        """Most that images add to the largest bin, over the magnitude that lines make in phase."""
+        smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
+        gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
+        image_response = self.sidelobe_max(self.bins_to_image) * np.sqrt(smear_factor)
+        return np.asarray(
+            gain_rise * image_response / self.window_response.scalloping_gain(self.bin_offset)
+        )
+
+    @property
+    def amplitudes_may_add(self) -> bool:
+        """True if amplitudes add, or may."""
+        return self.adds_amplitudes or self.any_nonzero("target.roughness")
+
+    @cached_property
+    def may_cancel(self) -> np.ndarray:
+        """True where amplitudes that add, or may, might nearly cancel."""
+        if not self.amplitudes_may_add:
+            return np.zeros_like(self.is_near_image)
+        return self.is_near_image | (self.n_beamlets > 1)
+
+    @cached_property
+    def peak_power_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest power of the largest bin, over that of all lines on a bin."""
+        return self.peak_power_bounds_for(self.line_spread)
+
+    def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
+        """Bound the largest bin's power for lines of a spread, over that of all lines on a bin.
+
+        Images are included. The bounds come from Taylor's series, the line of the strongest
+        beamlet, and Chebyshev's inequality: a share 1 - 1/t^2 of the power lies within t s, whose
+        largest bin holds the mean at least.
+        """
+        response, gain_slope, (mean, rms, extreme) = (
+            self.window_response,
+            self.gain_slope_max,
+            moments,
+        )
+        axis_power = response.scalloping_gain(self.bin_offset) ** 2
+        if moments is NO_SPREAD or self.n_beamlets == 1:
+            return axis_power, axis_power * np.where(self.is_near_image, 2.0, 1.01)
+        curvature_loss = 0.5 * response.curvature_max * rms * rms
+        power_min = (
+            axis_power
+            - np.minimum(response.slope_max, response.curvature_max * self.bin_offset) * mean
+        )
+        power_min = power_min - curvature_loss - gain_slope * rms
+        power_min = np.maximum(
+            power_min,
+            np.exp(-gain_slope * extreme) * (response.scalloping_gain_min**2 / self.n_beamlets),
+        )
+        for t in _CHEBYSHEV_DEVIATIONS:
+            half_width = t * rms
+            power_max = (
+                (1 - 1 / t**2)
+                * response.central_energy_min
+                / (2 * half_width + 2 * response.padding_factor + 1)
+            )
+            power_min = np.maximum(power_min, power_max * np.exp(-gain_slope * half_width))
+        power_max = np.minimum(axis_power + response.slope_max * mean + curvature_loss, 1.0)
+        gain_rise = np.exp(np.minimum(gain_slope * extreme, 50.0))
+        power_max = power_max * np.where(self.is_near_image, 2.0, 1.01)
+        power_max = power_max * (1 + gain_rise * np.minimum(gain_slope * rms, 50.0))
+        return np.minimum(power_min, power_max), power_max
+
+    def power_change_bound(
+        self,
+        added_moments: OffsetMoments,
+        present_moments: OffsetMoments,
+        shift_bins: np.ndarray | float = 0.0,
+    ):
+        """Relative change of the largest bin's power as lines are moved, or spread further.
+
+        P_k = sum_b p_b F(k - x_0 - X_b), and with F1, F2 the bounds on |F'| and |F''|
+
+            |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s
+
+        for the mean m and the rms s of X, added to lines of rms S, and c of the receiver's poles.
+        """
+        response, power_min = self.window_response, self.peak_power_bounds_for(present_moments)[0]
+        power_change = response.slope_max * (added_moments.mean + shift_bins)
+        power_change = power_change + response.curvature_max * (
+            present_moments.rms * added_moments.rms + added_moments.rms**2 / 2
+        )
+        gain_exponent = self.gain_slope_max * (
+            present_moments.extreme + added_moments.extreme + shift_bins
+        )
+        power_change = power_change + self.gain_slope_max * (added_moments.rms + shift_bins)
+        image_factor = np.where(self.is_near_image, 2.0, 1.05)
+        return image_factor * np.exp(np.minimum(gain_exponent, 50.0)) * power_change / power_min
+
+    def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
+        """Bound the relative change of a sum of amplitudes whose lines move by some bins.
+
+        Relative to the sum in phase; by |W'|, |H'| and the phase at mid-record, line and image.
+        """
+        phase_per_bin = (
+            2 * np.pi * (self.acquisition_delay + 0.5 * self.record_duration) * self.bin_width
+        )
+        line_change = (
+            np.sqrt(self.window_response.curvature_max) + 2 * self.gain_slope_max + phase_per_bin
+        ) * shift_bins
+        gain_rise = np.exp(
+            np.minimum(self.gain_slope_max * (self.line_spread.extreme + shift_bins), 50.0)
+        )
+        return (
+            2 * gain_rise * np.minimum(line_change, 2.0) / self.window_response.scalloping_gain_min
+        )

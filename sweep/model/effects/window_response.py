@@ -1,0 +1,154 @@
+"""Main lobe of a window, and bounds on how its power changes, for the sizes of effects.
+
+F(x) = |W(x r)|^2 / (sum w)^2 is the power of a bin x FFT bins away from a line, r = L/N. It is a
+cosine series in the autocorrelation of the window,
+
+    F(x) = sum_{n,m} w_n w_m cos(2 pi (n - m) x / N) / (sum w)^2,
+
+so that |F''| <= (2 pi r)^2 2 V, V the variance of n/L under the weights |w_n| (times
+(sum|w| / sum w)^2), and |F'| <= the root of it times sum|w| / sum w. Near the peak W follows from
+the window's moments,
+
+    |W(y)| = hypot(sum_n w_n cos(2 pi y (n/L - 1/2)), w_0 sin(pi y)).
+
+Over all bins F adds up to ENBW / r (Parseval), wherever the line lies.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.window import Window, get_window, window_samples
+
+_ROUNDING_ERROR = 1e-6
+_SERIES_TERMS = 28
+_MAIN_LOBE_STEPS = 1024
+_ENVELOPE_CELLS, _ENVELOPE_KNEE_WINDOW_BINS = 8192, 16.0
+"""Cells of the table of sidelobes, even in d / (d + knee), and its knee [bins of fs/L]."""
+_CELLS_PER_OCTAVE = 64
+"""Cells an octave of the table of how far lines reach."""
+_OCTAVE_MIN = -80
+"""Octaves below the peak at which that table ends."""
+
+
+class WindowResponse(NamedTuple):
+    """A window over an FFT's bins; powers and magnitudes relative to the peak's."""
+
+    main_lobe: np.ndarray
+    """(m,): magnitude at distances of 0..1/2 bin in equal steps."""
+    slope_max: float
+    """Bound on |F'| [1/bin]."""
+    curvature_max: float
+    """Bound on |F''| [1/bin^2]."""
+    padding_factor: float
+    """Bins to either side that are counted for ``central_energy_min``: 1/r, one of the window's."""
+    central_energy_min: float
+    """Least sum of F over the bins within ``padding_factor`` of a line."""
+    sidelobe_envelope: np.ndarray
+    """(cells + 1,): largest magnitude at or beyond distances even in d / (d + knee)."""
+    distance_by_octave: np.ndarray
+    """(cells,): distance [bins] from which on all are smaller, by octaves of magnitude."""
+    scalloping_gain_min: float
+    """Least magnitude of the bin nearest to a line."""
+
+    def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
+        """Magnitude of a bin at a distance from a line, 0..1/2 bin."""
+        clipped_distance = np.fmin(distance, 0.5)
+        return self.main_lobe[(clipped_distance * (2 * _MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
+
+    def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
+        """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
+        knee = _ENVELOPE_KNEE_WINDOW_BINS * self.padding_factor
+        table_position = 1 - knee / (np.fmax(distance, 0.0) + knee)
+        return self.sidelobe_envelope[(table_position * _ENVELOPE_CELLS).astype(np.int64)]
+
+    def distance_below(self, magnitude: np.ndarray) -> np.ndarray:
+        """Distance [bins] from which on all bins are smaller; infinite where none is known."""
+        octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_OCTAVE_MIN), 1.0))
+        return self.distance_by_octave[np.ceil(-octave * _CELLS_PER_OCTAVE).astype(np.int64)]
+
+
+@lru_cache(maxsize=32)
+def window_response(window_name: str, length: int, fft_size: int) -> WindowResponse:
+    """Return the lobe of the window of this name over an FFT, prepared once and cached."""
+    fft_window = get_window(window_name, length)
+    w = window_samples(fft_window.name, length)
+    position = np.arange(length) / length - 0.5
+    weight = np.abs(w) / np.abs(w).sum()
+    position_variance = float((weight * position**2).sum() - (weight * position).sum() ** 2)
+    magnitude_sum_ratio = float(np.abs(w).sum() / w.sum())
+    record_fraction = length / fft_size
+    curvature_max = (
+        2 * position_variance * (2 * math.pi * record_fraction * magnitude_sum_ratio) ** 2
+    )
+    coefficients = _main_lobe_series(w, position)
+    main_lobe_samples = main_lobe_magnitude(
+        fft_window, coefficients, np.linspace(0.0, 0.5, _MAIN_LOBE_STEPS + 1) * record_fraction
+    )
+    envelope_distance = np.concatenate([[0.0], fft_window.envelope_distances])
+    envelope = np.concatenate(
+        [
+            [max(1.0, main_lobe_samples.max(), fft_window.sidelobe_envelope[0])],
+            fft_window.sidelobe_envelope,
+        ]
+    )
+    table_position = np.arange(_ENVELOPE_CELLS + 1) / _ENVELOPE_CELLS
+    with np.errstate(divide="ignore"):
+        table_distance = _ENVELOPE_KNEE_WINDOW_BINS * table_position / (1 - table_position)
+    magnitude = 2.0 ** (-np.arange(-_OCTAVE_MIN * _CELLS_PER_OCTAVE + 2) / _CELLS_PER_OCTAVE)
+    first_below = np.searchsorted(-envelope, -magnitude)
+    return WindowResponse(
+        main_lobe=main_lobe_samples,
+        slope_max=magnitude_sum_ratio * math.sqrt(curvature_max),
+        curvature_max=curvature_max,
+        padding_factor=1 / record_fraction,
+        central_energy_min=_central_energy_min(
+            fft_window,
+            coefficients,
+            record_fraction,
+            magnitude_sum_ratio * math.sqrt(curvature_max),
+        ),
+        sidelobe_envelope=envelope[np.searchsorted(envelope_distance, table_distance, "right") - 1],
+        distance_by_octave=np.append(envelope_distance, np.inf)[first_below] / record_fraction,
+        scalloping_gain_min=float(main_lobe_samples.min()) * (1 - _ROUNDING_ERROR),
+    )
+
+
+def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Coefficients of S(y) / sum w in powers of y^2, from the window's even moments."""
+    moments = np.empty(_SERIES_TERMS)
+    weighted_power = w / w.sum()
+    for k in range(_SERIES_TERMS):
+        moments[k] = weighted_power.sum()
+        weighted_power = weighted_power * (position * position)
+    exponent = np.arange(_SERIES_TERMS)
+    series_factors = [(2 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in exponent.tolist()]
+    return np.asarray((-1.0) ** exponent * series_factors * moments)
+
+
+def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """|W(y)| / sum w for |y| <= 1.5 bins of fs/L, by its series."""
+    real_part = np.polynomial.polynomial.polyval(np.asarray(y, float) ** 2, coefficients)
+    return np.hypot(
+        real_part, fft_window.first_value / fft_window.sum * np.sin(np.pi * np.asarray(y, float))
+    )
+
+
+def _central_energy_min(
+    fft_window: Window, coefficients: np.ndarray, record_fraction: float, slope_max: float
+) -> float:
+    """Least sum of F over the bins within one window bin of a line, over where the line lies."""
+    reach_bins = math.floor(1 / record_fraction) + 1
+    bin_offset = np.arange(64) / 64
+    distance = (np.arange(-reach_bins, reach_bins + 1)[:, None] - bin_offset) * record_fraction
+    power = np.where(
+        abs(distance) <= 1,
+        main_lobe_magnitude(fft_window, coefficients, distance.clip(-1, 1)) ** 2,
+        0.0,
+    )
+    if reach_bins <= 2:
+        # a bin leaves the sum where it crosses the margin, the others change by their slope
+        return float(max(power.sum(axis=0).min() - 2 * reach_bins * slope_max / 128, 0.5))
+    return float(0.98 * power.sum(axis=0).min())

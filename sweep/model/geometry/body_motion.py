@@ -1,0 +1,400 @@
+"""Platform of the instrument: position, velocity and attitude against time.
+
+Velocity and acceleration are the exact derivatives of the position; every law of attitude gives
+the quaternion (body to world) and the angular velocity that is its derivative. A moving target is
+a `MovingBody` too. Body frame: x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.geometry import quaternion as quat
+from sweep.model.geometry.quaternion import rotate
+
+_HORIZONTAL_FRACTION_MIN, _HORIZONTAL_SPEED_MIN = 1e-9, 1e-100
+"""Horizontal share of the speed, and horizontal speed [m/s], under which there is no heading."""
+
+
+FloatSequence = Sequence[float] | np.ndarray
+
+AttitudeAndRate = tuple[np.ndarray, np.ndarray]
+"""Quaternion (n, 4), body to world, and angular velocity (n, 3) [rad/s] in the world frame.
+
+What a law of attitude makes of times (n,) [s], velocities and accelerations (n, 3) [m/s, m/s^2].
+"""
+
+
+@dataclass(frozen=True)
+class NadirAttitude:
+    """Level, so that a beam along -z points straight down."""
+
+    heading: float | None = 0.0
+    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]; None
+    follows the track over the ground, which a vertical movement does not have."""
+
+    def attitude_and_rate(
+        self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        if self.heading is not None:
+            return np.tile(quat.axis_angle(2, self.heading), (len(times), 1)), np.zeros(
+                (len(times), 3)
+            )
+        heading, yaw_rate = _heading_and_rate(velocity, acceleration)
+        return quat.axis_angle(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
+
+
+@dataclass(frozen=True)
+class AlongTrackAttitude:
+    """Forward axis along the velocity, wings level but for a bank."""
+
+    roll: float = 0.0
+    """Left side up [rad], constant."""
+
+    def attitude_and_rate(
+        self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        heading, yaw_rate = _heading_and_rate(velocity, acceleration)
+        horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
+        pitch = np.arctan2(velocity[:, 2], horizontal_speed)
+        horizontal_acceleration = (velocity[:, :2] * acceleration[:, :2]).sum(
+            axis=1
+        ) / horizontal_speed
+        pitch_rate = (
+            acceleration[:, 2] * horizontal_speed - velocity[:, 2] * horizontal_acceleration
+        )
+        pitch_rate /= (velocity**2).sum(axis=1)
+        left_axis = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(times))])
+        angular_velocity = yaw_rate[:, None] * [0.0, 0.0, 1.0] - pitch_rate[:, None] * left_axis
+        return quat.from_heading(heading=heading, pitch=pitch, roll=self.roll), angular_velocity
+
+
+def _heading_and_rate(
+    velocity: np.ndarray, acceleration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heading [rad] and its rate [rad/s], (n,) each."""
+    vx, vy = velocity[:, 0], velocity[:, 1]
+    horizontal_speed = np.hypot(vx, vy)
+    speed = np.linalg.norm(velocity, axis=1)
+    if not (
+        horizontal_speed > np.maximum(_HORIZONTAL_FRACTION_MIN * speed, _HORIZONTAL_SPEED_MIN)
+    ).all():
+        raise ValueError("a vertical movement (or none) has no heading to follow: state one")
+    return np.arctan2(vy, vx), (
+        vx * acceleration[:, 1] - vy * acceleration[:, 0]
+    ) / horizontal_speed**2
+
+
+@dataclass(frozen=True, eq=False)
+class FixedAttitude:
+    """One attitude throughout: (w, x, y, z), body to world, scaled to length 1."""
+
+    quaternion: FloatSequence
+
+    def attitude_and_rate(
+        self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        q = quat.normalise(np.asarray(self.quaternion, float))
+        return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
+
+
+@dataclass(frozen=True, eq=False)
+class SpinningAttitude:
+    """Turning at a constant rate about an axis that is fixed in the body and in the world."""
+
+    angular_velocity: FloatSequence
+    """(3,): angular velocity in the world frame [rad/s]."""
+    initial_quaternion: FloatSequence = (1.0, 0.0, 0.0, 0.0)
+    """Attitude at `initial_time` [s]."""
+    initial_time: float = 0.0
+
+    def attitude_and_rate(
+        self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        angular_velocity = np.asarray(self.angular_velocity, float)
+        rotation = quat.from_rotation_vector(
+            (times - self.initial_time)[:, None] * angular_velocity
+        )
+        initial_attitude = quat.normalise(np.asarray(self.initial_quaternion, float))
+        return quat.multiply(rotation, initial_attitude), np.tile(angular_velocity, (len(times), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeTrack:
+    """Attitudes (n, 4) at rising times (n,) [s], joined by the shorter turns at constant rates.
+
+    Slerp; before the first and after the last the attitude stays. q and -q are one.
+    """
+
+    times: FloatSequence
+    quaternions: Sequence[Sequence[float]] | np.ndarray
+    _rotation_steps: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        times, quaternions = checked_rising_times(self.times), np.asarray(self.quaternions, float)
+        if quaternions.shape != (len(times), 4):
+            raise ValueError(
+                f"a quaternion track needs four numbers a time, not {quaternions.shape}"
+            )
+        quaternions = quat.normalise(quaternions)
+        rotation_steps = quat.to_rotation_vector(
+            quat.multiply(quat.conjugate(quaternions[:-1]), quaternions[1:])
+        )
+        for name, value in (
+            ("times", times),
+            ("quaternions", quaternions),
+            ("_rotation_steps", rotation_steps),
+        ):
+            object.__setattr__(self, name, value)
+
+    def attitude_and_rate(
+        self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
+        interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
+        interval_duration = np.diff(times)[interval]
+        fraction = np.clip((query_times - times[interval]) / interval_duration, 0.0, 1.0)
+        rotation_step = self._rotation_steps[interval]
+        q = quat.multiply(
+            quaternions[interval], quat.from_rotation_vector(rotation_step * fraction[:, None])
+        )
+        is_turning = (query_times >= times[0]) & (query_times <= times[-1])
+        angular_velocity = (
+            quat.rotate(q, rotation_step / interval_duration[:, None]) * is_turning[:, None]
+        )
+        return q, angular_velocity
+
+
+@dataclass(frozen=True, eq=False)
+class MountedAttitude:
+    """An instrument turned, from its frame to the body's, with respect to its carrier."""
+
+    carrier: AttitudeLaw
+    mounting: FloatSequence
+
+    def attitude_and_rate(
+        self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> AttitudeAndRate:
+        """Attitude and angular velocity."""
+        q, angular_velocity = self.carrier.attitude_and_rate(times, velocity, acceleration)
+        return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
+
+
+_TIME_TOLERANCE = 1e-9
+"""Share of the duration by which a time may lie outside the path, for rounding's sake."""
+
+
+AttitudeLaw = (
+    NadirAttitude
+    | AlongTrackAttitude
+    | FixedAttitude
+    | SpinningAttitude
+    | AttitudeTrack
+    | MountedAttitude
+)
+
+
+class Motion(NamedTuple):
+    """Movement of a point: position [m], velocity [m/s], acceleration [m/s^2], each (n, 3)."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+
+
+class BodyState(NamedTuple):
+    """Pose of a body in the world frame, (n, 3) or (n, 4) each.
+
+    Position [m] and velocity [m/s] of the instrument, unit quaternion (w, x, y, z) from body to
+    world, angular velocity [rad/s]; acceleration of the instrument [m/s^2], as if that angular
+    velocity stayed as it is.
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    attitude: np.ndarray
+    angular_velocity: np.ndarray
+    acceleration: np.ndarray
+
+
+def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarray:
+    """Return times, those just off the path's ends clipped to it; a ValueError for others."""
+    times = np.atleast_1d(np.asarray(times, float))
+    tolerance = _TIME_TOLERANCE * max(stop - start, 1.0)
+    if not ((times >= start - tolerance) & (times <= stop + tolerance)).all():
+        raise ValueError(f"times must be numbers on the path, {start:g} to {stop:g} s")
+    return np.clip(times, start, stop)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantAcceleration:
+    """Path of a point under a constant acceleration; a straight line where that is 0.
+
+    Position, velocity and acceleration (3,) at time 0 [m, m/s, m/s^2]; duration [s], > 0.
+    """
+
+    position: FloatSequence
+    velocity: FloatSequence
+    acceleration: FloatSequence
+    duration: float
+    start: float = field(default=0.0, init=False)
+
+    def __post_init__(self) -> None:
+        if not (self.duration > 0 and math.isfinite(self.duration)):
+            raise ValueError(f"a path must last longer than 0 s, not {self.duration} s")
+
+    @property
+    def stop(self) -> float:
+        """Last time [s]."""
+        return self.duration
+
+    def motion(self, times: np.ndarray) -> Motion:
+        """Movement at times (n,) [s] from start to stop."""
+        times = _clip_to_duration(times, 0.0, self.duration)[:, None]
+        x0, v0, a = np.array([self.position, self.velocity, self.acceleration], float)
+        return Motion(x0 + (v0 + 0.5 * a * times) * times, v0 + a * times, a + 0 * times)
+
+
+def straight_trajectory(
+    *,
+    start_point: FloatSequence,
+    end_point: FloatSequence,
+    initial_speed: float,
+    final_speed: float | None = None,
+) -> ConstantAcceleration:
+    """Straight line between two points (3,) [m], the speed changing at a constant rate.
+
+    The speeds [m/s] are >= 0 and not both 0; the final one is the initial one by default. A
+    ValueError for equal points, or speeds that never cover the distance.
+    """
+    end_speed = initial_speed if final_speed is None else final_speed
+    first_point = np.asarray(start_point, float)
+    displacement = np.asarray(end_point, float) - first_point
+    length = float(np.linalg.norm(displacement))
+    if not (length > 0 and min(initial_speed, end_speed) >= 0 and initial_speed + end_speed > 0):
+        raise ValueError("a straight path needs two points apart and speeds >= 0, not both 0")
+    direction = displacement / length
+    acceleration = (end_speed - initial_speed) * (end_speed + initial_speed) / (2 * length)
+    duration = 2 * length / (initial_speed + end_speed)
+    return ConstantAcceleration(
+        first_point, direction * initial_speed, direction * acceleration, duration
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """Path through positions (n, 3) [m] at rising times (n,) [s], at least two."""
+
+    times: FloatSequence
+    positions: Sequence[Sequence[float]] | np.ndarray
+    is_smooth: bool = True
+    """A cubic spline, whose velocity and acceleration are steady (through two or three points,
+    the line or parabola); False joins the points by straight lines at constant velocities."""
+    _interpolant: Any = field(init=False, repr=False)
+    _origin: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        from scipy.interpolate import CubicSpline, PPoly  # which takes longer than all else here
+
+        times, positions = checked_rising_times(self.times), np.asarray(self.positions, float)
+        if positions.shape != (len(times), 3) or not np.isfinite(positions).all():
+            raise ValueError(
+                f"waypoints need three finite coordinates a time, not {positions.shape}"
+            )
+        # Far-off positions would cost the spline its last digits: it runs from the first one.
+        origin, positions = positions[0], positions - positions[0]
+        if self.is_smooth:
+            interpolant = CubicSpline(times, positions)
+        else:
+            interpolant = PPoly(
+                np.stack([np.diff(positions, axis=0) / np.diff(times)[:, None], positions[:-1]]),
+                times,
+            )
+        object.__setattr__(self, "_interpolant", interpolant)
+        object.__setattr__(self, "_origin", origin)
+
+    @property
+    def start(self) -> float:
+        """First time [s]."""
+        return float(self._interpolant.x[0])
+
+    @property
+    def stop(self) -> float:
+        """Last time [s]."""
+        return float(self._interpolant.x[-1])
+
+    def motion(self, times: np.ndarray) -> Motion:
+        """Movement at times (n,) [s] from start to stop."""
+        times = _clip_to_duration(times, self.start, self.stop)
+        return Motion(
+            self._interpolant(times) + self._origin,
+            self._interpolant(times, 1),
+            self._interpolant(times, 2),
+        )
+
+
+def checked_rising_times(time: FloatSequence) -> np.ndarray:
+    """Return times as an array; a ValueError for fewer than two, or where they do not rise."""
+    times = np.asarray(time, float)
+    if (
+        times.ndim != 1
+        or len(times) < 2
+        or not np.isfinite(times).all()
+        or not (np.diff(times) > 0).all()
+    ):
+        raise ValueError("times must be two or more finite numbers that rise")
+    return times
+
+
+Trajectory = ConstantAcceleration | Waypoints
+"""Movement of a point from `start` to `stop` [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingBody:
+    """A body whose reference point is on a path, with an attitude, carrying the instrument."""
+
+    trajectory: Trajectory
+    attitude_law: AttitudeLaw
+    lever_arm: FloatSequence = (0.0, 0.0, 0.0)
+    """(3,): position of the instrument in the body frame [m]."""
+
+    @property
+    def start(self) -> float:
+        """First time [s]."""
+        return self.trajectory.start
+
+    @property
+    def stop(self) -> float:
+        """Last time [s]."""
+        return self.trajectory.stop
+
+    def state(self, times: np.ndarray) -> BodyState:
+        """Pose at times (n,) [s] from start to stop.
+
+        A ValueError for a time outside the path, or an attitude that the movement leaves undefined.
+        """
+        motion = self.trajectory.motion(times)
+        clipped_times = _clip_to_duration(times, self.start, self.stop)
+        attitude, angular_velocity = self.attitude_law.attitude_and_rate(
+            clipped_times, motion.velocity, motion.acceleration
+        )
+        lever_arm = rotate(attitude, np.asarray(self.lever_arm, float))
+        lever_velocity = np.cross(angular_velocity, lever_arm)
+        return BodyState(
+            motion.position + lever_arm,
+            motion.velocity + lever_velocity,
+            attitude,
+            angular_velocity,
+            motion.acceleration + np.cross(angular_velocity, lever_velocity),
+        )

@@ -1,0 +1,245 @@
+"""Groups of adjacent bins at or above the threshold in noiseless spectra (PHYSICS section 6)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+from sweep.model.detection.echo_detection import (
+    bin_speckle_at,
+    bin_threshold_at,
+    echo_bounds,
+    pd_and_miss,
+)
+from sweep.model.preparation import Shots
+from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
+
+STRONGEST_ROW, FIRST_ROW, LAST_ROW = range(3)
+"""Bins of a group: the strongest, the first and the last."""
+
+
+class BinGroups(NamedTuple):
+    """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
+
+    Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
+    none. If no bin crosses the threshold the strongest is listed, as noise may lift it. Echoes that
+    are not searched for, or arrive after the record, have no group, but |X| of a strongest bin.
+    """
+
+    strongest_bin: np.ndarray
+    """(n, 3, most) int64: strongest bin, 0..N/2; of a complex record any of its run."""
+    first_bin: np.ndarray
+    """(n, 3, most) int64: first bin of the group."""
+    last_bin: np.ndarray
+    """(n, 3, most) int64: last bin of the group."""
+    neighbour_magnitudes: np.ndarray
+    """(n, 3, most, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
+    pd: np.ndarray
+    """(n, 3, most): probability of detection."""
+    n_exempt: np.ndarray
+    """(n, 3): bins that cannot raise a false alarm."""
+    leakage: np.ndarray
+    """(n, 3): probability that leaked signal raises a further group, over noise alone."""
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """|X| of the strongest bin, (n, 3, most)."""
+        return self.neighbour_magnitudes[..., 1]
+
+
+def list_bin_groups(
+    shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True
+) -> BinGroups:
+    """Find the ``groups_max`` strongest groups of each segment's spectrum without noise.
+
+    ``every_bin`` as of :func:`sweep.model.evaluation.find`. Without ``with_leakage`` its
+    probability is 0.
+    """
+    bin_rows, bin_groups = allocate_bin_groups(shots.size, groups_max)
+    for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, with_pd=False):
+        find_groups_in_spans(shots, spans, bin_rows, bin_groups)
+    return bin_groups
+
+
+def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, BinGroups]:
+    """Return no groups of ``n_points`` points, and the array of which their bins are parts.
+
+    This is (3, points, 3, most), by BIN, FIRST and LAST.
+    """
+    bin_rows = np.full((3, n_points, 3, groups_max), -1, np.int64)
+    return bin_rows, BinGroups(
+        bin_rows[STRONGEST_ROW],
+        bin_rows[FIRST_ROW],
+        bin_rows[LAST_ROW],
+        np.full((n_points, 3, groups_max, 3), np.nan),
+        np.full((n_points, 3, groups_max), np.nan),
+        *np.full((2, n_points, 3), np.nan),
+    )
+
+
+def find_groups_in_spans(
+    shots: Shots, spans: BinSpans, bin_rows: np.ndarray, bin_groups: BinGroups
+) -> None:
+    """Find the groups of some points by the runs of their bins.
+
+    ``bin_rows`` and ``bin_groups``, those of :func:`allocate_bin_groups`, take them.
+    """
+    pd = bin_groups.pd
+    nyquist_bin = 0 if shots.complex_record else shots.fft_size // 2
+    n_bins, magnitudes = (
+        (spans.n_bins, spans.magnitudes) if shots.search_band is None else _echo_bins_only(spans)
+    )
+    _fill_groups(
+        spans.point_numbers,
+        (spans.first_bin, n_bins, spans.peak_index, spans.span_start),
+        (magnitudes, spans.is_exempt),
+        shots.bin_threshold_table,
+        (nyquist_bin, shots.detection_rule, shots.speckle_table),
+        bin_rows,
+        bin_groups.neighbour_magnitudes,
+        pd,
+    )
+    if shots.looks.is_noncoherent:
+        strongest_bins, peak_magnitudes = (
+            bin_groups.strongest_bin[spans.point_numbers],
+            bin_groups.magnitude[spans.point_numbers],
+        )
+        peak_pd = shots.pd_and_miss_in_looks(
+            peak_magnitudes.T, strongest_bins.T, spans.point_numbers
+        )[0]
+        pd[spans.point_numbers] = peak_pd.T
+    lacks_group = (bin_groups.strongest_bin[spans.point_numbers, :, 0] < 0) & shots.has_segment
+    strongest_magnitudes = bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1]
+    bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1] = np.where(
+        lacks_group, spans.peak_magnitude.T, strongest_magnitudes
+    )
+    pd[spans.point_numbers, :, 0] = np.where(
+        spans.peak_is_searched.T | (n_bins.T > 0), pd[spans.point_numbers, :, 0], 0.0
+    )
+    n_exempt_or_nan = np.where((spans.n_bins > 0) | ~spans.peak_is_searched, spans.n_exempt, np.nan)
+    bin_groups.n_exempt[spans.point_numbers], bin_groups.leakage[spans.point_numbers] = (
+        n_exempt_or_nan.T,
+        spans.leakage.T,
+    )
+
+
+def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of bins of runs, and |X|, with nothing but echoes where the largest is not searched.
+
+    Sidelobes of what is not searched are no groups, and leak.
+    """
+    n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
+    for s, j in np.argwhere(~spans.peak_is_searched):
+        start, end = spans.span_start[s, j] + np.array([0, spans.n_bins[s, j]])
+        is_echo = spans.is_exempt[start:end]
+        magnitudes[start:end][~is_echo] = 0.0
+        if not is_echo.any():
+            n_bins[s, j] = 0
+    return n_bins, magnitudes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_groups(
+    point_indices,
+    spans,
+    bin_arrays,
+    bin_threshold_table,
+    config,
+    bin_rows,
+    neighbour_magnitudes,
+    pd,
+):
+    """Find the groups of every run, into arrays of the shapes of :class:`BinGroups`.
+
+    ``bin_arrays`` are |X| [V] of all runs, and whether bins are of echoes: other groups are leaked
+    signal.
+    ``config``: N/2, or 0 of complex records, :attr:`sweep.model.preparation.Shots.detection_rule`,
+    and :attr:`~sweep.model.preparation.Shots.speckle_table`.
+    """
+    (first_bin, n_bins, peak_index, start), (nyquist_bin, rule, speckle_table) = spans, config
+    magnitudes, is_echo_all = bin_arrays
+    for j in range(point_indices.size):
+        i = point_indices[j]
+        threshold = bin_threshold_table[1, i]
+        for segment in range(3):
+            if n_bins[segment, j] == 0:
+                continue
+            magnitude = magnitudes[start[segment, j] : start[segment, j] + n_bins[segment, j]]
+            is_echo = is_echo_all[
+                start[segment, j] : start[segment, j]
+                + (n_bins[segment, j] if nyquist_bin == 0 else 0)
+            ]
+            n_groups = _list_groups(
+                magnitude, is_echo, peak_index[segment, j], threshold, bin_rows[:, i, segment]
+            )
+            for group in range(n_groups):
+                strongest_index = bin_rows[STRONGEST_ROW, i, segment, group]
+                lobe_half_width = max(rule.lobe_half_width, int(bin_threshold_table[4, i]))
+                first_index, last_index = echo_bounds(
+                    magnitude,
+                    bin_rows[FIRST_ROW, i, segment, group],
+                    bin_rows[LAST_ROW, i, segment, group],
+                    threshold,
+                    lobe_half_width,
+                )
+                echo_mask = np.ones(last_index - first_index + 1, np.bool_)
+                pd[i, segment, group] = pd_and_miss(
+                    magnitude[first_index : last_index + 1],
+                    echo_mask,
+                    strongest_index - first_index,
+                    first_bin[segment, j] + first_index,
+                    rule,
+                    bin_threshold_at(bin_threshold_table, i),
+                    bin_speckle_at(speckle_table, segment, i),
+                )[0]
+                for side in range(3):
+                    neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
+                        magnitude, first_bin[segment, j], strongest_index + side - 1, nyquist_bin
+                    )
+                for field in range(3):
+                    bin_rows[field, i, segment, group] += first_bin[segment, j]
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
+    """Magnitude k of a span from ``first_bin`` on; mirrored at DC and Nyquist, 0 past it."""
+    if nyquist_bin > 0:
+        bin_ = abs(first_bin + index)
+        index = (2 * nyquist_bin - bin_ if bin_ > nyquist_bin else bin_) - first_bin
+    return magnitude[index] if 0 <= index < magnitude.size else 0.0
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
+    """List the strongest groups of a run in bins (3, most), as indices; return their number.
+
+    Groups of bins that are not ``is_echo`` are leaked signal; of no size all may be echoes.
+    """
+    if not magnitude[peak_index] >= threshold:
+        bin_rows[:, 0] = peak_index
+        return 1
+    groups_max, n_groups, k = bin_rows.shape[1], 0, 0
+    while k < magnitude.size:
+        if not magnitude[k] >= threshold:  # true of nan too, which would end no loop
+            k += 1
+            continue
+        strongest_index = first = k
+        while k < magnitude.size and magnitude[k] >= threshold:
+            strongest_index = k if magnitude[k] > magnitude[strongest_index] else strongest_index
+            k += 1
+        if is_echo.size > 0 and not is_echo[strongest_index] and strongest_index != peak_index:
+            continue
+        g = n_groups
+        while g > 0 and magnitude[bin_rows[STRONGEST_ROW, g - 1]] < magnitude[strongest_index]:
+            g -= 1
+        n_groups = min(n_groups + 1, groups_max)
+        for h in range(n_groups - 1, g, -1):
+            for field in range(3):
+                bin_rows[field, h] = bin_rows[field, h - 1]
+        if g < groups_max:
+            bin_rows[STRONGEST_ROW, g], bin_rows[FIRST_ROW, g], bin_rows[LAST_ROW, g] = (
+                strongest_index,
+                first,
+                k - 1,
+            )
+    return n_groups

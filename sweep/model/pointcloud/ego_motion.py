@@ -1,0 +1,195 @@
+"""Motion of the instrument within a shot, as far as it knows it, and the errors that are left.
+
+The beats of a shot tell range and radial velocity some milliseconds after its start, and tell them
+wrong while the closing speed grows. Let the segments start at t_i, with optical frequencies f_i and
+chirp rates r_i, and their records' middles lie t_c after. The beam sees scatterers that close at v
+and accelerate at a, and ground that comes nearer along it at u. To first order the beats are
+
+    f_i (2/c) (v + a (t_i + t_c)) - r_i (2/c) (R - u t_i - (v + u) t_c - a (t_i^2 + ...) / 2)
+
+and the fit takes a = 0 and u = v. The rest of each beat,
+
+    (2/c) f_i a (t_i + t_c)
+    - (2/c) r_i [ (v - u) (t_i + t_c) - a (t_i^2 / 2 + 2 t_i t_c + 3/2 t_c^2) ],
+
+moves range and velocity by the same fit, which is linear. For Table 4.1 11 m/s^2 move the range by
+0.55 m, and so does a beam that turns by 20 deg/s, through a = V.d'.
+
+**Known motion.** By inertial sensors and its scanner it knows its velocity V, its
+acceleration V' and the rate d' at which the beam d turns: so it knows a = V'.d + V.d' for ground at
+rest. It takes the ground to be level (:func:`ego_motion`): then a beam that points down meets it at
+a range that falls by u = (V + R d').z / d.z. A beam that points nowhere near the ground is taken to
+meet a surface that faces it, along which nothing slides. Range and velocity are corrected for both.
+
+**Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor how
+that moves. Of both it has standard deviations beforehand (:class:`MotionPriors`), which the spec of
+a flight states; they are never taken from the scene. With W = V + R d' and a gradient g of level
+ground, du/dg = (W_z d_h - W_h d_z) / d_z^2; with a gradient of a surface that faces the beam,
+du/dg = -W_perp. A target's velocity w changes v - u by (z / d.z - d).w over level ground and by
+nothing on a surface that faces the beam, and a by -w.d'. The standard errors of range and velocity
+have these deviations, times what range and velocity change by slip and acceleration, in quadrature.
+If the truth is outside the priors, its errors are not stated: a run, a report and an export compare
+errors with standard errors, and say so (:mod:`sweep.analysis.scene_results.consistency`).
+
+The slip v - u moves a range only because it is referred to the shot's start. Ground points of
+navigation are placed where the beam meets the ground as the beats tell its range, whatever its
+slope (:mod:`sweep.model.pointcloud.navigation`).
+
+The angular acceleration is left out on both sides (:mod:`sweep.model.geometry.body_motion`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sweep.model.pointcloud.eyepoints import Eyepoints
+
+DESCENT_SINE_MIN = 0.05
+"""Smallest sine of the depression angle at which a beam is taken to meet level ground."""
+
+
+class MotionPriors(NamedTuple):
+    """Standard deviations of what an instrument does not know of the motion along its beams."""
+
+    terrain_slope: float = 0.2
+    """Slope of the surface that a beam meets, against level ground or a surface that faces it."""
+    target_speed: float = 0.0
+    """Each component of the velocity of what a beam meets [m/s]."""
+    target_acceleration: float = 0.0
+    """Acceleration of what a beam meets, along the beam [m/s^2]."""
+
+
+class EgoMotion(NamedTuple):
+    """Motion along n beams as the instrument knows it; arrays are (n,) unless noted."""
+
+    closing_speed: np.ndarray
+    """Closing speed of ground at rest [m/s]."""
+    acceleration: np.ndarray
+    """Rate of change of the closing speed [m/s^2]."""
+    slip: np.ndarray
+    """Slip at range 0: closing speed less the speed at which the range to level ground falls
+    [m/s]."""
+    slip_per_range: np.ndarray
+    """Derivative of the slip with respect to the range [1/s]."""
+    slip_per_slope: np.ndarray
+    """(n, 3): derivative of the slip with respect to the surface's gradient, at range 0 [m/s]."""
+    slip_per_slope_per_range: np.ndarray
+    """(n, 3): derivative of ``slip_per_slope`` with respect to the range [1/s]."""
+    slip_per_target_speed: np.ndarray
+    """Standard deviation of the slip per standard deviation of a component of the target's
+    velocity."""
+    turn_rate: np.ndarray
+    """Rate at which the beam turns [rad/s]."""
+    priors: MotionPriors
+    """Standard deviations of what is not known."""
+
+    def slip_at(self, distance: np.ndarray) -> np.ndarray:
+        """Return the slip at ranges (n, ...) [m]: closing speed less range decrease [m/s]."""
+        slip, per_range = (
+            _align_with_ranges(v, distance) for v in (self.slip, self.slip_per_range)
+        )
+        return np.asarray(slip + per_range * distance)
+
+    def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
+        """Return the known rate of decrease of ranges (n, ...) [m], closing less slip [m/s]."""
+        return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
+
+    def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the slip at ranges (n, ...) [m] by the priors [m/s].
+
+        sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_by_target^2 + slope^2)).
+        """
+        slope_deviation, speed_deviation, _ = self.priors
+        at_range_0, per_range = self.slip_per_slope, self.slip_per_slope_per_range
+        constant, linear, quadratic = (
+            _align_with_ranges(v, distance)
+            for v in (
+                _row_dot(at_range_0, at_range_0),
+                2 * _row_dot(at_range_0, per_range),
+                _row_dot(per_range, per_range),
+            )
+        )
+        slope_variance = slope_deviation**2 * (
+            constant + (linear + quadratic * distance) * distance
+        )
+        target_variance = speed_deviation**2 * (
+            _align_with_ranges(self.slip_per_target_speed, distance) ** 2 + slope_deviation**2
+        )
+        return np.sqrt(np.maximum(slope_variance, 0.0) + target_variance)
+
+    @property
+    def acceleration_standard_error(self) -> np.ndarray:
+        """Standard deviation of the acceleration [m/s^2], (n,)."""
+        return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
+
+
+def ego_motion(eyepoints: Eyepoints, priors: MotionPriors = MotionPriors()) -> EgoMotion:  # noqa: B008  # a tuple
+    """Compute the known motion along the commanded beams of n shots over level ground."""
+    return ego_motion_of_beams(
+        eyepoints.direction, eyepoints.velocity, eyepoints.direction_rate,
+        eyepoints.platform_acceleration, priors,
+    )  # fmt: skip
+
+
+def ego_motion_of_beams(
+    direction: np.ndarray,
+    velocity: np.ndarray,
+    direction_rate: np.ndarray,
+    acceleration: np.ndarray,
+    priors: MotionPriors,
+) -> EgoMotion:
+    """Compute the known motion along n beams of a moving instrument over level ground.
+
+    Parameters
+    ----------
+    direction
+        (n, 3): unit vectors d of the beams.
+    velocity, acceleration
+        (n, 3): of the instrument, V [m/s] and V' [m/s^2].
+    direction_rate
+        (n, 3): rate of change d' of the directions [1/s].
+    priors
+        Standard deviations of what is not known.
+
+    Notes
+    -----
+    With the vertical z, u - V.d = V.z / d.z - V.d + R d'.z / d.z.
+    """
+    closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
+    closing_speed = _row_dot(velocity, direction)
+    meets_ground = direction[:, 2] < -DESCENT_SINE_MIN
+    direction_z = np.where(meets_ground, direction[:, 2], -1.0)
+
+    def slip_gradient(vector: np.ndarray) -> np.ndarray:
+        over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
+        over_ground /= direction_z[:, None] ** 2
+        for_facing_surface = vector - _row_dot(vector, direction)[:, None] * direction
+        return np.where(meets_ground[:, None], over_ground, for_facing_surface)
+
+    return EgoMotion(
+        closing_speed=closing_speed,
+        acceleration=closing_rate,
+        slip=np.where(meets_ground, closing_speed - velocity[:, 2] / direction_z, 0.0),
+        slip_per_range=np.where(meets_ground, -direction_rate[:, 2] / direction_z, 0.0),
+        slip_per_slope=slip_gradient(velocity),
+        slip_per_slope_per_range=slip_gradient(direction_rate),
+        slip_per_target_speed=np.where(
+            meets_ground, np.sqrt(np.maximum(direction_z**-2 - 1.0, 0.0)), 0.0
+        ),
+        turn_rate=np.sqrt(_row_dot(direction_rate, direction_rate)),
+        priors=priors,
+    )
+
+
+def _align_with_ranges(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Reshape values (n,) so that they broadcast with ranges (n, ...)."""
+    return values.reshape(-1, *[1] * (np.ndim(distance) - 1))
+
+
+def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.asarray(
+        first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]
+    )

@@ -1,0 +1,180 @@
+"""Floor of errors: what an instrument gets wrong however strong the echo is.
+
+Five errors, normal with a mean of 0. With u a beam's direction, R and v_r the range and the radial
+velocity that it reports, v the instrument's velocity and v_perp the part of v across the beam:
+
+========== ============================= ================= ================== =================
+error      standard deviation            of the range      of the velocity    independent
+========== ============================= ================= ================== =================
+clock      relative, of the sampling     R clock           v_r clock          none: common to
+           clock                                                              all beams
+wavelength relative, as it is known                        v_r wavelength     none: common to
+                                                                              all beams
+pointing   of the known direction on                       |v_perp| pointing  from beam to beam
+           each of two axes [rad]
+vibration  of the instrument along the                     vibration          from shot to shot
+           beam [m/s]
+range      of the range itself [m]       range noise                          from shot to shot
+noise
+========== ============================= ================= ================== =================
+
+A range is that along the light's own way, however it is known to run; the point lies there along
+the direction that the beam is thought to have. Common errors are one number each of a draw; the
+pointing's, two of each beam and draw, which turn with the beam; vibration's and the range's, one of
+each shot and draw. Common errors scale the velocity's vector and the altitude, and add the outer
+product of the velocity, times their variance, to its covariance
+(:mod:`sweep.model.pointcloud.navigation`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.model.sampling.philox import STREAM_ERROR_FLOOR, point_keys, to_normals_by_row, uniforms
+
+if TYPE_CHECKING:
+    from sweep.model.pointcloud.eyepoints import Eyepoints
+
+KEY_DOMAIN = "sweep.error_floor"
+"""Domain of the keys of errors that shots have in common."""
+
+INSTRUMENT_KEY_NUMBER = -1.0
+"""Number in the place of a beam's for errors that all beams share."""
+
+
+class ErrorFloor(NamedTuple):
+    """Standard deviations of an instrument's errors; all 0 for an instrument without any.
+
+    >>> ErrorFloor(clock=0.03, wavelength=0.04).scale
+    0.05
+    """
+
+    pointing: float = 0.0
+    """Of a beam's known direction, on each of two axes [rad]."""
+    clock: float = 0.0
+    """Of the sampling clock, relative."""
+    wavelength: float = 0.0
+    """Of the known wavelength, relative."""
+    vibration: float = 0.0
+    """Of the instrument's velocity along the beam [m/s]."""
+    range_noise: float = 0.0
+    """Of ranges [m]."""
+
+    @property
+    def velocity_scale_error(self) -> float:
+        """Relative standard deviation that all velocities share."""
+        return float(np.hypot(self.clock, self.wavelength))
+
+    def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
+        """Return the standard error of radial velocities [m/s] at a speed across the beam [m/s].
+
+        >>> ErrorFloor(pointing=1e-3, vibration=0.03).velocity_error(0.0, 40.0).round(12).item()
+        0.05
+        """
+        common_error = self.velocity_scale_error * np.asarray(radial_velocity)
+        independent_error = np.hypot(self.pointing * np.asarray(speed_across), self.vibration)
+        return np.asarray(np.hypot(common_error, independent_error))
+
+
+NO_ERROR_FLOOR = ErrorFloor()
+
+
+def apply_error_floor(
+    points: Mapping[str, np.ndarray],
+    eyepoints: Eyepoints,
+    error_floor: ErrorFloor,
+    *,
+    keys: np.ndarray,
+    seed: int,
+    first_draw: int = 0,
+) -> dict[str, np.ndarray]:
+    """Points with the instrument's errors in their values, places and standard errors.
+
+    `points` are results of :func:`sweep.model.pointcloud.point_cloud.simulate_cloud`, of the n
+    shots of `eyepoints` and some
+    draws, from `first_draw` on; `keys` (n, 2) the random key of each shot; `seed` the study's, for
+    errors that shots share. New are range, radial velocity and their standard errors, by whole bins
+    and interpolated, the compensated velocity, and position. The truth stays.
+    """
+    n, draws = points["flags"].shape[:2]
+    draw_numbers = np.arange(first_draw, first_draw + draws)
+    clock, wavelength = _draw_beam_normals(np.array([INSTRUMENT_KEY_NUMBER]), draw_numbers, seed)[
+        0
+    ].T
+    beam_numbers, beam_index = np.unique(eyepoints.beam, return_inverse=True)
+    pointing_errors = (
+        error_floor.pointing
+        * _draw_beam_normals(beam_numbers.astype(float), draw_numbers, seed)[beam_index]
+    )
+    uniform_numbers = uniforms(
+        np.repeat(keys, draws, axis=0), np.tile(draw_numbers, n), STREAM_ERROR_FLOOR, 2
+    )
+    vibration, range_errors = to_normals_by_row(uniform_numbers).T.reshape(2, n, draws, 1)
+    vibration_errors, range_errors = (
+        error_floor.vibration * vibration,
+        error_floor.range_noise * range_errors,
+    )
+    direction, velocity = eyepoints.direction[:, None], eyepoints.velocity[:, None]
+    first_axis, second_axis = _transverse_axes(eyepoints.direction)
+    direction_errors = (
+        pointing_errors[..., :1] * first_axis[:, None]
+        + pointing_errors[..., 1:] * second_axis[:, None]
+    )
+    speed_across = velocity - _scalar_product(velocity, direction) * direction
+    speed_across = np.sqrt(_scalar_product(speed_across, speed_across))
+    range_factor = (1.0 + error_floor.clock * clock)[:, None]
+    velocity_factor = range_factor + error_floor.wavelength * wavelength[:, None]
+    velocity_errors = vibration_errors - _scalar_product(direction_errors, velocity)
+    results = dict(points)
+    for suffix in ("", "_interpolated"):
+        range_name, velocity_name = f"range{suffix}", f"radial_velocity{suffix}"
+        results[range_name] = points[range_name] * range_factor + range_errors
+        results[velocity_name] = points[velocity_name] * velocity_factor + velocity_errors
+        range_error = np.hypot(
+            error_floor.clock * np.abs(results[range_name]), error_floor.range_noise
+        )
+        errors = range_error, error_floor.velocity_error(results[velocity_name], speed_across)
+        for name, error in zip((range_name, velocity_name), errors, strict=True):
+            error_name = f"{name}_standard_error"
+            results[error_name] = np.hypot(points[error_name], error)
+    stated_direction = direction + direction_errors
+    stated_direction /= np.sqrt(_scalar_product(stated_direction, stated_direction))
+    displacement = results["range_interpolated"][..., None] * stated_direction[:, :, None]
+    platform_velocity = eyepoints.platform_radial_velocity[:, None, None]
+    results["radial_velocity_compensated"] = (
+        results["radial_velocity_interpolated"] - platform_velocity
+    )
+    results["position"] = eyepoints.position[:, None, None] + displacement
+    return results
+
+
+def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
+    """Two standard normal numbers of each beam in each draw, (beams, draws, 2)."""
+    keys = np.repeat(
+        point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0
+    )
+    normal_numbers = to_normals_by_row(
+        uniforms(keys, np.tile(draw_numbers, beam_numbers.size), STREAM_ERROR_FLOOR, 2)
+    )
+    return normal_numbers.reshape(beam_numbers.size, draw_numbers.size, 2)
+
+
+def _scalar_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Scalar products (..., 1) of vectors (..., 3), summed in the same order whatever the shape."""
+    return sum(first[..., k : k + 1] * second[..., k : k + 1] for k in range(3))  # type: ignore[return-value]
+
+
+def _transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (n, 3) across each direction (n, 3), which turn steadily with it.
+
+    [Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017]
+    """
+    x, y, z = direction.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first_axis = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    return first_axis, np.stack([b, sign + y * y * a, -y], axis=-1)

@@ -1,0 +1,384 @@
+"""Eyepoints: what each shot of a flight sees, before any radiometry.
+
+The geometry of a shot - range, incidence, surface and radial velocity at every beamlet - does not
+depend on laser power, receiver or processing. It is worked out once and serves any number of
+radiometric studies [T 3.2].
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model import beam
+from sweep.model.beamlets import place_beamlets
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.atmosphere import BEAM_ELEVATION_PATH
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS
+from sweep.model.evaluation import prepare_ray_traced_shots
+from sweep.model.geometry.body_motion import BodyState, MovingBody
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.geometry.quaternion import rotate
+from sweep.model.geometry.ray_casting import BundleHits, Pose, RayCaster
+from sweep.model.geometry.scanner import PointingJitter, ScanPattern, beamlet_rays
+from sweep.model.ground import BeamletTable, RayTracedGround, backscatter
+from sweep.model.preparation import APPROACH_SPEED_PATH, Parameters, Shots
+from sweep.model.unsupported_shot import UnsupportedShotError
+
+TARGET_HEIGHT_PATH = "atmosphere.target_height"
+SOLAR_IRRADIANCE_PATH = "target.solar_irradiance"
+
+RANGE_MIN = 1e-3
+"""Range [m] below which a surface is passed through: no light is focused or falls off so near.
+
+An instrument in the plane of a wall, or standing on the ground, would see it at range 0, where the
+echo is infinite.
+"""
+
+_GRAZING_SINE_MIN = 0.01
+"""Sine of the grazing angle under which a surface is not taken to go on as a plane."""
+
+
+class Eyepoints(NamedTuple):
+    """Geometry of n shots of b beamlets; SI, world frame."""
+
+    time: np.ndarray
+    """(n,): start of the measurement [s]."""
+    beam: np.ndarray
+    """(n,) int64: number of the beam."""
+    cycle: np.ndarray
+    """(n,) int64: number of the measurement cycle."""
+    position: np.ndarray
+    """(n, 3): of the instrument [m]."""
+    velocity: np.ndarray
+    """(n, 3): of the instrument [m/s]."""
+    direction: np.ndarray
+    """(n, 3): unit vector along the beam's axis, as commanded."""
+    range: np.ndarray
+    """(n,): range R_0 of the reference beamlet [m]; inf where nothing is seen."""
+    offset: np.ndarray
+    """(n, b): R_b - R_0 [m]; nan for a beamlet that misses."""
+    radial_velocity: np.ndarray
+    """(n,): of the reference beamlet [m/s], positive when closing; nan where nothing is seen."""
+    acceleration: np.ndarray
+    """(n,): rate at which that grows [m/s^2]; nan where nothing is seen."""
+    approach_speed: np.ndarray
+    """(n,): speed at which its range falls [m/s]; nan where nothing is seen."""
+    turn_rate: np.ndarray
+    """(n,): rate at which its direction turns [rad/s], by scanner and platform."""
+    direction_rate: np.ndarray
+    """(n, 3): rate of change of the direction, as commanded [1/s]."""
+    platform_acceleration: np.ndarray
+    """(n, 3): of the instrument [m/s^2]."""
+    velocity_offset: np.ndarray
+    """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
+    cos_incidence: np.ndarray
+    """(n, b): 0..1; nan for a miss."""
+    surface: np.ndarray
+    """(n, b) int16: -1 for a miss."""
+    weight: np.ndarray
+    """(b,): power fractions; they sum to 1."""
+
+    @property
+    def has_target(self) -> np.ndarray:
+        """Shots of which any beamlet hits something, (n,) bool."""
+        return np.isfinite(self.range)
+
+    @property
+    def reference_beamlet(self) -> np.ndarray:
+        """Reference beamlet, the first that hits anything, (n,)."""
+        return np.asarray((self.surface >= 0).argmax(axis=1))
+
+    @property
+    def platform_radial_velocity(self) -> np.ndarray:
+        """Velocity of the instrument along its beams, as commanded, (n,) [m/s]."""
+        return _row_dot(self.velocity, self.direction)
+
+    def select(self, selection: slice | np.ndarray) -> "Eyepoints":
+        """Return some of the shots, by a slice, indices or a mask; neighbours are not copied."""
+        indices = np.arange(len(self.time))[selection]
+        if indices.size and (np.diff(indices) == 1).all():
+            selection = slice(indices[0], indices[-1] + 1)
+        return Eyepoints._make([*(values[selection] for values in self[:-1]), self.weight])
+
+
+def observe_eyepoints(
+    shot_numbers: np.ndarray,
+    *,
+    flight: MovingBody,
+    scanner: ScanPattern,
+    caster: RayCaster,
+    beam_divergence: float,
+    n_beamlets: int,
+    pattern: str = "hexagonal",
+    body_motions: Sequence[MovingBody | None] | None = None,
+    jitter: PointingJitter | None = None,
+    bodies_rotate: bool = True,
+    footprint_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
+) -> Eyepoints:
+    """Eyepoints of shots by number (n,), from 0; any part of a flight can be had alone.
+
+    `n_beamlets` and `pattern` are those of :func:`sweep.model.beamlets.place_beamlets`,
+    `body_motions` the motion
+    of each of the caster's bodies, None for one at rest. `footprint_angles` gives the footprint by
+    the range (n,) of the beam's axis, infinite where that hits nothing
+    (:func:`sweep.model.beam.footprint_angles`);
+    without it the beam is `beam_divergence` wide everywhere [rad, between 1/e^2 points].
+
+    Surfaces nearer than `RANGE_MIN` are passed through. `jitter` turns the light of each shot, of
+    which the instrument knows nothing: position, velocity and `direction` stay those commanded.
+    Without `bodies_rotate` the surfaces of turning bodies stand still. An UnsupportedShot names the
+    first shot whose geometry is not finite.
+    """
+    shot_numbers = np.asarray(shot_numbers)
+    shots = scanner.shots(shot_numbers)
+    time = flight.start + shots.time
+    state = flight.state(time)
+    (across, along), weight = place_beamlets(n_beamlets, pattern)
+    attitude = (
+        state.attitude if jitter is None else jitter.perturb_attitude(state.attitude, shot_numbers)
+    )
+    body_states = [None if body is None else body.state(time) for body in body_motions or ()]
+    poses = [None if body is None else Pose(body.position, body.attitude) for body in body_states]
+    make_rays = partial(beamlet_rays, attitude, shots.direction)
+    if footprint_angles is None:
+        light_directions = ray_directions = make_rays(across, along, beam_divergence / 4)
+    else:  # a ray along the axis tells how wide the footprint is
+        zero_angle = np.zeros(1)
+        axis_bundle = caster.cast_bundles(
+            state.position,
+            make_rays(zero_angle, zero_angle, 1.0),
+            poses=poses or None,
+            range_min=RANGE_MIN,
+        )
+        ray_directions, light_directions = (
+            make_rays(across, along, np.reshape(full_angle, (-1, 1)) / 4)
+            for full_angle in footprint_angles(axis_bundle.range)
+        )
+    bundle = caster.cast_bundles(
+        state.position, ray_directions, poses=poses or None, range_min=RANGE_MIN
+    )
+    radial_velocity = _radial_velocities(
+        state, (ray_directions, light_directions), bundle, body_states, bodies_rotate
+    )
+    rows = np.arange(len(time))
+    reference_velocity = radial_velocity[rows, np.maximum(bundle.reference_beamlet, 0)]
+    scanner_rate = rotate(state.attitude, shots.direction_rate)
+    _require_finite(shot_numbers, time, state, bundle, radial_velocity)
+    acceleration, approach_speed, turn_rate = _reference_beam_motion(
+        state, scanner_rate, ray_directions, bundle, body_states, bodies_rotate
+    )
+    direction = rotate(state.attitude, shots.direction)
+    direction_rate = np.cross(state.angular_velocity, direction) + scanner_rate
+    return Eyepoints(
+        time,
+        shots.beam_number,
+        shots.cycle_number,
+        state.position,
+        state.velocity,
+        direction,
+        bundle.range,
+        bundle.range_offset,
+        reference_velocity,
+        acceleration,
+        approach_speed,
+        turn_rate,
+        direction_rate,
+        state.acceleration,
+        radial_velocity - reference_velocity[:, None],
+        bundle.cos_incidence,
+        bundle.surface_index,
+        weight,
+    )
+
+
+def _require_finite(
+    shot_numbers: np.ndarray,
+    time: np.ndarray,
+    state: BodyState,
+    bundle: BundleHits,
+    velocity: np.ndarray,
+) -> None:
+    """Refuse shots whose geometry is not finite: no loop over their spectra would end."""
+    is_hit = bundle.is_hit
+    for label, is_wrong in (
+        ("position", ~np.isfinite(state.position).all(axis=1)),
+        ("velocity", ~np.isfinite(state.velocity).all(axis=1)),
+        ("range", (is_hit & ~np.isfinite(bundle.range[:, None] + bundle.range_offset)).any(axis=1)),
+        ("angle of incidence", (is_hit & ~np.isfinite(bundle.cos_incidence)).any(axis=1)),
+        ("radial velocity", (is_hit & ~np.isfinite(velocity)).any(axis=1)),
+    ):
+        if is_wrong.any():
+            k = int(is_wrong.argmax())
+            raise UnsupportedShotError(
+                f"shot {shot_numbers[k]}, at time {time[k]:.6g} s, has a {label} that is not "
+                "finite: "
+                "check the path and the scene there for numbers out of all proportion",
+                k,
+            )
+
+
+def _radial_velocities(
+    state: BodyState,
+    rays_and_light: tuple[np.ndarray, np.ndarray],
+    bundle: BundleHits,
+    body_states: Sequence[BodyState | None],
+    bodies_rotate: bool,
+) -> np.ndarray:
+    """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b); nan: a miss.
+
+    Rays find the places, and hold the directions of light there. A surface on a body that turns
+    moves with V + omega x (P - X) at the point P that is hit. A turn of the instrument about itself
+    moves no light: it shows in the lever arm's velocity.
+    """
+    ray_directions, light_directions = rays_and_light
+    closing_speed = light_directions[..., 0] * state.velocity[:, :1]
+    for k in (2, 1):  # the order that results have had, bit for bit
+        closing_speed += light_directions[..., k] * state.velocity[:, k, None]
+    closing_speed[~bundle.is_hit] = np.nan
+    for body, body_state in enumerate(body_states):
+        if body_state is None:
+            continue
+        surface_velocity = body_state.velocity[:, None]
+        if bodies_rotate and body_state.angular_velocity.any():
+            hit_range = np.where(
+                bundle.body_index == body, bundle.range[:, None] + bundle.range_offset, 0.0
+            )
+            lever_arm = (
+                state.position[:, None]
+                + ray_directions * hit_range[..., None]
+                - body_state.position[:, None]
+            )
+            surface_velocity = surface_velocity + np.cross(
+                body_state.angular_velocity[:, None], lever_arm
+            )
+        receding_speed = (light_directions * surface_velocity).sum(axis=-1)
+        closing_speed = np.where(
+            bundle.body_index == body, closing_speed - receding_speed, closing_speed
+        )
+    return closing_speed
+
+
+def _reference_beam_motion(
+    state: BodyState,
+    scanner_rate: np.ndarray,
+    ray_directions: np.ndarray,
+    bundle: BundleHits,
+    body_states: Sequence[BodyState | None],
+    bodies_rotate: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute closing acceleration, range rate (falling) and turn rate of reference beams, (n,).
+
+    V is the velocity of the instrument against the body that is hit, which turns by w and is
+    taken to extend to the instrument. The beam d sees the closing speed V.d, which grows by
+    V'.d + V.d'. It meets the surface, a plane of normal n there, at a range that falls by
+    (V + R (d' - w x d)).n / d.n. Bodies are taken to turn at steady rates. ``scanner_rate`` is the
+    scanner's part of d', (n, 3).
+    """
+    rows, reference = np.arange(len(ray_directions)), np.maximum(bundle.reference_beamlet, 0)
+    ray, body = ray_directions[rows, reference], bundle.body_index[rows, reference]
+    direction_rate = np.cross(state.angular_velocity, ray) + scanner_rate
+    velocity, acceleration = state.velocity.copy(), state.acceleration.copy()
+    relative_direction_rate = direction_rate.copy()
+    for body_number, body_state in enumerate(body_states):
+        if body_state is None:
+            continue
+        is_on_body = (body == body_number)[:, None]
+        angular_velocity = (
+            body_state.angular_velocity if bodies_rotate else 0.0 * body_state.angular_velocity
+        )
+        relative_velocity = state.velocity - body_state.velocity
+        lever_arm = state.position - body_state.position
+        velocity = np.where(
+            is_on_body, relative_velocity - np.cross(angular_velocity, lever_arm), velocity
+        )
+        grows = (
+            state.acceleration
+            - body_state.acceleration
+            - np.cross(angular_velocity, relative_velocity)
+        )
+        acceleration = np.where(is_on_body, grows, acceleration)
+        relative_direction_rate = np.where(
+            is_on_body, direction_rate - np.cross(angular_velocity, ray), relative_direction_rate
+        )
+    reference_range = np.where(bundle.reference_beamlet >= 0, bundle.range, np.nan)
+    grows = _row_dot(acceleration, ray) + _row_dot(velocity, direction_rate)
+    incidence_cosine = np.minimum(_row_dot(bundle.normal, ray), -_GRAZING_SINE_MIN)
+    approach_speed = (
+        _row_dot(velocity + reference_range[:, None] * relative_direction_rate, bundle.normal)
+        / incidence_cosine
+    )
+    turn_rate = np.sqrt(_row_dot(direction_rate, direction_rate))
+    return np.where(bundle.reference_beamlet >= 0, grows, np.nan), approach_speed, turn_rate
+
+
+def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]
+
+
+def prepare_eyepoint_shots(
+    eyepoints: Eyepoints,
+    parameters: Parameters,
+    surfaces: Sequence[SurfaceMaterial],
+    effects: Collection[str] = DEFAULT_EFFECTS,
+) -> Shots:
+    """Prepare the shots of eyepoints that all see something."""
+    return prepare_ray_traced_shots(
+        *parameters_and_ground_of_eyepoints(eyepoints, parameters, surfaces), effects
+    )
+
+
+def parameters_and_ground_of_eyepoints(
+    eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
+) -> tuple[Parameters, RayTracedGround]:
+    """Parameters of shots, and their footprints; a beamlet that misses sends nothing back.
+
+    All n shots see something. Range, velocity, reflectance and law come from the eyepoints and the
+    surfaces that their numbers mean, all other parameters are given, as scalars.
+    """
+    surface = eyepoints.surface
+    is_hit = surface >= 0
+    relative_range_offset = np.where(is_hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
+    doppler_ratio_offset = np.where(is_hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)
+    reflectances = np.array([surface_properties.reflectance for surface_properties in surfaces])
+    sent_fraction = np.where(is_hit, eyepoints.weight * reflectances[surface], 0.0)
+    beamlet_backscatter = np.zeros_like(sent_fraction)
+    for law in {surface_properties.reflectance_law for surface_properties in surfaces}:
+        has_law = np.array(
+            [surface_properties.reflectance_law == law for surface_properties in surfaces]
+        )[surface]
+        law_backscatter = backscatter(law, eyepoints.cos_incidence)
+        np.copyto(beamlet_backscatter, law_backscatter, where=is_hit & has_law)
+    range_loss = (1 + relative_range_offset) * (1 + relative_range_offset)
+    if beam.is_single_mode(parameters):
+        linear_coefficient, quadratic_coefficient = beam.range_loss_coefficients(
+            parameters, eyepoints.range[:, None]
+        )
+        range_loss = 1 + relative_range_offset * (
+            linear_coefficient + relative_range_offset * quadratic_coefficient
+        )
+    relative_echo = sent_fraction * beamlet_backscatter / range_loss
+    axis_surface = surface[np.arange(len(surface)), eyepoints.reference_beamlet]
+    direction_z = eyepoints.direction[:, 2]
+    height = eyepoints.position[:, 2] + eyepoints.range * direction_z
+    beamlet_table = BeamletTable(
+        np.arange(len(relative_echo)), relative_range_offset, doppler_ratio_offset, relative_echo
+    )
+    shot_parameters = {
+        **parameters,
+        "target.range": eyepoints.range,
+        "target.radial_velocity": eyepoints.radial_velocity,
+        "target.acceleration": eyepoints.acceleration,
+        APPROACH_SPEED_PATH: eyepoints.approach_speed,
+        beam.SCAN_RATE_PATH: parameters.get(beam.SCAN_RATE_PATH, 0.0) + eyepoints.turn_rate,
+        BEAM_ELEVATION_PATH: -np.arcsin(direction_z),
+        "target.reflectance": 1.0,
+        TARGET_HEIGHT_PATH: parameters.get(TARGET_HEIGHT_PATH, 0.0) + height,
+        # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
+        SOLAR_IRRADIANCE_PATH: np.asarray(parameters[SOLAR_IRRADIANCE_PATH])
+        * sent_fraction.sum(axis=1),
+    }
+    return shot_parameters, RayTracedGround(
+        beamlet_table, is_hit & (surface != axis_surface[:, None])
+    )

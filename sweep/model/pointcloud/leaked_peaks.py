@@ -1,0 +1,1252 @@
+"""False peaks that leaked signal raises: in which bins, how often, and how large.
+
+Each bin of a segment outside the echoes raises a false peak for two reasons, which are drawn apart.
+Noise alone does so in all bins searched alike. Leaked signal of amplitude a (over the noise per
+quadrature sigma) raises bin k in further draws, with the probability that it adds to noise,
+
+    c_k(z) = (Q_1(a_k, z) - e^(-z^2 / 2)) / (1 - e^(-z^2 / 2)),
+
+at the threshold z = b. The two together leave the bin below any level z with the probability
+
+    (1 - e^(-z^2 / 2)) (1 - c_k(z)) = 1 - Q_1(a_k, z)
+
+that Rice's law has for signal and noise. So a bin is found at its own place and as large as in
+drawn noise, and the probability of leakage of a segment is 1 - prod (1 - c_k(b)).
+
+Bins are independent. With the rates r_k = -ln(1 - c_k), the first bin in which a peak is raised is
+the one where the sum of rates exceeds a number from the exponential distribution. The search goes
+on from the next bin with another such number.
+
+Bins that cross next to an echo whose outermost bin crosses are part of the echo, where peaks are
+drawn as in probabilities (:mod:`sweep.model.detection.added_crossings`).
+
+An echo in developed speckle fades as a whole, and its leaked signal with it. A bin fades with the
+echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle. With
+the speckle's power u = e^t, of mean 1, and the sum R(u) of an echo's rates r(a_k sqrt(u)) it is
+
+    P = int (1 - exp(-R(e^t))) e^(t - e^t) dt,
+
+by the trapezoidal rule, which converges exponentially as the integrand vanishes at both ends. Its
+nodes are a whole number of steps of the tabulated ln(a) apart. A bin's rates at all nodes are then
+one row of a table (:func:`_rates_by_phase`), and R is a weighted sum of rows, without a logarithm.
+
+A line of leaked light (:mod:`sweep.model.effects.circulator_leak`) raises peaks in its own bins, by
+the magnitudes that it has there at one of some phases.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from sweep.kernel_cache import njit
+from sweep.model.detection.added_crossings import crossing_rate, edge_crossing_probability
+from sweep.model.detection.looks import Looks
+from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
+from sweep.model.effects.circulator_leak import N_PHASES, leak_line_of_point, line_bin_masks
+from sweep.model.pointcloud.bin_groups import BinGroups, allocate_bin_groups, find_groups_in_spans
+from sweep.model.preparation import Shots
+from sweep.model.sampling import philox
+from sweep.model.sampling.draws import NoiselessSpectra, iter_noiseless_spectra
+from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
+
+N_RATES = 2048
+"""Number of amplitudes at which rates are tabulated."""
+
+CERTAIN_MARGIN_SIGMA = 12.0
+"""Amplitude above the threshold [sigma] from which a bin is certain to cross."""
+
+TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
+"""Lowest tabulated amplitude [sigma]; below it rates go as the amplitude squared."""
+
+LEAKAGE_MIN = 1e-9
+"""Probability of leakage in a segment below which no leaked peaks are drawn."""
+
+LINE_RANDOM_OFFSET = 1 << 24
+"""First random number of the leaked light's line; lower ones belong to the echoes."""
+
+EDGE_RANDOM_OFFSET = 1 << 25
+"""Numbers of the random numbers of bins of an echo next to leaked signal, likewise."""
+
+LINE_BATCH_POINTS = 4
+"""Points processed at a time if leaked light has a line, which bounds memory to 1e8 numbers."""
+
+BISECTION_STEPS = 40
+"""Bisection steps for the magnitude of a raised peak; relative error 1e-11."""
+
+LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
+"""Ends of the average over speckle in ln(power), whose mean power is 1."""
+
+LOG_POWER_MIN_FAINT = -5.0
+"""Lower end where rates at mean power are FAINT_RATES or less in all, and below it go as power."""
+FAINT_RATE_SUM_MAX = 0.1
+
+LOG_POWER_STEP_MAX = 0.25
+"""Largest step of this average, which errs by 1e-8 of the mean for e^(2 t - e^t)."""
+
+JOINING_RATE_MIN = 1e-2
+"""Rate at the power e^(2 BRIGHT) of bins in a row below which the next one joins no echo."""
+BRIGHT_LOG_AMPLITUDE = math.log(4.0)
+
+FAINT_LEAKAGE_MAX = 1e-5
+"""Probability of leakage up to which its mean over speckle is the sum of the means of its bins.
+
+Two bins then hardly ever cross together, nor a bin with the echo that it would join."""
+
+MEAN_TABLE_STRIDE = 8
+"""Tabulated amplitudes from one to the next at which a bin's mean over speckle is integrated."""
+
+N_BOUND_POWERS = 5
+"""Speckle powers 1, 2, 4 .. at which bounds of the rates' sum are kept."""
+
+EDGE_LOG_POWER_STEP = 0.75
+"""Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
+EDGE_LOG_POWER_DEPTH = 3.0
+"""-ln(power) below which this probability is taken to be that at it."""
+
+LOG_RATE_STEP_MAX = 0.5
+"""Largest step of ln(rate) between nodes: what crosses within fewer ones errs by more than 1e-7."""
+
+
+class LeakageBins(NamedTuple):
+    """Bins in which leaked signal may raise false peaks, by point and segment (m, 3)."""
+
+    bin_slice: np.ndarray
+    """(m, 3, 2) int64: begin and end of segments in ``bins``, ``log_amplitude``, ``group``."""
+    bins: np.ndarray
+    """int64: bins with leaked echo, numbered as the strongest bins of groups."""
+    log_amplitude: np.ndarray
+    """ln(|X| / sigma) in these bins."""
+    group: np.ndarray
+    """int64: index of the group (echo) with which each bin fades."""
+    exempt_neighbour: np.ndarray
+    """|X| / sigma of the bin next to it that is exempt from false alarms, 0 for none."""
+    exempt_neighbour_side: np.ndarray
+    """int64: 1 where that bin is above, else -1."""
+    rate_sum: np.ndarray
+    """(m, 3): sum of the rates of these bins at mean speckle power, or somewhat more."""
+    rate_sum_bounds: np.ndarray
+    """(m, 3, OCTAVES): the same at speckle powers 1, 2, 4 .."""
+    mean_probability_sum: np.ndarray
+    """(m, 3): sum of the mean probabilities over speckle that these bins cross; nan if unknown."""
+    line_slice: np.ndarray
+    """(m, 3, 2) int64: each segment's begin and end in ``line_bins`` and ``line_log_amplitude``."""
+    line_bins: np.ndarray
+    line_log_amplitude: np.ndarray
+    """(PHASES, bins): ln(|X| / sigma) in these bins at each phase of the leaked light's line."""
+    line_rate_sum: np.ndarray
+    """(m, 3): largest over the phases of the sum of the rates of these bins."""
+    excluded_slice: np.ndarray
+    """(m, 3, 2) int64: begin and end of each segment in ``excluded_bins``."""
+    excluded_bins: np.ndarray
+    """int64: bins in which noise alone raises no peak."""
+    threshold_index: np.ndarray
+    """(m,) int64: row of ``log_rates`` and ``log_amplitude_grid`` of each point."""
+    log_rates: np.ndarray
+    """(laws, RATES): ln(rate) at evenly spaced ln(amplitude)."""
+    log_amplitude_grid: np.ndarray
+    """(laws, 2): first of these ln(amplitude), and their step."""
+    threshold_ratio: np.ndarray
+    """(laws,): threshold [sigma] of a record that detects as all looks do."""
+    amplitude_gain_max: float
+    """Factor on |X| / sigma with which that record has it."""
+    sidelobe_correlation: float
+    """Correlation of neighbours' noise in phase with the signal."""
+
+    @classmethod
+    def empty(cls, n_points: int) -> "LeakageBins":
+        """Return no bins at all, for ``n_points`` points."""
+        no_slices, no_bins, sum_shape = (
+            np.zeros((n_points, 3, 2), np.int64),
+            np.empty(0, np.int64),
+            (n_points, 3),
+        )
+        return cls(
+            no_slices,
+            no_bins,
+            np.empty(0),
+            no_bins,
+            np.empty(0),
+            no_bins,
+            np.zeros(sum_shape),
+            np.zeros((*sum_shape, N_BOUND_POWERS)),
+            np.full(sum_shape, np.nan),
+            no_slices,
+            no_bins,
+            np.empty((N_PHASES, 0)),
+            np.zeros(sum_shape),
+            no_slices,
+            no_bins,
+            np.zeros(n_points, np.int64),
+            np.zeros((1, 1)),
+            np.zeros((1, 2)),
+            np.zeros(1),
+            1.0,
+            0.0,
+        )
+
+    def select(self, points: np.ndarray) -> "LeakageBins":
+        """Bins of some points by their numbers, or a mask; lists of bins stay whole."""
+        by_point = (
+            "bin_slice",
+            "rate_sum",
+            "rate_sum_bounds",
+            "mean_probability_sum",
+            "line_slice",
+            "line_rate_sum",
+            "excluded_slice",
+            "threshold_index",
+        )
+        return self._replace(**{name: getattr(self, name)[points] for name in by_point})
+
+    def mean_leakage(self) -> np.ndarray:
+        """Return the mean probability of leakage over speckle and the line's phase, (m, 3)."""
+        leakage = np.empty(self.rate_sum.shape)
+        _average_leakage(self, leakage)
+        return leakage
+
+
+def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
+    """Return the indices of points whose probability of leakage exceeds SELDOM in any segment."""
+    return np.flatnonzero((groups.leakage > LEAKAGE_MIN).any(axis=1))
+
+
+def fading_group_of_bins(
+    shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
+) -> np.ndarray:
+    """Return the group with which each leaking bin fades, that of the nearest strongest bin.
+
+    ``points`` are the points of ``spectra``; distances of a complex record are around the circle.
+    """
+    bins, batch_index, segment = _leaked_bins(spectra)
+    group_bins = groups.strongest_bin[points[batch_index], segment]
+    distance = np.abs(bins[:, None] - group_bins)
+    if shots.complex_record:
+        distance = np.minimum(distance % shots.fft_size, -distance % shots.fft_size)
+    return np.where(group_bins < 0, np.iinfo(np.int64).max, distance).argmin(axis=1)
+
+
+def bins_without_noise_peaks(
+    shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
+) -> LeakageBins:
+    """List bins whose noise is drawn with their signal; noise alone raises no peak there.
+
+    No bin of the result raises leaked peaks; ``echo`` holds the group of each listed bin.
+    """
+    return LeakageBins.empty(points.size)._replace(
+        group=fading_group_of_bins(shots, groups, points, spectra),
+        excluded_slice=spectra.leaked_slice,
+        excluded_bins=_leaked_bins(spectra)[0],
+    )
+
+
+def iter_leakage_bins(
+    shots: Shots, groups: BinGroups, points: np.ndarray
+) -> Iterator[tuple[np.ndarray, LeakageBins]]:
+    """Yield batches of ``points``: their indices, and the bins of their leaked signal."""
+    if shots.circulator_leak_amplitude is None:
+        for spans in _iter_leaking_spans(shots, points):
+            yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
+        return
+    echoes_alone = replace(shots, circulator_leak_amplitude=None)
+    for batch_begin in range(0, points.size, LINE_BATCH_POINTS):
+        for batch, spectra in iter_noiseless_spectra(
+            echoes_alone, points[batch_begin : batch_begin + LINE_BATCH_POINTS]
+        ):
+            fading_group = fading_group_of_bins(shots, groups, batch, spectra)
+            spectra, fading_group, leakage_bins = _mask_leaked_light(
+                shots, batch, spectra, fading_group
+            )
+            leakage_bins = leakage_bins._replace(
+                bin_slice=spectra.leaked_slice,
+                bins=_leaked_bins(spectra)[0],
+                log_amplitude=np.log(spectra.leaked_ratio),
+                group=fading_group,
+                exempt_neighbour=spectra.exempt_neighbour_ratio,
+                exempt_neighbour_side=spectra.exempt_neighbour_side,
+            )
+            yield batch, _add_rate_tables(shots, batch, leakage_bins)
+
+
+def find_groups_and_leakage_bins(
+    shots: Shots, groups_max: int
+) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
+    """Find groups of bins, and list the peaks that leak from them.
+
+    Of echoes in developed speckle, which are searched for both at once. The probability of leakage
+    is its mean over speckle. A search band, or a line of leaked light, takes two searches.
+    """
+    bin_rows, groups = allocate_bin_groups(shots.size, groups_max)
+    leakage_bins_by_part = []
+    for spans in _iter_leaking_spans(shots, np.arange(shots.size)):
+        find_groups_in_spans(shots, spans, bin_rows, groups)
+        leakage_bins = _leakage_bins_of_spans(shots, groups, spans)
+        groups.leakage[spans.point_numbers] = leakage_bins.mean_leakage()
+        leakage_bins_by_part.append((spans.point_numbers, leakage_bins))
+    return groups, leakage_bins_by_part
+
+
+def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[BinSpans]:
+    """Yield runs of all bins of points that may leak."""
+    magnitude_min = np.minimum(
+        shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
+    )
+    return iter_spans(
+        shots, points=point_indices, level_min=magnitude_min, leakage=False, with_pd=False
+    )
+
+
+def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
+    """|X| / sigma from which bins of points may leak, (n,)."""
+    return np.broadcast_to(
+        shots.negligible_signal_ratio if shots.includes_leakage else np.inf, shots.size
+    )
+
+
+def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> LeakageBins:
+    """List the bins of leaked signal in runs of points."""
+    first_bin, n_bins, peak_index, span_start = (
+        np.ascontiguousarray(array)
+        for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
+    )
+    bins, group, exempt_neighbour_side = np.empty((3, n_bins.sum()), np.int64)
+    log_amplitude, exempt_neighbour = np.empty((2, bins.size))
+    bin_slice = np.empty((spans.point_numbers.size, 3, 2), np.int64)
+    n_listed = _fill_leakage_bins(
+        spans.point_numbers,
+        first_bin,
+        n_bins,
+        peak_index,
+        span_start,
+        np.ascontiguousarray(spans.peak_is_searched),
+        spans.magnitudes,
+        spans.is_exempt,
+        np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
+        np.array(_leaking_signal_ratio_min(shots)),
+        np.ascontiguousarray(groups.strongest_bin),
+        shots.fft_size if shots.complex_record else 0,
+        bin_slice,
+        bins,
+        log_amplitude,
+        group,
+        exempt_neighbour,
+        exempt_neighbour_side,
+    )
+    leakage_bins = LeakageBins.empty(spans.point_numbers.size)._replace(
+        bin_slice=bin_slice,
+        bins=bins[:n_listed],
+        log_amplitude=log_amplitude[:n_listed],
+        group=group[:n_listed],
+        exempt_neighbour=exempt_neighbour[:n_listed],
+        exempt_neighbour_side=exempt_neighbour_side[:n_listed],
+    )
+    return _add_rate_tables(shots, spans.point_numbers, leakage_bins)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", borrows=True)
+def _fill_leakage_bins(
+    point_numbers,
+    first_bin,
+    n_bins,
+    peak_index,
+    span_start,
+    peak_is_searched,
+    magnitudes,
+    is_exempt,
+    noise_sigma,
+    signal_ratio_min,
+    group_bins,
+    circle_bins,
+    bin_slice,
+    bins,
+    log_amplitude,
+    group,
+    exempt_neighbour,
+    exempt_neighbour_side,
+):
+    """List the bins of leaked signal in runs; return their number.
+
+    Parameters
+    ----------
+    point_numbers
+        (m,): points of the runs.
+    first_bin, n_bins, peak_index, span_start, peak_is_searched
+        (3, m): first bin, number of bins, place of the largest, begin in ``magnitudes`` and
+        ``is_exempt``, and whether the largest is searched, by segment.
+    magnitudes, is_exempt
+        |X| [V] of all bins, and whether they are of an echo.
+    noise_sigma, signal_ratio_min
+        (n,): noise per quadrature [V], and |X| / sigma from which bins of points may leak.
+    group_bins
+        (n, 3, most): strongest bins of groups, -1 for none.
+    circle_bins
+        Number of bins of a complex record, else 0.
+    bin_slice, bins, log_amplitude, group, exempt_neighbour, exempt_neighbour_side
+        Results, as of :class:`LeakageBins`.
+    """
+    n_listed = 0
+    for j in range(point_numbers.size):
+        i = point_numbers[j]
+        for s in range(3):
+            bin_slice[j, s, 0] = n_listed
+            span_begin = span_start[s, j]
+            for index_in_span in range(n_bins[s, j]):
+                flat_index = span_begin + index_in_span
+                signal_ratio = magnitudes[flat_index] / noise_sigma[i]
+                if (
+                    is_exempt[flat_index]
+                    or not signal_ratio >= signal_ratio_min[i]
+                    or (index_in_span == peak_index[s, j] and peak_is_searched[s, j])
+                ):
+                    continue
+                ratio_below, ratio_above = 0.0, 0.0
+                if index_in_span > 0 and is_exempt[flat_index - 1]:
+                    ratio_below = magnitudes[flat_index - 1] / noise_sigma[i]
+                if index_in_span + 1 < n_bins[s, j] and is_exempt[flat_index + 1]:
+                    ratio_above = magnitudes[flat_index + 1] / noise_sigma[i]
+                nearest_distance, nearest_group = np.int64(1) << 62, 0
+                for group_index in range(group_bins.shape[2]):
+                    if group_bins[i, s, group_index] < 0:
+                        continue
+                    distance = abs(first_bin[s, j] + index_in_span - group_bins[i, s, group_index])
+                    if circle_bins > 0:
+                        distance = min(distance % circle_bins, -distance % circle_bins)
+                    if distance < nearest_distance:
+                        nearest_distance, nearest_group = distance, group_index
+                bins[n_listed], log_amplitude[n_listed] = (
+                    first_bin[s, j] + index_in_span,
+                    math.log(signal_ratio),
+                )
+                group[n_listed], exempt_neighbour[n_listed] = (
+                    nearest_group,
+                    max(ratio_below, ratio_above),
+                )
+                exempt_neighbour_side[n_listed] = 1 if ratio_above >= ratio_below else -1
+                n_listed += 1
+            bin_slice[j, s, 1] = n_listed
+    return n_listed
+
+
+def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins) -> LeakageBins:
+    """Complete listed bins of points by the law and the sums of their rates."""
+    point_threshold_ratio = np.broadcast_to(shots.threshold / shots.bin_noise_sigma, shots.size)[
+        batch
+    ]
+    threshold_ratios, threshold_index = _distinct_thresholds(point_threshold_ratio)
+    in_speckle = shots.segment_correlations is not None
+    tables = [
+        _tabulate_rates(shots.looks, float(threshold_ratio), in_speckle)
+        for threshold_ratio in threshold_ratios
+    ]
+    log_rates, log_amplitude_grid, linear_rates, mean_probabilities = (
+        np.array([table[field_index] for table in tables]).reshape(threshold_ratios.size, -1)
+        for field_index in range(4)
+    )
+    leakage_bins = leakage_bins._replace(
+        threshold_index=threshold_index,
+        log_rates=log_rates,
+        log_amplitude_grid=log_amplitude_grid,
+        threshold_ratio=shots.looks.equivalent_threshold_ratio(threshold_ratios),
+        amplitude_gain_max=float(shots.looks.amplitude_gain_max),
+        sidelobe_correlation=shots.detection_rule.sidelobe_correlation,
+    )
+    _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities)
+    return leakage_bins
+
+
+class RateTables(NamedTuple):
+    """Tables of one threshold by ln(amplitude)."""
+
+    log_rates: np.ndarray
+    """(RATES,): ln(rate)."""
+    log_amplitude_grid: np.ndarray
+    """(2,): first ln(amplitude), and their step."""
+    linear_rates: np.ndarray
+    """(RATES,): rate."""
+    mean_probabilities: np.ndarray
+    """(RATES,): mean probability over speckle that a bin crosses; of no size if not asked for."""
+
+
+@lru_cache(maxsize=64)
+def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> RateTables:
+    """Return the tables of a threshold [sigma]; means over speckle if an echo ``in_speckle``."""
+    log_rates, log_amplitude_grid = _log_rates(looks, np.array([threshold_ratio]))
+    mean_probabilities = np.empty(0)
+    if in_speckle:
+        coarse_means, coarse_positions = (
+            np.empty(N_RATES // MEAN_TABLE_STRIDE + 1),
+            np.arange(N_RATES) / MEAN_TABLE_STRIDE,
+        )
+        _fill_mean_probabilities(log_rates[0], log_amplitude_grid[0], coarse_means)
+        log_means = np.log(np.maximum(coarse_means, 1e-300))
+        mean_probabilities = np.exp(
+            CubicSpline(np.arange(coarse_means.size), log_means)(coarse_positions)
+        )
+    return RateTables(log_rates[0], log_amplitude_grid[0], np.exp(log_rates[0]), mean_probabilities)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_mean_probabilities(log_rates, log_amplitude_grid, mean_probabilities):
+    """Fill in the mean over speckle of a bin's probability, at each MEAN_STEP th amplitude."""
+    quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
+    rate_sums = np.empty(quadrature.weights.size)
+    for k in range(mean_probabilities.size):
+        rate_sums[:] = 0.0
+        _add_rates_at_nodes(
+            log_amplitude_grid[0] + k * MEAN_TABLE_STRIDE * log_amplitude_grid[1],
+            log_amplitude_grid,
+            quadrature,
+            rate_sums,
+        )
+        mean_probabilities[k] = _mean_leakage_from_rate_sums(rate_sums, quadrature.weights)
+
+
+def _leaked_bins(spectra: NoiselessSpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bin number, point (index into the batch) and segment of each bin of leaked signal."""
+    n_bins = np.diff(spectra.leaked_slice.reshape(-1, 2)).ravel()
+    span = np.repeat(np.arange(n_bins.size), n_bins)
+    return spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3
+
+
+def _mask_leaked_light(
+    shots: Shots, batch: np.ndarray, spectra: NoiselessSpectra, group: np.ndarray
+) -> tuple[NoiselessSpectra, np.ndarray, LeakageBins]:
+    """Remove bins that a line of leaked light masks, and return the bins that this line raises.
+
+    Returns the reduced spectra, ``group`` (as of :func:`fading_group_of_bins`) of the bins that are
+    left, and :class:`LeakageBins` with the fields ``line_*`` and ``barred_*`` alone filled in.
+    """
+    is_kept = np.ones(spectra.leaked_index.size, bool)
+    slices = np.zeros((3, batch.size, 3, 2), np.int64)  # of leaked, raised and masked bins
+    raised_bins, masked_bins, line_amplitudes = [], [], [np.empty((N_PHASES, 0))]
+    phase_factors = np.exp(1j * np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES)[:, None]
+    slice_ends = np.zeros(3, np.int64)
+    for j, i in enumerate(batch.tolist()):
+        deviation = float(np.broadcast_to(shots.bin_noise_sigma, shots.size)[i])
+        for s in range(3):
+            slices[:, j, s] = slice_ends[:, None]
+            if not shots.has_segment[s]:
+                continue
+            line_scale, line = leak_line_of_point(shots, i, s)
+            start, first_bin = spectra.bins_start[j, s], spectra.first_bin[j, s]
+            echo_bins = first_bin + np.flatnonzero(
+                spectra.is_echo[start : start + spectra.n_bins[j, s]]
+            )
+            is_masked, _, may_raise = line_bin_masks(
+                shots, i, line, half_amplitude=line_scale, echo_bins=echo_bins
+            )
+            leaked_slice = slice(*spectra.leaked_slice[j, s])
+            bin_numbers = first_bin + spectra.leaked_index[leaked_slice]
+            is_kept[leaked_slice] = ~is_masked[
+                bin_numbers % shots.fft_size if shots.complex_record else bin_numbers
+            ]
+            raised_bins.append(np.flatnonzero(may_raise))
+            masked_bins.append(np.flatnonzero(is_masked))
+            term, image_term = (line_scale / deviation) * line.transforms[:, raised_bins[-1]]
+            line_amplitudes.append(np.abs(term * phase_factors + image_term * phase_factors.conj()))
+            slice_ends += np.array(
+                [is_kept[leaked_slice].sum(), raised_bins[-1].size, masked_bins[-1].size]
+            )
+            slices[:, j, s, 1] = slice_ends
+    no_bins = np.empty(0, np.int64)
+    return (
+        spectra._replace(
+            leaked_slice=slices[0],
+            leaked_index=spectra.leaked_index[is_kept],
+            leaked_ratio=spectra.leaked_ratio[is_kept],
+            exempt_neighbour_ratio=spectra.exempt_neighbour_ratio[is_kept],
+            exempt_neighbour_side=spectra.exempt_neighbour_side[is_kept],
+        ),
+        group[is_kept],
+        LeakageBins.empty(batch.size)._replace(
+            line_slice=slices[1],
+            line_bins=np.concatenate([no_bins, *raised_bins]),
+            line_log_amplitude=np.concatenate(line_amplitudes, axis=1),
+            excluded_slice=slices[2],
+            excluded_bins=np.concatenate([no_bins, *masked_bins]),
+        ),
+    )
+
+
+def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return different thresholds of points [sigma], and the number of each point's.
+
+    Thresholds within 1e-7 of each other, which those of a flight are, have one table of rates.
+    """
+    distinct_ratios, threshold_index = np.unique(np.round(threshold_ratio, 7), return_inverse=True)
+    return distinct_ratios, threshold_index.ravel().astype(np.int64)
+
+
+def _log_rates(looks: Looks, threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate ``log_rates`` and ``log_amplitude_grid`` by threshold (laws,) [sigma]."""
+    log_rates, log_amplitude_grid = (
+        np.empty((threshold_ratio.size, N_RATES)),
+        np.empty((threshold_ratio.size, 2)),
+    )
+    _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid)
+    if looks.is_noncoherent:
+        for j in range(threshold_ratio.size):
+            amplitudes = np.exp(
+                log_amplitude_grid[j, 0] + log_amplitude_grid[j, 1] * np.arange(N_RATES)
+            )
+            added_probability = np.minimum(
+                looks.added_crossing_probability(amplitudes, float(threshold_ratio[j])), 1 - 1e-16
+            )
+            log_rates[j] = np.log(np.maximum(-np.log1p(-added_probability), 1e-300))
+    return log_rates, log_amplitude_grid
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
+    """Fill ``log_rates`` (m, RATES) and ``log_amplitude_grid`` (m, 2) for single looks.
+
+    ``threshold_ratio`` (m,): threshold [sigma].
+    """
+    for j in range(threshold_ratio.size):
+        ratio = threshold_ratio[j]
+        log_amplitude_grid[j, 0] = math.log(TABLE_AMPLITUDE_MIN_SIGMA)
+        log_amplitude_grid[j, 1] = (
+            math.log(ratio + CERTAIN_MARGIN_SIGMA) - log_amplitude_grid[j, 0]
+        ) / (N_RATES - 1)
+        p_noise_stay = -math.expm1(-0.5 * ratio * ratio)
+        for k in range(N_RATES):
+            amplitude, rate = math.exp(log_amplitude_grid[j, 0] + log_amplitude_grid[j, 1] * k), 0.0
+            if p_noise_stay > 0.0 and amplitude < ratio:
+                rate = -math.log1p(-marcum_q1_excess(amplitude, ratio) / p_noise_stay)
+            elif p_noise_stay > 0.0:
+                rate = -math.log(max(marcum_q1_tails(amplitude, ratio)[1], 1e-300) / p_noise_stay)
+            log_rates[j, k] = math.log(max(rate, 1e-300))
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
+    """Return the rate -ln(1 - c) of a bin.
+
+    ``log_amplitude`` is ln(|X| / sigma); ``log_rates`` are logarithms, at the amplitudes of
+    ``log_amplitude_grid``.
+    """
+    table_position = (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1]
+    if table_position <= 0.0:
+        return math.exp(log_rates[0] + 2.0 * (log_amplitude - log_amplitude_grid[0]))
+    k = int(table_position)
+    if k >= log_rates.size - 1:
+        return math.exp(log_rates[log_rates.size - 1])
+    return math.exp(log_rates[k] + (table_position - k) * (log_rates[k + 1] - log_rates[k]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
+    """Store the sums of rates in the fields of ``leakage_bins``, in place.
+
+    ``linear_rates`` and ``mean_probabilities`` (laws, RATES) are those of :class:`RateTables`.
+    """
+    for k_power_or_phase in range(leakage_bins.line_log_amplitude.shape[0]):
+        for k in range(leakage_bins.line_log_amplitude.shape[1]):
+            leakage_bins.line_log_amplitude[k_power_or_phase, k] = math.log(
+                max(leakage_bins.line_log_amplitude[k_power_or_phase, k], 1e-300)
+            )
+    for j in range(leakage_bins.rate_sum.shape[0]):
+        log_rates, log_amplitude_grid = (
+            leakage_bins.log_rates[leakage_bins.threshold_index[j]],
+            leakage_bins.log_amplitude_grid[leakage_bins.threshold_index[j]],
+        )
+        steps_per_power_doubling = math.ceil(0.5 * math.log(2.0) / log_amplitude_grid[1])
+        for s in range(3):
+            rate_sums, mean_probability_sum = leakage_bins.rate_sum_bounds[j, s], 0.0
+            rate_sums[:] = 0.0
+            for k in range(leakage_bins.bin_slice[j, s, 0], leakage_bins.bin_slice[j, s, 1]):
+                power_fraction, table_position = (
+                    1.0,
+                    (leakage_bins.log_amplitude[k] - log_amplitude_grid[0]) / log_amplitude_grid[1],
+                )
+                if table_position < 0.0:  # rates go as the amplitude squared
+                    power_fraction, table_position = (
+                        math.exp(2.0 * (leakage_bins.log_amplitude[k] - log_amplitude_grid[0])),
+                        0.0,
+                    )
+                table_index = min(int(table_position), N_RATES - 2)
+                for k_power_or_phase in range(N_BOUND_POWERS):
+                    rate_sums[k_power_or_phase] += (
+                        power_fraction
+                        * linear_rates[
+                            leakage_bins.threshold_index[j],
+                            min(
+                                table_index + 1 + k_power_or_phase * steps_per_power_doubling,
+                                N_RATES - 1,
+                            ),
+                        ]
+                    )
+                if mean_probabilities.shape[1] > 0:
+                    mean_at_index, mean_at_next = (
+                        mean_probabilities[leakage_bins.threshold_index[j], table_index],
+                        mean_probabilities[leakage_bins.threshold_index[j], table_index + 1],
+                    )
+                    mean_probability_sum += power_fraction * (
+                        mean_at_index
+                        + min(table_position - table_index, 1.0) * (mean_at_next - mean_at_index)
+                    )
+            leakage_bins.rate_sum[j, s], leakage_bins.line_rate_sum[j, s] = rate_sums[0], 0.0
+            if mean_probabilities.shape[1] > 0:
+                leakage_bins.mean_probability_sum[j, s] = mean_probability_sum
+            for k_power_or_phase in range(leakage_bins.line_log_amplitude.shape[0]):
+                phase_sum = 0.0
+                for k in range(leakage_bins.line_slice[j, s, 0], leakage_bins.line_slice[j, s, 1]):
+                    phase_sum += _crossing_rate(
+                        leakage_bins.line_log_amplitude[k_power_or_phase, k],
+                        log_rates,
+                        log_amplitude_grid,
+                    )
+                leakage_bins.line_rate_sum[j, s] = max(leakage_bins.line_rate_sum[j, s], phase_sum)
+
+
+class SpeckleQuadrature(NamedTuple):
+    """Trapezoidal rule of the average over speckle, for one law of rates."""
+
+    node_stride: int
+    """Distance of nodes in steps of the tabulated ln(amplitude)."""
+    n_below_mean: int
+    """Number of nodes whose power is less than 1."""
+    weights: np.ndarray
+    """(nodes,): weights at the powers e^(2 stride step (i - below)), in rising order."""
+    interleaved_rates: np.ndarray
+    """(stride * columns,): rates at ln(amplitude), from ``n_below_mean`` strides under the table.
+
+    That with the number stride c + p is at p columns + c, so that the nodes of a bin are adjacent.
+    """
+
+
+@njit(cache=True, error_model="numpy")
+def _make_speckle_quadrature(log_rates, log_amplitude_grid):
+    """Make the quadrature over speckle for one row of rates."""
+    log_amplitude_step, log_rate_step_max = log_amplitude_grid[1], 0.0
+    for k in range(1, log_rates.size):
+        if log_rates[k] < 1.0:  # beyond, a bin crosses at almost any power
+            log_rate_step_max = max(log_rate_step_max, log_rates[k] - log_rates[k - 1])
+    node_stride = max(
+        int(
+            min(
+                0.5 * LOG_POWER_STEP_MAX / log_amplitude_step, LOG_RATE_STEP_MAX / log_rate_step_max
+            )
+        ),
+        1,
+    )
+    log_power_step = 2.0 * node_stride * log_amplitude_step
+    n_below_mean, n_above_mean = (
+        int(-LOG_POWER_MIN / log_power_step) + 1,
+        int(LOG_POWER_MAX / log_power_step) + 1,
+    )
+    weights = np.empty(n_below_mean + n_above_mean + 1)
+    for i in range(weights.size):
+        power = math.exp((i - n_below_mean) * log_power_step)
+        weights[i] = log_power_step * power * math.exp(-power)
+    # A bin crosses at the faintest node too from ``below`` strides beyond the table.
+    n_columns = 2 * n_below_mean + n_above_mean + log_rates.size // node_stride + 4
+    interleaved_rates = np.empty(node_stride * n_columns)
+    for k in range(interleaved_rates.size):
+        table_position = float(k - n_below_mean * node_stride - 1)
+        rate = _crossing_rate(
+            log_amplitude_grid[0] + table_position * log_amplitude_step,
+            log_rates,
+            log_amplitude_grid,
+        )
+        interleaved_rates[k % node_stride * n_columns + k // node_stride] = rate
+    return SpeckleQuadrature(node_stride, n_below_mean, weights, interleaved_rates)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums):
+    """Add the rates of a bin at the last nodes to ``rate_sums``, by cubic interpolation.
+
+    ``log_amplitude`` is ln(|X| / sigma) at mean power.
+    """
+    power_fraction, table_position = (
+        1.0,
+        (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1],
+    )
+    if table_position < 0.0:  # rates go as the amplitude squared
+        power_fraction, table_position = (
+            math.exp(2.0 * (log_amplitude - log_amplitude_grid[0])),
+            0.0,
+        )
+    n_columns = quadrature.interleaved_rates.size // quadrature.node_stride
+    table_index = int(
+        min(
+            table_position,
+            float(
+                quadrature.interleaved_rates.size
+                - quadrature.node_stride * quadrature.weights.size
+                - 4
+            ),
+        )
+    )
+    fraction = min(table_position - table_index, 1.0)
+    weight_1 = power_fraction * fraction * (fraction - 1.0) * (2.0 - fraction) / 6.0
+    weight_2 = power_fraction * (fraction + 1.0) * (fraction - 1.0) * (fraction - 2.0) / 2.0
+    weight_3 = power_fraction * (fraction + 1.0) * fraction * (2.0 - fraction) / 2.0
+    weight_4 = power_fraction * (fraction + 1.0) * fraction * (fraction - 1.0) / 6.0
+    row_1 = table_index % quadrature.node_stride * n_columns + table_index // quadrature.node_stride
+    row_2 = (table_index + 1) % quadrature.node_stride * n_columns + (
+        table_index + 1
+    ) // quadrature.node_stride
+    row_3 = (table_index + 2) % quadrature.node_stride * n_columns + (
+        table_index + 2
+    ) // quadrature.node_stride
+    row_4 = (table_index + 3) % quadrature.node_stride * n_columns + (
+        table_index + 3
+    ) // quadrature.node_stride
+    interleaved_rates, node_end, node_begin = (
+        quadrature.interleaved_rates,
+        quadrature.weights.size,
+        quadrature.weights.size - rate_sums.size,
+    )
+    rates_1, rates_2 = (
+        interleaved_rates[row_1 + node_begin : row_1 + node_end],
+        interleaved_rates[row_2 + node_begin : row_2 + node_end],
+    )
+    rates_3, rates_4 = (
+        interleaved_rates[row_3 + node_begin : row_3 + node_end],
+        interleaved_rates[row_4 + node_begin : row_4 + node_end],
+    )
+    for i in range(rate_sums.size):
+        rate_sums[i] += (weight_1 * rates_1[i] + weight_2 * rates_2[i]) + (
+            weight_3 * rates_3[i] + weight_4 * rates_4[i]
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_leakage_from_rate_sums(rate_sums, weights):
+    """Return the mean over speckle of 1 - exp(-R), of the sums of rates R at some last nodes.
+
+    Terms below the first node go on as a geometric series: in proportion to the power where all
+    draws leak, and else to its square.
+    """
+    mean, lowest_term, next_term = 0.0, 0.0, 0.0
+    for i in range(rate_sums.size - 1, -1, -1):
+        term = weights[weights.size - rate_sums.size + i] * _crossing_probability(rate_sums[i])
+        mean += term
+        lowest_term, next_term = term, lowest_term
+    return mean + (
+        lowest_term * lowest_term / (next_term - lowest_term) if next_term > lowest_term else 0.0
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _evaluate_joining_bins(
+    bin_index, bin_slice, leakage_bins, threshold_index, quadrature, is_evaluated, joining_rates
+):
+    """Evaluate a bin next to an echo, and further ones that may join the echo with it.
+
+    Parameters
+    ----------
+    bin_index
+        Index of the bin in ``leakage_bins.bin``.
+    bin_slice
+        First and last index + 1 of the segment's bins.
+    threshold_index
+        Row of ``leakage_bins.rates``.
+    quadrature
+        :class:`SpeckleQuadrature` of this law.
+    is_evaluated
+        True of bins that have been evaluated so.
+    joining_rates
+        Result: rates of a further group in these bins at some last nodes.
+
+    Returns
+    -------
+    int
+        Index of the last of these bins.
+    """
+    log_rates, log_amplitude_grid, step = (
+        leakage_bins.log_rates[threshold_index],
+        leakage_bins.log_amplitude_grid[threshold_index],
+        -leakage_bins.exempt_neighbour_side[bin_index],
+    )
+    n_nodes = joining_rates.size
+    end_index = bin_index + step
+    while (
+        bin_slice[0] <= end_index < bin_slice[1]
+        and leakage_bins.bins[end_index] - leakage_bins.bins[bin_index] == end_index - bin_index
+    ):
+        bright_log_amplitude = (
+            leakage_bins.log_amplitude[end_index - step] + BRIGHT_LOG_AMPLITUDE
+        )  # as long as the bins so far all cross
+        if (
+            abs(end_index - bin_index) > 1
+            and _crossing_rate(bright_log_amplitude, log_rates, log_amplitude_grid)
+            < JOINING_RATE_MIN
+        ):
+            break
+        if (
+            is_evaluated[end_index]
+            or leakage_bins.group[end_index] != leakage_bins.group[bin_index]
+            or leakage_bins.exempt_neighbour[end_index] > 0.0
+        ):
+            break
+        end_index += step
+    bin_rates, p_any_after_quiet, p_any = np.empty(n_nodes), np.zeros(n_nodes), np.zeros(n_nodes)
+    for j in range(end_index - step, bin_index, -step):
+        bin_rates[:] = 0.0
+        _add_rates_at_nodes(
+            leakage_bins.log_amplitude[j], log_amplitude_grid, quadrature, bin_rates
+        )
+        for i in range(n_nodes):
+            p_cross = _crossing_probability(bin_rates[i])
+            p_any_after_quiet[i] = p_cross * p_any_after_quiet[i] + (1.0 - p_cross) * p_any[i]
+            p_any[i] = p_cross + (1.0 - p_cross) * p_any[i]
+    bin_rates[:] = 0.0
+    _add_rates_at_nodes(
+        leakage_bins.log_amplitude[bin_index], log_amplitude_grid, quadrature, bin_rates
+    )
+    log_power_step = 2.0 * quadrature.node_stride * log_amplitude_grid[1]
+    nodes_per_step = max(int(EDGE_LOG_POWER_STEP / log_power_step), 1)
+    mean_power_node = n_nodes - quadrature.weights.size + quadrature.n_below_mean
+    first_edge_node = max(mean_power_node - int(EDGE_LOG_POWER_DEPTH / log_power_step), 0)
+    edge_ratio, neighbour_ratio = (
+        leakage_bins.amplitude_gain_max * leakage_bins.exempt_neighbour[bin_index],
+        leakage_bins.amplitude_gain_max * math.exp(leakage_bins.log_amplitude[bin_index]),
+    )
+    p_edge_after, step_begin = 0.0, -nodes_per_step
+    while step_begin < n_nodes:
+        step_end = first_edge_node if step_begin < 0 else step_begin + nodes_per_step
+        root_power = math.exp(0.5 * log_power_step * (step_end - mean_power_node))
+        p_edge_before = p_edge_after
+        p_edge_after = edge_crossing_probability(
+            edge_ratio * root_power,
+            neighbour_ratio * root_power,
+            leakage_bins.threshold_ratio[threshold_index],
+            leakage_bins.sidelobe_correlation,
+        )
+        p_edge_slope = (p_edge_after - p_edge_before) / nodes_per_step
+        if step_begin < 0:
+            step_begin, p_edge_before, p_edge_slope = 0, p_edge_after, 0.0
+        for i in range(step_begin, min(step_end, n_nodes)):
+            p_edge = p_edge_before + p_edge_slope * (i - step_begin)
+            p_cross = _crossing_probability(bin_rates[i])
+            p_apart = 1.0 - p_edge + p_edge * p_any_after_quiet[i]
+            joining_rates[i] = crossing_rate(p_cross * p_apart + (1.0 - p_cross) * p_any[i])
+        step_begin = step_end
+    return end_index - step
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing_probability(rate):
+    """Return 1 - e^-rate."""
+    if rate < 1e-4:
+        return rate * (1.0 - rate * (0.5 - rate / 6.0))
+    return -math.expm1(-rate)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average_leakage(leakage_bins, leakage_probability):
+    """Fill ``leakage_probability`` (m, 3) with its mean over speckle and the line's phase.
+
+    Each echo fades independently.
+    """
+    is_evaluated = np.zeros(leakage_bins.bins.size, np.bool_)
+    no_quadrature = SpeckleQuadrature(1, 0, np.empty(0), np.empty(0))
+    for threshold_index in range(leakage_bins.log_amplitude_grid.shape[0]):
+        log_rates, log_amplitude_grid = (
+            leakage_bins.log_rates[threshold_index],
+            leakage_bins.log_amplitude_grid[threshold_index],
+        )
+        needs_quadrature = False
+        for j in range(leakage_probability.shape[0]):
+            for s in range(3):
+                needs_quadrature |= (
+                    leakage_bins.threshold_index[j] == threshold_index
+                    and not leakage_bins.mean_probability_sum[j, s] <= FAINT_LEAKAGE_MAX
+                )
+        quadrature, node_scratch, faint_first_node = no_quadrature, np.empty((2, 0)), 0
+        if needs_quadrature:
+            quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
+            node_scratch = np.empty((2, quadrature.weights.size))
+            log_power_step = 2.0 * quadrature.node_stride * log_amplitude_grid[1]
+            faint_first_node = int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / log_power_step)
+        for j in range(leakage_probability.shape[0]):
+            if leakage_bins.threshold_index[j] != threshold_index:
+                continue
+            for s in range(3):
+                begin, end = leakage_bins.bin_slice[j, s]
+                first_node = (
+                    faint_first_node if leakage_bins.rate_sum[j, s] <= FAINT_RATE_SUM_MAX else 0
+                )
+                rate_sums, joining_rates = (
+                    node_scratch[0, first_node:],
+                    node_scratch[1, first_node:],
+                )
+                p_leakage, n_groups = 0.0, 0
+                if leakage_bins.mean_probability_sum[j, s] <= FAINT_LEAKAGE_MAX:
+                    p_leakage, end = leakage_bins.mean_probability_sum[j, s], begin
+                for k in range(begin, end):
+                    n_groups = max(n_groups, leakage_bins.group[k] + 1)
+                for group in range(n_groups):
+                    rate_sums[:] = 0.0
+                    for k in range(begin, end):
+                        if (
+                            leakage_bins.exempt_neighbour[k] > 0.0
+                            and leakage_bins.group[k] == group
+                            and not is_evaluated[k]
+                        ):
+                            last_joined = _evaluate_joining_bins(
+                                k,
+                                (begin, end),
+                                leakage_bins,
+                                threshold_index,
+                                quadrature,
+                                is_evaluated,
+                                joining_rates,
+                            )
+                            is_evaluated[min(k, last_joined) : max(k, last_joined) + 1] = True
+                            rate_sums += joining_rates
+                    for k in range(begin, end):
+                        if leakage_bins.group[k] == group and not is_evaluated[k]:
+                            _add_rates_at_nodes(
+                                leakage_bins.log_amplitude[k],
+                                log_amplitude_grid,
+                                quadrature,
+                                rate_sums,
+                            )
+                    p_leakage += _mean_leakage_from_rate_sums(rate_sums, quadrature.weights) * (
+                        1.0 - p_leakage
+                    )
+                n_phases, p_line_alarm = leakage_bins.line_log_amplitude.shape[0], 0.0
+                for phase in range(n_phases):
+                    rate_sum = 0.0
+                    for k in range(
+                        leakage_bins.line_slice[j, s, 0], leakage_bins.line_slice[j, s, 1]
+                    ):
+                        rate_sum += _crossing_rate(
+                            leakage_bins.line_log_amplitude[phase, k], log_rates, log_amplitude_grid
+                        )
+                    p_line_alarm -= math.expm1(-rate_sum) / n_phases
+                leakage_probability[j, s] = p_leakage + p_line_alarm * (1.0 - p_leakage)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def insert_peak(peak, peak_bins, peak_ratios, n_peaks):
+    """Insert a peak (bin, |X| / sigma) into a list sorted by strength; return its new length.
+
+    A bin of -1 is ignored. If the list is full, its weakest peak is dropped.
+    """
+    bin_, ratio = peak
+    if bin_ < 0:
+        return n_peaks
+    rank = n_peaks
+    while rank > 0 and peak_ratios[rank - 1] < ratio:
+        rank -= 1
+    if rank >= peak_bins.size:
+        return n_peaks
+    n_peaks = min(n_peaks + 1, peak_bins.size)
+    for k in range(n_peaks - 1, rank, -1):
+        peak_bins[k], peak_ratios[k] = peak_bins[k - 1], peak_ratios[k - 1]
+    peak_bins[rank], peak_ratios[rank] = bin_, ratio
+    return n_peaks
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_leaked_peaks(
+    address,
+    point_and_segment,
+    leakage_bins,
+    fading_factors,
+    threshold_ratio,
+    n_looks,
+    interpolation,
+    peak_bins,
+    peak_ratios,
+):
+    """Draw the leaked peaks of a segment, and insert them into the list of the strongest peaks.
+
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64) and number of the draw.
+    point_and_segment
+        Point and segment.
+    leakage_bins
+        :class:`LeakageBins` of the batch.
+    fading_factors
+        (groups, 3): factors on the echoes' magnitudes by speckle.
+    threshold_ratio
+        Threshold [sigma].
+    n_looks
+        Number of looks whose powers are averaged.
+    peak_bins, peak_ratios
+        Results: bin and |X| / sigma of the peaks, strongest first. For averaged looks |X| is that
+        of a single look of the same significance.
+
+    Returns
+    -------
+    int
+        Number of peaks in the list.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    log_rates, log_amplitude_grid = (
+        leakage_bins.log_rates[leakage_bins.threshold_index[i]],
+        leakage_bins.log_amplitude_grid[leakage_bins.threshold_index[i]],
+    )
+    speckle_power_max, bound_index, rate_sum_bound = 0.0, 0, np.inf
+    for group_index in range(fading_factors.shape[0]):
+        speckle_power_max = max(
+            speckle_power_max, fading_factors[group_index, s] * fading_factors[group_index, s]
+        )
+    while bound_index < N_BOUND_POWERS and speckle_power_max > float(1 << bound_index):
+        bound_index += 1
+    if bound_index < N_BOUND_POWERS:
+        rate_sum_bound = leakage_bins.rate_sum_bounds[i, s, bound_index]
+    n_peaks = 0
+    if rate_sum_bound > 0.0:
+        n_peaks = _draw_raised_bins(
+            address,
+            s,
+            0,
+            leakage_bins.bin_slice[i, s],
+            leakage_bins.bins,
+            leakage_bins.log_amplitude,
+            leakage_bins.group,
+            leakage_bins.exempt_neighbour,
+            fading_factors[:, s],
+            rate_sum_bound,
+            log_rates,
+            log_amplitude_grid,
+            (threshold_ratio, n_looks, interpolation.sidelobe_correlation),
+            peak_bins,
+            peak_ratios,
+            n_peaks,
+        )
+    if leakage_bins.line_rate_sum[i, s] > 0.0:
+        uniform_phase = philox.uniform(a, b, draw, philox.STREAM_LEAKAGE[s], LINE_RANDOM_OFFSET)
+        phase = int(uniform_phase * leakage_bins.line_log_amplitude.shape[0])
+        n_peaks = _draw_raised_bins(
+            address,
+            s,
+            LINE_RANDOM_OFFSET + 1,
+            leakage_bins.line_slice[i, s],
+            leakage_bins.line_bins,
+            leakage_bins.line_log_amplitude[phase],
+            leakage_bins.group[:0],
+            leakage_bins.exempt_neighbour[:0],
+            fading_factors[:, s],
+            leakage_bins.line_rate_sum[i, s],
+            log_rates,
+            log_amplitude_grid,
+            (threshold_ratio, n_looks, 0.0),
+            peak_bins,
+            peak_ratios,
+            n_peaks,
+        )
+    return n_peaks
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _draw_raised_bins(
+    address,
+    segment,
+    first_random,
+    bin_slice,
+    bins,
+    log_amplitude,
+    group,
+    exempt_neighbour,
+    fading_factors,
+    rate_sum,
+    log_rates,
+    log_amplitude_grid,
+    threshold_looks_correlation,
+    peak_bins,
+    peak_ratios,
+    n_peaks,
+):
+    """Draw which bins of a range are raised, and insert their peaks; adjacent bins make one peak.
+
+    Peaks that join on to a bin of the echo that crosses are the echo's.
+
+    Bins are skipped by exponential numbers, as the module says. ``first_random``: first random
+    number of
+    the segment's stream; ``group``, ``exempt_neighbour``: of no size of bins that do not fade and
+    join no echo; ``rate_sum``: bound of the sum of the rates of all bins in this draw;
+    ``threshold_looks_correlation``: threshold [sigma],
+    number of looks and correlation of neighbours' noise; ``peak_bins``, ``peak_ratios``,
+    ``n_peaks``: the list, as of :func:`insert_peak`. Returns its new length.
+    """
+    (a, b, draw), stream, (threshold_ratio, n_looks, correlation) = (
+        address,
+        philox.STREAM_LEAKAGE[segment],
+        threshold_looks_correlation,
+    )
+    remainder = math.sqrt(1.0 - correlation * correlation)
+    probability = philox.uniform(a, b, draw, stream, first_random)
+    if probability > rate_sum:  # and so is -ln(1 - chance)
+        return n_peaks
+    exponent_left = -math.log1p(-probability)
+    if exponent_left > rate_sum:
+        return n_peaks
+    root_looks = math.sqrt(float(n_looks))
+    scaled_threshold = threshold_ratio * root_looks
+    previous_bin, peak_bin, peak_ratio, is_echo = np.int64(-2), np.int64(-1), 0.0, False
+    for k in range(bin_slice[0], bin_slice[1]):
+        fading_factor = fading_factors[group[k]] if group.size > 0 else 1.0
+        log_amplitude_k = log_amplitude[k] + math.log(fading_factor)
+        exponent_left -= _crossing_rate(log_amplitude_k, log_rates, log_amplitude_grid)
+        if exponent_left > 0.0:
+            continue
+        if bins[k] != previous_bin + 1:
+            n_peaks = insert_peak(
+                (np.int64(-1) if is_echo else peak_bin, peak_ratio), peak_bins, peak_ratios, n_peaks
+            )
+            peak_bin, peak_ratio, is_echo = np.int64(-1), 0.0, False
+        previous_bin, signal = bins[k], math.exp(log_amplitude_k) * root_looks
+        probability = philox.uniform(
+            a, b, draw, stream, first_random + 1
+        ) * _added_crossing_probability(signal, scaled_threshold)
+        if (
+            exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
+        ):  # its noise is in step with that which raises this bin
+            re, im = philox.normal_pair(a, b, draw, stream, EDGE_RANDOM_OFFSET + k - bin_slice[0])
+            echo_bin_in_phase = exempt_neighbour[k] * fading_factor * root_looks + correlation * (
+                _raised_magnitude(signal, scaled_threshold, probability) - signal
+            )
+            is_echo |= (
+                math.hypot(echo_bin_in_phase + remainder * re, remainder * im) >= scaled_threshold
+            )
+        ratio_min = max(
+            peak_ratio, peak_ratios[n_peaks - 1] if n_peaks == peak_ratios.size else 0.0
+        )
+        if (
+            ratio_min * root_looks < scaled_threshold
+            or _added_crossing_probability(signal, ratio_min * root_looks) > probability
+        ):
+            peak_bin, peak_ratio = (
+                bins[k],
+                _raised_magnitude(signal, scaled_threshold, probability) / root_looks,
+            )
+        first_random += 2
+        exponent_left = -math.log1p(-philox.uniform(a, b, draw, stream, first_random))
+    return insert_peak(
+        (np.int64(-1) if is_echo else peak_bin, peak_ratio), peak_bins, peak_ratios, n_peaks
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _added_crossing_probability(signal, threshold_ratio):
+    """Return c(z), the probability that signal lifts a bin to a level that noise alone misses."""
+    return marcum_q1_excess(signal, threshold_ratio) / -math.expm1(
+        -0.5 * threshold_ratio * threshold_ratio
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _raised_magnitude(signal, threshold_ratio, probability):
+    """Find the magnitude z >= ``threshold_ratio`` [sigma] at which c(z) is ``probability``."""
+    low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_MARGIN_SIGMA
+    for _ in range(BISECTION_STEPS):
+        middle = 0.5 * (low + high)
+        if _added_crossing_probability(signal, middle) > probability:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)

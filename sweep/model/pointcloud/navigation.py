@@ -1,0 +1,689 @@
+"""Velocity and altitude of each measurement cycle and draw, with their uncertainties.
+
+Each beam measures the platform's velocity along itself, ``v_r = u . v`` (closing is positive),
+and a point of the ground, ``R u``. Weighted least squares over the beams that returned gives the
+velocity; a plane through the ground points gives the altitude. Standard errors are those of
+single beams, uncorrelated; covariances follow by linear propagation.
+
+The instrument does not know which of its points are true. Of each shot it takes the first, and
+strongest, that a Doppler peak confirms (:mod:`sweep.model.pointcloud.pairing`). False alarms that
+pass as
+confirmed, mispaired and misread points are used as if they were true; the test for one false beam
+is there to find them.
+
+The residuals of a solution may contradict the errors of its points: a chi-square that true errors
+exceed once in ten thousand, over unstated relief or with a false point. Its covariance is then that
+which the residuals tell, widened as Student's t is for so many degrees of freedom, so that 68 % of
+the errors are within it. The beams of one cycle tell no more: errors beyond two such deviations are
+more frequent than normal ones.
+
+A point whose standard error is not a number is left out; one under a millionth of a bin counts as
+that, to which the interpolation itself is good.
+
+The instrument is taken to know, from inertial sensors, how it is turned and how its place and
+velocity have changed within a cycle. So the altitude is that at the cycle's first shot, over the
+ground straight below it, and the velocity the mean over the cycle's shots, in the world's axes.
+
+The beats tell the range that the beam has some time after the shot's start: d range / d slip of a
+point (``range_per_slip``). A point's range is referred to the start by the speed u at which that of
+level ground falls (:mod:`sweep.model.pointcloud.ego_motion`). Here that is undone: the ground point
+is where
+the instrument, moved on by V t, sees it along the beam, turned on by d' t, at the range R - u t. It
+lies on the ground whatever the slope, and the error for an unknown slope is left out. The radial
+velocity depends on the slip a little, and is corrected by the slope of the plane. Its error for
+other slopes under the beams counts if `relief`, or the residuals, say that the ground is no plane.
+
+Of pointing jitter it knows the standard deviation. To first order a beam thrown off by sigma in
+each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity.
+Here v_perp is the velocity across it (by a first solution without jitter). It adds sigma R
+tan(angle of incidence) to that of its range, on the plane of a first solution.
+
+Of the floor of its errors (:mod:`sweep.model.pointcloud.error_floor`) it knows the standard
+deviations too.
+Those of pointing and vibration are independent from beam to beam: they weigh, and they show in the
+residuals. Clock and wavelength scale all beams alike, which no residual shows. They are taken out
+of the weights. Of a relative error of s the solution's covariance has s^2 v v^T more, the
+altitude's variance s^2 h^2. The altitude is that of the points where pointing has put them, and its
+variance counts the pointing as it counts jitter.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri, stdtrit
+
+from sweep.model.outputs import NAVIGATION_VARIABLES
+from sweep.model.pointcloud.ego_motion import (
+    DESCENT_SINE_MIN,
+    EgoMotion,
+    MotionPriors,
+    ego_motion_of_beams,
+)
+from sweep.model.pointcloud.error_floor import NO_ERROR_FLOOR, ErrorFloor
+from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
+
+BEAMS_PER_BATCH = 1 << 14
+"""Beams solved for at once: so many that what is made of them stays at hand."""
+
+GRAZING_SINE_MIN = 0.05
+"""A beam that grazes the ground at less than about 3 deg is weighted as if at that angle."""
+
+_CONDITION_NUMBER_MAX = 1e6
+"""Condition number above which beams count as in a plane; covariances tell weak geometries."""
+
+_INTERPOLATION_ERROR_MIN = 1e-6
+"""Least error of a place between bins, over that of a place by whole bins."""
+
+_ONE_SIGMA_PROBABILITY = 0.8413447460685429
+"""Probability that a normal error is below one standard deviation."""
+
+_ROUNDING_ERROR = 1e-14
+"""Relative error of numbers that are subtracted from each other."""
+
+_CONTRADICTION_PROBABILITY = 1e-4
+"""Probability of larger residuals from which on they tell the errors, and not what is stated."""
+
+STATUS_SOLVED = 0
+"""All valid beams are in the solution."""
+STATUS_EXCLUDED = 1
+"""All but one, which contradicts the others."""
+STATUS_WITHHELD = 2
+"""The beams contradict each other and it can not be told which one is false: no solution."""
+STATUS_UNDETERMINED = 3
+"""Too few beams, or too near to a plane: no solution."""
+
+ArraysByName = Mapping[str, np.ndarray]
+
+FitResult = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""First four fields of :class:`NavigationSolution`, of n cycles."""
+
+
+class NavigationSolution(NamedTuple):
+    """Velocities in the frame of the directions, or altitudes; nan where not available."""
+
+    value: np.ndarray
+    """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above
+    the ground's plane along the vertical [m]."""
+    covariance: np.ndarray
+    """(..., 3, 3) [m^2/s^2] or (...,) [m^2]: of its error."""
+    chi_square: np.ndarray
+    """(...,): weighted sum of squared residuals; of all valid beams where withheld."""
+    degrees_of_freedom: np.ndarray
+    """(...,) int64: observations beyond what the solution needs, the chi-square's expectation; 0
+    where undetermined."""
+    is_used: np.ndarray
+    """(..., b) bool: beams in the solution."""
+    status: np.ndarray
+    """(...,) int8: SOLVED, EXCLUDED, WITHHELD or UNDETERMINED."""
+
+    @property
+    def is_available(self) -> np.ndarray:
+        """(...,) bool: there is a solution."""
+        return self.status <= STATUS_EXCLUDED
+
+
+def solve_velocity(
+    *,
+    direction: np.ndarray,
+    radial_velocity: np.ndarray,
+    standard_error: np.ndarray,
+    test_level: float | None = None,
+) -> NavigationSolution:
+    """Velocity vector and covariance of each cycle of b beams.
+
+    Directions (..., b, 3) are unit vectors from the instrument. Velocities along them, positive
+    when closing and not finite for a beam that has not returned, and their errors are (..., b).
+    Leading dimensions broadcast. `test_level` is that of the test for one false beam, None for no
+    test: it needs five beams to find it; with four it withholds the solution.
+    """
+    u, closing_speed, error, leading_shape = _flatten_cycles(
+        direction, radial_velocity, standard_error
+    )
+
+    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FitResult:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            design = np.where(is_used[..., None], u[cycles] / error[cycles, :, None], 0.0)
+            residual = np.where(is_used, closing_speed[cycles] / error[cycles], 0.0)
+            right_vectors, squared_singular_values, coordinates = _least_squares(design, residual)
+            condition = np.sqrt(
+                squared_singular_values.max(axis=1) / squared_singular_values.min(axis=1)
+            )
+            is_solved = (is_used.sum(axis=1) >= 3) & (condition <= _CONDITION_NUMBER_MAX)
+            value = sum(right_vectors[:, :, k] * coordinates[:, k, None] for k in range(3))
+            covariance = sum(
+                right_vectors[:, :, None, k]
+                * right_vectors[:, None, :, k]
+                / squared_singular_values[:, k, None, None]
+                for k in range(3)
+            )
+        chi_square = np.where(is_solved, sum(residual.T**2), np.nan)
+        degrees_of_freedom = np.where(is_solved, is_used.sum(axis=1) - 3, 0)
+        scale = _covariance_scale(chi_square, degrees_of_freedom, degrees_of_freedom)
+        return value, covariance * scale[:, None, None], chi_square, degrees_of_freedom
+
+    return _solve_screened(fit_cycles, np.isfinite(closing_speed), test_level, leading_shape)
+
+
+def solve_altitude(
+    *,
+    direction: np.ndarray,
+    range: np.ndarray,
+    standard_error: np.ndarray,
+    slope: float,
+    offset: np.ndarray | None = None,
+    relief: float = 0.0,
+    test_level: float | None = None,
+) -> NavigationSolution:
+    """Altitude above the plane through each cycle's ground points, and its variance.
+
+    Arrays and `test_level` are as for :func:`solve_velocity`, z up. `offset` (..., b, 3) is the
+    place of the instrument when each beam fires, from that whose altitude is asked [m].
+
+    The ground's slope, known beforehand to be 0 with the standard deviation `slope`, is weighed
+    against the points, whatever their number. 0 states level ground; then every second beam is a
+    check on the first, and three are enough to find a false one. `relief` is the standard deviation
+    of heights about the plane [m], which adds to the errors of range. Real ground fails the test
+    for a false beam without it. If the residuals tell that the ground is no plane, the variance
+    counts that the ground straight below is off the plane as the points are.
+    """
+    ground_points, u, error, leading_shape = _ground_points(
+        direction, range, standard_error, offset
+    )
+
+    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FitResult:
+        is_used_by_beam = np.ascontiguousarray(is_used.T)
+        plane_arguments = (
+            np.where(is_used_by_beam, ground_points[..., cycles], 0.0),
+            u[..., cycles],
+            error[:, cycles],
+            is_used_by_beam,
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level_plane = _fit_plane(*plane_arguments, np.zeros((2, cycles.size)), slope, relief)
+            plane = _fit_plane(*plane_arguments, level_plane.gradient, slope, relief)
+        n_used = is_used.sum(axis=1)
+        chi_square, degrees_of_freedom = (
+            np.where(n_used > 0, plane.chi_square, np.nan),
+            np.maximum(n_used - 1, 0),
+        )
+        scale = _covariance_scale(
+            chi_square, degrees_of_freedom, n_used - 1 - plane.n_fitted_slopes
+        )
+        off_plane_variance = n_used * np.where(scale > 1, plane.point_variance, 0.0)
+        return (
+            plane.height,
+            scale * (plane.variance + off_plane_variance),
+            chi_square,
+            degrees_of_freedom,
+        )
+
+    return _solve_screened(fit_cycles, np.isfinite(ground_points[0]).T, test_level, leading_shape)
+
+
+def ground_gradient(
+    *,
+    direction: np.ndarray,
+    range: np.ndarray,
+    standard_error: np.ndarray,
+    is_used: np.ndarray,
+    slope: float,
+    offset: np.ndarray | None = None,
+    relief: float = 0.0,
+) -> np.ndarray:
+    """Gradient (..., 2) of the plane through the ground points of some beams of each cycle.
+
+    Arguments are those of :func:`solve_altitude`, and `is_used` (..., b) the beams of its solution;
+    0 of a cycle that uses none.
+    """
+    ground_points, u, error, leading_shape = _ground_points(
+        direction, range, standard_error, offset
+    )
+    is_used_by_beam = np.ascontiguousarray(is_used.reshape(-1, is_used.shape[-1]).T)
+    plane_arguments, gradient = (
+        (np.where(is_used_by_beam, ground_points, 0.0), u, error, is_used_by_beam),
+        np.zeros((2, is_used_by_beam.shape[1])),
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for _ in (1, 2):
+            gradient = _fit_plane(*plane_arguments, gradient, slope, relief).gradient
+    gradient = np.where(is_used_by_beam.any(axis=0), gradient, 0.0)
+    return np.ascontiguousarray(gradient.T).reshape(*leading_shape, 2)
+
+
+def _ground_points(
+    direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
+    offset: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
+    """Ground points and directions (3, b, n), errors of range (b, n), and the shape n stands for.
+
+    Beams come first and cycles last: NumPy is fast along the last.
+    """
+    u, distance, error, leading_shape = _flatten_cycles(direction, distance, standard_error)
+    ground_points = u * distance[..., None]
+    if offset is not None:
+        offsets = np.broadcast_to(np.asarray(offset, float), (*leading_shape, *u.shape[1:]))
+        ground_points += offsets.reshape(u.shape)
+    ground_points, u, error = (
+        np.ascontiguousarray(values.T) for values in (ground_points, u, error)
+    )
+    return ground_points, u, error, leading_shape
+
+
+def _covariance_scale(
+    chi_square: np.ndarray, degrees_of_freedom: np.ndarray, residual_degrees: np.ndarray
+) -> np.ndarray:
+    """Return the factor on the covariance of solutions whose residuals exceed the stated errors.
+
+    Residuals that true errors reach with :data:`_CONTRADICTION_PROBABILITY` or less tell their size
+    themselves: it
+    is the chi-square over the degrees of freedom that the residuals have, at least one. The error
+    over a deviation so estimated follows Student's t, whose central 68 % the scaled deviation has.
+    """
+    n_residual_degrees = np.maximum(residual_degrees, 1)
+    scale = (
+        chi_square / n_residual_degrees * stdtrit(n_residual_degrees, _ONE_SIGMA_PROBABILITY) ** 2
+    )
+    return np.where(_residuals_contradict(chi_square, degrees_of_freedom), scale, 1.0)
+
+
+def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
+    """Return true where residuals contradict the stated errors."""
+    return (degrees_of_freedom > 0) & (
+        chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
+    )
+
+
+class _GroundPlane(NamedTuple):
+    """Plane through the ground points of n cycles; arrays (n,) unless said otherwise."""
+
+    height: np.ndarray
+    """Height of the platform above it [m]."""
+    variance: np.ndarray
+    """Of that height [m^2]."""
+    chi_square: np.ndarray
+    gradient: np.ndarray
+    """(2, n): along x and y."""
+    n_fitted_slopes: np.ndarray
+    """Slopes that the points tell, and not what is known beforehand: 0 to 2 of them."""
+    point_variance: np.ndarray
+    """Harmonic mean of the variances of the points' heights, over the number of points [m^2]."""
+
+
+def _fit_plane(
+    ground_points: np.ndarray, directions: np.ndarray, errors: np.ndarray, is_used: np.ndarray,
+    gradient: np.ndarray, slope: float, relief: float,
+) -> _GroundPlane:  # fmt: skip
+    """Planes through n cycles' ground points, by weighted least squares.
+
+    The plane is z = -altitude + gradient . (x, y) with the platform at the zero. An error of range
+    moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``, so the weights
+    need a gradient beforehand. Points and beams are (3, b, n), gradients (2, n).
+    """
+    n_beams, n_cycles = is_used.shape
+    incidence_sine = gradient[0] * directions[0] + gradient[1] * directions[1] - directions[2]
+    height_errors = errors * np.maximum(incidence_sine, GRAZING_SINE_MIN)
+    weights = np.where(is_used, 1.0 / np.hypot(height_errors, relief), 0.0)
+    weight_sum = np.asarray(
+        sum(weights**2)
+    )  # one beam after the other: NumPy's order would go by n
+    weight_fractions = weights**2 / np.where(weight_sum > 0, weight_sum, 1.0)
+    centroid = np.asarray(sum((ground_points * weight_fractions).swapaxes(0, 1)))
+    weighted_offsets = weights * (ground_points - centroid[:, None])
+    residual = np.zeros((n_cycles, n_beams + 2))
+    residual[:, :n_beams] = weighted_offsets[2].T
+    height, variance, gradient = -centroid[2], 1.0 / weight_sum, np.zeros((2, n_cycles))
+    n_fitted_slopes = np.zeros(n_cycles)
+    if slope > 0:
+        design = np.zeros((n_cycles, n_beams + 2, 2))
+        design[:, :n_beams] = weighted_offsets[:2].T
+        design[:, n_beams, 0] = design[:, n_beams + 1, 1] = 1.0 / slope
+        right_vectors, squared_singular_values, coordinates = _least_squares(design, residual)
+        right_vectors, squared_singular_values, coordinates = (
+            right_vectors.T,
+            squared_singular_values.T,
+            coordinates.T,
+        )  # cycles last
+        for k in range(2):
+            centroid_along = centroid[0] * right_vectors[k, 0] + centroid[1] * right_vectors[k, 1]
+            height = height + centroid_along * coordinates[k]
+            variance = variance + centroid_along**2 / squared_singular_values[k]
+            gradient = gradient + right_vectors[k] * coordinates[k]
+            n_fitted_slopes = n_fitted_slopes + 1.0 - 1.0 / (slope**2 * squared_singular_values[k])
+    chi_square = np.asarray(sum(residual.T**2))
+    return _GroundPlane(height, variance, chi_square, gradient, n_fitted_slopes, 1.0 / weight_sum)
+
+
+def _flatten_cycles(
+    direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Directions (n, b, 3), values and errors (n, b), and the shape that n stands for."""
+    u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
+    leading_shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape)
+    u = np.broadcast_to(u, (*leading_shape, 3)).reshape(-1, leading_shape[-1], 3)
+    value, error = (
+        np.broadcast_to(a, leading_shape).reshape(-1, leading_shape[-1]) for a in (value, error)
+    )
+    return u, value, error, leading_shape[:-1]
+
+
+def _least_squares(
+    design: np.ndarray, residual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right singular vectors (n, m, m), squares of singular values and coordinates (n, m).
+
+    The unknowns of problem i are ``turn[i] @ coordinate[i]``; `residual` (n, b) becomes what they
+    leave of itself by columns (n, b, m). Normal equations would square the condition number.
+    """
+    n, b, m = design.shape
+    padded_design = np.pad(design, ((0, 0), (0, max(m - b, 0)), (0, 0)))
+    left_vectors, singular_values, right_vectors = np.linalg.svd(padded_design, full_matrices=False)
+    coordinates = np.empty((n, m))
+    for k in range(m):
+        left_vector = left_vectors[:, :b, k]
+        projection = np.asarray(
+            sum((left_vector * residual).T)
+        )  # one beam after the other, as above
+        residual -= projection[:, None] * left_vector
+        coordinates[:, k] = projection / singular_values[:, k]
+    return right_vectors.mT, singular_values**2, coordinates
+
+
+def _solve_screened(
+    fit_cycles: Callable[[np.ndarray, np.ndarray], FitResult],
+    is_valid: np.ndarray,
+    test_level: float | None,
+    leading_shape: tuple[int, ...],
+) -> NavigationSolution:
+    """Solutions of n cycles of b beams, with a beam that contradicts the others left out.
+
+    A cycle is suspect where its chi-square is larger than it is with probability `test_level` when
+    all
+    beams are true. Then each beam is left out in turn: where exactly one such fit passes the same
+    test, that beam is false and that fit is the solution; else the solution is withheld. With one
+    degree of freedom every exclusion leaves an exact fit: a false alarm is noticed, never found.
+
+    `fit_cycles` takes the cycles' index (k,) and a mask of beams (k, b); its chi-square is nan
+    without a solution. `is_valid` (n, b) beams have returned; n stands for `leading_shape`.
+    """
+    is_used, n_beams = is_valid.copy(), is_valid.shape[1]
+    fitted = fit_cycles(np.arange(len(is_valid)), is_used)
+    value, covariance, chi_square, degrees_of_freedom = fitted
+    status = np.where(np.isnan(chi_square), STATUS_UNDETERMINED, STATUS_SOLVED).astype(np.int8)
+    if test_level is not None:
+        chi_square_max = np.concatenate([[np.inf], chdtri(np.arange(1, n_beams + 1), test_level)])
+        suspect_cycles = np.flatnonzero(chi_square > chi_square_max[degrees_of_freedom])
+        passes_without = np.zeros((suspect_cycles.size, n_beams), bool)
+        for beam in range(n_beams):
+            _, _, trial_chi_square, trial_degrees = fit_cycles(
+                suspect_cycles, is_used[suspect_cycles] & (np.arange(n_beams) != beam)
+            )
+            passes_without[:, beam] = trial_chi_square <= chi_square_max[trial_degrees]
+        has_one_false = passes_without.sum(axis=1) == 1
+        status[suspect_cycles] = np.where(has_one_false, STATUS_EXCLUDED, STATUS_WITHHELD)
+        corrected_cycles = suspect_cycles[has_one_false]
+        is_used[corrected_cycles, passes_without[has_one_false].argmax(axis=1)] = False
+        for all_values, corrected_values in zip(
+            fitted, fit_cycles(corrected_cycles, is_used[corrected_cycles]), strict=True
+        ):
+            all_values[corrected_cycles] = corrected_values
+    value[status > STATUS_EXCLUDED] = covariance[status > STATUS_EXCLUDED] = np.nan
+    return NavigationSolution(
+        *(a.reshape(leading_shape + a.shape[1:]) for a in (*fitted, is_used, status))
+    )
+
+
+def solve_navigation(
+    shot_arrays: ArraysByName,
+    point_arrays: ArraysByName,
+    *,
+    shots_per_cycle: int,
+    ground_slope: float,
+    test_level: float | None = None,
+    relief: float = 0.0,
+    pointing_jitter: float = 0.0,
+    error_floor: ErrorFloor = NO_ERROR_FLOOR,
+    motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
+) -> dict[str, np.ndarray]:
+    """Solve for the velocity and altitude of every cycle and draw.
+
+    `shot_arrays` and `point_arrays` are arrays of :data:`sweep.model.outputs.SHOT_VARIABLES` and
+    POINTS, cycle by cycle;
+    positions of points are used where the floor has an error of pointing. The ground's slope and
+    relief and the level are those of :func:`solve_altitude`, level None or 0 for no test.
+    `pointing_jitter` is the
+    standard deviation of each angle of the pointing [rad], and `error_floor` has those of the
+    instrument's other errors. `motion_priors` are those that the points' errors have. Numbers of
+    beams are 0 where there is no solution.
+    """
+    n, draws = point_arrays["flags"].shape[:2]
+    cycles = n // shots_per_cycle
+    sizes = {"cycle": cycles, "draw": draws, "xyz": 3, "xyz_again": 3}
+    results = {name: output.empty(sizes) for name, output in NAVIGATION_VARIABLES.items()}
+    step = max(1, BEAMS_PER_BATCH // max(1, shots_per_cycle * draws))
+    for first in range(0, cycles, step):
+        cycle_slice = slice(first, min(first + step, cycles))
+        shot_slice = slice(cycle_slice.start * shots_per_cycle, cycle_slice.stop * shots_per_cycle)
+        poses = Poses(*(shot_arrays[name][shot_slice] for name in _POSE_VARIABLES))
+        known_motion = ego_motion_of_beams(
+            poses.direction, poses.velocity, poses.direction_rate, poses.acceleration, motion_priors
+        )
+        solutions = _solve_cycles(
+            poses.by_cycle(shots_per_cycle),
+            _select_beams(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
+            {"test_level": test_level or None},
+            {"slope": ground_slope, "relief": relief},
+            pointing_jitter,
+            error_floor,
+        )
+        for quantity, spread_name, solution in solutions:
+            n_beams = np.where(solution.is_available, solution.is_used.sum(axis=-1), 0)
+            results[quantity][cycle_slice] = solution.value
+            results[f"{quantity}_{spread_name}"][cycle_slice] = solution.covariance
+            results[f"{quantity}_status"][cycle_slice] = solution.status
+            results[f"{quantity}_beams"][cycle_slice] = n_beams
+    return results
+
+
+_POSE_VARIABLES = (
+    "platform_position", "platform_velocity", "beam_direction", "beam_turning",
+    "platform_acceleration",
+)  # fmt: skip
+
+
+class Poses(NamedTuple):
+    """Motion of shots' beams as the instrument knows it: fields (..., 3), in the world's axes."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    direction: np.ndarray
+    direction_rate: np.ndarray
+    """Rate of change of the direction [1/s]."""
+    acceleration: np.ndarray
+
+    def by_cycle(self, beams_per_cycle: int) -> "Poses":
+        """Return poses (n / beams, beams, 3) of n shots."""
+        return Poses(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
+
+
+def _select_beams(
+    point_arrays: ArraysByName,
+    shot_slice: slice,
+    shots_per_cycle: int,
+    error_floor: ErrorFloor,
+    known_motion: EgoMotion,
+) -> dict[str, np.ndarray]:
+    """Values and errors of trusted points, (cycles, draws, each), nan without one; positions too.
+
+    The errors are without what all beams have in common, and without that of an unknown slip, which
+    is ``radial_velocity_slip_error`` of the velocity. ``delay`` is the time from the shot's start
+    to that of the range [s], and ``range_then`` the range at that time.
+    """
+    flags = point_arrays["flags"][shot_slice]
+    values_by_name: dict[str, np.ndarray] = {}
+    is_trusted = (flags != 0) & (flags & UNCONFIRMED_FLAG == 0)
+    for name, common_error in (
+        ("range", error_floor.clock),
+        ("radial_velocity", error_floor.velocity_scale_error),
+    ):
+        value, error = (
+            point_arrays[f"{name}_interpolated{suffix}"][shot_slice]
+            for suffix in ("", "_standard_error")
+        )
+        if common_error > 0:
+            error = np.sqrt(np.maximum(error**2 - (common_error * value) ** 2, 0.0))
+        per_slip = point_arrays[f"{name}_per_slip"][shot_slice]
+        slip_error = abs(per_slip) * known_motion.slip_standard_error(
+            point_arrays["range_interpolated"][shot_slice]
+        )
+        # The slip's error goes by the range, and so is known no better than the clock.
+        error_min = 2 * math.sqrt(error_floor.clock + _ROUNDING_ERROR) * slip_error
+        error = np.sqrt(np.maximum(error**2 - slip_error**2, error_min**2))
+        if name == "range":
+            range_at_delay = value - per_slip * known_motion.approach_speed_at(value)
+            values_by_name |= {"delay": per_slip, "range_then": range_at_delay}
+        else:
+            values_by_name |= {
+                "velocity_per_slip": per_slip,
+                "radial_velocity_slip_error": slip_error,
+            }
+        error = np.maximum(
+            error, _INTERPOLATION_ERROR_MIN * point_arrays[f"{name}_standard_error"][shot_slice]
+        )
+        is_trusted &= np.isfinite(value) & np.isfinite(error) & (error > 0)
+        values_by_name |= {name: value, f"{name}_standard_error": error}
+    first_return, has_none = is_trusted.argmax(axis=2)[..., None], ~is_trusted.any(axis=2)
+    beams = {}
+    if error_floor.pointing > 0:
+        selected = np.take_along_axis(
+            point_arrays["position"][shot_slice], first_return[..., None], axis=2
+        )[:, :, 0]
+        beams["position"] = selected.reshape(-1, shots_per_cycle, *selected.shape[1:]).swapaxes(
+            1, 2
+        )
+    for name, values in values_by_name.items():
+        selected = np.take_along_axis(values, first_return, axis=2)[..., 0]
+        selected[has_none] = np.nan
+        beams[name] = selected.reshape(-1, shots_per_cycle, selected.shape[1]).swapaxes(1, 2)
+    return beams
+
+
+def _solve_cycles(
+    poses: Poses, beams: dict[str, np.ndarray], test_arguments: dict, ground_arguments: dict,
+    pointing_jitter: float, error_floor: ErrorFloor,
+) -> list[tuple[str, str, NavigationSolution]]:  # fmt: skip
+    """Solutions of (cycles, draws) measurement cycles, with what they and their spread are."""
+    positions, velocities, direction, direction_rates, _ = poses
+    velocity_offset = np.einsum(
+        "cbi,cbi->cb", direction, velocities - velocities.mean(axis=1, keepdims=True)
+    )
+    beams = beams | {"radial_velocity": beams["radial_velocity"] - velocity_offset[:, None]}
+    if pointing_jitter > 0 or error_floor.pointing > 0:
+        offset = (positions - positions[:, :1])[:, None]
+        beams = beams | _add_pointing_errors(
+            direction, offset, beams, ground_arguments, pointing_jitter, error_floor.pointing
+        )
+    known_directions, delay = direction[:, None], beams["delay"][..., None]
+    if error_floor.pointing > 0:
+        known_directions = (beams["position"] - positions[:, None]) / beams["range"][..., None]
+    ground_points = ground_arguments | {
+        "direction": known_directions + delay * direction_rates[:, None],
+        "range": beams["range_then"],
+        "standard_error": beams["range_standard_error"],
+        "offset": (positions - positions[:, :1])[:, None] + delay * velocities[:, None],
+    }
+    altitude_solution = solve_altitude(**ground_points, **test_arguments)
+    is_used = altitude_solution.is_used & altitude_solution.is_available[..., None]
+    gradient = ground_gradient(**ground_points, is_used=is_used)
+    missing_slip = _slip_of_ground_gradient(poses, beams["range"], gradient)
+    unknown_slip = beams["radial_velocity_slip_error"]
+    if ground_arguments["relief"] == 0:
+        is_plane = altitude_solution.is_available & ~_residuals_contradict(
+            altitude_solution.chi_square, altitude_solution.degrees_of_freedom
+        )
+        unknown_slip = np.where(is_plane[..., None], 0.0, unknown_slip)
+    velocity_solution = solve_velocity(
+        direction=direction[:, None],
+        radial_velocity=beams["radial_velocity"] - beams["velocity_per_slip"] * missing_slip,
+        standard_error=np.hypot(beams["radial_velocity_standard_error"], unknown_slip),
+        **test_arguments,
+    )
+    if error_floor.velocity_scale_error > 0:
+        common_variance = (
+            error_floor.velocity_scale_error**2
+            * velocity_solution.value[..., None]
+            * velocity_solution.value[..., None, :]
+        )
+        velocity_solution = velocity_solution._replace(
+            covariance=velocity_solution.covariance + common_variance
+        )
+    if error_floor.clock > 0:
+        common_variance = (error_floor.clock * altitude_solution.value) ** 2
+        altitude_solution = altitude_solution._replace(
+            covariance=altitude_solution.covariance + common_variance
+        )
+    # The ground straight below is off the plane, too.
+    altitude_solution = altitude_solution._replace(
+        covariance=altitude_solution.covariance + ground_arguments["relief"] ** 2
+    )
+    return [
+        ("velocity", "covariance", velocity_solution),
+        ("altitude", "variance", altitude_solution),
+    ]
+
+
+def _slip_of_ground_gradient(poses: Poses, ranges: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Slip over a plane less that over level ground [m/s], (cycles, draws, each).
+
+    Ranges `ranges` (cycles, draws, each), gradients (cycles, draws, 2). With W = V + R d' and the
+    normal n of the plane it is W.z / d.z - W.n / d.n; 0 along beams that do not point down at both.
+    """
+    _, velocity, direction, direction_rates, _ = poses
+    d = [direction[:, None, :, k] for k in range(3)]
+    w = [velocity[:, None, :, k] + ranges * direction_rates[:, None, :, k] for k in range(3)]
+    x, y = gradient[..., :1], gradient[..., 1:]
+    plane_sine = d[2] - x * d[0] - y * d[1]
+    points_down = (d[2] < -DESCENT_SINE_MIN) & (plane_sine < -DESCENT_SINE_MIN)
+    slip = w[2] / np.where(points_down, d[2], -1.0)
+    slip = slip - (w[2] - x * w[0] - y * w[1]) / np.where(points_down, plane_sine, -1.0)
+    return np.where(points_down, slip, 0.0)
+
+
+def _add_pointing_errors(
+    direction: np.ndarray,
+    offset: np.ndarray,
+    beams: ArraysByName,
+    ground_arguments: dict,
+    pointing_jitter: float,
+    pointing: float,
+) -> dict[str, np.ndarray]:
+    """Add the pointing's error to standard errors (cycles, draws, each); velocities have it."""
+    closing_speed, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
+    first_velocity = solve_velocity(
+        direction=direction[:, None], radial_velocity=closing_speed, standard_error=error
+    ).value
+    along_beam = np.einsum("cbi,cdi->cdb", direction, first_velocity)
+    squared_across = np.sum(first_velocity**2, axis=2)[..., None] - along_beam**2
+    speed_across = np.sqrt(np.maximum(np.nan_to_num(squared_across), 0.0))
+    gradient = ground_gradient(
+        direction=direction[:, None],
+        range=beams["range"],
+        offset=offset,
+        standard_error=beams["range_standard_error"],
+        is_used=np.isfinite(beams["range"]),
+        **ground_arguments,
+    )
+    x, y = gradient[..., :1], gradient[..., 1:]
+    d = [direction[:, None, :, k] for k in range(3)]
+    plane_sine = d[2] - x * d[0] - y * d[1]  # d.n for the normal n = (-x, -y, 1)
+    incidence_tangent = np.sqrt(np.maximum(1 + x**2 + y**2 - plane_sine**2, 0.0)) / np.maximum(
+        -plane_sine, GRAZING_SINE_MIN
+    )
+    return {
+        "radial_velocity_standard_error": np.hypot(error, pointing_jitter * speed_across),
+        "range_standard_error": np.hypot(
+            beams["range_standard_error"],
+            np.hypot(pointing_jitter, pointing) * beams["range"] * incidence_tangent,
+        ),
+    }

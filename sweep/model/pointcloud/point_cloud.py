@@ -1,0 +1,266 @@
+"""Point clouds: what an instrument reports of a flight's eyepoints, shot by shot and draw by draw.
+
+Every point comes with its position in the world, its standard errors and the truth: surface, range
+and radial velocity of the beamlet that it has seen, and flags that say what it is.
+
+A shot that sees nothing has noise alone in its record: its false alarms are the largest of all bins
+that are counted, drawn like those of any other shot, from the same addresses. A shot sees the air
+once: all its draws, and its probabilities, have the scintillation of its own key. Results of a shot
+do not depend on the shots and draws that are computed with it.
+"""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from sweep.model.detection.detectors import FIXED_THRESHOLD
+from sweep.model.detection.estimators import DETECTOR_PREFIX
+from sweep.model.detection.marcum import at_least_one_probability
+from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.effects.effect import DrawAddresses, EffectContext
+from sweep.model.evaluation import prepare_ray_traced_shots
+from sweep.model.geometry.mesh import SurfaceMaterial
+from sweep.model.ground import BeamletTable
+from sweep.model.outputs import POINT_VARIABLES, SHOT_STATISTIC_VARIABLES
+from sweep.model.pointcloud.bin_groups import BinGroups, list_bin_groups
+from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion
+from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
+from sweep.model.pointcloud.leaked_peaks import (
+    LeakageBins,
+    find_groups_and_leakage_bins,
+    iter_leakage_bins,
+)
+from sweep.model.pointcloud.ray_error import estimate_ray_error
+from sweep.model.pointcloud.returns import Returns, draw_returns
+from sweep.model.pointcloud.spectra_returns import draw_spectra_returns
+from sweep.model.preparation import Parameters, Shots, parameters_as_arrays
+from sweep.model.sampling.noisy_spectra import SpectrumMethods
+from sweep.model.sampling.realisations import random_effects
+from sweep.model.sampling.samplers import SPECTRA_METHOD
+from sweep.model.unsupported_shot import UnsupportedShotError
+from sweep.model.waveform import STRONGEST_PEAK
+
+VALUES_PER_BATCH = 1 << 20
+"""Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
+
+_EMPTY_SHOT_RANGE = 1.0
+"""Range [m] of a shot that sees nothing. No light comes back from there."""
+
+
+def simulate_cloud(
+    eyepoints: Eyepoints,
+    *,
+    parameters: Parameters,
+    surfaces: Sequence[SurfaceMaterial],
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int = 1,
+    method: str = "probabilities",
+    methods: SpectrumMethods = SpectrumMethods(),  # noqa: B008  # a tuple
+    returns_max: int = 4,
+    effects: Collection[str] = DEFAULT_EFFECTS,
+    effect_flags: np.ndarray | None = None,
+    estimates_ray_error: bool = False,
+    motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
+) -> dict[str, np.ndarray]:
+    """Statistics and points of n shots, whether they see anything or not.
+
+    Arrays are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`, (n,), and
+    :data:`sweep.model.outputs.POINT_VARIABLES`, (n, draws, returns[, 3]). `keys` (n, 2) are random,
+    `method`
+    is ``probabilities``, ``noise`` or ``spectra``. `returns_max` is the number of groups that are
+    looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
+    `effects` and `effect_flags` are as of :func:`sweep.model.evaluation.prepare_ray_traced_shots`.
+    `estimates_ray_error` asks for
+    ``beamlets_error``, which needs powers that add and is else nan. ``surface``, ``true_range`` and
+    ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
+    error of a misread one shows. `motion_priors` are what the instrument knows beforehand of motion
+    that it does not measure; standard errors have it.
+    """
+    n_shots = len(eyepoints.time)
+    sizes = {"shot": n_shots, "draw": draws, "return_number": returns_max, "xyz": 3}
+    results = {
+        name: output.empty(sizes)
+        for name, output in (SHOT_STATISTIC_VARIABLES | POINT_VARIABLES).items()
+    }
+    step = max(1, VALUES_PER_BATCH // (12 * draws * returns_max + 12 * eyepoints.weight.size))
+    for first in range(0, n_shots, step):
+        shot_slice = slice(first, first + step)
+        part_eyepoints = eyepoints.select(shot_slice)
+        part_flags = None if effect_flags is None else effect_flags[shot_slice]
+        effect_arguments = effects, part_flags, keys[shot_slice]
+        try:
+            shots, beamlet_table, bin_groups, known_leakage_bins = _prepare_bin_groups(
+                part_eyepoints, parameters, surfaces, returns_max, effect_arguments
+            )
+        except UnsupportedShotError as error:
+            if error.point_index is None:
+                raise
+            time = float(part_eyepoints.time[error.point_index])
+            shot_index = first + error.point_index
+            raise UnsupportedShotError(
+                f"the shot at time {time:.6g} s: {error}", shot_index
+            ) from None
+        draw_arguments = {"first_draw": first_draw, "draws": draws}
+        if method == SPECTRA_METHOD:
+            if (
+                shots.reported_peaks == STRONGEST_PEAK
+                or parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) != FIXED_THRESHOLD
+            ):
+                # Probabilities are those of crossing the fixed threshold.
+                bin_groups = bin_groups._replace(
+                    pd=bin_groups.pd * np.nan, leakage=bin_groups.leakage * np.nan
+                )
+            part_returns = draw_spectra_returns(
+                shots,
+                bin_groups,
+                keys=keys[shot_slice],
+                parameters=parameters,
+                methods=methods,
+                motion=ego_motion(part_eyepoints, motion_priors),
+                **draw_arguments,
+            )
+        else:
+            part_returns = draw_returns(
+                shots,
+                bin_groups,
+                keys=keys[shot_slice],
+                method=method,
+                motion=ego_motion(part_eyepoints, motion_priors),
+                known_leakage_bins=known_leakage_bins,
+                **draw_arguments,
+            )
+        rays_error = np.full(shots.size, np.nan)
+        if estimates_ray_error:
+            rays_error = estimate_ray_error(
+                shots,
+                beamlet_table,
+                bin_groups.strongest_bin[:, :, 0],
+                bin_groups.magnitude[:, :, 0],
+            )
+        part_results = _statistics_before_draws(shots, bin_groups) | _cloud_points(
+            part_eyepoints, part_returns, shots.relative_range_offset.shape[1]
+        )
+        part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
+        part_results["beamlets"] = np.full(shots.size, part_eyepoints.weight.size)
+        for name, values in part_results.items():
+            results[name][shot_slice] = values
+    return results
+
+
+def _prepare_bin_groups(
+    eyepoints: Eyepoints,
+    parameters: Parameters,
+    surfaces: Sequence[SurfaceMaterial],
+    groups_max: int,
+    effect_arguments: tuple[Collection[str], np.ndarray | None, np.ndarray],
+) -> tuple[Shots, BeamletTable, BinGroups, list[tuple[np.ndarray, LeakageBins]] | None]:
+    """Return prepared shots, footprints, and groups in their spectra; no groups without a target.
+
+    And their leaked peaks, where these had to be listed and are few. `effect_arguments`: names of
+    effects, flags of each shot, and the shots' keys.
+    """
+    (effects, effect_flags, keys), has_target = effect_arguments, eyepoints.has_target
+    placed_eyepoints = eyepoints._replace(
+        range=np.where(has_target, eyepoints.range, _EMPTY_SHOT_RANGE),
+        radial_velocity=np.where(has_target, eyepoints.radial_velocity, 0.0),
+        acceleration=np.where(has_target, eyepoints.acceleration, 0.0),
+        approach_speed=np.where(has_target, eyepoints.approach_speed, 0.0),
+    )
+    shot_parameters, ground = parameters_and_ground_of_eyepoints(
+        placed_eyepoints, parameters, surfaces
+    )
+    shots = prepare_ray_traced_shots(shot_parameters, ground, effects, effect_flags)
+    context = EffectContext(
+        parameters_as_arrays(PARAMETER_DEFAULTS | dict(shot_parameters)), ground
+    )
+    for effect in random_effects(effects):
+        if effect.perturb_shots is not None:
+            shots = effect.perturb_shots(
+                shots, context, DrawAddresses(keys, np.zeros(shots.size, np.int64))
+            )
+    leaks_in_speckle = shots.segment_correlations is not None and bool(shots.includes_leakage)
+    known_leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None = None
+    finds_groups_with_leakage = (
+        leaks_in_speckle and shots.circulator_leak_amplitude is None and shots.search_band is None
+    )
+    if finds_groups_with_leakage:
+        bin_groups, known_leakage_bins = find_groups_and_leakage_bins(shots, groups_max)
+    else:
+        bin_groups = list_bin_groups(
+            shots, groups_max=groups_max, with_leakage=not leaks_in_speckle
+        )
+    if not has_target.all():
+        without_target = ~has_target
+        for bin_array in bin_groups[:3]:
+            bin_array[without_target] = -1
+        bin_groups.neighbour_magnitudes[without_target] = bin_groups.pd[without_target] = np.nan
+        bin_groups.n_exempt[without_target] = bin_groups.leakage[without_target] = 0.0
+    if leaks_in_speckle and not finds_groups_with_leakage:
+        known_leakage_bins = (
+            [] if shots.circulator_leak_amplitude is None else None
+        )  # a line has a great many bins
+        for indices, leakage_bins in iter_leakage_bins(
+            shots, bin_groups, np.flatnonzero(has_target)
+        ):
+            bin_groups.leakage[indices] = leakage_bins.mean_leakage()
+            if known_leakage_bins is not None:
+                known_leakage_bins.append((indices, leakage_bins))
+    return shots, ground.beamlets, bin_groups, known_leakage_bins
+
+
+def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
+    """Probabilities before any draw, (n,) each."""
+    pd_up, pd_doppler, pd_down = bin_groups.pd[:, :, 0].T
+    pd_both = shots.joint_detection_probability(
+        pd_up, pd_down, (bin_groups.magnitude[:, 0, 0], bin_groups.magnitude[:, 2, 0])
+    )
+    pfa_bin = np.exp(shots.looks.log_pfa(shots.threshold / shots.bin_noise_sigma))[:, None]
+    pfa_noise = at_least_one_probability(
+        pfa_bin, shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T[:, [0, 2]]
+    )
+    p_leakage = bin_groups.leakage[:, [0, 2]]
+    pfa = p_leakage + pfa_noise * (1 - p_leakage)
+    is_above_threshold = (bin_groups.strongest_bin[:, 0] >= 0) & (
+        bin_groups.magnitude[:, 0] >= shots.threshold[:, None]
+    )
+    return {
+        "pd_up": pd_up,
+        "pd_down": pd_down,
+        "pd_doppler": pd_doppler,
+        "pd_shot": pd_both,
+        "pfa_up": pfa[:, 0],
+        "pfa_down": pfa[:, 1],
+        "snr_up": shots.snr(bin_groups.magnitude[:, 0, 0]),
+        "surfaces_seen": is_above_threshold.sum(axis=1),
+    }
+
+
+def _cloud_points(
+    eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
+) -> dict[str, np.ndarray]:
+    """Points and their truth, (n, draws, returns[, 3]) each."""
+    has_beamlet = shot_returns.beamlet >= 0
+    shot = np.arange(len(has_beamlet))[:, None, None]
+    shot_and_beamlet = shot, np.maximum(shot_returns.beamlet, 0)
+    if n_lines < eyepoints.weight.size:  # the footprint is left out: its one line is the axis's
+        shot_and_beamlet = (
+            shot,
+            np.broadcast_to(eyepoints.reference_beamlet[:, None, None], has_beamlet.shape),
+        )
+    true_range = eyepoints.range[:, None, None] + eyepoints.offset[shot_and_beamlet]
+    true_velocity = (
+        eyepoints.radial_velocity[:, None, None] + eyepoints.velocity_offset[shot_and_beamlet]
+    )
+    displacement = shot_returns.range_interpolated[..., None] * eyepoints.direction[:, None, None]
+    reported = {
+        name: getattr(shot_returns, name) for name in POINT_VARIABLES if name in Returns._fields
+    }
+    return reported | {
+        "position": eyepoints.position[:, None, None] + displacement,
+        "radial_velocity_compensated": shot_returns.radial_velocity_interpolated
+        - eyepoints.platform_radial_velocity[:, None, None],
+        "surface": np.where(has_beamlet, eyepoints.surface[shot_and_beamlet], -1),
+        "true_range": np.where(has_beamlet, true_range, np.nan),
+        "true_radial_velocity": np.where(has_beamlet, true_velocity, np.nan),
+    }

@@ -1,0 +1,2226 @@
+"""Returns of footprints with several surfaces, draw by draw.
+
+:func:`draw_returns` draws which groups of bins (:mod:`sweep.model.pointcloud.bin_groups`) are
+detected, adds false
+peaks, pairs the peaks (:mod:`sweep.model.pointcloud.pairing`) and reports range and radial
+velocity, by whole bins and interpolated between them.
+
+The two ways to draw are those of :mod:`sweep.model.sampling.draws`, with the same random numbers:
+the strongest group is detected in the very draws that are counted there, and so are false alarms of
+noise.
+Against ``probabilities`` peaks stay in their noiseless bins, and the interpolated position has a
+normal error of the standard error that is reported. ``noise`` is added to ``peak_bin`` and its two
+neighbours, so that another may be the largest, or to all bins of a group's echo.
+
+Ranges and velocities are those at the shot's start, the instant of the truth. Range walk moves the
+interpolated range by v_r (T_w + 2 t_0), and motion between segments moves both. The velocity that
+is measured with them corrects both. Nothing in the beats tells of the acceleration, or of ground
+that slides under the beam: the instrument's own motion, where it is known, corrects the points for
+them as far as it can (:mod:`sweep.model.pointcloud.ego_motion`). Of segments with slopes other than
+1, 0 and
+-1 a return is the fit of all its peaks.
+
+Echoes in developed speckle have the amplitudes that the lines of their footprint make in a draw, in
+the bins about a group's strongest of all three segments
+(:mod:`sweep.model.sampling.speckle_lines`). Their
+places wander with it. By either method noise is added, and the peak is what the bins then show. Of
+``noise`` the bins detect by themselves; against ``probabilities`` the strongest bin's amplitude is
+held against the level that it exceeds with the group's probability. All three segments are so drawn
+together, by the same law as grids' closed forms. Draws of grids have other speckle.
+
+Standard errors are those of noise and, in quadrature, what the lines in a group make by their
+spread (:func:`interpolation.spread_error`), or of echoes in developed speckle by their speckle
+(:func:`sweep.model.sampling.speckle_lines.position_error_moments`). That moves the beats of both
+chirps with the range where both see the same speckle, and velocities little.
+
+Of noise alone a segment and draw has one false peak at most, the largest, in any of the bins
+searched outside the listed groups, uniformly. False peaks of leaked signal lie in their own bins,
+the strongest of them where there are many: by their noise, or against probabilities by the bins'
+own (:mod:`sweep.model.pointcloud.leaked_peaks`). Groups beyond the ``most`` strongest are neither
+detected nor false alarms.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+from sweep.model import waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.echo_detection import (
+    bin_threshold_at,
+    echo_bounds,
+    fill_pedestal_ratios,
+    is_real_bin,
+)
+from sweep.model.detection.estimators import RangeVelocityDeviation, range_velocity_deviation
+from sweep.model.detection.hoyt import hoyt_tails, pseudo_variance_ratio_at
+from sweep.model.detection.looks import COMBINE_BINARY
+from sweep.model.detection.marcum import at_least_one_probability
+from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
+from sweep.model.detection.sub_bin_interpolation import (
+    drift_error,
+    estimate_sub_bin_offset,
+    interpolator,
+    late_echo_correction,
+    line_spread_error,
+    sub_bin_standard_error,
+)
+from sweep.model.evaluation import fit_peaks
+from sweep.model.pointcloud.bin_groups import FIRST_ROW, LAST_ROW, STRONGEST_ROW, BinGroups
+from sweep.model.pointcloud.ego_motion import EgoMotion
+from sweep.model.pointcloud.leaked_peaks import (
+    LeakageBins,
+    bins_without_noise_peaks,
+    draw_leaked_peaks,
+    find_leaking_points,
+    insert_peak,
+    iter_leakage_bins,
+)
+from sweep.model.pointcloud.pairing import (
+    CONFIRMATION_TOLERANCE_BINS,
+    FALSE_PEAK,
+    MISREAD_FLAG,
+    NO_PEAK,
+    TRUE_FLAG,
+    UNCONFIRMED_FLAG,
+    judge_return,
+    pair_peaks,
+)
+from sweep.model.preparation import Shots
+from sweep.model.sampling import philox
+from sweep.model.sampling.draws import (
+    ECHO_NOISE_FIRST_INDEX,
+    NoiselessSpectra,
+    down_pd_given_up,
+    draw_bin_noise,
+    draw_bin_noise_by_root,
+    iter_noiseless_spectra,
+    largest_noise_magnitude,
+    make_echo_noise_filter,
+    noise_covariance_root,
+    speckle_amplitudes,
+    threshold_and_line_noise_ratios,
+)
+from sweep.model.sampling.speckle_lines import (
+    CHIRP_PAIRS,
+    FACTORED_BINS_MAX,
+    LOOK_DRAW_STRIDE,
+    SEGMENT_PAIRS_AND_SELF,
+    SpeckleLineGrid,
+    SpecklePeaks,
+    draw_bin_amplitudes,
+    draw_factored_amplitudes,
+    factor_bin_covariance,
+    folding_signs,
+    interpolate_transform,
+    mean_bin_powers,
+    position_error_moments,
+    speckle_line_grid,
+)
+from sweep.model.spectrum.search_restriction import as_columns, beamlet_line_positions
+
+BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
+"""Fields of a peak: bin; position between bins and its standard error by noise [bins]; |X| / sigma.
+"""
+
+
+DRAWN_INDEPENDENT_BINS_MAX = 32.0
+"""Largest number of independent bins of an echo in developed speckle that are drawn."""
+
+CORRELATED_LOOKS_MAX = 32
+"""Number of looks up to which speckle that they share in part is drawn; of more, one amplitude is
+held against the probability of detection."""
+
+
+class Returns(NamedTuple):
+    """Up to ``most`` returns of each shot and draw, each (n, draws, most); nan where there is none.
+
+    Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, a false
+    up peak last. Units are those of :data:`sweep.model.outputs.POINT_VARIABLES`. ``_interpolated``
+    goes with
+    peaks placed between bins; their errors are those of noise, with what the spread of the groups'
+    own lines adds. No suffix goes with whole bins; rounding (1/sqrt(12) bin) adds to their errors.
+    """
+
+    range: np.ndarray
+    range_interpolated: np.ndarray
+    radial_velocity: np.ndarray
+    radial_velocity_interpolated: np.ndarray
+    range_standard_error: np.ndarray
+    range_interpolated_standard_error: np.ndarray
+    radial_velocity_standard_error: np.ndarray
+    radial_velocity_interpolated_standard_error: np.ndarray
+    snr: np.ndarray
+    """Power of the weaker of up and down peak as found over the mean noise power of a bin."""
+    pd: np.ndarray
+    """Probability that up and down peak are both detected; nan with a false peak."""
+    flags: np.ndarray
+    """uint8: :data:`sweep.model.pointcloud.pairing.FLAG_BITS`; 0 where there is no return."""
+    beamlet: np.ndarray
+    """int32: beamlet that a true or misread return has seen, -1 otherwise."""
+    group: np.ndarray
+    """(n, draws, most, 3) int8: number of the up, Doppler and down group; -1 none or false."""
+    range_per_slip: np.ndarray
+    """Change of the interpolated range [m] for 1 m/s of slip."""
+    radial_velocity_per_slip: np.ndarray
+    """Change of the interpolated radial velocity [m/s] for 1 m/s of slip."""
+
+
+def draw_returns(
+    shots: Shots,
+    bin_groups: BinGroups,
+    *,
+    keys: np.ndarray,
+    first_draw: int = 0,
+    draws: int = 1,
+    method: str = "probabilities",
+    motion: EgoMotion | None = None,
+    known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None = None,
+) -> Returns:
+    """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
+
+    ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
+    ``motion`` is what the instrument knows of its own, by which it corrects range and velocity.
+    ``known_leakage_bins`` are the :func:`iter_leakage_bins` of all points that may leak, if they
+    are known already.
+    """
+    in_noise = method == "noise"
+    inputs, drawn_peaks = (
+        make_draw_inputs(shots, bin_groups, motion),
+        DrawnPeaks.empty(bin_groups, draws),
+    )
+    pfa_bin = np.exp(shots.looks.log_pfa(inputs.noise_and_threshold[:, 1:2]))
+    config, interpolation = (
+        DrawConfig.from_shots(shots, first_draw, in_noise),
+        interpolator(shots.window, shots.fft_size),
+    )
+    window_bins = int(2 * inputs.line_grid.peak_search_bins.max(initial=0) + 1)
+    noise_roots: dict[int, np.ndarray] = {}
+    for indices, spectra, part_leakage_bins in _iter_spectra(
+        shots, bin_groups, in_noise, known_leakage_bins
+    ):
+        part_inputs = inputs.select(indices)
+        part_inputs = part_inputs._replace(
+            pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
+        )
+        part_peaks = DrawnPeaks(*(column[indices] for column in drawn_peaks))
+        filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
+        n_noise_bins = filter_rule[0].shape[0]
+        if n_noise_bins not in noise_roots:
+            noise_roots[n_noise_bins] = noise_covariance_root(filter_rule)
+        part_config = config._replace(
+            noise_filter=filter_rule, noise_root=noise_roots[n_noise_bins]
+        )
+        if (
+            shots.real_fft_size
+            and shots.segment_correlations is not None
+            and (shots.speckle_table.ratio_row > 0).any()
+        ):
+            noise_ratio = noise_pseudo_variance_ratio(shots.window, shots.fft_size)
+            n_near_bins = 1 + int(
+                np.flatnonzero(np.abs(noise_ratio) > _CIRCULAR_PSEUDO_VARIANCE_MAX)[-1]
+            )
+            n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
+            end_filter = (
+                *noise_filter(shots.window, shots.fft_size, n_filter_bins),
+                shots.real_fft_size,
+            )
+            part_config = part_config._replace(
+                end_noise_filter=end_filter,
+                noise_pseudo_variance_ratio=np.ascontiguousarray(noise_ratio[:n_near_bins]),
+            )
+        n_filter_bins = max(
+            window_bins,
+            part_config.end_noise_filter[0].shape[0],
+            int(spectra.n_bins.max(initial=0)),
+        )
+        workspace = DrawWorkspace.allocate(n_filter_bins, bin_groups.strongest_bin.shape[2])
+        _draw_points(
+            keys[indices],
+            part_config,
+            part_inputs,
+            spectra,
+            part_leakage_bins,
+            interpolation,
+            workspace,
+            part_peaks,
+        )
+        for column, values in zip(drawn_peaks, part_peaks, strict=True):
+            column[indices] = values
+    return measure_returns(shots, inputs, drawn_peaks, motion)
+
+
+_CIRCULAR_PSEUDO_VARIANCE_MAX = 1e-3
+"""Pseudo-variance of a bin's noise over its power below which its quadratures are alike."""
+
+
+def _iter_spectra(
+    shots: Shots,
+    bin_groups: BinGroups,
+    in_noise: bool,
+    known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None,
+) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
+    """Yield some points at a time, with their spectra and the bins of their leaked signal."""
+    if in_noise:
+        for indices, spectra in iter_noiseless_spectra(shots):
+            yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
+        return
+    n_noise_bins = np.nan_to_num(shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T)
+    leaking_indices = find_leaking_points(shots, bin_groups)
+    leakage_bins_by_part: Iterable[tuple[np.ndarray, LeakageBins]] = iter_leakage_bins(
+        shots, bin_groups, leaking_indices
+    )
+    if known_leakage_bins is not None:
+        leakage_bins_by_part = (
+            (indices[is_leaking], leakage_bins.select(is_leaking))
+            for indices, leakage_bins in known_leakage_bins
+            if (is_leaking := np.isin(indices, leaking_indices)).any()
+        )
+    for indices, leakage_bins in leakage_bins_by_part:
+        yield (
+            indices,
+            NoiselessSpectra.empty(indices.size)._replace(n_noise_bins=n_noise_bins[indices]),
+            leakage_bins,
+        )
+    other_indices = np.setdiff1d(np.arange(shots.size), leaking_indices)
+    empty_spectra = NoiselessSpectra.empty(other_indices.size)._replace(
+        n_noise_bins=n_noise_bins[other_indices]
+    )
+    yield other_indices, empty_spectra, LeakageBins.empty(other_indices.size)
+
+
+class DrawConfig(NamedTuple):
+    """Way in which draws are taken."""
+
+    first_draw: int
+    in_noise: bool
+    adds_powers: bool
+    """Lines add as powers."""
+    has_doppler: bool
+    """There is a Doppler segment."""
+    nyquist_bin: int
+    """N/2."""
+    down_beat_sign: float
+    """Of a complex record, of bins -N/2 .. N/2 - 1: 1 where the down beat rises against the up beat
+    as the range does, else -1. 0 of a real one, of bins 1 .. N/2."""
+    two_beat_reading: int
+    """Reading of up and down peak without a Doppler segment."""
+    real_fft_size: int
+    """N where noise at DC and Nyquist is real, else 0."""
+    lobe_half_width: int
+    """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
+    noise_filter: tuple[np.ndarray, np.ndarray, int]
+    """:func:`sweep.model.sampling.draws.make_echo_noise_filter`"""
+    noise_root: np.ndarray
+    """:func:`sweep.model.sampling.draws.noise_covariance_root` of it."""
+    end_noise_filter: tuple[np.ndarray, np.ndarray, int]
+    """Filter likewise of bins from DC or Nyquist on; of no bins where no echo in developed speckle
+    lies near."""
+    noise_pseudo_variance_ratio: np.ndarray
+    """(bins,): pseudo-variance ratio of the noise, from DC or Nyquist on, as far
+    as the noise's quadratures differ; none where no echo in developed speckle lies near."""
+    n_looks: int
+    """Records whose powers are averaged."""
+    has_independent_speckle: bool
+    """Each has its own speckle, or a mixture of its own."""
+    votes_needed: int
+    """Of them that have to detect, 0 where their mean power does; -1 where they are held against
+    the probability, as more than MIXED_LOOKS_MAX share their speckle in part."""
+
+    @classmethod
+    def from_shots(cls, shots: Shots, first_draw: int, in_noise: bool) -> "DrawConfig":
+        """Draw some shots from a draw on."""
+        two_beat_reading = (
+            waveform.FAST_READING
+            if shots.two_beat_assumption == waveform.FAST_TARGET
+            else waveform.FAR_READING
+        )
+        down_beat_sign = 0.0
+        if shots.complex_record:
+            two_beat_reading, down_beat_sign = (
+                waveform.SIGNED_READING,
+                math.copysign(1.0, 1.0 - shots.chirp_slopes[2]),
+            )
+        votes = shots.looks.votes if shots.looks.combine == COMBINE_BINARY else 0
+        if shots.look_speckle is not None and shots.looks.number > CORRELATED_LOOKS_MAX:
+            votes = -1
+        return cls(
+            int(first_draw),
+            in_noise,
+            shots.adds_powers,
+            bool(shots.has_segment[1]),
+            shots.fft_size // 2,
+            down_beat_sign,
+            two_beat_reading,
+            shots.real_fft_size,
+            shots.detection_rule[1],
+            make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
+            np.zeros((0, 0)),
+            make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
+            np.empty(0),
+            shots.looks.number if shots.looks.is_noncoherent else 1,
+            shots.looks.has_independent_speckle or (shots.look_speckle is not None and votes >= 0),
+            votes,
+        )
+
+
+class DrawInputs(NamedTuple):
+    """Knowledge of n points, by segment, before any draw."""
+
+    group_bins: np.ndarray
+    """(n, 3, 3, most) int64: BIN, FIRST and LAST of the groups; -1 for none."""
+    pd: np.ndarray
+    """(n, 3, most)"""
+    group_magnitudes: np.ndarray
+    """(n, 3, most, 3): of the strongest bin and its neighbours [V]."""
+    line_deviation_bins: np.ndarray
+    """(n, 3, most): standard deviation [bins] of the lines in a group, weighted by power."""
+    line_positions: np.ndarray
+    """(n, 3, beamlets): place of each beamlet's line [bins, 0..N/2]; with signs, as near to the
+    strongest group as whole FFT lengths bring it."""
+    beamlet_amplitude: np.ndarray
+    """(n, beamlets)"""
+    noise_and_threshold: np.ndarray
+    """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
+    bin_threshold_table: np.ndarray
+    """(n, 7): of :class:`sweep.model.detection.echo_detection.BinThreshold` [V]."""
+    pfa_noise: np.ndarray
+    """(n, 3): probability of a false alarm by noise alone."""
+    doppler_prediction: np.ndarray
+    """(n, 3): as of :func:`sweep.model.pointcloud.pairing.find_confirming_peak`."""
+    down_pd_given_up: np.ndarray
+    """(n, 2, most): probability of a group in the down segment, where the up segment's of the same
+    number is missed, or detected."""
+    searched_range: np.ndarray
+    """(n, 3, 2) int64: first and last of the bins that false peaks may lie in."""
+    line_grid: SpeckleLineGrid
+    """Lines of footprints in developed speckle, of n points; or of none."""
+    line_centre: np.ndarray
+    """(n, 3, most): middle of the lines in a group [bins]."""
+    echo_fraction: np.ndarray
+    """(n, 3, most): share of the echo in the mean power by which a group is detected."""
+    wander_deviation: np.ndarray
+    """(n, 3, most): standard deviation of its place by speckle [bins], at |X| of one sigma; 0
+    without speckle."""
+    n_independent_bins: np.ndarray
+    """(n, 3, most): number of independent bins as which a group in developed speckle counts."""
+    cholesky_factors: np.ndarray
+    """(n, 6): Cholesky factors of the segments' correlation, 0 without speckle."""
+    look_covariance_root: np.ndarray
+    """(n, 3, looks, sets) complex: speckles of the looks by independent ones, where looks share
+    them in part; of no sets otherwise."""
+
+    def select(self, indices: np.ndarray) -> "DrawInputs":
+        """Knowledge of some points by their numbers."""
+        return DrawInputs(
+            *(v.select(indices) if isinstance(v, SpeckleLineGrid) else v[indices] for v in self)  # type: ignore[arg-type]
+        )
+
+
+class DrawWorkspace(NamedTuple):
+    """Arrays that kernels write to within a draw, made once for all draws."""
+
+    noise_bins: np.ndarray
+    """(4, bins + TAPS): noise of an echo's bins, and what it is made of."""
+    bin_power: np.ndarray
+    """(bins,): power of an echo's bins over sigma^2."""
+    pedestal_power: np.ndarray
+    """(bins,): power of the pedestal in an echo's bins, over that of noise."""
+    all_echo: np.ndarray
+    """(bins,) bool: true."""
+    false_bins: np.ndarray
+    """(most + 1,) int64: bins of a segment's false peaks."""
+    false_ratios: np.ndarray
+    """(most + 1,): their |X| / sigma."""
+    peak_positions: np.ndarray
+    """(3,): positions of a return's peaks [bins]."""
+
+    @classmethod
+    def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
+        """Make room for echoes of so many bins, and for ``groups_max`` groups of a segment."""
+        return cls(
+            np.empty((4, n_bins + NOISE_FILTER_TAPS)),
+            np.empty(n_bins),
+            np.empty(n_bins),
+            np.ones(n_bins, np.bool_),
+            np.empty(groups_max + 1, np.int64),
+            np.empty(groups_max + 1),
+            np.empty(3),
+        )
+
+
+class DrawnPeaks(NamedTuple):
+    """Results of the draws of n points."""
+
+    peaks: np.ndarray
+    """(n, draws, most, 3, 4): up, Doppler and down peak of each return; nan for none."""
+    reading: np.ndarray
+    """(n, draws, most) int64: reading of the default slopes; -1 where there is no return."""
+    group: np.ndarray
+    """(n, draws, most, 3) int8: group of the up, Doppler and down peak, FALSE or ABSENT."""
+    flags: np.ndarray
+    beamlet: np.ndarray
+
+    @classmethod
+    def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
+        """No returns of shots with these groups."""
+        n, _, groups_max = bin_groups.strongest_bin.shape
+        return cls(
+            np.full((n, draws, groups_max, 3, 4), np.nan),
+            np.full((n, draws, groups_max), -1),
+            np.full((n, draws, groups_max, 3), NO_PEAK, np.int8),
+            np.zeros((n, draws, groups_max), np.uint8),
+            np.full((n, draws, groups_max), -1, np.int32),
+        )
+
+
+def make_draw_inputs(
+    shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
+) -> DrawInputs:
+    """Return what is known of shots and their groups before any draw.
+
+    ``motion`` is as of :func:`draw_returns`.
+    """
+    line_positions, beamlet_amplitude = (
+        beamlet_line_positions(shots),
+        shots.relative_amplitude[shots.footprint_row],
+    )
+    if shots.complex_record:
+        apart = (line_positions - bin_groups.strongest_bin[:, :, :1]) / shots.fft_size
+        line_positions = line_positions - shots.fft_size * np.floor(apart + 0.5)
+    group_bins = np.stack(
+        [bin_groups.strongest_bin, bin_groups.first_bin, bin_groups.last_bin], axis=2
+    )
+    apart = line_positions[:, :, None] - bin_groups.strongest_bin[..., None]
+    is_in_group = (line_positions[:, :, None] >= bin_groups.first_bin[..., None] - 1) & (
+        line_positions[:, :, None] <= bin_groups.last_bin[..., None] + 1
+    )
+    weight = np.where(is_in_group, beamlet_amplitude[:, None, None] ** 2, 0.0)
+    total = weight.sum(axis=-1)
+    total[total == 0] = 1.0
+    pd_up, pd_down = bin_groups.pd[:, 0], bin_groups.pd[:, 2]
+    pd_both = shots.joint_detection_probability(
+        pd_up.T, pd_down.T, (bin_groups.magnitude[:, 0].T, bin_groups.magnitude[:, 2].T)
+    ).T
+    down_pd = down_pd_given_up(pd_up, pd_down, pd_both)
+    mean_offset = (weight * apart).sum(axis=-1) / total
+    mean_square = (weight * apart**2).sum(axis=-1) / total
+    line_deviation = np.sqrt(np.maximum(mean_square - mean_offset**2, 0.0))
+    if shots.segment_correlations is not None:  # drawn lines have it
+        line_deviation *= 0.0
+    return DrawInputs(
+        group_bins,
+        bin_groups.pd,
+        bin_groups.neighbour_magnitudes,
+        line_deviation,
+        line_positions,
+        beamlet_amplitude,
+        np.stack([shots.bin_noise_sigma, *threshold_and_line_noise_ratios(shots)], axis=1),
+        np.ascontiguousarray(shots.bin_threshold_table.T),
+        np.zeros(bin_groups.leakage.shape),
+        np.stack(
+            [np.broadcast_to(part, shots.size) for part in _doppler_prediction(shots, motion)],
+            axis=1,
+        ),
+        np.ascontiguousarray(np.moveaxis(down_pd, 0, 1)),
+        _searched_ranges(shots),
+        speckle_line_grid(shots),
+        np.where(bin_groups.strongest_bin < 0, np.nan, bin_groups.strongest_bin + mean_offset),
+        *_speckle_draw_inputs(shots, bin_groups),
+        _segment_cholesky_factors(shots),
+        _look_covariance_roots(shots),
+    )
+
+
+def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
+    """Return what mixes the speckle of the three segments, as of Known."""
+    if shots.segment_correlations is None:
+        return np.zeros((shots.size, 6))
+    cholesky_factors = np.broadcast_to(
+        shots.segment_correlations.cholesky_factors(), (6, shots.size)
+    )
+    return np.ascontiguousarray(cholesky_factors.T)
+
+
+def _look_covariance_roots(shots: Shots) -> np.ndarray:
+    """Return what mixes the speckle of looks, as of Known."""
+    n_looks = shots.looks.number
+    if shots.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
+        return np.zeros((shots.size, 3, 1, 0), complex)
+    return np.ascontiguousarray(np.moveaxis(shots.look_speckle.covariance_roots(), 0, 1))
+
+
+def _n_independent_bins(
+    shots: Shots, bin_groups: BinGroups, has_noncircular_bins: np.ndarray
+) -> np.ndarray:
+    """Return the number of independent bins as which each group counts, (n, 3, most).
+
+    That of :meth:`sweep.model.preparation.Shots.joint_detection_probability` for the chirps; 1 near
+    DC and Nyquist.
+    """
+    n_independent = np.ones(bin_groups.pd.shape)
+    if shots.detection == "peak_bin":
+        return n_independent
+    for segments in ((0, 2), (1,)):
+        pd_by_segment = tuple(bin_groups.pd[:, s].T for s in segments)
+        magnitudes_by_segment = tuple(bin_groups.magnitude[:, s].T for s in segments)
+        n_equivalent = np.asarray(
+            shots.detection_equivalent_bins(pd_by_segment, magnitudes_by_segment)
+        ).T
+        for s in segments:
+            n_independent[:, s] = n_equivalent
+    return np.where(
+        has_noncircular_bins, 1.0, np.clip(n_independent, 1.0, DRAWN_INDEPENDENT_BINS_MAX)
+    )
+
+
+def _speckle_draw_inputs(
+    shots: Shots, bin_groups: BinGroups
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share of the echo in the power that detects a group, its wander, and number, as of Known."""
+    noise_sigma, line_sigma, threshold = (
+        np.broadcast_to(v, shots.size)[:, None, None]
+        for v in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
+    )
+    if shots.line_gradients is None:
+        return (
+            np.zeros(bin_groups.pd.shape),
+            np.zeros(bin_groups.pd.shape),
+            np.ones(bin_groups.pd.shape),
+        )
+    has_noncircular_bins = (shots.speckle_table.ratio_row.T > 0)[:, :, None] & (
+        shots.real_fft_size > 0
+    )
+    n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # As if one bin were detected as often: fading_together has the same share.
+        single_bin_pd = -np.expm1(np.log1p(-bin_groups.pd) / n_independent)
+        echo_fraction = (
+            1
+            + np.log(np.where(n_independent > 1, single_bin_pd, bin_groups.pd))
+            * 2
+            * (line_sigma / threshold) ** 2
+        )
+        signal_power = np.square(bin_groups.magnitude / line_sigma)
+        echo_fraction = np.where(
+            has_noncircular_bins, signal_power / (2 + signal_power), echo_fraction
+        )
+    line_deviation = np.sqrt((shots.line_gradients.line_shift**2).sum(axis=-1))
+    n_looks = (
+        shots.looks.number
+        if shots.looks.is_noncoherent and shots.looks.has_independent_speckle
+        else 1
+    )
+    wander_deviation = (
+        line_deviation[..., None] * bin_groups.magnitude / noise_sigma / math.sqrt(2 * n_looks)
+    )
+    return (
+        np.clip(np.nan_to_num(echo_fraction), 0.0, 1.0),
+        np.nan_to_num(wander_deviation),
+        n_independent,
+    )
+
+
+def _doppler_prediction(
+    shots: Shots, motion: EgoMotion | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share of the up and of the down beat in the Doppler segment's, which these two tell.
+
+    And the bins by which that is off for the motion that the instrument knows.
+    """
+    _, doppler, down = shots.chirp_slopes
+    up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.carriers)
+    determinant = at_down - down * up_carrier
+    up_share = (doppler * at_down - down * at_doppler) / determinant
+    down_share = (at_doppler - doppler * up_carrier) / determinant
+    if motion is None:
+        return up_share, down_share, np.zeros(())
+    known_motion = (motion.acceleration, motion.slip_at(shots.range))
+    mismatch = sum(
+        abs((up_share * beats[0] + down_share * beats[2] - beats[1]) * moved)
+        for beats, moved in zip(_beat_change_by_motion(shots), known_motion, strict=True)
+    )
+    return up_share, down_share, np.asarray(mismatch * shots.fft_size / shots.sample_rate)
+
+
+def _searched_ranges(shots: Shots) -> np.ndarray:
+    """First and last bin searched for alarms, as of :class:`DrawInputs`.
+
+    Of a complex record 0..N - 1. Of a real one those whose noise is circular, which are all but a
+    few next to DC and Nyquist; 1..N/2 where noise is taken to be so in all.
+    """
+    first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
+    last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
+    bounds = np.empty((shots.size, 3, 2), np.int64)
+    bounds[:] = (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
+    if shots.search_band is not None:
+        first, number = shots.search_band[:, 0].T, shots.search_band[:, 1].T
+        if shots.complex_record:
+            bounds[..., 0], bounds[..., 1] = first, first + number - 1
+        else:
+            bounds[..., 0] = np.maximum(first, first_searched)
+            bounds[..., 1] = np.minimum(first + number - 1, nyquist_bin - first_searched)
+    return bounds
+
+
+class Measurements(NamedTuple):
+    """Range [m] and radial velocity [m/s] of returns by WHOLE and FINE peaks, (n, draws, most, 2).
+
+    And their standard errors by noise, and what half a bin of the chirps is worth, (n, 1, 1).
+    """
+
+    range: np.ndarray
+    radial_velocity: np.ndarray
+    range_error: np.ndarray
+    velocity_error: np.ndarray
+    range_per_half_bin: np.ndarray
+    velocity_per_half_bin: np.ndarray
+    range_bias: np.ndarray | float
+    """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
+
+
+def measure_returns(
+    shots: Shots,
+    inputs: DrawInputs,
+    drawn_peaks: DrawnPeaks,
+    motion: EgoMotion | None = None,
+    *,
+    from_three_bins: bool = True,
+) -> Returns:
+    """Compute returns from pairs of peaks; flag those that misread their common beamlet.
+
+    ``motion`` is as of :func:`draw_returns`. ``from_three_bins``: places between bins are those of
+    :mod:`sweep.model.detection.sub_bin_interpolation`, and not another estimator's.
+    """
+    uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
+    drawn_peaks = _add_drift_errors(shots, drawn_peaks, motion)
+    measure = _measure_by_fit if uses_fit else _measure_by_reading
+    if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise
+        drawn_peaks = _correct_late_echoes(shots, drawn_peaks, measure(shots, drawn_peaks, None))
+    wander_covariance = _wander_covariance(shots, inputs, drawn_peaks)
+    if wander_covariance is not None:
+        peaks = drawn_peaks.peaks.copy()
+        wander_variance = np.diagonal(wander_covariance, axis1=-2, axis2=-1)
+        peaks[..., ERROR_COLUMN] = np.sqrt(peaks[..., ERROR_COLUMN] ** 2 + wander_variance)
+        drawn_peaks = drawn_peaks._replace(peaks=peaks)
+    measurements = measure(shots, drawn_peaks, wander_covariance)
+    point_index, group = np.arange(shots.size)[:, None, None], np.maximum(drawn_peaks.group, 0)
+    group_widths = (inputs.group_bins[:, :, LAST_ROW] - inputs.group_bins[:, :, FIRST_ROW])[
+        point_index[..., None], np.arange(3), group
+    ]
+    tolerance_half_bins = 2 * (
+        4 + np.where(drawn_peaks.group >= 0, group_widths, 0).sum(axis=-1)
+    )  # of half bins
+    range_offset, velocity_offset = (
+        shots.relative_range_offset[shots.footprint_row],
+        SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[shots.footprint_row],
+    )
+    true_velocity = as_columns(shots, shots.radial_velocity) + velocity_offset
+    axis_range, beamlet = as_columns(shots, shots.range, 2), np.maximum(drawn_peaks.beamlet, 0)
+    range_error = (
+        measurements.range[..., POSITION_COLUMN]
+        - measurements.range_bias
+        - axis_range * (1 + range_offset[point_index, beamlet])
+    )
+    is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
+    is_right &= (
+        abs(
+            measurements.radial_velocity[..., POSITION_COLUMN] - true_velocity[point_index, beamlet]
+        )
+        <= tolerance_half_bins * measurements.velocity_per_half_bin
+    )
+    is_signal = (drawn_peaks.group[..., ::2] >= 0).all(axis=-1) & (
+        drawn_peaks.group[..., 1] != FALSE_PEAK
+    )
+    pd = (
+        inputs.pd[point_index, 0, group[..., 0]]
+        * inputs.down_pd_given_up[point_index, 1, group[..., 2]]
+    )
+    is_misread = (drawn_peaks.flags & TRUE_FLAG > 0) & ~is_right
+    uncorrected = (
+        measurements.range[..., POSITION_COLUMN].copy(),
+        measurements.radial_velocity[..., POSITION_COLUMN].copy(),
+    )
+    if not uses_fit:  # what the ground came nearer by within the shot: the measured velocity tells
+        measurements.radial_velocity[..., POSITION_COLUMN] *= 1 + as_columns(
+            shots, shots.velocity_bias_fraction, 2
+        )
+        measurements.range[..., POSITION_COLUMN] += measurements.radial_velocity[
+            ..., POSITION_COLUMN
+        ] * as_columns(shots, shots.range_walk_time, 2)
+    per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
+    if motion is not None:
+        per_slip = _apply_motion_correction(shots, drawn_peaks, measurements, motion)
+    for values, errors, uncorrected_values in zip(
+        (measurements.range, measurements.radial_velocity),
+        (measurements.range_error, measurements.velocity_error),
+        uncorrected,
+        strict=True,
+    ):  # whole bins stay uncorrected: their errors say so
+        errors[..., BIN_COLUMN] = np.hypot(
+            errors[..., BIN_COLUMN], values[..., POSITION_COLUMN] - uncorrected_values
+        )
+    return Returns(
+        measurements.range[..., BIN_COLUMN],
+        measurements.range[..., POSITION_COLUMN],
+        measurements.radial_velocity[..., BIN_COLUMN],
+        measurements.radial_velocity[..., POSITION_COLUMN],
+        measurements.range_error[..., BIN_COLUMN],
+        measurements.range_error[..., POSITION_COLUMN],
+        measurements.velocity_error[..., BIN_COLUMN],
+        measurements.velocity_error[..., POSITION_COLUMN],
+        drawn_peaks.peaks[..., ::2, RATIO_COLUMN].min(axis=-1) ** 2 / 2,
+        np.where(is_signal, pd, np.nan),
+        np.where(is_misread, drawn_peaks.flags ^ (TRUE_FLAG | MISREAD_FLAG), drawn_peaks.flags),
+        drawn_peaks.beamlet,
+        np.maximum(drawn_peaks.group, FALSE_PEAK),
+        *(np.where(drawn_peaks.flags > 0, change, np.nan) for change in per_slip),
+    )
+
+
+def _wander_covariance(
+    shots: Shots, inputs: DrawInputs, drawn_peaks: DrawnPeaks
+) -> np.ndarray | None:
+    """Mean products [bins^2] of the errors of each return's peaks by speckle.
+
+    (n, draws, most, 3, 3) by segment, signed as the beats; None of shots that do not fade.
+    """
+    line_gradients = shots.line_gradients
+    if line_gradients is None:
+        return None
+    covariance = np.zeros((*drawn_peaks.group.shape, 3))
+    point, draw, return_number = np.nonzero((drawn_peaks.group >= 0).any(axis=-1))
+    group, peaks = (
+        drawn_peaks.group[point, draw, return_number],
+        drawn_peaks.peaks[point, draw, return_number],
+    )
+    segment, point_column = np.arange(3), point[:, None]
+    present = np.where(group >= 0, 1.0, np.nan)
+    group_index = np.maximum(group, 0)
+    noise_sigma, line_sigma = (
+        np.broadcast_to(v, shots.size)[point_column]
+        for v in (shots.bin_noise_sigma, shots.line_noise_sigma)
+    )
+    signal_power = (
+        inputs.group_magnitudes[point_column, segment, group_index, 1] / noise_sigma
+    ) ** 2
+    mean_power = signal_power + 2 * (line_sigma / noise_sigma) ** 2
+    offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
+    if shots.detection == "peak_bin":  # placed by the bins about that one
+        bin_shift = (
+            peaks[..., BIN_COLUMN]
+            - inputs.group_bins[point_column, segment, STRONGEST_ROW, group_index]
+        )
+        if shots.complex_record:
+            bin_shift = bin_shift - shots.fft_size * np.rint(bin_shift / shots.fft_size)
+        offset = offset + np.where(np.abs(bin_shift) <= 1, bin_shift, 0.0)
+    relative_power = present * peaks[..., RATIO_COLUMN] ** 2 / mean_power
+    speckle_peaks = SpecklePeaks(
+        offset, folding_signs(shots)[point], relative_power, signal_power / mean_power
+    )
+    segment_pairs = (
+        CHIRP_PAIRS
+        if shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+        else SEGMENT_PAIRS_AND_SELF
+    )
+    covariance[point, draw, return_number] = position_error_moments(
+        line_gradients.select(point), speckle_peaks, shots, segment_pairs
+    )
+    return covariance
+
+
+def _add_drift_errors(
+    shots: Shots, drawn_peaks: DrawnPeaks, motion: EgoMotion | None
+) -> DrawnPeaks:
+    """Add to the peaks' errors what the drift of their lines within the record makes.
+
+    It is that by the motion that the instrument knows, if there is one.
+    """
+    if motion is not None:
+        shots = replace(
+            shots,
+            acceleration=motion.acceleration,
+            approach_speed=motion.approach_speed_at(shots.range),
+        )
+    bins_per_rate = shots.record_duration * shots.fft_size / shots.sample_rate
+    drift_bins = np.array(
+        [
+            np.broadcast_to(abs(rate) * bins_per_rate, shots.size)
+            for rate in shots.frequency_drift_rates
+        ]
+    )
+    peaks = drawn_peaks.peaks.copy()
+    offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
+    drift_errors = drift_error(offset, drift_bins.T[:, None, None], shots.window, shots.fft_size)
+    peaks[..., ERROR_COLUMN] = np.hypot(peaks[..., ERROR_COLUMN], drift_errors)
+    return drawn_peaks._replace(peaks=peaks)
+
+
+_POSITION_ERROR_MAX_BINS = 0.5
+
+
+def _correct_late_echoes(
+    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements
+) -> DrawnPeaks:
+    """Correct places between bins for the samples that lack before the echo arrives.
+
+    The instrument knows them by the range that whole bins tell. No error is larger than half a bin,
+    as a place is always within one.
+    """
+    column = partial(as_columns, shots, n_trailing=2)
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[..., BIN_COLUMN])
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[..., BIN_COLUMN])
+    n_missing = waveform.count_samples_before_echo(
+        delay=delay, doppler_ratio=beta, record_start=column(shots.acquisition_delay),
+        sample_rate=column(shots.sample_rate), length=shots.window.length,
+    )  # fmt: skip
+    peaks = drawn_peaks.peaks.copy()
+    offset = np.nan_to_num(peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN])
+    correction = late_echo_correction(offset, n_missing[..., None], shots.window, shots.fft_size)
+    peaks[..., POSITION_COLUMN] += correction.shift
+    widened_errors = np.minimum(
+        peaks[..., ERROR_COLUMN] * correction.error_factor, _POSITION_ERROR_MAX_BINS
+    )
+    peaks[..., ERROR_COLUMN] = np.where(
+        correction.error_factor > 1,
+        np.maximum(widened_errors, peaks[..., ERROR_COLUMN]),
+        widened_errors,
+    )
+    return drawn_peaks._replace(peaks=peaks)
+
+
+def _apply_motion_correction(
+    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements, motion: EgoMotion
+) -> tuple[np.ndarray, np.ndarray]:
+    """Correct range and velocity between bins for the motion that the instrument knows, in place.
+
+    The standard deviation of what it does not know goes into the standard errors
+    (:mod:`sweep.model.pointcloud.ego_motion`). Returns what range [s] and velocity change by 1 m/s
+    of slip.
+    """
+    per_acceleration, per_slip = _response_to_motion(shots, drawn_peaks)
+    known_slip = motion.slip_at(measurements.range[..., POSITION_COLUMN])
+    known_acceleration, acceleration_error = (
+        as_columns(shots, values, 2)
+        for values in (motion.acceleration, motion.acceleration_standard_error)
+    )
+    values_by = zip(
+        (measurements.range, measurements.radial_velocity), per_slip, per_acceleration, strict=True
+    )
+    for values, by_slip, by_acceleration in values_by:
+        values[..., POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * known_acceleration
+    slip_error = motion.slip_standard_error(measurements.range[..., POSITION_COLUMN])
+    errors_by = zip(
+        (measurements.range_error, measurements.velocity_error),
+        per_slip,
+        per_acceleration,
+        strict=True,
+    )
+    for errors, by_slip, by_acceleration in errors_by:
+        unknown_error = np.hypot(by_slip * slip_error, by_acceleration * acceleration_error)
+        errors[:] = np.hypot(errors, unknown_error[..., None])
+    return per_slip
+
+
+def _response_to_motion(
+    shots: Shots, drawn_peaks: DrawnPeaks
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Range [m] and velocity [m/s] that beats gain by 1 m/s^2 of acceleration, and 1 m/s of slip.
+
+    The slip is the radial velocity less the speed at which the range falls. All broadcast with the
+    returns (n, draws, most).
+    """
+    carriers, chirp_rates = shots.beat_coefficients
+    by_acceleration, by_slip = _beat_change_by_motion(shots)
+    if (
+        shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+    ):  # half sum and half difference of up and down beat
+        point_index: np.ndarray | slice = slice(None)
+        weights, shape = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates, (shots.size, 1, 1)
+    else:
+        shape = drawn_peaks.flags.shape
+        point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+        peaks = np.moveaxis(drawn_peaks.peaks[..., ERROR_COLUMN], 3, 0).reshape(3, point_index.size)
+        weights = np.where(np.isfinite(peaks), 1 / peaks**2, 0.0)
+    per_acceleration, per_slip = (
+        tuple(
+            responses.reshape(shape)
+            for responses in waveform.range_velocity_response(
+                beats[:, point_index],
+                weights=weights,
+                carriers=carriers[:, point_index],
+                chirp_rates=chirp_rates[:, point_index],
+            )
+        )
+        for beats in (by_acceleration, by_slip)
+    )
+    return per_acceleration, per_slip  # type: ignore[return-value]  # pairs
+
+
+def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Hz that beats (3, n) gain by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
+    chirp_rates = shots.beat_coefficients[1]
+    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.segment_starts])
+    middle_time = shots.record_middle_time
+    two_over_c = 2 / SPEED_OF_LIGHT
+    carriers = np.array([np.broadcast_to(carrier, shots.size) for carrier in shots.carriers])
+    range_terms = (
+        starts**2 / 2 + 2 * starts * middle_time + 1.5 * middle_time * shots.velocity_drift_time
+    )
+    by_acceleration = two_over_c * (
+        carriers * (starts + shots.velocity_drift_time) + chirp_rates * range_terms
+    )
+    return by_acceleration, -two_over_c * chirp_rates * (starts + middle_time)
+
+
+def _measure_by_reading(
+    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+) -> Measurements:
+    """Tell range and velocity at mid-chirp by each return's reading of its up and down peak.
+
+    Speckle that both see moves their beats against each other with the range, and along with each
+    other with the velocity.
+    """
+    carrier, bandwidth, duration, sample_rate = (
+        as_columns(shots, column, 3)
+        for column in (
+            shots.carriers[0],
+            shots.chirp_bandwidth,
+            shots.chirp_duration,
+            shots.sample_rate,
+        )
+    )
+    bin_width, chirp_rate = sample_rate / shots.fft_size, bandwidth / duration
+    up, down = (drawn_peaks.peaks[..., side, : POSITION_COLUMN + 1] * bin_width for side in (0, 2))
+    f_d, f_r = np.full((2, *up.shape), np.nan)
+    for reading in np.unique(drawn_peaks.reading[drawn_peaks.reading >= 0]):
+        has_reading = (drawn_peaks.reading == reading)[..., None]
+        f_d, f_r = (
+            np.where(has_reading, new, old)
+            for new, old in zip(
+                waveform.read_beats(reading, up, down, sample_rate), (f_d, f_r), strict=True
+            )
+        )
+    measured_range, measured_velocity = waveform.range_velocity_of_beats(
+        f_d, f_r, carrier, bandwidth, duration
+    )
+    range_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / chirp_rate
+    velocity_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / (carrier + bandwidth / 2)
+    variance = (drawn_peaks.peaks[..., ::2, ERROR_COLUMN] ** 2).sum(axis=-1)
+    covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[..., 0, 2]
+    range_variance, velocity_variance = (
+        np.maximum(variance + v, 0.0) for v in (-covariance, covariance)
+    )
+    range_error, velocity_error = (
+        np.sqrt(np.stack([value + 1 / 6, value], axis=-1))
+        for value in (range_variance, velocity_variance)
+    )
+    # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
+    up_start, down_start = (as_columns(shots, shots.segment_starts[s], 2) for s in (0, 2))
+    range_bias = (carrier / chirp_rate)[..., 0] * as_columns(shots, shots.acceleration, 2)
+    range_bias = 0.5 * (down_start - up_start) * range_bias
+    range_bias -= 0.5 * (down_start + up_start) * as_columns(shots, shots.approach_speed, 2)
+    return Measurements(
+        measured_range,
+        measured_velocity,
+        range_per_half_bin * range_error,
+        velocity_per_half_bin * velocity_error,
+        range_per_half_bin[..., 0],
+        velocity_per_half_bin[..., 0],
+        range_bias,
+    )
+
+
+def _measure_by_fit(
+    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+) -> Measurements:
+    """Tell range and velocity at the shot's start by the fit of each return's peaks."""
+    shape = drawn_peaks.flags.shape
+    point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+    bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
+    carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
+    chirp_rate = np.broadcast_to(shots.chirp_rate, shots.size)
+    peaks = np.moveaxis(drawn_peaks.peaks, 3, 0).reshape(3, point_index.size, -1)
+    is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
+
+    def bound_of(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
+        """Of errors [bins], (3, m), of points."""
+        up, doppler, down = errors * bin_width[points]
+        return range_velocity_deviation(
+            up=up,
+            doppler=doppler,
+            down=down,
+            carriers=tuple(carrier[points] for carrier in carriers),
+            chirp_rate=chirp_rate[points],
+            slopes=shots.chirp_slopes,
+            range=shots.range[points],
+            radial_velocity=shots.radial_velocity[points],
+        )
+
+    results_by_column = []
+    for column in (BIN_COLUMN, POSITION_COLUMN):
+        errors = np.where(is_finite, peaks[..., ERROR_COLUMN], np.inf)
+        errors = np.hypot(errors, math.sqrt(1 / 12) if column == BIN_COLUMN else 0.0)
+        fitted = fit_peaks(
+            shots, peaks[..., column] * bin_width[point_index], 1 / errors**2, point_index
+        )
+        deviations = bound_of(errors, point_index)
+        if wander_covariance is not None:
+            beat_covariance = (
+                wander_covariance.reshape(point_index.size, 3, 3)
+                * (bin_width[point_index] ** 2)[:, None, None]
+            )
+            deviations = _add_wander_covariance(
+                shots, deviations, beat_covariance, 1 / errors**2, point_index
+            )
+        results_by_column.append((*fitted, *deviations))
+    has_return = (drawn_peaks.reading >= 0)[..., None]
+    measured_range, measured_velocity, range_error, velocity_error = (
+        np.where(has_return, np.stack(pair, axis=-1).reshape(*shape, 2), np.nan)
+        for pair in zip(*results_by_column, strict=True)
+    )
+    segments = np.array(shots.has_segment)[:, None]
+    half_bin_deviation = bound_of(
+        np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
+    )
+    range_per_half_bin, velocity_per_half_bin = (
+        value[:, None, None] for value in half_bin_deviation
+    )
+    return Measurements(
+        measured_range,
+        measured_velocity,
+        range_error,
+        velocity_error,
+        range_per_half_bin,
+        velocity_per_half_bin,
+        0.0,
+    )
+
+
+def _add_wander_covariance(
+    shots: Shots,
+    deviations: RangeVelocityDeviation,
+    beat_covariance: np.ndarray,
+    weights: np.ndarray,
+    point_index: np.ndarray,
+) -> RangeVelocityDeviation:
+    """Add to deviations of fits what the covariances of their beats (m, 3, 3) [Hz^2] make."""
+    carriers, chirp_rates = shots.beat_coefficients
+    responses = []
+    for unit in np.eye(3):
+        beats = unit[:, None] + np.zeros(point_index.size)
+        responses.append(
+            waveform.range_velocity_response(
+                beats,
+                weights=weights,
+                carriers=carriers[:, point_index],
+                chirp_rates=chirp_rates[:, point_index],
+            )
+        )
+    response_by_beat = np.array(responses)  # by beat, range and velocity, return
+    widened = []
+    for value, gains_by_beat in zip(deviations, response_by_beat.swapaxes(0, 1), strict=True):
+        covariance_term = sum(
+            gains_by_beat[i] * gains_by_beat[j] * beat_covariance[:, i, j]
+            for i, j in ((0, 1), (0, 2), (1, 2))
+        )
+        with np.errstate(invalid="ignore"):
+            widened.append(np.sqrt(np.maximum(value**2 + 2 * covariance_term, 0.0)))
+    return RangeVelocityDeviation(*widened)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_points(
+    keys, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
+):
+    """All draws of all points: peaks of the three segments, and which make returns."""
+    n, draws, returns_max = drawn_peaks.flags.shape
+    peaks, peak_groups = np.zeros((3, returns_max + 1, 4)), np.empty((3, returns_max + 1), np.int64)
+    n_peaks, pairs = np.empty(3, np.int64), np.empty((returns_max + 1, 4), np.int64)
+    is_up_detected, speckle_factors = np.zeros(returns_max, np.bool_), np.ones((returns_max, 3))
+    in_speckle = inputs.line_grid.line_shift.shape[0] > 0
+    speckle = empty_group_speckle(returns_max)
+    for i in range(n):
+        if in_speckle:
+            speckle = prepare_group_speckle(i, config, inputs, spectra)
+        for d in range(draws):
+            address = keys[i, 0], keys[i, 1], config.first_draw + d
+            if in_speckle:
+                draw_group_speckle(address, i, inputs, speckle, speckle_factors)
+            for s in range(3):
+                if s != 1 or config.has_doppler:
+                    n_peaks[s] = draw_segment_peaks(
+                        address,
+                        (i, s),
+                        config,
+                        inputs,
+                        spectra,
+                        leakage_bins,
+                        speckle_factors,
+                        speckle,
+                        interpolation,
+                        workspace,
+                        peaks[s],
+                        peak_groups[s],
+                        is_up_detected,
+                    )
+            pair_into_returns(
+                (i, d), config, inputs, (peaks, peak_groups, n_peaks), pairs, workspace, drawn_peaks
+            )
+
+
+class GroupSpeckle(NamedTuple):
+    """Bins of a point's groups by segment, and their speckle in a draw."""
+
+    first_bin: np.ndarray
+    """(most, 3) int64: first bin."""
+    n_bins: np.ndarray
+    """(most, 3) int64: number of bins, 0 where a segment lacks the group."""
+    mean_power: np.ndarray
+    """(most, 3, bins): mean power by the lines of the footprint."""
+    pseudo_variance_ratio: np.ndarray
+    """(most, 3, bins): pseudo-variance over that power."""
+    rms_ratio: np.ndarray
+    """(most, 3, bins): root mean square of the echo's |X| / sigma."""
+    amplitudes: np.ndarray
+    """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
+    the same."""
+    factor_rank: np.ndarray
+    """(most,) int64: rows of ``factor`` of a group; 0 where its lines are drawn one by one."""
+    factor: np.ndarray
+    """(groups, rows, 3, bins): factors of the bins' covariance."""
+    independent_amplitudes: np.ndarray
+    """(sets, 3, bins): independent amplitudes, of which those of looks are mixed that share them in
+    part."""
+    detection_weights: np.ndarray
+    """(most, 3, bins): weights of the bins in the amplitude, of mean power 1, that is held against
+    the probability of detection."""
+
+
+@njit(cache=True, error_model="numpy")
+def empty_group_speckle(groups_max):
+    """Return the record of a point whose echoes do not fade."""
+    bins = np.zeros((groups_max, 3), np.int64)
+    no_amplitudes = np.zeros((groups_max, 1, 3, 0), np.complex128)
+    powers = np.zeros((groups_max, 3, 0))
+    no_independent = np.zeros((0, 3, 0), np.complex128)
+    factor_rank = np.zeros(groups_max, np.int64)
+    return GroupSpeckle(
+        bins,
+        bins,
+        powers,
+        powers,
+        powers,
+        no_amplitudes,
+        factor_rank,
+        no_amplitudes,
+        no_independent,
+        powers,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def prepare_group_speckle(i, config, inputs, spectra):
+    """List the bins of a point's groups that are looked at, and their mean powers."""
+    groups_max, n_bins_max = inputs.group_bins.shape[3], 0
+    first_bin, n_bins = np.zeros((groups_max, 3), np.int64), np.zeros((groups_max, 3), np.int64)
+    for g in range(groups_max):
+        for s in range(3):
+            strongest_bin = inputs.group_bins[i, s, STRONGEST_ROW, g]
+            if strongest_bin < 0:
+                continue
+            if config.in_noise and config.lobe_half_width > 0:
+                span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
+                span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
+                group_ends = (
+                    inputs.group_bins[i, s, FIRST_ROW, g] - span_first_bin,
+                    inputs.group_bins[i, s, LAST_ROW, g] - span_first_bin,
+                )
+                lobe_half_width = max(config.lobe_half_width, int(inputs.bin_threshold_table[i, 4]))
+                begin, end = echo_bounds(
+                    span_ratios,
+                    group_ends[0],
+                    group_ends[1],
+                    inputs.noise_and_threshold[i, 1],
+                    lobe_half_width,
+                )
+                first_bin[g, s], n_bins[g, s] = span_first_bin + begin, end - begin + 1
+            else:
+                first_bin[g, s] = strongest_bin - inputs.line_grid.peak_search_bins[i]
+                n_bins[g, s] = 2 * inputs.line_grid.peak_search_bins[i] + 1
+            n_bins_max = max(n_bins_max, n_bins[g, s])
+    mean_power, pseudo_variance_ratio = (
+        np.zeros((groups_max, 3, n_bins_max)),
+        np.zeros((groups_max, 3, n_bins_max)),
+    )
+    n_looks = config.n_looks if config.has_independent_speckle else 1
+    rows_max = 3 * n_bins_max if 3 * n_bins_max <= FACTORED_BINS_MAX else 0
+    factor_rank, factor = (
+        np.zeros(groups_max, np.int64),
+        np.empty((groups_max, rows_max, 3, n_bins_max), np.complex128),
+    )
+    for g in range(groups_max):
+        if n_bins[g].max() == 0:
+            continue
+        has_images = mean_bin_powers(
+            inputs.line_grid,
+            i,
+            inputs.line_centre[i, :, g],
+            first_bin[g],
+            mean_power[g],
+            pseudo_variance_ratio[g],
+        )
+        if rows_max > 0 and not has_images:
+            factor_rank[g] = factor_bin_covariance(
+                inputs.line_grid,
+                i,
+                inputs.line_centre[i, :, g],
+                first_bin[g],
+                mean_power[g],
+                factor[g],
+            )
+    amplitudes = np.zeros((groups_max, n_looks, 3, n_bins_max), np.complex128)
+    independent_amplitudes = np.zeros(
+        (inputs.look_covariance_root.shape[3], 3, n_bins_max), np.complex128
+    )
+    rms_ratio, detection_weights = (
+        np.zeros((groups_max, 3, n_bins_max)),
+        np.zeros((groups_max, 3, n_bins_max)),
+    )
+    for g in range(groups_max):
+        for s in range(3):
+            if n_bins[g, s] == 0 or config.in_noise:
+                continue
+            fill_detection_weights(
+                i,
+                (g, s),
+                config,
+                inputs,
+                first_bin,
+                mean_power,
+                factor_rank,
+                factor,
+                detection_weights[g, s],
+            )
+            strongest_index, noise_sigma = (
+                inputs.group_bins[i, s, STRONGEST_ROW, g] - first_bin[g, s],
+                inputs.noise_and_threshold[i, 0],
+            )
+            magnitudes = inputs.group_magnitudes[i, s, g]
+            for k in range(n_bins[g, s]):
+                if abs(k - strongest_index) <= 1:
+                    rms_ratio[g, s, k] = magnitudes[1 + k - strongest_index] / noise_sigma
+                else:
+                    relative_power = mean_power[g, s, k] / mean_power[g, s, strongest_index]
+                    rms_ratio[g, s, k] = magnitudes[1] / noise_sigma * math.sqrt(relative_power)
+    return GroupSpeckle(
+        first_bin,
+        n_bins,
+        mean_power,
+        pseudo_variance_ratio,
+        rms_ratio,
+        amplitudes,
+        factor_rank,
+        factor,
+        independent_amplitudes,
+        detection_weights,
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def fill_detection_weights(
+    point, group_and_segment, config, inputs, first_bin, mean_power, factor_rank, factor, weights
+):
+    """Set the detection weights (bins,) of a group and segment.
+
+    With ``peak_bin`` that is the amplitude of the strongest bin. If any bin detects, the amplitudes
+    of two segments have the correlation of those in the middle of the echo: the bins are weighted
+    as a lone line in the middle would fill them.
+    """
+    group, segment = group_and_segment
+    weights[:] = 0.0
+    weights[inputs.group_bins[point, segment, STRONGEST_ROW, group] - first_bin[group, segment]] = (
+        1.0
+    )
+    if config.lobe_half_width == 0 or factor_rank[group] == 0:
+        return
+    weighted_power = 0.0
+    for k in range(weights.size):
+        distance = first_bin[group, segment] + k - inputs.line_centre[point, segment, group]
+        weights[k] = interpolate_transform(distance, inputs.line_grid) * math.sqrt(
+            mean_power[group, segment, k]
+        )
+    for factor_row in range(factor_rank[group]):
+        mode_amplitude = complex(0.0, 0.0)
+        for k in range(weights.size):
+            mode_amplitude += weights[k] * factor[group, factor_row, segment, k]
+        weighted_power += 2.0 * abs(mode_amplitude) ** 2
+    weights /= math.sqrt(weighted_power)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
+    """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
+    for g in range(speckle.n_bins.shape[0]):
+        speckle_factors[g] = 1.0
+        if speckle.n_bins[g].max() == 0:
+            continue
+        n_independent_sets = speckle.independent_amplitudes.shape[0]
+        for look in range(
+            n_independent_sets if n_independent_sets > 0 else speckle.amplitudes.shape[1]
+        ):
+            own = address[0], address[1], address[2] + look * LOOK_DRAW_STRIDE
+            amplitudes = (
+                speckle.independent_amplitudes[look]
+                if n_independent_sets > 0
+                else speckle.amplitudes[g, look]
+            )
+            if speckle.factor_rank[g] > 0:
+                draw_factored_amplitudes(
+                    own, g, speckle.factor[g], speckle.factor_rank[g], amplitudes
+                )
+            else:
+                draw_bin_amplitudes(
+                    own, g, inputs.line_grid, i, inputs.line_centre[i, :, g], speckle.first_bin[g],
+                    speckle.mean_power[g], amplitudes,
+                )  # fmt: skip
+        if n_independent_sets > 0:
+            mix_look_amplitudes(
+                inputs.look_covariance_root[i],
+                speckle.independent_amplitudes,
+                speckle.amplitudes[g],
+            )
+        for s in range(3):
+            if speckle.n_bins[g, s] == 0:
+                continue
+            strongest_index, power_sum = (
+                inputs.group_bins[i, s, STRONGEST_ROW, g] - speckle.first_bin[g, s],
+                0.0,
+            )
+            for look in range(speckle.amplitudes.shape[1]):
+                own = speckle.amplitudes[g, look, s]
+                for k in range(speckle.n_bins[g, s]):
+                    if not speckle.mean_power[g, s, k] > 0.0:  # beyond all lines
+                        own[k] = own[strongest_index]
+                power_sum += own[strongest_index].real ** 2 + own[strongest_index].imag ** 2
+            speckle_factors[g, s] = math.sqrt(power_sum / speckle.amplitudes.shape[1])
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes):
+    """Mix independent amplitudes (sets, 3, bins) to those of looks (looks, 3, bins)."""
+    look_amplitudes[:] = 0.0
+    for look in range(look_amplitudes.shape[0]):
+        for s in range(3):
+            for set_index in range(independent_amplitudes.shape[0]):
+                for bin_ in range(independent_amplitudes.shape[2]):
+                    look_amplitudes[look, s, bin_] += (
+                        covariance_root[s, look, set_index]
+                        * independent_amplitudes[set_index, s, bin_]
+                    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
+    """Pair the peaks of one point (i, draw) into returns, and judge each.
+
+    ``peak_lists``: peaks (3, most + 1, 4), their groups, and their number in each segment.
+    """
+    (i, d), (peaks, peak_groups, n_peaks) = point_and_draw, peak_lists
+    if config.has_doppler:
+        n_confirmed, n_pairs = pair_peaks(
+            peaks[0, : n_peaks[0], POSITION_COLUMN],
+            peaks[1, : n_peaks[1], POSITION_COLUMN],
+            peaks[2, : n_peaks[2], POSITION_COLUMN],
+            inputs.doppler_prediction[i],
+            2.0 * config.nyquist_bin,
+            config.down_beat_sign,
+            config.two_beat_reading,
+            CONFIRMATION_TOLERANCE_BINS,
+            pairs,
+        )
+    else:
+        n_confirmed = n_pairs = min(n_peaks[0], n_peaks[2])
+        for r in range(n_pairs):
+            pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, config.two_beat_reading
+    for r in range(min(n_pairs, drawn_peaks.flags.shape[2])):
+        up_index, doppler_index, down_index, drawn_peaks.reading[i, d, r] = pairs[r]
+        peak_group_row, positions = drawn_peaks.group[i, d, r], workspace.peak_positions
+        positions[1] = 0.0
+        peak_group_row[0], peak_group_row[2] = peak_groups[0, up_index], peak_groups[2, down_index]
+        positions[0], positions[2] = (
+            peaks[0, up_index, POSITION_COLUMN],
+            peaks[2, down_index, POSITION_COLUMN],
+        )
+        if doppler_index >= 0:
+            peak_group_row[1], positions[1] = (
+                peak_groups[1, doppler_index],
+                peaks[1, doppler_index, POSITION_COLUMN],
+            )
+        for s in range(3):
+            if (
+                peak_group_row[s] >= 0 and inputs.line_grid.line_shift.shape[0] > 0
+            ):  # of the echo, not of its speckle
+                positions[s] = inputs.line_centre[i, s, peak_group_row[s]]
+        for s in range(3):  # groups of complex records may lie whole FFT lengths from their peaks
+            if config.down_beat_sign != 0.0 and peak_group_row[s] >= 0:
+                bin_distance = (
+                    inputs.group_bins[i, s, STRONGEST_ROW, peak_group_row[s]] - positions[s]
+                )
+                positions[s] += (
+                    2
+                    * config.nyquist_bin
+                    * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
+                )
+        peak_rows = drawn_peaks.peaks[i, d, r]
+        for f in range(4):  # slices would compile an error message of shapes
+            peak_rows[0, f], peak_rows[2, f] = peaks[0, up_index, f], peaks[2, down_index, f]
+            peak_rows[1, f] = peaks[1, doppler_index, f] if doppler_index >= 0 else np.nan
+        flag, drawn_peaks.beamlet[i, d, r] = judge_return(
+            peak_group_row,
+            positions,
+            inputs.group_bins[i],
+            inputs.line_positions[i],
+            inputs.beamlet_amplitude[i],
+        )
+        drawn_peaks.flags[i, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_segment_peaks(
+    address,
+    point_and_segment,
+    config,
+    inputs,
+    spectra,
+    leakage_bins,
+    speckle_factors,
+    speckle,
+    interpolation,
+    workspace,
+    peaks,
+    peak_groups,
+    is_up_detected,
+):
+    """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
+
+    ``address`` is the key of the point and the number of the draw, ``point_and_segment`` point and
+    segment.
+    ``speckle_factors`` (most, 3) are factors on the groups' magnitudes, by segment, and ``speckle``
+    has the
+    amplitudes of their bins. ``is_up_detected`` (most,) tells which groups are detected in the up
+    segment, which comes first.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    group_bins, n_peaks = inputs.group_bins[i, s], 0
+    for g in range(group_bins.shape[1]):
+        if group_bins[STRONGEST_ROW, g] < 0:
+            break
+        if config.in_noise and config.lobe_half_width > 0:
+            is_detected = draw_all_bins(
+                address,
+                point_and_segment,
+                g,
+                config,
+                inputs,
+                spectra,
+                speckle,
+                interpolation,
+                workspace,
+                peaks[n_peaks],
+            )
+        elif config.in_noise:
+            is_detected = draw_peak_bin(
+                address,
+                point_and_segment,
+                g,
+                config,
+                inputs,
+                spectra,
+                speckle,
+                interpolation,
+                workspace,
+                peaks[n_peaks],
+            )
+        elif speckle.n_bins[g, s] > 0:
+            is_detected = detect_in_speckle(
+                address,
+                point_and_segment,
+                g,
+                config,
+                inputs,
+                speckle,
+                interpolation,
+                workspace,
+                peaks[n_peaks],
+            )
+        else:
+            chance = (
+                inputs.down_pd_given_up[i, 1 if is_up_detected[g] else 0, g]
+                if s == 2
+                else inputs.pd[i, s, g]
+            )
+            uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
+            is_detected = uniform < chance
+            if is_detected:
+                magnitudes, line_deviation = (
+                    inputs.group_magnitudes[i, s, g],
+                    inputs.line_deviation_bins[i, s, g],
+                )
+                offset, ratio = (
+                    estimate_sub_bin_offset(
+                        magnitudes[0], magnitudes[1], magnitudes[2], interpolation
+                    ),
+                    magnitudes[1] / noise_sigma,
+                )
+                error = sub_bin_standard_error(
+                    offset, ratio / line_noise_ratio, interpolation
+                ) / math.sqrt(config.n_looks)
+                # With the pedestal that is under the lines.
+                ratio = math.sqrt(ratio * ratio + 2.0 * (line_noise_ratio * line_noise_ratio - 1.0))
+                normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
+                position = group_bins[STRONGEST_ROW, g] + offset + error * normal
+                store_peak(
+                    peaks[n_peaks],
+                    group_bins[STRONGEST_ROW, g],
+                    position,
+                    error,
+                    ratio,
+                    line_deviation,
+                    config,
+                    interpolation,
+                )
+        if s == 0:
+            is_up_detected[g] = is_detected
+        if is_detected:
+            peak_groups[n_peaks] = g
+            n_peaks += 1
+    n_free = peaks.shape[0] - n_peaks
+    false_bins, false_ratios, n_false = (
+        workspace.false_bins[:n_free],
+        workspace.false_ratios[:n_free],
+        0,
+    )
+    false_ratios[:] = 0.0
+    if config.in_noise:
+        n_false = list_noisy_leaked_peaks(
+            address,
+            point_and_segment,
+            spectra,
+            leakage_bins,
+            speckle_factors[:, s],
+            threshold_ratio,
+            interpolation,
+            false_bins,
+            false_ratios,
+        )
+    else:
+        n_false = draw_leaked_peaks(
+            address,
+            point_and_segment,
+            leakage_bins,
+            speckle_factors,
+            threshold_ratio,
+            config.n_looks,
+            interpolation,
+            false_bins,
+            false_ratios,
+        )
+    stream = philox.STREAM_NOISE_MAXIMUM[s] if config.in_noise else philox.STREAM_FALSE_ALARM[s]
+    random_words = philox.four_words(a, b, draw, stream, philox.FIRST_BLOCK_NUMBER)
+    chance = philox.to_uniform(random_words[0])
+    if chance < inputs.pfa_noise[i, s]:
+        ratio = max(
+            largest_noise_magnitude(spectra.n_noise_bins[i, s], chance, config.n_looks),
+            threshold_ratio,
+        )
+        searched_range = inputs.searched_range[i, s, 0], inputs.searched_range[i, s, 1]
+        excluded_bins = leakage_bins.excluded_bins[
+            leakage_bins.excluded_slice[i, s, 0] : leakage_bins.excluded_slice[i, s, 1]
+        ]
+        chance = philox.to_uniform(random_words[1])
+        false_bin = draw_free_bin(
+            chance,
+            group_bins,
+            excluded_bins,
+            searched_range,
+            2 * config.nyquist_bin,
+            config.down_beat_sign,
+        )
+        n_false = insert_peak((false_bin, ratio), false_bins, false_ratios, n_false)
+    for n in range(n_false):
+        error = sub_bin_standard_error(0.0, false_ratios[n], interpolation) / math.sqrt(
+            config.n_looks
+        )
+        store_peak(
+            peaks[n_peaks],
+            false_bins[n],
+            false_bins[n],
+            error,
+            false_ratios[n],
+            0.0,
+            config,
+            interpolation,
+        )
+        peak_groups[n_peaks] = FALSE_PEAK
+        n_peaks += 1
+    return n_peaks
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def list_noisy_leaked_peaks(
+    address,
+    point_and_segment,
+    spectra,
+    leakage_bins,
+    speckle_factors,
+    threshold_ratio,
+    interpolation,
+    bins,
+    ratios,
+):
+    """List the strongest peaks of bins of leaked signal with their noise; return their number.
+
+    Adjacent bins that cross make one peak, the largest, or are of the echo if they join on to a bin
+    of it that crosses. ``speckle_factors`` (most,): factors on the groups' magnitudes. Results are
+    bins, and |X| / sigma.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
+    correlation, is_echo = interpolation.sidelobe_correlation, False
+    independent_part = math.sqrt(1.0 - correlation * correlation)
+    for n in range(spectra.leaked_slice[i, s, 0], spectra.leaked_slice[i, s, 1]):
+        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], spectra.leaked_index[n])
+        speckle_factor = speckle_factors[leakage_bins.group[n]]
+        ratio = math.hypot(spectra.leaked_ratio[n] * speckle_factor + re, im)
+        if ratio < threshold_ratio:
+            continue
+        bin_number = spectra.first_bin[i, s] + spectra.leaked_index[n]
+        if bin_number != previous_bin + 1:
+            n_peaks = insert_peak(
+                (np.int64(-1) if is_echo else peak, largest), bins, ratios, n_peaks
+            )
+            peak, largest, is_echo = np.int64(-1), 0.0, False
+        previous_bin = bin_number
+        if ratio > largest:
+            peak, largest = bin_number, ratio
+        if spectra.exempt_neighbour_ratio[n] > 0.0:
+            neighbour_index = spectra.leaked_index[n] + spectra.exempt_neighbour_side[n]
+            re_own, im_own = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], neighbour_index)
+            in_phase = (
+                spectra.exempt_neighbour_ratio[n] * speckle_factor
+                + correlation * re
+                + independent_part * re_own
+            )
+            is_echo |= (
+                math.hypot(in_phase, correlation * im + independent_part * im_own)
+                >= threshold_ratio
+            )
+    return insert_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, n_peaks)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_peak_bin(
+    address,
+    point_and_segment,
+    group,
+    config,
+    inputs,
+    spectra,
+    speckle,
+    interpolation,
+    workspace,
+    peak,
+):
+    """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
+    (a, b, draw), (i, s) = address, point_and_segment
+    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
+    k = strongest_bin - spectra.first_bin[i, s]
+    re, im = philox.normal_pair(a, b, draw, stream, k)
+    is_real = is_real_bin(strongest_bin, config.real_fft_size)
+    if is_real:
+        re, im = math.sqrt(2.0) * re, 0.0
+    re, im = re * line_noise_ratio, im * line_noise_ratio
+    group_magnitudes = inputs.group_magnitudes[i, s, group]
+    near_end = speckle.n_bins[group, s] > 0 and is_near_end(strongest_bin - 1, 3, config)
+    scratch = workspace.noise_bins
+    if near_end:
+        draw_noise_near_end(
+            (a, b, draw, stream),
+            ECHO_NOISE_FIRST_INDEX * (1 + group),
+            (strongest_bin - 1, 3),
+            config,
+            scratch,
+        )
+        re, im = line_noise_ratio * scratch[0, 1], line_noise_ratio * scratch[1, 1]
+    amplitude = speckled_amplitude(group_magnitudes[1] / noise_sigma, speckle, group, s, 1)
+    if (amplitude.real + re) ** 2 + (amplitude.imag + im) ** 2 < threshold_ratio * threshold_ratio:
+        return False
+    # Neighbours are exempt from false alarms, so their bins' own numbers are free.
+    re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
+    re_above, im_above = philox.normal_pair(a, b, draw, stream, k + 1)
+    re_below, im_below = re_below * line_noise_ratio, im_below * line_noise_ratio
+    re_above, im_above = re_above * line_noise_ratio, im_above * line_noise_ratio
+    from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
+    amplitude_below = speckled_amplitude(group_magnitudes[0] / noise_sigma, speckle, group, s, 0)
+    amplitude_above = speckled_amplitude(group_magnitudes[2] / noise_sigma, speckle, group, s, 2)
+    below_ratio = math.hypot(
+        amplitude_below.real
+        + (from_centre * re + below_from_above * re_above + below_own * re_below),
+        amplitude_below.imag
+        + (from_centre * im + below_from_above * im_above + below_own * im_below),
+    )
+    centre_ratio = math.hypot(amplitude.real + re, amplitude.imag + im)
+    above_ratio = math.hypot(
+        amplitude_above.real + (from_centre * re + above_own * re_above),
+        amplitude_above.imag + (from_centre * im + above_own * im_above),
+    )
+    if near_end:
+        below_ratio = abs(
+            amplitude_below + line_noise_ratio * complex(scratch[0, 0], scratch[1, 0])
+        )
+        above_ratio = abs(
+            amplitude_above + line_noise_ratio * complex(scratch[0, 2], scratch[1, 2])
+        )
+    offset = estimate_sub_bin_offset(below_ratio, centre_ratio, above_ratio, interpolation)
+    peak_shift = 0
+    if max(below_ratio, above_ratio) > centre_ratio:
+        peak_shift = 1 if above_ratio > below_ratio else -1
+    error, ratio = (
+        sub_bin_standard_error(offset, centre_ratio / line_noise_ratio, interpolation),
+        max(below_ratio, centre_ratio, above_ratio),
+    )
+    store_peak(
+        peak,
+        strongest_bin + peak_shift,
+        strongest_bin + offset,
+        error,
+        ratio,
+        inputs.line_deviation_bins[i, s, group],
+        config,
+        interpolation,
+    )
+    return True
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
+    """Complex amplitude of bin k of a group in a draw, of a mean square magnitude."""
+    if speckle.n_bins[group, segment] == 0:
+        return complex(magnitude, 0.0)
+    return magnitude * speckle.amplitudes[group, 0, segment, bin_index]
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def detect_in_speckle(
+    address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
+):
+    """Draw a group in developed speckle: True, and its peak, where it is detected.
+
+    Its amplitude, echo and noise, is normal, of the echo's share in the mean power. It is detected
+    where its power exceeds what it exceeds with the group's probability of detection. So segments
+    are detected together as two correlated Rayleigh magnitudes of their own probabilities are, by
+    :func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`. An echo that counts as several
+    independent bins
+    is detected by any of as many amplitudes, of which the drawn one is the first. Several looks
+    detect by their own powers.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    _, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    strongest_bin, first_bin = (
+        inputs.group_bins[i, s, STRONGEST_ROW, group],
+        speckle.first_bin[group, s],
+    )
+    strongest_index, n_bins, pd = (
+        strongest_bin - first_bin,
+        speckle.n_bins[group, s],
+        inputs.pd[i, s, group],
+    )
+    n_independent_bins = inputs.n_independent_bins[i, s, group]
+    if n_independent_bins > 1.0:
+        pd = -math.expm1(math.log1p(-pd) / n_independent_bins)
+    echo_fraction, is_noncircular = (
+        inputs.echo_fraction[i, s, group],
+        is_near_end(first_bin, n_bins, config),
+    )
+    if not pd > 0.0:
+        return False
+    power, scratch = workspace.bin_power[:n_bins], workspace.noise_bins
+    power[:] = 0.0
+    in_phase, in_quadrature, n_votes = 0.0, 0.0, 0
+    echo_weight, noise_weight = math.sqrt(echo_fraction), math.sqrt(0.5 * (1.0 - echo_fraction))
+    for look in range(config.n_looks):
+        look_draw = draw + look * LOOK_DRAW_STRIDE
+        address_of_noise = a, b, look_draw, philox.STREAM_NOISE[s]
+        if n_bins == 3 and not is_noncircular:
+            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, scratch)
+        else:
+            draw_adjacent_noise(
+                address_of_noise,
+                ECHO_NOISE_FIRST_INDEX * (1 + group),
+                (first_bin, n_bins),
+                config,
+                scratch,
+            )
+        bin_amplitudes = speckle.amplitudes[
+            group, look if speckle.amplitudes.shape[1] > 1 else 0, s
+        ]
+        for k in range(n_bins):
+            magnitude_ratio, bin_weight = (
+                speckle.rms_ratio[group, s, k],
+                echo_weight * speckle.detection_weights[group, s, k],
+            )
+            re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * scratch[0, k]
+            im = magnitude_ratio * bin_amplitudes[k].imag + line_noise_ratio * scratch[1, k]
+            if look == 0:
+                in_phase, in_quadrature = (
+                    in_phase + bin_weight * bin_amplitudes[k].real,
+                    in_quadrature + bin_weight * bin_amplitudes[k].imag,
+                )
+            if k == strongest_index and look == 0:
+                in_phase, in_quadrature = (
+                    in_phase + noise_weight * scratch[0, k],
+                    in_quadrature + noise_weight * scratch[1, k],
+                )
+            if k == strongest_index:
+                n_votes += re * re + im * im >= threshold_ratio * threshold_ratio
+            power[k] += (re * re + im * im) / config.n_looks
+    if config.n_looks > 1 and config.votes_needed >= 0:
+        is_detected = (
+            n_votes >= config.votes_needed
+            if config.votes_needed > 0
+            else power[strongest_index] >= threshold_ratio * threshold_ratio
+        )
+    elif is_noncircular:
+        mean_pseudo_variance = (
+            echo_fraction * speckle.pseudo_variance_ratio[group, s, strongest_index]
+        )
+        mean_pseudo_variance += (1.0 - echo_fraction) * pseudo_variance_ratio_at(
+            abs(strongest_bin), config.nyquist_bin, config.noise_pseudo_variance_ratio
+        )
+        is_detected = (
+            hoyt_tails(1.0, mean_pseudo_variance, math.hypot(in_phase, in_quadrature))[0] < pd
+        )
+    else:
+        is_detected = math.exp(-(in_phase * in_phase + in_quadrature * in_quadrature)) < pd
+        if not is_detected and n_independent_bins > 1.0:
+            is_detected = is_detected_by_other_bin(address, (i, s), group, inputs, pd)
+    if not is_detected:
+        return False
+    peak_index = strongest_index
+    if n_bins > 3:
+        for k in range(1, n_bins - 1):
+            peak_index = k if power[k] > power[peak_index] else peak_index
+    below, peak_magnitude, above = (
+        math.sqrt(power[peak_index - 1]),
+        math.sqrt(power[peak_index]),
+        math.sqrt(power[peak_index + 1]),
+    )
+    offset, peak_shift = estimate_sub_bin_offset(below, peak_magnitude, above, interpolation), 0
+    if max(below, above) > peak_magnitude:
+        peak_shift = 1 if above > below else -1
+    error = sub_bin_standard_error(
+        offset, peak_magnitude / line_noise_ratio, interpolation
+    ) / math.sqrt(config.n_looks)
+    ratio = max(below, peak_magnitude, above, threshold_ratio)
+    store_peak(
+        peak,
+        first_bin + peak_index + peak_shift,
+        first_bin + peak_index + offset,
+        error,
+        ratio,
+        0.0,
+        config,
+        interpolation,
+    )
+    return True
+
+
+_OTHER_BINS_RANDOM_OFFSET = 1 << 22
+"""Random numbers from which those of further independent bins of groups count, group by group."""
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_bin_pd):
+    """Return true where an independent bin of a group but its strongest one is detected.
+
+    ``single_bin_pd`` is the probability of a bin. The last of them is a part of one.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    n_bins_left, echo_fraction = (
+        inputs.n_independent_bins[i, s, group] - 1.0,
+        inputs.echo_fraction[i, s, group],
+    )
+    random_index = _OTHER_BINS_RANDOM_OFFSET + group * int(DRAWN_INDEPENDENT_BINS_MAX)
+    while n_bins_left > 1e-6:
+        speckle_amplitude = speckle_amplitudes(
+            (a, b), draw, random_index, inputs.cholesky_factors[i]
+        )[s]
+        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], random_index)
+        noise_weight, echo_weight = math.sqrt(0.5 * (1.0 - echo_fraction)), math.sqrt(echo_fraction)
+        power = (echo_weight * speckle_amplitude[0] + noise_weight * re) ** 2 + (
+            echo_weight * speckle_amplitude[1] + noise_weight * im
+        ) ** 2
+        if math.exp(-power) < (
+            single_bin_pd
+            if n_bins_left >= 1.0
+            else -math.expm1(n_bins_left * math.log1p(-single_bin_pd))
+        ):
+            return True
+        n_bins_left, random_index = n_bins_left - 1.0, random_index + 1
+    return False
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
+    """Noise of adjacent bins over sigma, to rows 0 and 1 of ``scratch`` (4, >= bins + TAPS).
+
+    It has room for all bins of ``config.end_rule`` and TAPS where bins are near DC or Nyquist.
+
+    ``address``: key, draw, stream; independent numbers count from ``first_index``.
+    ``first_and_count``: the first bin, and their number.
+    """
+    first_bin, n_bins = first_and_count
+    touches_end = config.real_fft_size > 0 and (
+        first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
+    )
+    if is_near_end(first_bin, n_bins, config):
+        draw_noise_near_end(address, first_index, first_and_count, config, scratch)
+    elif n_bins <= config.noise_root.shape[0] and not touches_end:
+        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, scratch)
+    else:
+        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, scratch)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def is_near_end(first_bin, n_bins, config):
+    """Return true of adjacent bins so near to DC or Nyquist that the noise's quadratures differ."""
+    n_near_bins = config.noise_pseudo_variance_ratio.size
+    return n_near_bins > 0 and (
+        first_bin < n_near_bins or first_bin + n_bins - 1 > config.nyquist_bin - n_near_bins
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
+    """Noise of :func:`draw_adjacent_noise` near DC or Nyquist, beyond which bins are conjugate."""
+    first_bin, n_bins = first_and_count
+    last_bin = first_bin + n_bins - 1
+    drawn_first, drawn_last = 0, max(last_bin, -first_bin)
+    if first_bin >= config.noise_pseudo_variance_ratio.size:
+        drawn_first, drawn_last = (
+            min(first_bin, 2 * config.nyquist_bin - last_bin),
+            config.nyquist_bin,
+        )
+    draw_bin_noise(
+        address,
+        first_index,
+        drawn_first,
+        drawn_last - drawn_first + 1,
+        config.end_noise_filter,
+        scratch,
+    )
+    for k in range(drawn_last - drawn_first + 1):
+        scratch[2, k], scratch[3, k] = scratch[0, k], scratch[1, k]
+    for k in range(n_bins):
+        bin_ = abs(first_bin + k)
+        sign = -1.0 if first_bin + k < 0 or bin_ > config.nyquist_bin else 1.0
+        bin_ = min(bin_, 2 * config.nyquist_bin - bin_) - drawn_first
+        scratch[0, k], scratch[1, k] = scratch[2, bin_], sign * scratch[3, bin_]
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_three_bin_noise(address, first_index, interpolation, scratch):
+    """Noise of three adjacent bins over sigma, to rows 0 and 1 of ``scratch``.
+
+    ``address``: key, draw, stream; independent numbers count from ``first_index``.
+    """
+    from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
+    a, b, draw, stream = address
+    re, im = philox.normal_pair(a, b, draw, stream, first_index)
+    re_above, im_above = philox.normal_pair(a, b, draw, stream, first_index + 1)
+    re_below, im_below = philox.normal_pair(a, b, draw, stream, first_index + 2)
+    scratch[0, 0] = from_centre * re + below_from_above * re_above + below_own * re_below
+    scratch[1, 0] = from_centre * im + below_from_above * im_above + below_own * im_below
+    scratch[0, 1], scratch[1, 1] = re, im
+    scratch[0, 2], scratch[1, 2] = (
+        from_centre * re + above_own * re_above,
+        from_centre * im + above_own * im_above,
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_all_bins(
+    address,
+    point_and_segment,
+    group,
+    config,
+    inputs,
+    spectra,
+    speckle,
+    interpolation,
+    workspace,
+    peak,
+):
+    """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
+
+    The peak is the largest of them.
+    """
+    (a, b, draw), (i, s) = address, point_and_segment
+    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
+    span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
+    first_index, last_index = (
+        inputs.group_bins[i, s, FIRST_ROW, group] - span_first_bin,
+        inputs.group_bins[i, s, LAST_ROW, group] - span_first_bin,
+    )
+    first_index, last_index = echo_bounds(
+        span_ratios,
+        first_index,
+        last_index,
+        threshold_ratio,
+        max(config.lobe_half_width, int(inputs.bin_threshold_table[i, 4])),
+    )
+    n_bins, peak_index = last_index - first_index + 1, 0
+    pedestal_power, scratch = workspace.pedestal_power[:n_bins], workspace.noise_bins
+    pedestal_power[:] = 0.0
+    if line_noise_ratio > 1.0:
+        magnitudes = workspace.bin_power[:n_bins]
+        for k in range(n_bins):
+            magnitudes[k] = noise_sigma * span_ratios[first_index + k]
+        bin_threshold = bin_threshold_at(inputs.bin_threshold_table.T, i)
+        fill_pedestal_ratios(magnitudes, workspace.all_echo[:n_bins], bin_threshold, pedestal_power)
+    address_of_noise, first_number = (
+        (a, b, draw, philox.STREAM_NOISE[s]),
+        ECHO_NOISE_FIRST_INDEX * (1 + group),
+    )
+    if speckle.n_bins[group, s] > 0:
+        draw_adjacent_noise(
+            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, scratch
+        )
+    else:
+        draw_bin_noise(
+            address_of_noise,
+            first_number,
+            span_first_bin + first_index,
+            n_bins,
+            config.noise_filter,
+            scratch,
+        )
+    for k in range(n_bins):
+        amplitude, noise_deviation = (
+            speckled_amplitude(span_ratios[first_index + k], speckle, group, s, k),
+            1.0,
+        )
+        if pedestal_power[k] > 0.0:  # fades as the lines do
+            power = pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, s, k)) ** 2
+            noise_deviation = math.sqrt(1.0 + power)
+        re, im = (
+            amplitude.real + noise_deviation * scratch[0, k],
+            amplitude.imag + noise_deviation * scratch[1, k],
+        )
+        scratch[0, k] = math.hypot(re, im)
+        peak_index = k if scratch[0, k] > scratch[0, peak_index] else peak_index
+    peak_ratio, line_deviation = scratch[0, peak_index], inputs.line_deviation_bins[i, s, group]
+    if peak_ratio < threshold_ratio:
+        return False
+    below_ratio = scratch[0, peak_index - 1] if peak_index > 0 else 0.0
+    above_ratio = scratch[0, peak_index + 1] if peak_index + 1 < n_bins else 0.0
+    offset, peak_bin = (
+        estimate_sub_bin_offset(below_ratio, peak_ratio, above_ratio, interpolation),
+        span_first_bin + first_index + peak_index,
+    )
+    error = sub_bin_standard_error(offset, peak_ratio / line_noise_ratio, interpolation)
+    store_peak(
+        peak, peak_bin, peak_bin + offset, error, peak_ratio, line_deviation, config, interpolation
+    )
+    return True
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def store_peak(peak, bin_number, position, error, ratio, line_deviation, config, interpolation):
+    """Write a peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
+
+    A peak of a complex record wraps from N/2 to -N/2.
+    """
+    fft_size = 2 * config.nyquist_bin
+    if config.down_beat_sign:
+        wrap_shift = fft_size * math.floor((bin_number + config.nyquist_bin) / fft_size)
+        peak[BIN_COLUMN], peak[POSITION_COLUMN] = bin_number - wrap_shift, position - wrap_shift
+    else:
+        bin_number, position = abs(bin_number), abs(position)
+        peak[BIN_COLUMN] = fft_size - bin_number if bin_number > config.nyquist_bin else bin_number
+        peak[POSITION_COLUMN] = fft_size - position if position > config.nyquist_bin else position
+    line_error = line_spread_error(
+        peak[POSITION_COLUMN] - peak[BIN_COLUMN],
+        line_deviation,
+        config.adds_powers or not config.has_doppler,
+        interpolation,
+    )
+    peak[ERROR_COLUMN], peak[RATIO_COLUMN] = math.hypot(error, line_error), ratio
+
+
+@njit(cache=True, error_model="numpy")
+def draw_free_bin(
+    uniform_number, group_bins, excluded_bins, searched_range, fft_size, down_beat_sign
+):
+    """Draw a bin outside the groups, their neighbours and ``excluded_bins``, uniformly.
+
+    One of those from the first to the last of ``searched_range``; of a complex record, of N =
+    ``fft_size`` bins, as far round as they go on.
+    """
+    first, last = searched_range
+    n_groups = 0
+    while n_groups < group_bins.shape[1] and group_bins[STRONGEST_ROW, n_groups] >= 0:
+        n_groups += 1
+    group_spans, n_free, span_end = np.empty((n_groups, 2), np.int64), last - first + 1, first
+    for g in range(n_groups):  # disjoint; in rising order
+        wrap_shift = (
+            (group_bins[STRONGEST_ROW, g] - first) // fft_size * fft_size if down_beat_sign else 0
+        )
+        k = g
+        while k > 0 and group_spans[k - 1, 0] > group_bins[FIRST_ROW, g] - wrap_shift:
+            group_spans[k, 0], group_spans[k, 1] = group_spans[k - 1, 0], group_spans[k - 1, 1]
+            k -= 1
+        group_spans[k, 0], group_spans[k, 1] = (
+            group_bins[FIRST_ROW, g] - wrap_shift,
+            group_bins[LAST_ROW, g] - wrap_shift,
+        )
+    for g in range(n_groups):
+        group_spans[g, 0] = max(group_spans[g, 0] - 1, span_end)
+        span_end = max(min(group_spans[g, 1] + 2, last + 1), group_spans[g, 0])
+        group_spans[g, 1], n_free = span_end, n_free - (span_end - group_spans[g, 0])
+    excluded_elsewhere = np.empty(
+        excluded_bins.size, np.int64
+    )  # barred bins that are searched, and in no group
+    n_excluded = 0
+    for k in range(excluded_bins.size):
+        bin_number = (
+            first + (excluded_bins[k] - first) % fft_size if down_beat_sign else excluded_bins[k]
+        )
+        is_skipped = bin_number < first or bin_number > last
+        for g in range(n_groups):
+            is_skipped |= group_spans[g, 0] <= bin_number < group_spans[g, 1]
+        if not is_skipped:
+            excluded_elsewhere[n_excluded] = bin_number
+            n_excluded += 1
+    rank = int(uniform_number * max(n_free - n_excluded, 1))
+    n_passed_before, bin_number = -1, first + rank
+    n_passed = 0
+    while n_passed != n_passed_before:  # as many barred bins below it are passed over
+        n_passed_before, bin_number = n_passed, first + rank + n_passed
+        for g in range(n_groups):
+            if bin_number >= group_spans[g, 0]:
+                bin_number += group_spans[g, 1] - group_spans[g, 0]
+        n_passed = 0
+        for k in range(n_excluded):
+            n_passed += excluded_elsewhere[k] <= bin_number
+    return min(bin_number, last)

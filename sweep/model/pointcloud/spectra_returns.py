@@ -1,0 +1,243 @@
+"""Returns of a flight's shots that a detector and an estimator find in whole spectra, draw by draw.
+
+Spectra are those of :mod:`sweep.model.sampling.noisy_spectra`, as grids have them: a shot is a
+point, with
+the echoes of all the surfaces that it sees. Flagged bins that are adjacent make a peak, placed by
+the estimator; the strongest of them are paired, judged and measured as all others of a flight
+(:mod:`sweep.model.pointcloud.returns`). A peak belongs to an echo whose bins it touches. These are
+the bins
+from the first to the last of half the echo's largest magnitude, and a main lobe's half-width to
+either side (by ``peak_bin`` the strongest alone). An echo has one peak, the strongest. All others
+are false, as many as there are, but those that touch bins of a signal at or above a fixed
+threshold, or their neighbours: closed forms exempt these from false alarms, too.
+
+A draw is looked at by itself, so that a user's function answers the same however draws are cut.
+
+Standard errors are those of three bins' interpolation, whatever the estimator, which an instrument
+does not know better; those of ``peak_bin`` count its rounding.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sweep.model.detection.detectors import main_lobe_half_width
+from sweep.model.detection.estimators import ESTIMATOR_PREFIX, PEAK_BIN, SPECTRUM_METHOD_DEFAULTS
+from sweep.model.detection.sub_bin_interpolation import interpolator, sub_bin_standard_error
+from sweep.model.pointcloud.bin_groups import BinGroups
+from sweep.model.pointcloud.ego_motion import EgoMotion
+from sweep.model.pointcloud.pairing import FALSE_PEAK
+from sweep.model.pointcloud.returns import (
+    DrawConfig,
+    DrawnPeaks,
+    DrawWorkspace,
+    Returns,
+    make_draw_inputs,
+    measure_returns,
+    pair_into_returns,
+    store_peak,
+)
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.sampling.noisy_spectra import (
+    SegmentSignal,
+    SpectrumMethods,
+    SpectrumView,
+    estimate_positions,
+    flag_bins,
+    iter_look_spectra,
+    make_spectrum_view,
+    unroll_bins,
+    unrolling_shift,
+    zero_frequency_index,
+)
+from sweep.model.waveform import STRONGEST_PEAK
+
+
+def draw_spectra_returns(
+    shots: Shots,
+    bin_groups: BinGroups,
+    *,
+    keys: np.ndarray,
+    parameters: Parameters,
+    methods: SpectrumMethods,
+    first_draw: int = 0,
+    draws: int = 1,
+    motion: EgoMotion | None = None,
+) -> Returns:
+    """Draw returns from whole spectra, by the detector and estimator of these names.
+
+    `parameters` are scalars; :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`
+    stand for any not given.
+    """
+    method_parameters, groups_max = (
+        {**SPECTRUM_METHOD_DEFAULTS, **parameters},
+        bin_groups.strongest_bin.shape[2],
+    )
+    inputs, drawn_peaks = (
+        make_draw_inputs(shots, bin_groups, motion),
+        DrawnPeaks.empty(bin_groups, draws),
+    )
+    config, interpolation = (
+        DrawConfig.from_shots(shots, first_draw, True),
+        interpolator(shots.window, shots.fft_size),
+    )
+    peaks, peak_groups = np.zeros((3, groups_max + 1, 4)), np.empty((3, groups_max + 1), np.int64)
+    pairs, root_n_looks = np.empty((groups_max + 1, 4), np.int64), math.sqrt(shots.looks.number)
+    workspace = DrawWorkspace.allocate(0, groups_max)
+    zero_index, peaks_max = (
+        zero_frequency_index(shots),
+        1 if shots.reported_peaks == STRONGEST_PEAK else groups_max + 1,
+    )
+    rounding_error = (
+        math.sqrt(1 / 12) if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN else 0.0
+    )
+    for point in range(shots.size):
+        spectrum_view = make_spectrum_view(
+            shots,
+            point,
+            method_parameters,
+            keys[point],
+            methods,
+            bin_groups.strongest_bin[point],
+            inputs.line_grid,
+        )
+        noise_sigma, _, line_noise_ratio = inputs.noise_and_threshold[point]
+        echo_bounds = [
+            _echo_bin_bounds(spectrum_view, s, signal)
+            for s, signal in enumerate(spectrum_view.signals)
+        ]
+        for d in range(draws):
+            n_peaks = np.zeros(3, np.int64)
+            for s, signal in enumerate(spectrum_view.signals):
+                if signal is None:
+                    continue
+                spectra = list(iter_look_spectra(spectrum_view, s, np.array([first_draw + d])))
+                power, bins, echo_of_peak = list_flagged_peaks(
+                    spectra, signal, echo_bounds[s], spectrum_view, peaks_max
+                )
+                repeated_spectra = [np.repeat(spectrum, bins.size, axis=0) for spectrum in spectra]
+                positions = (
+                    estimate_positions(repeated_spectra, bins, spectrum_view)
+                    if bins.size
+                    else np.empty(0)
+                )
+                for k, (bin_, position) in enumerate(
+                    zip(bins.tolist(), positions.tolist(), strict=True)
+                ):
+                    ratio = math.sqrt(power[bin_]) / noise_sigma
+                    offset = min(max(position - bin_, -0.5), 0.5)
+                    error = (
+                        sub_bin_standard_error(offset, ratio / line_noise_ratio, interpolation)
+                        / root_n_looks
+                    )
+                    line_deviation = (
+                        inputs.line_deviation_bins[point, s, echo_of_peak[k]]
+                        if echo_of_peak[k] >= 0
+                        else 0.0
+                    )
+                    error = math.hypot(error, rounding_error)
+                    bin_and_position = bin_ - zero_index, position - zero_index
+                    store_peak(
+                        peaks[s, k],
+                        *bin_and_position,
+                        error,
+                        ratio,
+                        line_deviation,
+                        config,
+                        interpolation,
+                    )
+                    peak_groups[s, k] = echo_of_peak[k]
+                n_peaks[s] = bins.size
+            pair_into_returns(
+                (point, d),
+                config,
+                inputs,
+                (peaks, peak_groups, n_peaks),
+                pairs,
+                workspace,
+                drawn_peaks,
+            )
+    return measure_returns(shots, inputs, drawn_peaks, motion, from_three_bins=False)
+
+
+def _echo_bin_bounds(view: SpectrumView, segment: int, signal: SegmentSignal | None) -> np.ndarray:
+    """First and last bin (echoes, 2) of each echo in a segment, unrolled by :func:`unroll_bins`.
+
+    The strongest of all stands in the middle of a complex record's bins.
+    """
+    echo_indices = view.echo_indices(segment)
+    if signal is None or not echo_indices.size:
+        return np.empty((0, 2), np.int64)
+    shots, setting = view.shots, view.setting
+    shift = unrolling_shift(shots, signal.strongest_bin)
+    if shots.complex_record:
+        echo_indices = (echo_indices + shift - 1) % shots.fft_size + 1
+    if shots.detection != "any_bin":
+        return np.stack([echo_indices, echo_indices], axis=1)
+    if echo_indices.size == 1:
+        return np.array([[signal.first_bin + shift, signal.last_bin + shift]])
+    magnitude = unroll_bins(shots, np.abs(signal.spectrum), signal.strongest_bin)
+    lobe_half_width = math.ceil(
+        main_lobe_half_width(setting.window) * setting.fft_size / setting.window.length
+    )
+    bounds = []
+    for echo_index in echo_indices:
+        low_bins = np.flatnonzero(magnitude < 0.5 * magnitude[echo_index])
+        next_low = int(np.searchsorted(low_bins, echo_index))
+        first = low_bins[next_low - 1] + 1 if next_low else 0
+        last = low_bins[next_low] - 1 if next_low < low_bins.size else magnitude.size - 1
+        bounds.append((first - lobe_half_width, last + lobe_half_width))
+    return np.array(bounds)
+
+
+def list_flagged_peaks(
+    spectra: Sequence[np.ndarray],
+    signal: SegmentSignal,
+    echo_bounds: np.ndarray,
+    view: SpectrumView,
+    peaks_max: int,
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Power (bins,) of one draw of a segment, and the peaks in it, strongest first.
+
+    Of each the strongest bin, and the echo whose bins it touches, or FALSE. ``spectra``: (1, bins)
+    each, of one or several looks; ``echo_bounds``: of :func:`_echo_bin_bounds`.
+    """
+    (all_power,), (flags,) = flag_bins(spectra, view, signal.segment)
+    shots, shift = view.shots, unrolling_shift(view.shots, signal.strongest_bin)
+    power, flags = (
+        unroll_bins(shots, values, signal.strongest_bin) for values in (all_power, flags)
+    )
+    end_index = power.size - 1
+    if view.shots.real_fft_size and signal.last_bin >= signal.first_bin:  # an echo on DC or Nyquist
+        # No group holds these bins: where they are flagged, the next one stands for them.
+        for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
+            if flags[end] and end in (signal.first_bin, signal.last_bin):
+                flags[inner_bin] = True
+                echo_bounds = np.where(echo_bounds == end, inner_bin, echo_bounds)
+    flags[[0, -1]] = False
+    assert signal.is_exempt is not None
+    is_exempt = unroll_bins(shots, signal.is_exempt, signal.strongest_bin)
+    edges = np.diff(flags.astype(np.int8))
+    starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
+    bins: list[int] = []
+    echo_of_peak: list[int] = []
+    first_searched = view.shots.first_searched_bin
+    group_power = [power[start:end].max() for start, end in zip(starts, ends, strict=True)]
+    for group_index in np.argsort(-np.array(group_power), kind="stable"):
+        start, end = int(starts[group_index]), int(ends[group_index])
+        touched_echoes = np.flatnonzero((echo_bounds[:, 0] < end) & (start <= echo_bounds[:, 1]))
+        echo_number = int(touched_echoes[0]) if touched_echoes.size else FALSE_PEAK
+        if echo_number == FALSE_PEAK and (
+            start > end_index - first_searched or end <= first_searched
+        ):
+            continue
+        if echo_number == FALSE_PEAK and is_exempt[start:end].any():
+            continue
+        if echo_number != FALSE_PEAK and echo_number in echo_of_peak:
+            continue
+        bins.append((start + int(power[start:end].argmax()) - shift) % all_power.size)
+        echo_of_peak.append(echo_number)
+        if len(bins) == peaks_max:
+            break
+    return all_power, np.array(bins, np.int64), echo_of_peak

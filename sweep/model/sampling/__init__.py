@@ -1,0 +1,1 @@
+"""Random draws: generators of numbers, random effects, noise and whole noisy spectra."""

@@ -1,0 +1,932 @@
+"""Random draws of shots: detections and false alarms counted, batch by batch.
+
+Two ways that agree in the mean. ``probabilities`` is [T 3.3.2]'s: uniform numbers against pd and
+the probability of a false alarm (noise and leakage together). ``noise`` adds complex Gaussian
+noise to the bins of the echo, alike as window and padding make it, and looks. Over the other bins,
+which hold noise alone, the largest magnitude is drawn from the order statistic of as many
+independent ones as alarm as often. If effects are random, each draw has a spectrum and
+probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling.samplers`, which
+also says
+when to stop. Echoes in developed speckle fade by factors that the segments have partly in common,
+or, where any bin detects, by the lines of their footprint
+(:mod:`sweep.model.sampling.speckle_lines`).
+
+Every number is addressed by point, draw, cause and index (:mod:`sweep.model.sampling.philox`).
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernel_cache import njit
+from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.echo_detection import bin_threshold_at, fill_pedestal_ratios
+from sweep.model.detection.hoyt import pseudo_variance_ratio_at
+from sweep.model.detection.marcum import at_least_one_probability
+from sweep.model.preparation import Shots
+from sweep.model.sampling import philox
+from sweep.model.sampling.philox import (
+    STREAM_DETECTION,
+    STREAM_FALSE_ALARM,
+    STREAM_NOISE,
+    STREAM_NOISE_MAXIMUM,
+)
+from sweep.model.sampling.speckle_lines import (
+    FACTORED_BINS_MAX,
+    SpeckleLineGrid,
+    draw_bin_amplitudes,
+    draw_factored_amplitudes,
+    factor_bin_covariance,
+    mean_bin_powers,
+    speckle_line_grid,
+)
+from sweep.model.spectrum.search_restriction import mean_line_positions
+from sweep.model.spectrum.segment_spectra import iter_spans
+
+PD_BOTH_CHIRPS = "pd_both_chirps"
+"""Probability of a detection in both chirps, beside the outputs where any two segments detect."""
+
+_DRAWS_PER_STEP = 256
+"""Draws of a row whose random numbers are made together."""
+
+
+class DrawRanges(NamedTuple):
+    """Spectra, (m,) each, of a run of draws."""
+
+    point_index: np.ndarray
+    """int64: the point whose counts they add to."""
+    keys: np.ndarray
+    """(m, 2) uint64: random key of that point."""
+    first_draw: np.ndarray
+    """int64: number of the first draw."""
+    end_draw: np.ndarray
+    """int64: number after the last."""
+
+
+def count_by_probability(
+    draw_ranges: DrawRanges,
+    batch_edges: np.ndarray,
+    outputs: Mapping[str, np.ndarray],
+    counts: np.ndarray,
+) -> None:
+    """Add the draws of some rows, held against their outputs, to the counts.
+
+    ``batch_edges`` (batches + 1,) are the numbers of draws between batches; the counts, int64, are
+    (names, points, batches) in the order of :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`.
+    """
+    n_rows, probabilities = draw_ranges.point_index.size, _draw_probabilities(outputs)
+    no_filter = np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0
+    config = False, *no_filter, np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan)))
+    no_spectra = NoiselessSpectra.empty(n_rows), np.empty((0, n_rows))
+    no_pseudo_variance = (
+        np.zeros((3, n_rows), np.int64),
+        np.zeros((1, 0)),
+        0,
+        SpeckleLineGrid.empty(),
+    )
+    no_speckle = *no_pseudo_variance, np.empty((0, 3))
+    no_levels = np.zeros((2, n_rows)), np.zeros((7, n_rows))
+    _count_draws(
+        draw_ranges,
+        batch_edges,
+        *no_levels,
+        probabilities,
+        config,
+        *no_spectra,
+        no_speckle,
+        0.0,
+        counts,
+    )
+
+
+def count_in_noise(
+    draw_ranges: DrawRanges, batch_edges: np.ndarray, shots: Shots, counts: np.ndarray
+) -> None:
+    """Count the draws of some rows in the noise of their shots."""
+    threshold_and_noise = threshold_and_line_noise_ratios(shots)
+    mixing = (
+        np.empty((0, shots.size))
+        if shots.segment_correlations is None
+        else shots.segment_correlations.cholesky_factors()
+    )
+    pfa_bin, speckle_table = np.exp(-0.5 * threshold_and_noise[0] ** 2), shots.speckle_table
+    line_grid = speckle_line_grid(shots)
+    for indices, spectra in iter_noiseless_spectra(shots):
+        pfa_elsewhere = at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins.T)
+        probabilities = np.array(
+            [pfa_elsewhere, *np.zeros((2, *pfa_elsewhere.shape))]
+        )  # in C order
+        part_ranges = DrawRanges(*(column[indices] for column in draw_ranges))
+        filter_rule = make_echo_noise_filter(shots, spectra)
+        kernel_arguments = (
+            threshold_and_noise[:, indices].copy(),
+            shots.bin_threshold_table[:, indices].copy(),
+            probabilities,
+            (True, *filter_rule, np.full(indices.size, shots.any_two)),
+            spectra,
+            mixing[:, indices].copy(),
+            (
+                speckle_table.ratio_row[:, indices].copy(),
+                speckle_table.pseudo_variance_ratio,
+                shots.fft_size // 2,
+                line_grid.select(indices),
+                np.ascontiguousarray(
+                    mean_line_positions(shots, indices, spectra.first_bin + spectra.peak_index)
+                ),
+            ),
+            shots.detection_rule.sidelobe_correlation,
+        )
+        _count_draws(part_ranges, batch_edges, *kernel_arguments, counts)
+
+
+def make_echo_noise_filter(
+    shots: Shots, spectra: "NoiselessSpectra", bins_min: int = 0
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Filter of the noise of an echo's bins, none where the largest alone detects; N or 0.
+
+    It has ``bins_min`` bins where any detects, if that is more than there are. The last is N where
+    noise at DC and Nyquist is real.
+    """
+    n_echo_bins = (
+        max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule[1] else 0
+    )
+    n_filter_bins = 1 << (n_echo_bins - 1).bit_length() if n_echo_bins else 0
+    if shots.noise_bins == "independent":
+        weights = np.zeros((n_filter_bins, NOISE_FILTER_TAPS))
+        weights[:, NOISE_FILTER_TAPS // 2] = 1.0
+        return weights, np.arange(n_filter_bins) - NOISE_FILTER_TAPS // 2, 0
+    return *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_fft_size
+
+
+ROOT_BINS_MAX = 16
+"""Bins of which noise is made of as few numbers as there are bins."""
+
+
+def noise_covariance_root(filter_rule: tuple[np.ndarray, np.ndarray, int]) -> np.ndarray:
+    """Return the triangular matrix (k, k) that makes the noise of adjacent bins of k numbers.
+
+    Of the filter of :func:`make_echo_noise_filter`, up to ROOT_BINS_MAX bins; away from DC and
+    Nyquist, where :func:`draw_bin_noise` says how bins are alike.
+    """
+    weights, start, _ = filter_rule
+    n_bins = min(weights.shape[0], ROOT_BINS_MAX)
+    number_weights = np.zeros(
+        (n_bins, int(start[n_bins - 1] - start[0]) + NOISE_FILTER_TAPS if n_bins else 0)
+    )
+    for k in range(n_bins):
+        number_weights[k, start[k] - start[0] : start[k] - start[0] + NOISE_FILTER_TAPS] = weights[
+            k
+        ]
+    root = np.zeros((n_bins, n_bins))
+    for k in range(n_bins):
+        for j in range(k + 1):
+            covariance = (number_weights[k] * number_weights[j]).sum() - (
+                root[k, :j] * root[j, :j]
+            ).sum()
+            if j < k:
+                root[k, j] = covariance / root[j, j] if root[j, j] > 0 else 0.0
+            elif covariance > _REMAINDER_MIN:
+                root[k, k] = math.sqrt(covariance)
+    return root
+
+
+_REMAINDER_MIN = 1e-9
+"""Share of a bin's noise that its neighbours do not make, below which there is none."""
+
+
+def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Probabilities of a false alarm, and of a detection without and with one in the up segment.
+
+    By segment (up, Doppler, down), (3, 3, n); of a detection in the Doppler segment where not one
+    alone of the other two has a detection, and where one has, which decides if any two detect.
+    """
+    pd_up, pd_down, pd_shot = (
+        np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot")
+    )
+    stated_both = outputs.get(PD_BOTH_CHIRPS, np.full(pd_up.shape, np.nan))
+    both = np.where(np.isfinite(stated_both), stated_both, pd_shot)
+    down_without_up, down_with_up = down_pd_given_up(pd_up, pd_down, both)
+    pd_doppler = np.nan_to_num(outputs["pd_doppler"])
+    pd_of_exactly_one, pd_added_by_doppler, detects_any_two = (
+        pd_up + pd_down - 2 * both,
+        pd_shot - both,
+        np.isfinite(stated_both),
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        doppler_if_one = np.where(
+            detects_any_two & (pd_of_exactly_one > 0),
+            np.clip(pd_added_by_doppler / pd_of_exactly_one, 0.0, 1.0),
+            pd_doppler,
+        )
+        doppler_if_not_one = np.clip(
+            (pd_doppler - pd_added_by_doppler) / (1 - pd_of_exactly_one), 0.0, 1.0
+        )
+    doppler_otherwise = np.where(
+        detects_any_two & (pd_of_exactly_one < 1), doppler_if_not_one, pd_doppler
+    )
+    pfa_noise_up = outputs["pfa_segment"]
+    both, log_pfa_up = outputs["log10_pfa_both_chirps"], outputs["log10_pfa_segment"]
+    has_free_bins = np.isfinite(log_pfa_up)  # else the detection occupies every bin
+    pfa_noise_down = np.where(
+        has_free_bins, 10 ** (both - np.where(has_free_bins, log_pfa_up, 0.0)), 0.0
+    )
+    alarm_up = 1 - (1 - pfa_noise_up) * (1 - outputs["p_leakage_up"])
+    alarm_down = 1 - (1 - pfa_noise_down) * (1 - outputs["p_leakage_down"])
+    alarms = alarm_up, np.zeros_like(alarm_up), alarm_down
+    return np.array(
+        [alarms, (pd_up, doppler_otherwise, down_without_up), (pd_up, doppler_if_one, down_with_up)]
+    )
+
+
+def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> np.ndarray:
+    """Probabilities of a detection in the down segment, without and with one in up, (2, ...).
+
+    From those of either segment and of both.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        without_up = np.where(
+            pd_up < 1, np.clip((pd_down - pd_both) / (1 - pd_up), 0.0, 1.0), pd_down
+        )
+        return np.stack(
+            [without_up, np.where(pd_up > 0, np.minimum(pd_both / pd_up, 1.0), pd_down)]
+        )
+
+
+def threshold_and_line_noise_ratios(shots: Shots) -> np.ndarray:
+    """Threshold and noise under the lines, over the noise of any other bin, (2, n)."""
+    ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
+    return np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
+
+
+ECHO_NOISE_FIRST_INDEX = 1 << 24
+"""Numbers of the noise of an echo's bins, from which they count apart from those of single bins."""
+
+
+class NoiselessSpectra(NamedTuple):
+    """Spectra without noise, by point and segment (m, 3), for noise to be added to."""
+
+    first_bin: np.ndarray
+    """int64: first of the bins that hold signal, from which they are numbered."""
+    peak_index: np.ndarray
+    """int64: number of the largest."""
+    peak_ratio: np.ndarray
+    """Its |X| / sigma; nan for a segment that does not exist."""
+    has_real_noise: np.ndarray
+    """bool: whether noise is real there."""
+    bins_start: np.ndarray
+    """int64: where the segment's bins begin in the two that follow, from ``first_bin`` on."""
+    n_bins: np.ndarray
+    """int64: number of these."""
+    bin_ratios: np.ndarray
+    """|X| / sigma of all bins."""
+    is_echo: np.ndarray
+    """bool: whether they are of the echo."""
+    n_noise_bins: np.ndarray
+    """Bins that count for false alarms and hold noise alone."""
+    leaked_slice: np.ndarray
+    """(m, 3, 2) int64: first of the bins below, and after the last; none without leakage."""
+    leaked_index: np.ndarray
+    """int64: numbers of bins of leaked signal, that may raise a false alarm by themselves."""
+    leaked_ratio: np.ndarray
+    """|X| / sigma of them."""
+    exempt_neighbour_ratio: np.ndarray
+    """|X| / sigma of the bin next to each of them that is exempt from false alarms, 0 for none."""
+    exempt_neighbour_side: np.ndarray
+    """int64: 1 where that bin is above, else -1."""
+
+    @classmethod
+    def empty(cls, n_points: int) -> "NoiselessSpectra":
+        """No spectra, for what is drawn against probabilities."""
+        zeros, empty_slices = (
+            np.zeros((n_points, 3), np.int64),
+            np.zeros((n_points, 3, 2), np.int64),
+        )
+        nans, no_bins = np.full((n_points, 3), np.nan), np.zeros((n_points, 3))
+        numbers, values = np.empty(0, np.int64), np.empty(0)
+        no_bin_arrays = zeros, zeros, values, np.empty(0, np.bool_)
+        no_leaked = numbers, values, values, numbers
+        return cls(
+            zeros,
+            zeros,
+            nans,
+            np.zeros((n_points, 3), np.bool_),
+            *no_bin_arrays,
+            no_bins,
+            empty_slices,
+            *no_leaked,
+        )
+
+
+def iter_noiseless_spectra(
+    shots: Shots, point_indices: np.ndarray | None = None
+) -> Iterator[tuple[np.ndarray, NoiselessSpectra]]:
+    """Yield points of some shots, all or those of ``point_indices``, and their spectra.
+
+    As many at once as memory holds.
+    """
+    noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.real_fft_size > 0
+    # Without leakage none but the peak is looked at.
+    negligible_ratio = (
+        shots.negligible_signal_ratio + np.zeros(shots.size)
+        if shots.includes_leakage
+        else np.full(shots.size, np.inf)
+    )
+    magnitude_min = np.minimum(shots.threshold, negligible_ratio * noise_sigma)
+    for spans in iter_spans(
+        shots, points=point_indices, level_min=magnitude_min, leakage=False, with_pd=False
+    ):
+        n_bins, start, peak_index = (
+            c.T.ravel() for c in (spans.n_bins, spans.span_start, spans.peak_index)
+        )
+        span_of_bin = np.repeat(np.arange(n_bins.size), n_bins)  # of each bin, point by point
+        index_in_span = np.arange(span_of_bin.size) - (np.cumsum(n_bins) - n_bins)[span_of_bin]
+        flat_index, point_of_bin = (
+            start[span_of_bin] + index_in_span,
+            spans.point_numbers[span_of_bin // 3],
+        )
+        ratio = spans.magnitudes[flat_index] / noise_sigma[point_of_bin]
+        is_searched = spans.peak_is_searched.T.ravel()
+        is_leaked = (ratio >= negligible_ratio[point_of_bin]) & (
+            (index_in_span != peak_index[span_of_bin]) | ~is_searched[span_of_bin]
+        )
+        is_leaked &= ~spans.is_exempt[flat_index]
+        exempt_ratios = np.pad(np.where(spans.is_exempt[flat_index], ratio, 0.0), 1)
+        below = np.where(index_in_span > 0, exempt_ratios[:-2], 0.0)
+        above = np.where(index_in_span < n_bins[span_of_bin] - 1, exempt_ratios[2:], 0.0)
+        n_leaked = np.bincount(span_of_bin[is_leaked], minlength=n_bins.size).reshape(-1, 3)
+        leaked_end = np.cumsum(n_leaked).reshape(-1, 3)
+        exists = spans.n_bins.T > 0
+        n_exempt = np.where(exists, spans.n_exempt.T, 0.0)
+        n_noise_bins = shots.alarm_equivalent_bins(n_exempt.T, spans.point_numbers).T - n_leaked
+        spectra = NoiselessSpectra(
+            first_bin=np.where(exists, spans.first_bin.T, 0),
+            peak_index=np.where(exists, spans.peak_index.T, 0),
+            has_real_noise=np.isin(
+                (spans.first_bin + spans.peak_index).T, (0, shots.real_fft_size / 2)
+            )
+            & exists
+            & has_real_ends,
+            peak_ratio=np.where(
+                exists & spans.peak_is_searched.T,
+                spans.peak_magnitude.T / noise_sigma[spans.point_numbers, None],
+                np.nan,
+            ),
+            bins_start=(np.cumsum(n_bins) - n_bins).reshape(-1, 3),
+            n_bins=spans.n_bins.T,
+            bin_ratios=ratio,
+            is_echo=spans.is_exempt[flat_index],
+            n_noise_bins=np.maximum(n_noise_bins, 0.0),
+            leaked_slice=np.stack([leaked_end - n_leaked, leaked_end], axis=2),
+            leaked_index=index_in_span[is_leaked],
+            leaked_ratio=ratio[is_leaked],
+            exempt_neighbour_ratio=np.maximum(below, above)[is_leaked],
+            exempt_neighbour_side=np.where(above >= below, 1, -1)[is_leaked],
+        )
+        # In C order as those of `nothing`: numba compiles anew for each order.
+        yield spans.point_numbers, NoiselessSpectra(*map(np.ascontiguousarray, spectra))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_draws(
+    draw_ranges,
+    batch_edges,
+    threshold_and_noise,
+    bin_threshold_table,
+    probabilities,
+    config,
+    spectra,
+    mixing,
+    pseudo_variance_and_lines,
+    sidelobe_correlation,
+    counts,
+):
+    """Add the draws of each row to the counts.
+
+    ``config``: whether in noise; filter of an echo's noise, as of :func:`make_echo_noise_filter`;
+    whether any two segments detect a shot. ``threshold_and_noise`` (2,
+    m): :func:`threshold_and_line_noise_ratios`; ``bin_threshold_table`` (7, m) the levels of bins
+    of which any detects
+    (:class:`sweep.model.detection.echo_detection.BinThreshold`). ``probabilities`` (3, 3, m): those
+    of a false alarm in
+    bins that are not looked at one by one, and, of no meaning in noise, of a detection without and
+    with one in the up segment. ``mixing`` (6, m):
+    :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`, or nothing.
+    ``pseudo_variance_and_lines``: rows (3, m) of the pseudo-variances near DC and Nyquist
+    (:class:`sweep.model.detection.pseudo_variance.SignalPseudoVariance`), these, and N/2; lines of
+    footprints in
+    developed speckle, and their middles (m, 3) [bins]. ``sidelobe_correlation``: that of
+    neighbours' noise in phase with the signal.
+    """
+    in_noise, weights, start, real_ends, any_two = config
+    noise_scratch = np.empty((4, weights.shape[0] + weights.shape[1]))
+    random_words = np.empty((4, _DRAWS_PER_STEP), np.uint64)
+    segment_factors, segment_amplitudes = (
+        np.ones((3, _DRAWS_PER_STEP)),
+        np.zeros((3, 2, _DRAWS_PER_STEP)),
+    )
+    along, across = np.ones(_DRAWS_PER_STEP), np.zeros(_DRAWS_PER_STEP)
+    no_amplitudes = np.zeros((3, 0, 0), np.complex128)
+    is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
+    for j in range(draw_ranges.point_index.size):
+        threshold_power, line_noise_ratio = (
+            threshold_and_noise[0, j] * threshold_and_noise[0, j],
+            threshold_and_noise[1, j],
+        )
+        i, batch = draw_ranges.point_index[j], 0
+        for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
+            n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
+            address = draw_ranges.keys[j, 0], draw_ranges.keys[j, 1], first, n_draws
+            is_detected[:], has_alarm[:] = False, False
+            for d in range(n_draws if mixing.shape[0] > 0 else 0):
+                one, amplitude_doppler, amplitude_down = speckle_amplitudes(
+                    address[:2], first + d, 0, mixing[:, j]
+                )
+                for component in range(2):
+                    segment_amplitudes[0, component, d], segment_amplitudes[1, component, d] = (
+                        one[component],
+                        amplitude_doppler[component],
+                    )
+                    segment_amplitudes[2, component, d] = amplitude_down[component]
+                for s in range(3):
+                    segment_factors[s, d] = math.hypot(
+                        segment_amplitudes[s, 0, d], segment_amplitudes[s, 1, d]
+                    )
+            echo_amplitudes = no_amplitudes
+            if mixing.shape[0] > 0 and weights.size > 0:
+                echo_amplitudes = _draw_echo_amplitudes(
+                    address, j, spectra, pseudo_variance_and_lines, segment_factors
+                )
+            for s in (0, 2, 1):
+                stream, peak_ratio, peak_index = (
+                    STREAM_NOISE[s],
+                    spectra.peak_ratio[j, s],
+                    spectra.peak_index[j, s],
+                )
+                ratio_row = pseudo_variance_and_lines[0][s, j]
+                pseudo_variance_ratios = pseudo_variance_and_lines[1][
+                    ratio_row, : (pseudo_variance_and_lines[1].shape[1] if ratio_row > 0 else 0)
+                ]
+                if in_noise and weights.size > 0:
+                    _mark_any_bin_crossings(
+                        address,
+                        (j, s),
+                        spectra,
+                        (weights, start, real_ends),
+                        bin_threshold_at(bin_threshold_table, j),
+                        echo_amplitudes[s],
+                        noise_scratch,
+                        is_detected[s],
+                    )
+                elif in_noise:
+                    noise_deviations = line_noise_ratio, line_noise_ratio
+                    if spectra.has_real_noise[j, s]:
+                        noise_deviations = math.sqrt(2.0) * line_noise_ratio, 0.0
+                    along[:], across[:] = segment_factors[s], 0.0
+                    if ratio_row > 0:
+                        bin_pseudo_variance = pseudo_variance_ratio_at(
+                            spectra.first_bin[j, s] + peak_index,
+                            pseudo_variance_and_lines[2],
+                            pseudo_variance_ratios,
+                        )
+                        along[:] = math.sqrt(1.0 + bin_pseudo_variance) * segment_amplitudes[s, 0]
+                        across[:] = (
+                            math.sqrt(max(1.0 - bin_pseudo_variance, 0.0))
+                            * segment_amplitudes[s, 1]
+                        )
+                    crossing = peak_ratio, noise_deviations, threshold_power, along, across
+                    _mark_crossings(
+                        address, stream, peak_index, crossing, random_words, is_detected[s]
+                    )
+                else:
+                    pd_pair = probabilities[1, s, j], probabilities[2, s, j]
+                    one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
+                    _mark_random_events(
+                        address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]
+                    )
+                if probabilities[0, s, j] > 0.0:
+                    alarm_stream = STREAM_NOISE_MAXIMUM[s] if in_noise else STREAM_FALSE_ALARM[s]
+                    alarm_pair = probabilities[0, s, j], probabilities[0, s, j]
+                    _mark_random_events(
+                        address,
+                        alarm_stream,
+                        alarm_pair,
+                        is_detected[0],
+                        random_words,
+                        has_alarm[s],
+                    )
+                _mark_leakage_alarms(
+                    address,
+                    (j, s),
+                    spectra,
+                    threshold_and_noise[0, j],
+                    sidelobe_correlation,
+                    segment_factors[s],
+                    random_words,
+                    has_alarm[s],
+                )
+            for d in range(n_draws):
+                while first + d >= batch_edges[batch + 1]:
+                    batch += 1
+                counts[0, i, batch] += is_detected[0, d]
+                counts[1, i, batch] += is_detected[2, d]
+                counts[2, i, batch] += is_detected[1, d]
+                by_doppler = (
+                    any_two[j] & is_detected[1, d] & (is_detected[0, d] | is_detected[2, d])
+                )
+                counts[3, i, batch] += (is_detected[0, d] & is_detected[2, d]) | by_doppler
+                counts[4, i, batch] += has_alarm[0, d]
+                counts[5, i, batch] += has_alarm[2, d]
+                counts[6, i, batch] += has_alarm[0, d] & has_alarm[2, d]
+
+
+@njit(cache=True, error_model="numpy")
+def _mark_leakage_alarms(
+    address,
+    point_and_segment,
+    spectra,
+    threshold_ratio,
+    sidelobe_correlation,
+    magnitude_factors,
+    random_words,
+    has_alarm,
+):
+    """Mark the draws in which bins of leaked signal, with their noise, raise a further group.
+
+    Bins that cross next to an echo whose outermost bin crosses are part of the echo.
+
+    Parameters
+    ----------
+    address
+        Key (two uint64), first draw, and number of draws.
+    point_and_segment
+        Point and segment.
+    spectra
+        :class:`NoiselessSpectra`.
+    threshold_ratio
+        Threshold [sigma].
+    sidelobe_correlation
+        Correlation of neighbours' noise in phase with the signal.
+    magnitude_factors
+        (draws,): factors on magnitudes by speckle.
+    random_words
+        Room for random numbers (4, draws).
+    has_alarm
+        Result (draws,), bool: True where they do.
+    """
+    stream, n_draws = STREAM_NOISE[point_and_segment[1]], address[3]
+    independent_part = math.sqrt(1.0 - sidelobe_correlation * sidelobe_correlation)
+    zeros, joins_echo = np.zeros(n_draws), np.zeros(n_draws, np.bool_)
+    begin, end = spectra.leaked_slice[point_and_segment]
+    # A group that begins beside an echo is the echo's to its end, and one that ends beside an echo
+    # from its begin: an alarm waits until its group ends.
+    is_pending, is_crossing = np.zeros(n_draws, np.bool_), np.empty(n_draws, np.bool_)
+    for leaked_bin in range(begin, end):
+        if (
+            leaked_bin > begin
+            and spectra.leaked_index[leaked_bin] != spectra.leaked_index[leaked_bin - 1] + 1
+        ):
+            for d in range(n_draws):
+                has_alarm[d] |= is_pending[d]
+                is_pending[d] = joins_echo[d] = False
+        is_crossing[:] = False
+        crossing = (
+            spectra.leaked_ratio[leaked_bin],
+            (1.0, 1.0),
+            threshold_ratio * threshold_ratio,
+            magnitude_factors,
+            zeros,
+        )
+        _mark_crossings(
+            address, stream, spectra.leaked_index[leaked_bin], crossing, random_words, is_crossing
+        )
+        for d in range(n_draws):
+            if not is_crossing[d]:
+                has_alarm[d] |= is_pending[d]
+                is_pending[d] = joins_echo[d] = False
+                continue
+            if spectra.exempt_neighbour_ratio[leaked_bin] > 0.0:
+                draw_number = address[2] + d
+                re, im = philox.normal_pair(
+                    address[0], address[1], draw_number, stream, spectra.leaked_index[leaked_bin]
+                )
+                edge_index = (
+                    spectra.leaked_index[leaked_bin] + spectra.exempt_neighbour_side[leaked_bin]
+                )
+                re_edge, im_edge = philox.normal_pair(
+                    address[0], address[1], draw_number, stream, edge_index
+                )
+                in_phase = (
+                    spectra.exempt_neighbour_ratio[leaked_bin] * magnitude_factors[d]
+                    + sidelobe_correlation * re
+                    + independent_part * re_edge
+                )
+                in_quadrature = sidelobe_correlation * im + independent_part * im_edge
+                joins_echo[d] |= math.hypot(in_phase, in_quadrature) >= threshold_ratio
+            is_pending[d] = not joins_echo[d]
+    for d in range(n_draws):
+        has_alarm[d] |= is_pending[d]
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def speckle_factors(key, draw, group, mixing):
+    """Factors of a draw on a group's magnitudes in the three segments; their mean square is 1."""
+    up, doppler, down = speckle_amplitudes(key, draw, group, mixing)
+    return (
+        math.hypot(up[0], up[1]),
+        math.hypot(doppler[0], doppler[1]),
+        math.hypot(down[0], down[1]),
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def speckle_amplitudes(key, draw, group, mixing):
+    """Amplitudes of a draw of a group in the three segments, complex; their mean square is 1.
+
+    Three standard normal amplitudes of the stream, those of the group's number, mixed.
+    """
+    stream, root_half = philox.STREAM_SPECKLE, math.sqrt(0.5)
+    a, b = philox.normal_pair(key[0], key[1], draw, stream, 3 * group)
+    c, d = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 1)
+    e, f = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 2)
+    (
+        doppler_from_up,
+        doppler_own,
+        down_from_up,
+        down_from_doppler_re,
+        down_from_doppler_im,
+        down_own,
+    ) = mixing
+    doppler = (
+        root_half * (doppler_from_up * a + doppler_own * c),
+        root_half * (doppler_from_up * b + doppler_own * d),
+    )
+    down_re = (
+        down_from_up * a + (down_from_doppler_re * c - down_from_doppler_im * d) + down_own * e
+    )
+    down_im = (
+        down_from_up * b + (down_from_doppler_re * d + down_from_doppler_im * c) + down_own * f
+    )
+    return (root_half * a, root_half * b), doppler, (root_half * down_re, root_half * down_im)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _mark_random_events(address, stream, probabilities, condition, random_words, is_marked):
+    """Mark the draws (key, first, number) in which something happens, by two probabilities.
+
+    The second is that of draws that are ``condition``. These may be the ones that are marked.
+    """
+    philox.fill_words(
+        address[:3],
+        stream,
+        philox.FIRST_BLOCK_NUMBER,
+        philox.DRAW_INCREMENTS,
+        address[3],
+        random_words,
+    )
+    for d in range(address[3]):
+        probability = probabilities[1] if condition[d] else probabilities[0]
+        is_marked[d] |= philox.to_uniform(random_words[0, d]) < probability
+
+
+@njit(cache=True, error_model="numpy")
+def _echo_end_indices(point_and_segment, spectra):
+    """First and last bin of an echo, from those of the spectrum; the last is -1 of none."""
+    bins_start, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
+    first_index, last_index = 0, n_bins - 1
+    while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:
+        first_index += 1
+    while last_index > first_index and not spectra.is_echo[bins_start + last_index]:
+        last_index -= 1
+    return first_index, (last_index if first_index < n_bins else -1)
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_echo_amplitudes(address, column, spectra, pseudo_variance_and_lines, segment_factors):
+    """Draw amplitudes (3, draws, bins) of an echo's bins in developed speckle, of mean power 1.
+
+    Those of the lines of its footprint; bins that no line reaches have that of the strongest bin.
+    ``segment_factors`` (3, draws) takes the size of the strongest bin's.
+    ``pseudo_variance_and_lines`` is the ``quadratures`` of :func:`_count_draws`.
+    """
+    line_grid, line_centre = (
+        pseudo_variance_and_lines[3],
+        pseudo_variance_and_lines[4][column].copy(),
+    )
+    first_bin, n_bins_max = np.zeros(3, np.int64), 0
+    first_index = np.zeros(3, np.int64)
+    for s in range(3):
+        begin_index, end_index = _echo_end_indices((column, s), spectra)
+        first_bin[s], first_index[s] = spectra.first_bin[column, s] + begin_index, begin_index
+        n_bins_max = max(n_bins_max, end_index - begin_index + 1)
+        if end_index < begin_index:
+            line_centre[s] = np.nan
+    mean_power, pseudo_variance = np.zeros((3, n_bins_max)), np.zeros((3, n_bins_max))
+    has_images = mean_bin_powers(
+        line_grid, column, line_centre, first_bin, mean_power, pseudo_variance
+    )
+    n_rows_max, factor_rank = 3 * n_bins_max, 0
+    factor = np.empty(
+        (n_rows_max if n_rows_max <= FACTORED_BINS_MAX else 0, 3, n_bins_max), np.complex128
+    )
+    if factor.shape[0] > 0 and not has_images:
+        factor_rank = factor_bin_covariance(
+            line_grid, column, line_centre, first_bin, mean_power, factor
+        )
+    amplitudes, drawn_amplitudes = (
+        np.zeros((3, address[3], n_bins_max), np.complex128),
+        np.zeros((3, n_bins_max), np.complex128),
+    )
+    for d in range(address[3]):
+        address_of_draw = address[0], address[1], address[2] + d
+        if factor_rank > 0:
+            draw_factored_amplitudes(address_of_draw, 0, factor, factor_rank, drawn_amplitudes)
+        else:
+            draw_bin_amplitudes(
+                address_of_draw,
+                0,
+                line_grid,
+                column,
+                line_centre,
+                first_bin,
+                mean_power,
+                drawn_amplitudes,
+            )
+        for s in range(3):
+            peak_index = spectra.peak_index[column, s] - first_index[s]
+            if not 0 <= peak_index < n_bins_max:
+                continue
+            segment_factors[s, d] = abs(drawn_amplitudes[s, peak_index])
+            for k in range(n_bins_max):
+                amplitudes[s, d, k] = (
+                    drawn_amplitudes[s, k]
+                    if mean_power[s, k] > 0.0
+                    else drawn_amplitudes[s, peak_index]
+                )
+    return amplitudes
+
+
+@njit(cache=True, error_model="numpy")
+def _mark_any_bin_crossings(
+    address,
+    point_and_segment,
+    spectra,
+    filter_rule,
+    bin_threshold,
+    echo_amplitudes,
+    noise_scratch,
+    is_marked,
+):
+    """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
+
+    ``bin_threshold`` are the :class:`sweep.model.detection.echo_detection.BinThreshold` of the
+    point. ``echo_amplitudes`` (draws,
+    bins): amplitudes of the echo's bins, of none if it does not fade. A pedestal fades as they do.
+    """
+    begin, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
+    bin_ratios, is_echo = (
+        spectra.bin_ratios[begin : begin + n_bins],
+        spectra.is_echo[begin : begin + n_bins],
+    )
+    first_index, last_index = _echo_end_indices(point_and_segment, spectra)
+    if last_index < 0:
+        return
+    threshold_ratio = bin_threshold.threshold / bin_threshold.noise_without_pedestal
+    pedestal_power = np.zeros(n_bins)
+    if (
+        bin_threshold.side_noise > bin_threshold.noise_without_pedestal
+        or bin_threshold.line_noise > bin_threshold.noise_without_pedestal
+    ):
+        fill_pedestal_ratios(bin_ratios, is_echo, bin_threshold, pedestal_power)
+    for d in range(address[3]):
+        noise_address = address[0], address[1], address[2] + d, STREAM_NOISE[point_and_segment[1]]
+        draw_bin_noise(
+            noise_address,
+            ECHO_NOISE_FIRST_INDEX,
+            spectra.first_bin[point_and_segment] + first_index,
+            last_index - first_index + 1,
+            filter_rule,
+            noise_scratch,
+        )
+        for i in range(first_index, last_index + 1):
+            amplitude = (
+                echo_amplitudes[d, i - first_index]
+                if echo_amplitudes.shape[1] > 0
+                else complex(1.0, 0.0)
+            )
+            noise_deviation = math.sqrt(1.0 + pedestal_power[i] * abs(amplitude) ** 2)
+            re = (
+                noise_deviation * noise_scratch[0, i - first_index] + bin_ratios[i] * amplitude.real
+            )
+            im = (
+                noise_deviation * noise_scratch[1, i - first_index] + bin_ratios[i] * amplitude.imag
+            )
+            is_marked[d] |= is_echo[i] and re * re + im * im >= threshold_ratio * threshold_ratio
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch):
+    """Noise of adjacent bins over sigma, in phase with the signal and across, to rows 0 and 1.
+
+    ``address``: key of the point, number of the draw, stream; independent numbers count from
+    ``first_index``. ``first_bin``, ``n_bins``: first bin, number of bins. ``filter_rule``:
+    :func:`make_echo_noise_filter`.
+    ``scratch`` (4, >= count + TAPS): result, and the independent numbers.
+    """
+    weights, start, real_fft_size = filter_rule
+    n_taps = weights.shape[1]
+    is_from_nyquist = (
+        real_fft_size > 0 and 2 * (first_bin + n_bins - 1) == real_fft_size
+    )  # counted from Nyquist
+    is_symmetric = is_from_nyquist or (real_fft_size > 0 and first_bin == 0)
+    first_number = 0 if is_symmetric else start[0]
+    for j in range(start[n_bins - 1] + n_taps - first_number):
+        re, im = philox.normal_pair(address[0], address[1], address[2], address[3], first_index + j)
+        if is_symmetric and j == 0:
+            re, im = math.sqrt(2.0) * re, 0.0
+        scratch[2, j], scratch[3, j] = re, im
+    for k in range(n_bins):
+        re, im = 0.0, 0.0
+        for m in range(n_taps):
+            j = start[k] + m - first_number
+            sign = -1.0 if is_symmetric and j < 0 else 1.0  # a real record's are conjugate
+            re += weights[k, m] * scratch[2, abs(j)]
+            im += weights[k, m] * sign * scratch[3, abs(j)]
+        i = n_bins - 1 - k if is_from_nyquist else k
+        scratch[0, i], scratch[1, i] = re, im
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_bin_noise_by_root(address, first_index, n_bins, root, scratch):
+    """Noise of ``n_bins`` adjacent bins over sigma, to rows 0 and 1 of ``scratch`` (4, >= count).
+
+    ``address`` and ``first_index`` are as of :func:`draw_bin_noise`, with an even number; ``root``
+    is :func:`noise_covariance_root`.
+    """
+    for k in range(0, n_bins, 2):
+        words = philox.four_words(
+            address[0], address[1], address[2], address[3], (first_index + k) >> 1
+        )
+        scratch[2, k], scratch[3, k] = philox.to_normals(words[0], words[1])
+        if k + 1 < n_bins:
+            scratch[2, k + 1], scratch[3, k + 1] = philox.to_normals(words[2], words[3])
+    for k in range(n_bins):
+        re, im = 0.0, 0.0
+        for j in range(k + 1):
+            re += root[k, j] * scratch[2, j]
+            im += root[k, j] * scratch[3, j]
+        scratch[0, k], scratch[1, k] = re, im
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _mark_crossings(address, stream, pair_index, crossing, random_words, is_marked):
+    """Mark the draws in which a bin, with its noise, reaches the threshold.
+
+    ``pair_index``: pair of the stream that the noise is. ``crossing``: |X| / sigma; the noise's
+    deviations
+    in its phase and across; the threshold, a power; factors on |X| in both, draw by draw.
+    """
+    ratio, noise_deviation, threshold, along, across = crossing
+    philox.fill_words(
+        address[:3], stream, pair_index >> 1, philox.DRAW_INCREMENTS, address[3], random_words
+    )
+    lane = 2 * (pair_index & 1)
+    for d in range(address[3]):
+        re, im = philox.to_normals(random_words[lane, d], random_words[lane + 1, d])
+        re, im = (
+            ratio * along[d] + re * noise_deviation[0],
+            ratio * across[d] + im * noise_deviation[1],
+        )
+        is_marked[d] |= re**2 + im**2 >= threshold
+
+
+@njit(cache=True, error_model="numpy")
+def largest_noise_magnitude(n_bins, probability, n_looks):
+    """|X| / sigma that the largest of so many bins of noise exceeds with the given probability.
+
+    The root of the mean power of some looks.
+    """
+    if not n_bins > 0.0:
+        return 0.0
+    if n_looks > 1:
+        bin_probability = -math.expm1(math.log1p(-probability) / n_bins)
+        return math.sqrt(2.0 * gamma_upper_quantile(n_looks, bin_probability) / n_looks)
+    return math.sqrt(-2.0 * math.log(-math.expm1(math.log1p(-probability) / n_bins)))
+
+
+@njit(cache=True, error_model="numpy")
+def gamma_upper_quantile(order, probability):
+    """Return x of Q(n, x) = `probability`, which a Gamma variable of whole order exceeds."""
+    low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
+    for _ in range(60):
+        x = 0.5 * (low + high)
+        term = total = 1.0
+        for k in range(1, order):
+            term *= x / k
+            total += term
+        if math.log(total) - x > math.log(max(probability, 1e-300)):
+            low = x
+        else:
+            high = x
+    return 0.5 * (low + high)

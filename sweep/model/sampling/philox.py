@@ -1,0 +1,190 @@
+"""Random numbers by address: Philox4x64-10 [Salmon et al., SC 2011], compiled.
+
+A draw is a function of the point (the key), the number of the draw, the physical cause (the
+stream) and an index within it. It does not depend on the order of work, the size of blocks
+or the number of workers. The 256-bit counter is
+
+    word 0: block of four outputs    word 1: 0    word 2: draw    word 3: stream
+
+and the function of (key, counter) is that of ``numpy.random.Philox``, bit for bit.
+"""
+
+import hashlib
+import math
+
+import numpy as np
+
+from sweep.kernel_cache import high_word, njit
+
+# Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
+# part of every stored draw: add, never change.
+STREAM_DETECTION = (1, 3, 2)
+STREAM_FALSE_ALARM = (4, 6, 5)
+STREAM_NOISE = (7, 9, 8)
+STREAM_NOISE_MAXIMUM = (10, 12, 11)
+STREAM_FOOTPRINT_PHASE = 13
+STREAM_SPECKLE = 14
+STREAM_POINTING_JITTER = 16
+STREAM_SCINTILLATION = 17
+STREAM_RECORD = (18, 20, 19)
+STREAM_LASER_PHASE = (21, 23, 22)
+STREAM_ERROR_FLOOR = 24
+STREAM_LEAKAGE = (25, 27, 26)
+
+_MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
+_M0, _M1 = (np.uint64(m) for m in _MULTIPLIERS)
+_LOW0, _LOW1 = (np.uint64(m & 0xFFFFFFFF) for m in _MULTIPLIERS)
+_HIGH0, _HIGH1 = (np.uint64(m >> 32) for m in _MULTIPLIERS)
+_WEYL_0 = np.uint64(0x9E3779B97F4A7C15)
+_WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
+_HALF_WORD = np.uint64(0xFFFFFFFF)
+
+FIRST_BLOCK_NUMBER, DRAW_INCREMENTS, BLOCK_INCREMENTS = np.int64(0), (1, 0), (0, 1)
+"""Arguments of :func:`fill_words`, which numba compiles anew for each number written in a call."""
+
+_SHIFT_32, _SHIFT_12 = np.uint64(32), np.uint64(12)
+
+
+@njit(cache=True)
+def _round(x0, x1, x2, x3, key0, key1):
+    """One of the ten rounds: high words of 128-bit products by halves of words.
+
+    So several are computed at once, in vector registers, which have no such product.
+    """
+    low, high = x0 & _HALF_WORD, x0 >> _SHIFT_32
+    middle = _LOW0 * high + (_LOW0 * low >> _SHIFT_32)
+    product0 = (
+        _HIGH0 * high + (middle >> _SHIFT_32) + (_HIGH0 * low + (middle & _HALF_WORD) >> _SHIFT_32)
+    )
+    low, high = x2 & _HALF_WORD, x2 >> _SHIFT_32
+    middle = _LOW1 * high + (_LOW1 * low >> _SHIFT_32)
+    product1 = (
+        _HIGH1 * high + (middle >> _SHIFT_32) + (_HIGH1 * low + (middle & _HALF_WORD) >> _SHIFT_32)
+    )
+    return product1 ^ x1 ^ key0, _M1 * x2, product0 ^ x3 ^ key1, _M0 * x0
+
+
+@njit(cache=True)
+def four_words(key0, key1, draw, stream, block):
+    """Four words of indices 4 block .. 4 block + 3, for the price of one."""
+    k0, k1 = np.uint64(key0), np.uint64(key1)
+    x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
+    for _ in range(10):
+        x0, x1, x2, x3 = (
+            high_word(_M1, x2) ^ x1 ^ k0, _M1 * x2, high_word(_M0, x0) ^ x3 ^ k1, _M0 * x0,
+        )  # fmt: skip
+        k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
+    return x0, x1, x2, x3
+
+
+@njit(cache=True)
+def fill_words(address, stream, block, increments, count, words):
+    """Words of `four_words` into the first columns of (4, >= number), in C order.
+
+    From an address (key0, key1, draw) on, draw and block rise by the steps each time. All take one
+    round after the other, which the processor does for several at once: some six times as fast.
+    """
+    k0, k1, draw = np.uint64(address[0]), np.uint64(address[1]), np.uint64(address[2])
+    x0, x1, x2, x3 = words[0], words[1], words[2], words[3]
+    for i in range(count):
+        x0[i], x1[i] = np.uint64(block) + np.uint64(increments[1] * i), 0
+        x2[i], x3[i] = draw + np.uint64(increments[0] * i), stream
+    for _ in range(10):
+        for i in range(count):
+            x0[i], x1[i], x2[i], x3[i] = _round(x0[i], x1[i], x2[i], x3[i], k0, k1)
+        k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
+
+
+@njit(cache=True)
+def to_uniform(word):
+    """Uniform number in (0, 1) of a word, the centre of one of 2^52 equal cells.
+
+    By the upper 52 bits: with 53 the last centre would round to 1; so 0 and 1 are both impossible,
+    and u and 1-u, both exact, equally likely.
+    """
+    return (np.float64(word >> _SHIFT_12) + 0.5) * 2.0**-52
+
+
+@njit(cache=True)
+def to_normals(word0, word1):
+    """Two independent standard normal numbers of two words, by Box and Muller's transform.
+
+    As real and imaginary part, sigma times this pair is one bin's noise (sigma per quadrature).
+    Their magnitude reaches sqrt(2 ln 2^53) = 8.57 at most.
+    """
+    radius, angle = math.sqrt(-2.0 * math.log(to_uniform(word0))), 2.0 * math.pi * to_uniform(word1)
+    return radius * math.cos(angle), radius * math.sin(angle)
+
+
+@njit(cache=True)
+def uniform(key0, key1, draw, stream, index):
+    """Return uniform number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
+
+    A probability below 1.1e-16 can not be drawn by comparison.
+    """
+    return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
+
+
+@njit(cache=True)
+def normal_pair(key0, key1, draw, stream, index):
+    """Pair `index` of normal numbers: of the uniforms ``2 index`` and ``2 index + 1``."""
+    words = four_words(key0, key1, draw, stream, index >> 1)
+    return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])
+
+
+def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np.ndarray:
+    """Return the first ``count`` of `uniform`, (m, number), in a draw (m,) of each key (m, 2)."""
+    out = np.empty((draws.size, (count + 3) // 4 * 4))
+    _fill_uniforms(np.ascontiguousarray(keys), np.asarray(draws, np.int64), stream, out)
+    return out[:, :count]
+
+
+@njit(cache=True, nogil=True)
+def _fill_uniforms(keys, draws, stream, out):
+    """Blocks of four uniforms, from the first on, in a draw of each key."""
+    words = np.empty((4, out.shape[1] // 4), np.uint64)
+    for i in range(draws.size):
+        address = keys[i, 0], keys[i, 1], draws[i]
+        fill_words(address, stream, FIRST_BLOCK_NUMBER, BLOCK_INCREMENTS, words.shape[1], words)
+        for block in range(words.shape[1]):
+            for lane in range(4):
+                out[i, 4 * block + lane] = to_uniform(words[lane, block])
+
+
+def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
+    """Independent standard normal numbers of as many uniforms, an even number in a row (m, k).
+
+    Pair by pair those of `normal_pair`, but for a last bit.
+    """
+    # In one piece each: bits do not depend on how many rows there are.
+    first, second = (np.ascontiguousarray(uniform_numbers[:, lane::2]) for lane in range(2))
+    radius, angle = np.sqrt(-2.0 * np.log(first)), 2.0 * np.pi * second
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(
+        len(uniform_numbers), -1
+    )
+
+
+def point_keys(parameter_rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:
+    """Philox keys (n, 2) of points, from what they are and not from where they stand in a grid.
+
+    BLAKE2b-128 of domain, seed and row (n, m): equal rows have equal keys, others different ones.
+    The domain tells what the rows mean (names and order of the columns, say), so that equal numbers
+    of different meaning give different keys.
+    """
+    table = np.asarray(parameter_rows, dtype="<f8")
+    if table.ndim != 2:
+        raise ValueError("rows of parameters form an array of shape (n, m)")
+    if np.isnan(table).any():
+        raise ValueError("a parameter is nan, which no point can be known by")
+    if seed < 0:
+        raise ValueError("a seed is not negative")
+    prefix_hash = hashlib.blake2b(digest_size=16)
+    for encoded in (domain.encode(), str(int(seed)).encode()):
+        prefix_hash.update(len(encoded).to_bytes(8, "little"))
+        prefix_hash.update(encoded)
+    digests = []
+    for row in np.ascontiguousarray(table + 0.0):  # -0.0 + 0.0 is 0.0
+        row_hash = prefix_hash.copy()
+        row_hash.update(row.tobytes())
+        digests.append(row_hash.digest())
+    return np.frombuffer(b"".join(digests), dtype="<u8").reshape(-1, 2).astype(np.uint64)

@@ -1,0 +1,497 @@
+"""Points sampled by draws: a fixed number of them, or as many as it takes to keep a promise.
+
+Draws are held against probabilities, or noise is added to the bins that matter
+(:mod:`sweep.model.sampling.draws`), or a detector and an estimator look at whole spectra with noise
+(:mod:`sweep.model.sampling.noisy_spectra`).
+
+The promise bounds the error of pd, each segment's and the shot's, with some confidence. The
+estimate of pd from draws depends on what is random. If effects are random, pd is the mean over
+draws of the conditional probabilities that each draw has over its noise. If noise alone is random
+and is drawn, it is the share of draws with a detection. If noise alone is random and draws are
+compared with known probabilities, pd is exact, and the counts sample it.
+
+Drawing until the promise is kept goes in rounds over all points that are still open. A test stops
+sooner, on the average, if the draws happen to vary little. This costs coverage and adds bias:
+:func:`stopping_checks` looks seldom enough for both to be small. ``benchmarks/stopping_rule.py``
+measures
+them. Looks come at the same numbers of draws for every point, and what a point has drawn depends on
+nothing but its own draws: other points, blocks and workers change no bit of it. A detector sees the
+draws of one point and segment together, in pieces that depend on the FFT size and on numbers of
+draws alone.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import waveform
+from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
+from sweep.model.error_budget import (
+    COUNT_INTERVALS,
+    ErrorBudget,
+    bounded_mean_interval,
+    interval_half_width,
+)
+from sweep.model.evaluation import evaluate, prepare_shots, shot_statistics
+from sweep.model.outputs import (
+    DETECTOR_INDEPENDENT_OUTPUTS,
+    DRAW_COUNT_OUTPUTS,
+    PD_OUTPUTS,
+    RUNNING_SUMS,
+)
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.sampling.draws import DrawRanges, count_by_probability, count_in_noise
+from sweep.model.sampling.noisy_spectra import (
+    AVERAGED_VALUES,
+    SpectrumMethods,
+    SpectrumView,
+    count_detections,
+    make_spectrum_view,
+)
+from sweep.model.sampling.realisations import (
+    DRAWS_PER_BATCH,
+    RunningMeans,
+    iter_realisations,
+    random_effects,
+    zero_standard_errors,
+)
+
+NOISE_DRAWS_PER_STEP = 1 << 16
+"""Draws of a point that are taken at once where nothing but noise is random."""
+RANDOM_EFFECT_DRAWS_PER_STEP_MIN = 16
+"""Draws of a point that are taken at once where random effects are simulated, at the least."""
+
+SPECTRUM_SAMPLES_PER_STEP = 1 << 18
+"""Samples of whole spectra that are held at once."""
+
+FFT_SIZE_PATH = "instrument.processing.fft_size"
+
+SPECTRA_METHOD = "spectra"
+"""Way to draw beside :data:`sweep.model.sampling.draws.METHODS`."""
+
+PD_COUNT_ROWS = [
+    list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
+]
+
+
+class PriorDraws(NamedTuple):
+    """Draws of n points that were taken before: further ones are added to them, bit for bit."""
+
+    n_draws: np.ndarray
+    """(n,) int64: how many, 0 where there are none."""
+    counts: np.ndarray
+    """(names, n, batches) int64: over the batches that are to be filled, as of DRAW_OUTPUTS."""
+    means: Mapping[str, np.ndarray]
+    """(n,) by the names of OUTPUTS, and RUNNING; for points with random effects."""
+
+
+class Sampler(ABC):
+    """Sums over the draws of n points so far, to be continued; arguments of :func:`simulate_draws`.
+
+    ``batch_edges`` (batches + 1,) are numbers of draws between batches, from the first draw's on.
+    """
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, keys: np.ndarray,
+        batch_edges: np.ndarray, prior_draws: PriorDraws | None = None,
+    ) -> None:  # fmt: skip
+        self.parameters: dict[str, Any] = dict(parameters)
+        self.effects, self.keys, self.batch_edges = effects, keys, batch_edges
+        self.n_draws = np.zeros(len(keys), np.int64)
+        self.counts = np.zeros((len(DRAW_COUNT_OUTPUTS), len(keys), batch_edges.size - 1), np.int64)
+        if prior_draws is not None:
+            self.n_draws += prior_draws.n_draws
+            self.counts += prior_draws.counts
+
+    @abstractmethod
+    def draws_per_step(self, n_points: int) -> int:
+        """Draws of each of so many points that one `draw` is for: a few seconds at the most."""
+
+    def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
+        """Draw some points, of which there are equally many draws, so many times more."""
+        first_draw = self.batch_edges[0] + self.n_draws[point_indices[0]]
+        counts = np.zeros(
+            (len(DRAW_COUNT_OUTPUTS), point_indices.size, self.batch_edges.size - 1), np.int64
+        )
+        self.count_draws(point_indices, first_draw, first_draw + n_draws, counts)
+        self.counts[:, point_indices] += counts
+        self.n_draws[point_indices] += n_draws
+
+    @abstractmethod
+    def count_draws(
+        self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
+    ) -> None:
+        """Add draws `first_draw` to `end_draw` - 1 to the counts (names, points, batches)."""
+
+    @abstractmethod
+    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+        """Half-widths (4, points) of pd at the confidence of `error_budget`.
+
+        By the names of PROMISED; nan where there is none.
+        """
+
+    @abstractmethod
+    def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
+        """Return outputs, errors and accuracy, (n,) each, and the sums for further draws."""
+
+    def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
+        """Parameters of some of the points."""
+        return {
+            path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
+            for path, v in self.parameters.items()
+        }
+
+    def n_detected(self) -> np.ndarray:
+        """Draws with a detection, (4, n), by the names of PROMISED."""
+        return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
+
+    def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+        """Half-widths of the shares of draws with a detection."""
+        counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
+        confidence = error_budget.select(point_indices, self.n_draws.size).confidence
+        interval = COUNT_INTERVALS[error_budget.interval](
+            successes=counts, trials=n, confidence=confidence
+        )
+        return interval_half_width(counts / n, interval)
+
+    def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+        """Compute the excess of the worst half-width over the tolerance; 0 where there is none."""
+        widths = self.half_widths(point_indices, error_budget)
+        excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
+        return np.fmax.reduce(excess, axis=0, initial=0.0)
+
+    def accuracy_outputs(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
+        """(n,) by the names of ACCURACY_OUTPUTS."""
+        point_indices = np.arange(self.n_draws.size)
+        widths = zip(PD_OUTPUTS, self.half_widths(point_indices, error_budget), strict=True)
+        return {
+            "n_draws": self.n_draws,
+            **{f"{name}_half_width": width for name, width in widths},
+            "accuracy_missed": self.half_width_excess(point_indices, error_budget),
+        }
+
+
+def never_stop() -> bool:
+    """Not to stop before all is drawn."""
+    return False
+
+
+def stopping_checks(batch_size: int, draws_max: int) -> Iterator[int]:
+    """Numbers of draws, rising to `draws_max`, after which half-widths are looked at.
+
+    After each of the first batches, then after a quarter as many again, in whole batches.
+    """
+    n_batches = 1
+    while n_batches * batch_size < draws_max:
+        yield n_batches * batch_size
+        n_batches = max(n_batches + 1, int(n_batches * ErrorBudget.stopping_check_growth))
+    yield draws_max
+
+
+def simulate_draws(
+    parameters: Parameters,
+    effects: Collection[str],
+    *,
+    keys: np.ndarray,
+    method: str,
+    first_draw: int = 0,
+    batch_sizes: Sequence[int] = (),
+    batch: int = 0,
+    limit: int = 0,
+    error_budget: ErrorBudget = ErrorBudget(),  # noqa: B008  # frozen
+    methods: SpectrumMethods = SpectrumMethods(),  # noqa: B008  # a tuple
+    prior_draws: PriorDraws | None = None,
+    should_stop: Callable[[], bool] = never_stop,
+) -> dict[str, np.ndarray]:
+    """Simulate draws with all effects: outputs, their errors, and counts of draws.
+
+    The result has the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS
+    of :mod:`sweep.model.outputs`, (n,), and those of DRAW_OUTPUTS, (n, batches). With random
+    effects or whole spectra it also has RUNNING, (n, columns), and outputs are means over the draws
+    that are counted.
+
+    `parameters` and `effects` are as for :func:`sweep.model.evaluation.evaluate`, `keys` (n, 2)
+    random, `method` is ``probabilities``, ``noise`` or ``spectra``. A point has as many draws as
+    `batch_sizes` say. Without them (then all draws are one count) it has as many as `error_budget`
+    needs, which is checked at multiples of `batch` draws, but no more than `limit`. `prior_draws`
+    are
+    earlier draws, from `first_draw` on, for the same accuracy or a looser one. If `should_stop`,
+    called between draws, returns true, the result holds the draws taken so far, at least some: a
+    `prior_draws` from which another call continues.
+    """
+    batch_edges = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
+    sampler_arguments: dict[str, Any] = {
+        "keys": keys,
+        "batch_edges": batch_edges,
+        "prior_draws": prior_draws,
+    }
+    sampler: Sampler
+    if method == SPECTRA_METHOD:
+        sampler = SpectraSampler(parameters, effects, methods=methods, **sampler_arguments)
+    else:
+        sampler = DetectionSampler(parameters, effects, method=method, **sampler_arguments)
+    point_indices = np.arange(len(keys))
+    if batch_sizes:
+        draw_until_accurate(sampler, point_indices, [sum(batch_sizes)], None, should_stop)
+        counts = sampler.counts
+    else:
+        draw_until_accurate(
+            sampler, point_indices, stopping_checks(batch, limit), error_budget, should_stop
+        )
+        counts = sampler.counts[..., 0]
+    return sampler.results(error_budget) | dict(zip(DRAW_COUNT_OUTPUTS, counts, strict=True))
+
+
+def draw_until_accurate(
+    sampler: Sampler,
+    point_indices: np.ndarray,
+    check_draws: Iterable[int],
+    error_budget: ErrorBudget | None,
+    should_stop: Callable[[], bool] = never_stop,
+) -> None:
+    """Draw points until the promise is kept of each, numbers to look at end, or told to stop.
+
+    One that has more draws than a look is at was looked at there before, or need not be. Without
+    an accuracy nothing is promised.
+    """
+    has_drawn = False
+    for check_at in check_draws:
+        n_draws = sampler.n_draws[point_indices]
+        for n_done in np.unique(n_draws[n_draws < check_at]):
+            equal_points = point_indices[n_draws == n_done]
+            step = sampler.draws_per_step(equal_points.size)
+            for start in range(n_done, check_at, step):
+                if has_drawn and should_stop():
+                    return
+                sampler.draw(equal_points, min(step, check_at - start))
+                has_drawn = True
+        if error_budget is not None:
+            is_checked = n_draws <= check_at
+            is_open = ~is_checked
+            is_open[is_checked] = (
+                sampler.half_width_excess(point_indices[is_checked], error_budget) > 0
+            )
+            point_indices = point_indices[is_open]
+            if not point_indices.size:
+                return
+
+
+class DetectionSampler(Sampler):
+    """Draws held against probabilities, or in noise, with or without random effects."""
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, method: str,
+        prior_draws: PriorDraws | None = None, **base_arguments: Any,
+    ) -> None:  # fmt: skip
+        super().__init__(parameters, effects, prior_draws=prior_draws, **base_arguments)
+        self._draws_noise, n_points = method == "noise", self.n_draws.size
+        self._running_means = RunningMeans(n_points) if random_effects(effects) else None
+        if self._running_means is None:
+            values = evaluate(parameters, effects)
+            self._outputs = {name: np.broadcast_to(v, (n_points,)) for name, v in values.items()}
+        elif prior_draws is not None:
+            self._running_means.resume(prior_draws.means)
+
+    def draws_per_step(self, n_points: int) -> int:
+        """As of :class:`Sampler`."""
+        return (
+            NOISE_DRAWS_PER_STEP
+            if self._running_means is None
+            else max(RANDOM_EFFECT_DRAWS_PER_STEP_MIN, 4 * DRAWS_PER_BATCH // n_points)
+        )
+
+    def count_draws(
+        self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
+    ) -> None:
+        """As of :class:`Sampler`: of random effects, draws are added to the means as well."""
+        point_parameters, keys = self.select_parameters(point_indices), self.keys[point_indices]
+        if self._running_means is not None:
+            for members, draw_numbers, shots in iter_realisations(
+                point_parameters,
+                self.effects,
+                keys=keys,
+                first_draw=first_draw,
+                draws=end_draw - first_draw,
+            ):
+                draw_statistics = shot_statistics(shots)
+                self._running_means.add(point_indices[members], draw_statistics)
+                draw_ranges = DrawRanges(members, keys[members], draw_numbers, draw_numbers + 1)
+                if self._draws_noise:
+                    count_in_noise(draw_ranges, self.batch_edges, shots, counts)
+                else:
+                    count_by_probability(draw_ranges, self.batch_edges, draw_statistics, counts)
+            return
+        first_and_end = np.full((2, point_indices.size), [[first_draw], [end_draw]])
+        draw_ranges = DrawRanges(np.arange(point_indices.size), keys, *first_and_end)
+        if not self._draws_noise:
+            outputs = {name: v[point_indices] for name, v in self._outputs.items()}
+            count_by_probability(draw_ranges, self.batch_edges, outputs, counts)
+            return
+        for indices, shots in prepare_shots(point_parameters, self.effects):
+            count_in_noise(
+                DrawRanges(*(v[indices] for v in draw_ranges)), self.batch_edges, shots, counts
+            )
+
+    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+        """As of :class:`Sampler`."""
+        confidence = error_budget.select(point_indices, self.n_draws.size).confidence
+        if self._running_means is not None:
+            mean, variance, n_draws = self._running_means.moments(PD_OUTPUTS, point_indices)
+            interval = bounded_mean_interval(
+                mean=mean, variance=variance, n_values=np.maximum(n_draws, 1), confidence=confidence
+            )
+            return interval_half_width(mean, interval)
+        zero_or_nan = np.stack([0.0 * self._outputs[name][point_indices] for name in PD_OUTPUTS])
+        return zero_or_nan + (
+            self.count_half_widths(point_indices, error_budget) if self._draws_noise else 0.0
+        )
+
+    def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
+        """As of :class:`Sampler`."""
+        if self._running_means is None:
+            outputs = self._outputs | zero_standard_errors(self._outputs)
+        else:
+            outputs = self._running_means.results() | {
+                RUNNING_SUMS: self._running_means.running_sums()
+            }
+        return outputs | self.accuracy_outputs(error_budget)
+
+
+class SpectraSampler(Sampler):
+    """Draws of whole spectra, looked at by detectors and estimators of given names."""
+
+    def __init__(
+        self, parameters: Parameters, effects: Collection[str], *, methods: SpectrumMethods,
+        prior_draws: PriorDraws | None = None, **base_arguments: Any,
+    ) -> None:  # fmt: skip
+        super().__init__(
+            {**SPECTRUM_METHOD_DEFAULTS, **parameters},
+            effects,
+            prior_draws=prior_draws,
+            **base_arguments,
+        )
+        self._methods, n_points = methods, self.n_draws.size
+        self._value_means, self._statistic_means = (
+            RunningMeans(n_points, AVERAGED_VALUES),
+            RunningMeans(n_points),
+        )
+        self._shot_of_point: dict[int, tuple[Shots, int]] = {}
+        if not random_effects(effects):
+            ranges = np.broadcast_to(np.asarray(parameters["target.range"]), n_points)
+            all_parameters: dict[str, Any] = {**parameters, "target.range": ranges}
+            for indices, shots in prepare_shots(all_parameters, effects):
+                self._statistic_means.add(indices, shot_statistics(shots))
+                self._shot_of_point |= {int(p): (shots, i) for i, p in enumerate(indices)}
+        if prior_draws is not None:
+            value_sums, statistic_sums = np.split(
+                prior_draws.means[RUNNING_SUMS].T, [3 * len(AVERAGED_VALUES)]
+            )
+            self._value_means.restore_state(value_sums)
+            if not self._shot_of_point:
+                self._statistic_means.restore_state(statistic_sums)
+
+    def draws_per_step(self, n_points: int) -> int:
+        """Return the number of draws that one step takes of each of ``n_points`` points.
+
+        Whole ones, so that a detector sees the same draws together however they are cut.
+        """
+        fft_sizes = np.unique(self.parameters[FFT_SIZE_PATH])
+        return max(1, 4 // n_points) * math.lcm(
+            *(max(1, SPECTRUM_SAMPLES_PER_STEP // int(n)) for n in fft_sizes)
+        )
+
+    def count_draws(
+        self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
+    ) -> None:
+        """As of :class:`Sampler`: and values are added to running means."""
+        for column, point in enumerate(point_indices):
+            for view, draws in self._iter_views(int(point), int(first_draw), int(end_draw)):
+                batch_index = np.searchsorted(self.batch_edges, draws, "right") - 1
+                draw_counts, values = count_detections(view, draws)
+                np.add.at(counts[:, column].T, batch_index, draw_counts.T)
+                values_by_name = dict(zip(AVERAGED_VALUES, values, strict=True))
+                self._value_means.add(np.full(draws.size, point), values_by_name)
+
+    def _iter_views(
+        self, point: int, first_draw: int, end_draw: int
+    ) -> Iterator[tuple[SpectrumView, np.ndarray]]:
+        """Yield views of a point, with the numbers of the draws that each is for."""
+        point_parameters = self.select_parameters(point)
+        if self._shot_of_point:
+            view = make_spectrum_view(
+                *self._shot_of_point[point], point_parameters, self.keys[point], self._methods
+            )
+            step = max(1, SPECTRUM_SAMPLES_PER_STEP // view.setting.fft_size)
+            for start in range(first_draw, end_draw, step):
+                yield view, np.arange(start, min(start + step, end_draw))
+            return
+        for realised in iter_realisations(
+            point_parameters,
+            self.effects,
+            keys=self.keys[[point]],
+            first_draw=first_draw,
+            draws=end_draw - first_draw,
+        ):
+            self._statistic_means.add(
+                np.full(realised.draw_numbers.size, point), shot_statistics(realised.shots)
+            )
+            for i, draw_number in enumerate(realised.draw_numbers):
+                view = make_spectrum_view(
+                    realised.shots, i, point_parameters, self.keys[point], self._methods
+                )
+                yield view, np.array([draw_number])
+
+    def _nan_where_missing(self) -> np.ndarray:
+        """0, but nan for a segment that is not there, (4, n), by the names of PROMISED."""
+        is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
+        segment_orders = np.asarray(
+            self.parameters.get(
+                waveform.SEGMENT_ORDER_PATH, waveform.WAVEFORM_DEFAULTS[waveform.SEGMENT_ORDER_PATH]
+            )
+        )
+        lacks_doppler = is_direct | (np.char.find(segment_orders, "doppler") < 0)
+        zero_or_nan = np.zeros((len(PD_OUTPUTS), self.n_draws.size))
+        zero_or_nan[
+            PD_OUTPUTS.index("pd_doppler"), np.broadcast_to(lacks_doppler, self.n_draws.shape)
+        ] = np.nan
+        return zero_or_nan
+
+    def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
+        """As of :class:`Sampler`."""
+        return (
+            self.count_half_widths(point_indices, error_budget)
+            + self._nan_where_missing()[:, point_indices]
+        )
+
+    def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
+        """As of :class:`Sampler`."""
+        values, statistics = self._value_means, self._statistic_means.results()
+        n, mean, squared_deviations, error = (
+            dict(zip(AVERAGED_VALUES, part, strict=True))
+            for part in (
+                values.n_values,
+                values.mean,
+                values.squared_deviations,
+                values.standard_errors(),
+            )
+        )
+        outputs = {name: statistics[name] for name in DETECTOR_INDEPENDENT_OUTPUTS}
+        detected_fractions = self.n_detected() / self.n_draws + self._nan_where_missing()
+        outputs |= dict(zip(PD_OUTPUTS, detected_fractions, strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for name in ("pfa_bin", "false_alarms"):
+                outputs |= {name: mean[name], f"{name}_error": error[name]}
+            for name in ("range", "radial_velocity"):
+                zero_or_nan = np.where(n[name] > 0, 0.0, np.nan)
+                outputs |= {
+                    f"{name}_bias": mean[name] + zero_or_nan,
+                    f"{name}_bias_error": error[name] + zero_or_nan,
+                    f"{name}_rmse": np.sqrt(mean[name] ** 2 + squared_deviations[name] / n[name]),
+                    f"{name}_bound": np.sqrt(mean[f"{name}_2"])
+                    + np.where(n[f"{name}_2"] > 0, 0.0, np.nan),
+                }
+        running_sums = np.concatenate([values.state(), self._statistic_means.state()]).T
+        return outputs | self.accuracy_outputs(error_budget) | {RUNNING_SUMS: running_sums}

@@ -1,0 +1,76 @@
+"""Errors of range and radial velocity because the places of peaks wander with speckle."""
+
+import numpy as np
+from scipy.special import exp1
+
+from sweep.model import waveform
+from sweep.model.preparation import Shots
+from sweep.model.sampling.speckle_lines import SpecklePeaks, folding_signs, position_error_moments
+
+NEGATIVE_LOG_PD_MAX = 700.0
+"""-ln of the least probability of detection that differs from 0."""
+
+
+def wander_variance(
+    shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
+) -> np.ndarray:
+    """Mean square errors of range [m^2] and radial velocity [m^2/s^2] by speckle, (2, m).
+
+    Parameters
+    ----------
+    point_indices
+        (m,): points of the shots that the peaks are of.
+    is_detected
+        (3, m): true for segments that are detected. The Doppler segment's beat is used if slopes
+        are not the default ones or any two segments detect a shot.
+    """
+    if shots.line_gradients is None:
+        return np.zeros((2, point_indices.size))
+    beat_covariance_bins = position_error_moments(
+        shots.line_gradients.select(point_indices), peaks, shots
+    )
+    is_resolved = np.array(
+        [True, shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or shots.any_two, True]
+    )
+    carriers, chirp_rates = (values[:, point_indices] for values in shots.beat_coefficients)
+    response_arguments = {
+        "weights": 1.0 * (is_detected & is_resolved[:, None]),
+        "carriers": carriers,
+        "chirp_rates": chirp_rates,
+    }
+    bin_width = np.broadcast_to(shots.sample_rate, shots.size)[point_indices] / shots.fft_size
+    response_per_bin = np.array(
+        [
+            waveform.range_velocity_response(unit[:, None] * bin_width, **response_arguments)
+            for unit in np.eye(3)
+        ]
+    )
+    return np.einsum("iam,mij,jam->am", response_per_bin, beat_covariance_bins, response_per_bin)
+
+
+def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
+    """Mean square errors as of :func:`wander_variance` over the echoes that are detected, (2, n).
+
+    Parameters
+    ----------
+    pd, snr
+        (3, n): probability of detection and SNR of each segment; nan where there is none.
+
+    Notes
+    -----
+    The power q^2 of a detected peak, in units of its mean, is exponential beyond A = -ln pd. The
+    mean of 1 / q^2, with which the wander goes, is e^A E_1(A) with the exponential integral E_1.
+    """
+    is_present = np.isfinite(pd) & np.isfinite(snr) & (pd > 0)
+    with np.errstate(divide="ignore"):
+        detection_exponent = np.clip(
+            -np.log(np.where(is_present, pd, 1.0)), 1e-6, NEGATIVE_LOG_PD_MAX
+        )
+    mean_inverse_power = np.exp(detection_exponent) * exp1(detection_exponent)
+    relative_power = np.where(is_present, 1 / np.maximum(mean_inverse_power, 1e-300), np.nan).T
+    echo_fraction = np.where(is_present, snr / (1 + snr), np.nan).T
+    point_indices = np.arange(shots.size)
+    peaks = SpecklePeaks(
+        np.zeros(relative_power.shape), folding_signs(shots), relative_power, echo_fraction
+    )
+    return wander_variance(shots, point_indices, peaks, is_present)

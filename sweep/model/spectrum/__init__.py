@@ -1,0 +1,1 @@
+"""Spectra of segments: lines, their shapes, the bins around them, and leakage far from them."""

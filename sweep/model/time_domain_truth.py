@@ -1,0 +1,201 @@
+"""The slow, obviously right simulation: every beamlet, every sample, the whole FFT.
+
+The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 2, sample by
+sample; the records add up, are windowed and transformed. Every fast path is held against this.
+It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
+kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
+
+With the effect of overlap a beamlet has an echo in samples from its own delay tau(t) on, and until
+the chirp ends.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+
+from sweep.model import receiver_chain, window
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.echo_detection import detect_in_spectra
+from sweep.model.effects.segment_motion import split_looks
+from sweep.model.preparation import Shots
+from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
+
+
+def time_domain_spectrum(
+    shots: Shots,
+    point: int,
+    segment: int,
+    *,
+    with_range_walk: bool = True,
+    with_acceleration: bool = False,
+    laser_phase: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
+
+    Of a complex record for k = -N/2..N/2 - 1, (N,). With incoherent phases: the root of the mean of
+    |X|^2 over independent uniform phases. ``with_range_walk`` keeps the terms of the phase in t^2,
+    the frequency drift while the target moves; ``with_acceleration`` that of its velocity;
+    ``laser_phase`` (L,) is theta(t) - theta(t - tau) in each sample [rad].
+    """
+    w = window.window_samples(shots.window.name, shots.window.length)
+    n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
+    record_sum = np.zeros(shots.window.length, complex)
+    power, image_gain = np.zeros(shots.n_bins), _value_at(shots.image_gain, point)
+    for beamlet in range(shots.relative_range_offset.shape[1]):
+        beamlet_record = analytic_record(
+            shots,
+            point,
+            segment,
+            beamlet,
+            with_range_walk=with_range_walk,
+            with_acceleration=with_acceleration,
+        )
+        beamlet_record *= np.exp(1j * np.asarray(laser_phase))
+        record_sum += beamlet_record
+        if shots.adds_powers:
+            power_spectrum = abs(np.fft.fft(w * beamlet_record, shots.fft_size) / 2) ** 2
+            if is_complex:
+                power += np.fft.fftshift(
+                    power_spectrum + image_gain**2 * np.roll(power_spectrum[::-1], 1)
+                )
+            else:
+                power += power_spectrum[:n_real_bins] + power_spectrum[-np.arange(n_real_bins)]
+    if shots.adds_powers:
+        return np.sqrt(power)
+    if is_complex:
+        record = w * (record_sum + image_gain * record_sum.conj()) / 2
+        return np.abs(np.fft.fftshift(np.fft.fft(record, shots.fft_size)))
+    return np.abs(np.fft.rfft(w * record_sum.real, shots.fft_size))
+
+
+def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = True) -> np.ndarray:
+    """Evaluate each segment's spectrum as :func:`sweep.model.evaluation.find` does; no leakage.
+
+    Range walk is the only change of lines within a record that is included.
+    """
+    segment_results = np.full((3, 6, shots.size), np.nan)
+    for point in range(shots.size):
+        last_bin_and_width = shots.n_bins - 1, float(shots.sample_rate[point]) / shots.fft_size
+        for segment in map(int, np.flatnonzero(shots.has_segment)):
+            look_magnitudes = [
+                time_domain_spectrum(look, point, segment, with_range_walk=with_range_walk)
+                for look in (split_looks(shots) if np.any(shots.line_drift_per_look) else [shots])
+            ]
+            magnitude, peak_row = (
+                np.sqrt(np.mean(np.square(look_magnitudes), axis=0)),
+                np.empty((6, 1)),
+            )
+            detect_in_spectra(
+                magnitude[None],
+                np.zeros(1, np.int64),
+                last_bin_and_width,
+                shots.detection_rule,
+                shots.bin_threshold_table[:, [point]],
+                shots.speckle_table.select(segment, np.array([point])),
+                peak_row,
+            )
+            segment_results[segment, :, point] = peak_row[:, 0]
+            if shots.complex_record:
+                segment_results[segment, 3, point] -= float(shots.sample_rate[point]) / 2
+    if shots.looks.is_noncoherent:
+        peak = np.rint(segment_results[:, 3] / (shots.sample_rate / shots.fft_size))
+        segment_results[:, 0], segment_results[:, 1] = shots.pd_and_miss_in_looks(
+            segment_results[:, 2], peak
+        )
+    return segment_results
+
+
+def analytic_record(
+    shots: Shots,
+    point: int,
+    segment: int,
+    beamlet: int,
+    *,
+    with_range_walk: bool = True,
+    with_acceleration: bool = False,
+) -> np.ndarray:
+    """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled.
+
+    The ground that the beam meets comes nearer by ``approach``, its scatterers by their own radial
+    velocity; both from the shot's start on. If the two differ the beam slides over the ground:
+    scatterers take each other's place, and the beat has the delay of those that are there.
+    """
+    chirp_slope, carrier = (
+        shots.chirp_slopes[segment],
+        float(_value_at(shots.carriers[segment], point)),
+    )
+    doppler_ratio_offset, segment_start = (
+        float(shots.doppler_ratio_offset[shots.footprint_row[point], beamlet]),
+        float(_value_at(shots.segment_starts[segment], point)),
+    )
+    approach_speed, acceleration_value = (
+        float(_value_at(shots.approach_speed, point)),
+        float(_value_at(shots.acceleration, point)),
+    )
+    alpha = acceleration_value / SPEED_OF_LIGHT
+    doppler_ratio = (
+        float(_value_at(shots.doppler_ratio, point))
+        + 2 * alpha * segment_start
+        + doppler_ratio_offset
+    )
+    chirp_rate = float(_value_at(shots.chirp_rate, point))
+    axis_range = float(shots.range[point])
+    range_offset = axis_range * float(
+        shots.relative_range_offset[shots.footprint_row[point], beamlet]
+    )
+    range_offset -= SPEED_OF_LIGHT / 2 * doppler_ratio_offset * segment_start
+    range_decrease = approach_speed * segment_start + acceleration_value * segment_start**2 / 2
+    t = float(_value_at(shots.acquisition_delay, point)) + np.arange(shots.window.length) / float(
+        shots.sample_rate[point]
+    )
+    start_delay = 2 * (axis_range - range_decrease + range_offset) / SPEED_OF_LIGHT
+    delay_change = -doppler_ratio * t - with_acceleration * alpha * t**2  # tau(t) - tau_0
+    chirp_phase = delay_change * (2 * start_delay + delay_change) / 2 - t * (
+        start_delay + delay_change
+    )
+    chirp_phase += (approach_speed - float(shots.radial_velocity[point])) / SPEED_OF_LIGHT * t**2
+    if not with_range_walk:
+        chirp_phase = start_delay * (delay_change - t)
+    cycles = -carrier * delay_change + chirp_slope * chirp_rate * chirp_phase
+    start_phase = _start_phase(
+        chirp_slope, carrier, chirp_rate, axis_range, range_offset, range_decrease
+    )
+    beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
+    gain = receiver_chain.receiver_transfer(
+        np.array(beat),
+        detector_bandwidth=_value_at(shots.detector_bandwidth, point),
+        amplifier_bandwidth=_value_at(shots.amplifier_bandwidth, point),
+    )
+    amplitude = (
+        _value_at(shots.beat_amplitude_scale, point)
+        * shots.relative_amplitude[shots.footprint_row[point], beamlet]
+    )
+    amplitude = amplitude * shots.whitening_gain[segment][point]
+    record = amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start_phase))
+    if shots.n_samples_before_echo is not None:
+        has_arrived = (
+            t >= start_delay + delay_change - SAMPLE_TIME_TOLERANCE / shots.sample_rate[point]
+        )
+        record *= has_arrived & (t <= _value_at(shots.chirp_duration, point))
+    return np.asarray(record)
+
+
+def _start_phase(
+    chirp_slope: float,
+    carrier: float,
+    chirp_rate: float,
+    axis_range: float,
+    range_offset: float,
+    range_decrease: float,
+) -> float:
+    """-f tau_0 + s S tau_0^2 / 2, the phase at t = 0 [cycles], in exact fractions."""
+    delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
+    delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
+    phase = -Fraction(carrier) * delay + Fraction(chirp_slope) * Fraction(chirp_rate) * delay**2 / 2
+    return float(phase - round(phase))
+
+
+def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
+    """Point i of a column that may be one value for all."""
+    column = np.asarray(column)
+    return column[point] if column.ndim else column
