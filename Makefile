@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size cold-reading stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -67,6 +67,10 @@ compile-%: $(READY)
 size: $(READY)
 	$(BIN)/python tests/code_size.py
 	$(BIN)/python tests/list_entered_modules.py experiments/quickstart.yaml experiments/square_low_descent.yaml
+
+# 100 names and 60 docstrings, drawn by SEED, for a reader who has not seen the code.
+cold-reading: $(READY)
+	$(BIN)/python benchmarks/cold_reading.py --seed $(SEED)
 
 stability: $(READY)
 	PYTHONPATH=tests $(BIN)/python tests/stability/write_stability_page.py
