@@ -1,9 +1,11 @@
-"""The physics of FMCW Doppler lidar: arrays in, arrays out; SI and radians throughout.
+"""Physics of FMCW Doppler lidars: functions from arrays to arrays, in SI units and radians.
 
-Compiled code takes no liberties with the order of sums (no reassociation, no contraction). The
-number of optimisation passes depends on what was compiled before and what came from a cache; with
-liberties, so would its last bits. They would buy 5 % of speed.
+Compiled code keeps the order of floating-point sums: neither reassociation nor contraction is
+allowed. The number of optimisation passes depends on what was compiled before and on what came from
+a cache. With reassociation, the last bits of results would depend on it too, for a gain in speed of
+5 %.
 """
 
 VERSION = "45"
-"""Version of the physics: part of a study's identity, raised when any result can change."""
+"""Version of the physics. It is part of a study's identity and is raised when any result can
+change."""

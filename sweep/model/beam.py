@@ -1,27 +1,29 @@
-"""Gaussian beams between telescope and target, and what a receiver of one mode collects of an echo.
+"""Gaussian beams between telescope and target, and the share of an echo that one mode receives.
 
-A coherent receiver sees one spatial mode: light mixes as far as it lies in the mode of the local
-oscillator, carried back through the telescope to the target. A diffuse surface sends the radiance
-rho_pi P I_T back, and a mode collects lambda^2 of a radiance wherever it is seen (Siegman, Appl.
-Opt. 5, 1966, 1588), so that of the power P_tx
+A coherent receiver sees one spatial mode. Light mixes with the local oscillator as far as it lies
+in the oscillator's mode, propagated back through the telescope to the target. A diffuse surface
+returns the radiance rho_pi P I_T. A single mode collects lambda^2 of a radiance at any distance
+(Siegman, Appl. Opt. 5, 1966, 1588). With the transmitted power P_tx the received power is
 
     P_sig = P_tx tau_o rho_pi lambda^2  integral of I_T I_L d^2x
 
-with the irradiances I_T of the sent beam and I_L of the local oscillator, each of unit power. This
-module gives the integral as the area of an aperture that would collect as much: lambda^2 R^2 times
-it takes the place of A in A / R^2. Gaussian beams of 1/e^2 radii w_T and w_L, with their axes d
-apart, have
+with the irradiance I_T of the transmitted beam and I_L of the local oscillator, each of unit power.
+This module expresses the integral as the area of an aperture that would collect as much: lambda^2
+R^2 times the integral replaces A in A / R^2. For Gaussian beams of 1/e^2 radii w_T and w_L, whose
+axes are d apart,
 
     integral = 2 / (pi (w_T^2 + w_L^2)) exp(-2 d^2 / (w_T^2 + w_L^2))
 
-and the light that counts lies within w_T w_L / sqrt(w_T^2 + w_L^2): what lies at the rim of one of
-two equal beams counts by its square, and the footprint is narrower by sqrt(2).
+The effective footprint, the product I_T I_L, has the 1/e^2 radius w_T w_L / sqrt(w_T^2 + w_L^2).
+With equal beams it is narrower than the transmitted beam by sqrt(2), as light counts by the square
+of its irradiance.
 
-Two laws (``instrument.telescope.coupling``): ``single_mode`` is this one; ``aperture`` is that of
-[T 4.4], where all light in the aperture mixes, as it always does in direct detection. A ray stands
-for the light of a place, and for a direction. Near the telescope and near a focus the two spread
-unlike. Ranges follow places, w(R) / R. Doppler shifts follow directions, which spread at every
-range as they do far away.
+``instrument.telescope.coupling`` selects one of two laws. ``single_mode`` is the law above.
+``aperture`` is that of [T 4.4]: all light in the aperture mixes, as is always so in direct
+detection. A ray represents the light at one position on the target and of one direction. Near the
+telescope and near a focus, positions and directions spread differently. Ranges follow positions,
+which spread as w(R) / R. Doppler shifts follow directions, which have the far-field spread at every
+range.
 """
 
 import math
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 SINGLE_MODE, APERTURE = COUPLINGS = "single_mode", "aperture"
 
 COUPLING_PATH = "instrument.telescope.coupling"
+"""Parameter that selects the law of coupling, one of `COUPLINGS`."""
 APERTURE_DIAMETER_PATH = "instrument.telescope.aperture"
 WAVELENGTH_PATH = "instrument.laser.wavelength"
 DIVERGENCE_PATH = "instrument.laser.beam_divergence"
@@ -61,28 +64,33 @@ BEAM_DEFAULTS: dict[str, float | str] = {
     FOCUS_PATH: 0.0,
     OSCILLATOR_WAIST_PATH: 0.0,
 }
-"""Defaults of a beam's parameters; 0: not given, collimated, or as the sent one."""
+"""Default values of a beam's parameters, by dotted path.
+
+A divergence or waist of 0 is not given, a focus of 0 is a collimated beam, and a local oscillator's
+waist of 0 is that of the transmitted beam.
+"""
 
 FOOTPRINT_ANGLE_MAX = math.pi / 2
-"""Full angle [rad] beyond which a footprint is taken to be no wider."""
+"""Upper limit [rad] of the full angle of a footprint."""
 
 Parameters = Mapping[str, Any]
 
 
 class GaussianBeam(NamedTuple):
-    """Gaussian beam at its telescope; SI, arrays that broadcast.
+    """Gaussian beam at its telescope, in SI units; the arrays broadcast.
 
-    >>> beam = Beam.of(waist=1.31e-3, wavelength=1310e-9)
-    >>> f"{beam.rayleigh_range:.1f} m, {1e6 * beam.angle(math.inf):.0f} urad"
+    >>> beam = GaussianBeam.from_waist(waist=1.31e-3, wavelength=1310e-9)
+    >>> f"{beam.rayleigh_range:.1f} m, {1e6 * beam.full_angle(math.inf):.0f} urad"
     '4.1 m, 637 urad'
     """
 
     waist: np.ndarray
     """1/e^2 radius at the telescope, w_a [m]."""
     rayleigh_range: np.ndarray
-    """z_R = pi w_a^2 / (M^2 lambda) [m]."""
+    """Rayleigh range z_R = pi w_a^2 / (M^2 lambda) [m]."""
     focus_curvature: np.ndarray | float = 0.0
-    """1 / f, of the distance at which it is focused [1/m]; 0 for a collimated beam."""
+    """Reciprocal 1 / f [1/m] of the distance at which the beam is focused; 0 for a collimated beam.
+    """
 
     @classmethod
     def from_waist(
@@ -93,26 +101,50 @@ class GaussianBeam(NamedTuple):
         quality: ArrayLike = 1.0,
         focus: ArrayLike = 0.0,
     ) -> "GaussianBeam":
-        """Beam of a waist w_a [m], wavelength [m], quality M^2, and focus [m], 0 for collimated."""
+        """Make a beam from its radius at the telescope.
+
+        Parameters
+        ----------
+        waist : array_like
+            1/e^2 radius w_a at the telescope [m], above 0.
+        wavelength : array_like
+            Wavelength [m].
+        quality : array_like
+            Beam quality M^2, 1 for a perfect beam.
+        focus : array_like
+            Distance f of the focus [m]; 0 for a collimated beam.
+        """
         w, f = np.asarray(waist, float), np.asarray(focus, float)
         curvature = np.where(f > 0, 1 / np.where(f > 0, f, 1.0), 0.0)
         return cls(w, np.asarray(math.pi * w**2 / (np.asarray(quality) * wavelength)), curvature)
 
     def full_angle(self, range: ArrayLike) -> np.ndarray:
-        """Full angle 2 w(R) / R [rad] at ranges above 0, infinity included.
+        """Return the full angle 2 w(R) / R at which the beam is seen from the telescope.
 
+        Parameters
+        ----------
+        range : array_like
+            Range R [m], above 0; infinity gives the far-field divergence.
+
+        Returns
+        -------
+        ndarray
+            Full 1/e^2 angle [rad].
+
+        Notes
+        -----
         w(R)^2 = w_a^2 ((1 - R/f)^2 + (R/z_R)^2).
         """
         defocus = 1 / np.asarray(range, float) - self.focus_curvature
         return np.asarray(2 * self.waist * np.hypot(defocus, 1 / self.rayleigh_range))
 
     def radius(self, range: ArrayLike) -> np.ndarray:
-        """1/e^2 radius w(R) [m] at ranges above 0."""
+        """Return the 1/e^2 radius w(R) [m] at ranges [m] above 0."""
         return self.full_angle(range) * np.asarray(range, float) / 2
 
 
 def is_single_mode(parameters: Parameters) -> bool:
-    """Return true where the receiver of points of one category sees a single mode."""
+    """Return True if the receiver of points of one category sees a single spatial mode."""
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
@@ -122,12 +154,27 @@ def is_single_mode(parameters: Parameters) -> bool:
 def divergence_from_waist(
     waist: ArrayLike, wavelength: ArrayLike, quality: ArrayLike = 1.0
 ) -> np.ndarray:
-    """Full far-field angle 2 M^2 lambda / (pi w_a) [rad] of a collimated beam; or w_a from that."""
+    """Return the full far-field angle of a collimated beam from its waist, or the inverse.
+
+    Parameters
+    ----------
+    waist : array_like
+        1/e^2 radius w_a [m]; or a full far-field angle [rad].
+    wavelength : array_like
+        Wavelength [m].
+    quality : array_like
+        Beam quality M^2.
+
+    Returns
+    -------
+    ndarray
+        2 M^2 lambda / (pi w_a) [rad]; or the radius [m], as the relation is its own inverse.
+    """
     return np.asarray(2 * np.asarray(quality) * wavelength / (math.pi * np.asarray(waist)))
 
 
 def far_field_divergence(parameters: Parameters) -> np.ndarray:
-    """Full angle of the sent beam far away, unless it is focused [rad]."""
+    """Return the full far-field angle [rad] of the transmitted beam, as if it were not focused."""
     stated_divergence, waist = (
         np.asarray(parameters[DIVERGENCE_PATH], float),
         np.asarray(parameters[WAIST_PATH], float),
@@ -141,9 +188,9 @@ def far_field_divergence(parameters: Parameters) -> np.ndarray:
 
 
 def sent_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, GaussianBeam]:
-    """Return the sent beam and, with M^2 = 1, the local oscillator's at the target.
+    """Return the transmitted beam, and the local oscillator's beam with M^2 = 1.
 
-    The local oscillator's waist at the telescope is that of the sent beam by default.
+    The local oscillator's waist at the telescope is by default that of the transmitted beam.
     """
     waist, oscillator_waist = (
         np.asarray(parameters[WAIST_PATH], float),
@@ -166,16 +213,35 @@ def sent_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, Gau
 
 
 class FootprintAngles(NamedTuple):
-    """Full 1/e^2 angles of the light that counts, as seen from the instrument [rad]."""
+    """Full 1/e^2 angles of the effective footprint, as seen from the instrument [rad]."""
 
     positions: np.ndarray
-    """Of the places where it meets the target."""
+    """Full angle of the positions where the effective light meets the target [rad]."""
     directions: np.ndarray
-    """Of the directions that it has there."""
+    """Full angle of the directions of that light [rad], which set its Doppler shifts."""
 
 
 def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
-    """Angles of the footprint of points of one category, at `range` or ``target.range`` [m]."""
+    """Compute the angles of the effective footprint of points of one category.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    range : array_like, optional
+        Range [m]; by default ``target.range``.
+
+    Returns
+    -------
+    FootprintAngles
+        Full 1/e^2 angles of positions and of directions [rad], at most :data:`FOOTPRINT_ANGLE_MAX`.
+        With a stated divergence and no single mode, both are the divergence.
+
+    Notes
+    -----
+    A single mode has the angle a b / sqrt(a^2 + b^2), with the full angles a of the transmitted
+    beam and b of the local oscillator's: at `range` for positions, in the far field for directions.
+    """
     if has_constant_divergence(parameters):
         stated_divergence = np.asarray(parameters[DIVERGENCE_PATH], float)
         return FootprintAngles(stated_divergence, stated_divergence)
@@ -203,7 +269,7 @@ def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> 
 
 
 def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
-    """Parameters that say how wide a beam is at each range."""
+    """Return the parameters that determine a beam's width at every range."""
     paths = (
         WAVELENGTH_PATH,
         DIVERGENCE_PATH,
@@ -216,7 +282,7 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
 
 
 def has_constant_divergence(parameters: Parameters) -> bool:
-    """Return true where every footprint is as wide as divergence times range, [T]'s law."""
+    """Return True if every footprint is divergence times range wide, as in [T]."""
     return not (
         is_single_mode(parameters)
         or np.any(parameters[WAIST_PATH])
@@ -227,9 +293,24 @@ def has_constant_divergence(parameters: Parameters) -> bool:
 def range_loss_coefficients(
     parameters: Parameters, range: ArrayLike | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (b, c) of 1 + b x + c x^2, by which a place at R (1 + x) has less than one at R.
+    """Return coefficients (b, c) of the relative range loss 1 + b x + c x^2.
 
-    The light in the aperture falls by (1 + x)^2; of one mode, w_T^2 + w_L^2 says how far.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, of points of one category.
+    range : array_like, optional
+        Range R [m]; by default ``target.range``.
+
+    Returns
+    -------
+    b, c : ndarray
+        The echo of a surface at R (1 + x) is that at R divided by 1 + b x + c x^2.
+
+    Notes
+    -----
+    Light collected by an aperture falls as (1 + x)^2. Light of a single mode falls as w_T^2 + w_L^2
+    grows.
     """
     if not is_single_mode(parameters):
         return np.asarray(2.0), np.asarray(1.0)
@@ -251,9 +332,10 @@ def range_loss_coefficients(
 
 
 def effective_collecting_area(parameters: Parameters) -> np.ndarray:
-    """Area [m^2] that collects, at ``target.range``, as much of a diffuse echo as mixes.
+    """Return the area [m^2] that collects, at ``target.range``, as much of a diffuse echo as mixes.
 
-    The aperture's, or lambda^2 R^2 times the integral of I_T I_L, of beams that the aperture cuts.
+    This is the area of the aperture; or for a single mode lambda^2 R^2 times the integral of I_T
+    I_L, reduced by :func:`truncation_efficiency` of both beams.
     """
     diameter = np.asarray(parameters[APERTURE_DIAMETER_PATH])
     if not is_single_mode(parameters):
@@ -277,9 +359,19 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
 
 
 def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """Diameter [m] and full angle [rad] that light from elsewhere than the target passes.
+    """Return the diameter and the full angle of view that collect background light.
 
-    Of one mode, that of the local oscillator's beam, whose area times solid angle is lambda^2.
+    Returns
+    -------
+    diameter : ndarray
+        Diameter of the receiving area [m].
+    angle : ndarray
+        Full angle of view [rad].
+
+    Notes
+    -----
+    A single mode has those of the local oscillator's beam, whose area times solid angle is
+    lambda^2.
     """
     if not is_single_mode(parameters):
         return np.asarray(parameters[APERTURE_DIAMETER_PATH], float), far_field_divergence(
@@ -292,10 +384,20 @@ def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np
 
 
 def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Distance [m] between the axes of sent and received beam at a range [m], in one plane.
+    """Return the distance [m] between the axes of transmitted and received beam at the target.
 
-    A scan has turned by omega 2R/c until the light is back; a bistatic pair's axes are apart at the
-    instrument already; axes that are not parallel part with range, or meet, where signs differ.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    range : array_like
+        Range R [m].
+
+    Notes
+    -----
+    All three contributions lie in one plane. A scan of rate omega has turned by omega 2R/c when the
+    light returns. The axes of a bistatic pair are separated at the instrument. Axes that are not
+    parallel diverge with range, or meet where the signs differ.
     """
     distance = np.asarray(range, float)
     angle_between_axes = (
@@ -306,30 +408,54 @@ def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Share of a single mode's echo that is left with the axes :func:`axis_offset` apart, 0..1."""
+    """Return the fraction, 0..1, of a single mode's echo that remains with its axes apart.
+
+    Notes
+    -----
+    exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`axis_offset`.
+    """
     squared_radii = sum(beam.radius(range) ** 2 for beam in sent_and_oscillator_beams(parameters))
     return np.asarray(np.exp(-2 * axis_offset(parameters, range) ** 2 / squared_radii))
 
 
 _UNTRUNCATED_FILL_MAX = 0.25
-"""w_a over the aperture's radius up to which 5e-7 of the echo is cut off, or less."""
+"""Ratio w_a / a of beam radius to aperture radius up to which at most 5e-7 of the echo is cut off.
+"""
 _TABLE_MIDDLE_PHASE = 4.0
-"""Phase [rad] at the rim that lies in the middle of the table."""
+"""Defocus phase [rad] at the rim that lies in the middle of the table."""
 _RIM_PHASE_MAX = 60.0
-"""Largest phase of the table; nearer by, within 2 % of it, all is as there."""
+"""Largest defocus phase [rad] of the table; beyond it the efficiency changes by less than 2 %."""
 
 
 def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0) -> np.ndarray:
-    """Echo of a beam that its aperture cuts off, sent and received, over that of the whole beam.
+    """Return the echo of a beam truncated by its aperture, over the echo of the full beam.
 
-    The light cut off is lost, and the rest spreads. Far away, or in focus, 0.63 of the echo is
-    left at w_a = 0.8 a, which makes 0.40 A / R^2, the most that any Gaussian beam has (Rye and
-    Frehlich, Appl. Opt. 31, 1992, 2891). Near the telescope the beam's middle is as it was. Beams
-    of unequal radii take the geometric mean of two. `fill_ratio` is w_a / a, 1/e^2 radius over the
-    aperture's radius, up to 1; `defocus_phase` the phase [rad] at the rim, pi a^2 / lambda (1/R -
-    1/f).
+    Parameters
+    ----------
+    fill_ratio : array_like
+        w_a / a: 1/e^2 radius of the beam over the radius of the aperture, up to 1.
+    defocus_phase : array_like
+        Phase at the rim [rad], pi a^2 / lambda (1/R - 1/f).
 
-    >>> f"{0.8**2 * truncation(0.8):.2f}"
+    Returns
+    -------
+    ndarray
+        Efficiency of transmission and reception together, 0..1, to some 1e-4. Beams of unequal
+        radii take the geometric mean of the two efficiencies.
+
+    Notes
+    -----
+    The truncated light is lost, and the rest diverges more. In the far field or in focus 0.63 of
+    the echo remains at w_a = 0.8 a. The effective area is then 0.40 A, the most of any Gaussian
+    beam [1]_. Near the telescope the middle of the beam is unchanged.
+
+    References
+    ----------
+    .. [1] Rye and Frehlich, Appl. Opt. 31, 1992, 2891.
+
+    Examples
+    --------
+    >>> f"{0.8**2 * truncation_efficiency(0.8):.2f}"
     '0.40'
     """
     fill_ratio, rim_phase = np.broadcast_arrays(
@@ -346,12 +472,13 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
 
 @lru_cache(maxsize=1)
 def _truncation_table() -> "RectBivariateSpline":
-    """:func:`truncation_efficiency` over fill and 1 / (1 + defocus / 4), to some 1e-4.
+    """Tabulate :func:`truncation_efficiency` over fill ratio and 1 / (1 + defocus / 4), to 1e-4.
 
-    Far away a field exp(-c r^2), c = (a/w)^2 - i defocus, of the unit circle becomes its Hankel
-    transform; uncut, the integral of its fourth power over the plane is 1 / (32 |c|^2 Re c).
+    In the far field a field exp(-c r^2) of the unit circle, c = (a/w)^2 - i defocus, becomes its
+    Hankel transform. The integral of the fourth power of the untruncated beam is 1 / (32 |c|^2 Re
+    c).
     """
-    from scipy.interpolate import RectBivariateSpline  # slow to import, and few need it
+    from scipy.interpolate import RectBivariateSpline  # slow to import, and rarely needed
 
     radii, radius_weights = np.polynomial.legendre.leggauss(96)
     radii, radius_weights = (radii + 1) / 2, radius_weights / 2
@@ -368,7 +495,7 @@ def _truncation_table() -> "RectBivariateSpline":
     for row, fill_ratio in zip(table, fill_ratios.tolist(), strict=True):
         c = 1 / fill_ratio**2 - 1j * _TABLE_MIDDLE_PHASE * (1 / phase_coordinates - 1)
         field = np.exp(-c[:, None] * radii**2)
-        power = np.abs(np.einsum("pr,qr->pq", field, kernel)) ** 2  # no matrix product: same bits
+        power = np.abs(np.einsum("pr,qr->pq", field, kernel)) ** 2  # bits as with any threads
         untruncated = 1 / (32 * np.abs(c) ** 2 * c.real)
         row[:] = (power**2 * (q * q_weights)).sum(axis=1) / untruncated
     return RectBivariateSpline(fill_ratios, phase_coordinates, table)

@@ -1,21 +1,21 @@
-"""The beam's footprint as beamlets: where they point, what they weigh, and where they meet a plane.
+"""Beamlets of a beam's footprint: directions, weights, and intersections with a plane.
 
 A Gaussian beam of full divergence Theta (between the 1/e^2 intensity points) has the standard
-deviation Theta/4 on each axis. A pattern of points in a circle is weighted by the beam, then
-mapped linearly so that its mean and covariance are the beam's own exactly. The beam keeps its
-pointing, its size and its power whatever the number of beamlets.
+deviation Theta/4 on each axis. A pattern of points in a circle is weighted by the beam, then mapped
+linearly so that its mean and covariance are exactly those of the beam. So the beam keeps its
+pointing, its width and its power with any number of beamlets.
 
-Two patterns. If beamlets add as powers, a hexagonal lattice is the better quadrature. If they add
-as amplitudes with the phases of a smooth plane, a lattice cancels. Off normal incidence its phases
-step evenly from row to row, and the sum is nearly nothing but at grating lobes. A sunflower has no
-rows; its sum fades like the random one that rough ground would give, which is what [T 4.2]
-describes (first dips of Pd at some 4 km).
+There are two patterns for footprints of given numbers. If beamlets add as powers, a hexagonal
+lattice is the better quadrature. If beamlets add as amplitudes with the phases of a smooth plane, a
+lattice cancels. Off normal incidence its phases step evenly from row to row, and the sum almost
+vanishes except at grating lobes. A sunflower pattern has no rows. Its sum fades like the random sum
+of rough ground, as [T 4.2] describes (first dips of Pd at some 4 km).
 
 Moments of a plane's lines: let u be the angle of a beamlet along the slope times cot(grazing), and
-d its direction, whose length on the axis is 1. Then (1 + d)/(1 + u) is R_b/R_0, and ((1 + u)/|d|)^m
-is its echo over that on the axis, with m = 2 for laws that are even in all directions, 3 for
-Lambert's. The pattern has exactly the beam's covariance, so that u has the mean 0 and the rms q =
-(divergence/4) cot(grazing). If a beamlet may pass over the horizon moments are infinite.
+d its direction, of length 1 on the axis. Then R_b/R_0 = (1 + d)/(1 + u). The echo relative to that
+on the axis is ((1 + u)/|d|)^m, where m = 2 for isotropic reflectance laws and m = 3 for Lambert's.
+The pattern has exactly the beam's covariance, so u has mean 0 and rms q = (divergence/4)
+cot(grazing). If a beamlet may pass over the horizon, the moments are infinite.
 """
 
 import math
@@ -28,32 +28,44 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 BEAMLET_PATTERNS = ("hexagonal", "sunflower", "line", "square")
+"""Names of patterns; ``3 lines`` and the like name a number of parallel lines."""
 
 PATTERN_RADIUS_SIGMA = 3.0
-"""Radius of the pattern before the mapping, in standard deviations: 98.9 % of the power."""
+"""Radius of the pattern before the mapping [standard deviations]; it holds 98.9 % of the power."""
 
 SQUARED_RADIUS_GROWTH = 2.9
 """Growth of a lattice's squared radius with the logarithm of its number of beamlets, from 19 on.
 
-What lies beyond the radius is left out, and its spacing misses what is narrow. So both fall as
-beamlets are added: a radius of 3.3 deviations for 37 beamlets, 3.8 for 109, 4.7 for 2,029."""
+A lattice errs by the power outside its radius and by its spacing. A growing radius reduces both as
+beamlets are added: 3.3 standard deviations for 37 beamlets, 3.8 for 109, 4.7 for 2,029.
+"""
 
 _LATTICE_ROTATION = 0.191
-"""Rotation [rad] of the lattice against the slope, so that no two rows project onto each other."""
+"""Rotation [rad] of the lattice relative to the slope, so that no two rows project onto each other.
+"""
 
 
 GAUSS_HERMITE_NODES_MAX = 15
-"""Nodes up to which the rule is Gauss and Hermite's."""
+"""Largest number of nodes for which the rule is Gauss-Hermite quadrature."""
 
 UNIFORM_RULE_RADIUS_SIGMA = 7.0
-"""Standard deviations on either side over which more nodes step evenly; 3e-12 is beyond."""
+"""Half-width [standard deviations] of rules of more nodes, which are evenly spaced; 3e-12 is
+outside."""
 
 
 @lru_cache(maxsize=64)
 def gaussian_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights for the mean over the standard normal distribution, (number,) each.
+    """Return nodes and weights of a quadrature for means over the standard normal distribution.
 
-    The weights sum to 1; the mean is 0 and, from two nodes on, the variance 1.
+    Parameters
+    ----------
+    n_nodes : int
+        Number of nodes; Gauss-Hermite up to :data:`GAUSS_HERMITE_NODES_MAX`, evenly spaced above.
+
+    Returns
+    -------
+    nodes, weights : ndarray (n_nodes,)
+        The weights sum to 1. The mean is 0 and, with two nodes or more, the variance is 1.
     """
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
         nodes, weights = np.polynomial.hermite_e.hermegauss(n_nodes)
@@ -68,14 +80,28 @@ def gaussian_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.ndarray]:
-    """Directions (2, number) and weights (number,) of a Gaussian beam's beamlets.
+    """Return directions and weights of a Gaussian beam's beamlets.
 
-    Directions are angles off the axis in units of the beam's standard deviation (Theta/4), across
-    the plane's slope and along it. Their weighted mean is 0 and, from three beamlets on, their
-    covariance the identity; but that those of lines all lie to the same side, which has the mean
-    square of both sides. [T 3.3.1] uses 109, a full hexagonal lattice. The pattern is one of
-    :data:`BEAMLET_PATTERNS`, or ``3 lines`` for as many parallel ones; a square has the whole root
-    of the number on each side.
+    Parameters
+    ----------
+    n_beamlets : int
+        Number of beamlets; the square root of the number per side for a square.
+    pattern : str
+        One of :data:`BEAMLET_PATTERNS`, or ``3 lines`` for that many parallel lines.
+
+    Returns
+    -------
+    directions : ndarray (2, n_beamlets)
+        Angles off the axis in standard deviations of the beam (Theta/4): across the plane's slope,
+        and along it.
+    weights : ndarray (n_beamlets,)
+        Fractions of the power; they sum to 1.
+
+    Notes
+    -----
+    The weighted mean of directions is 0 and, with three beamlets or more, their covariance is the
+    identity. Lines are an exception: they all lie on the same side of the axis, with the mean
+    square of both sides. [T 3.3.1] uses 109 beamlets, a full hexagonal lattice.
     """
     if n_beamlets == 1:
         return np.zeros((2, 1)), np.ones(1)
@@ -86,7 +112,7 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
     offsets = _PATTERN_FUNCTIONS[pattern](n_beamlets)
     weights = np.exp(-0.5 * (offsets**2).sum(axis=0))
     weights /= weights.sum()
-    # Sums, not products of matrices, whose order depends on the number of threads.
+    # Sums in place of matrix products, whose order of summation depends on the number of threads.
     offsets = offsets - (offsets * weights).sum(axis=1)[:, None]
     covariance = (offsets[:, None] * offsets * weights).sum(axis=-1)
     eigenvalues, eigenvectors = np.linalg.eigh(covariance)
@@ -94,12 +120,12 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
 
 
 def _hexagonal_lattice(n_points: int) -> np.ndarray:
-    """Return the points of a hexagonal lattice nearest to one of its points, (2, number)."""
+    """Return the points of a hexagonal lattice nearest to one of its points, (2, n_points)."""
     search_radius = 2 + math.ceil(math.sqrt(n_points))
     i, j = np.mgrid[-search_radius : search_radius + 1, -search_radius : search_radius + 1].reshape(
         2, -1
     )
-    squared_distance = i * i + i * j + j * j  # whole numbers, so that shells are told apart exactly
+    squared_distance = i * i + i * j + j * j  # integers: shells are separated exactly
     angle = np.arctan2(math.sqrt(0.75) * j, i + 0.5 * j)
     nearest = np.lexsort((angle, squared_distance))[:n_points]
     i, j = i[nearest], j[nearest]
@@ -117,14 +143,14 @@ def lattice_radius(n_beamlets: int) -> float:
 
 
 def _sunflower_pattern(n_points: int) -> np.ndarray:
-    """Points of equal areas of the circle, each turned by the golden angle, (2, number)."""
+    """Return points of equal areas of a circle, each rotated by the golden angle, (2, n_points)."""
     k = np.arange(n_points) + 0.5
     radius, angle = PATTERN_RADIUS_SIGMA * np.sqrt(k / n_points), k * math.pi * (3 - math.sqrt(5))
     return np.array([radius * np.cos(angle), radius * np.sin(angle)])
 
 
 def _product_rule(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets and weights of a Gaussian's rules along the slope, and across it."""
+    """Return directions and weights of a product of Gaussian rules along and across the slope."""
     if pattern == "square":
         nodes_per_side = max(math.isqrt(n_beamlets), 2)
         (x, x_weights), (y, y_weights) = (
@@ -153,17 +179,39 @@ def plane_footprint(
     transverse_velocity: ArrayLike = 0.0,
     direction_angle: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Beamlets of a beam on a flat plane, per unit of range along its axis, (n, number) each.
+    """Compute the beamlets of a beam on a flat plane, per unit of range along its axis.
 
+    Parameters
+    ----------
+    grazing_angle : ndarray (n,)
+        Angle between the axis and the plane [rad], above 0 to pi/2.
+    beam_divergence : ndarray (n,)
+        Full 1/e^2 angle of the beam [rad].
+    n_beamlets, pattern
+        Number and pattern, as of :func:`place_beamlets`.
+    radial_velocity, transverse_velocity : array_like
+        Velocity along the beam, positive when closing, and across it, positive towards the near
+        side of the plane [m/s].
+    direction_angle : ndarray (n,), optional
+        Full 1/e^2 angle of the directions along which velocities are seen [rad]; by default
+        `beam_divergence`.
+
+    Returns
+    -------
+    relative_range_offset : ndarray (n, n_beamlets)
+        (R_b - R_0) / R_0, computed without subtracting the two ranges.
+    cos_incidence : ndarray (n, n_beamlets)
+        Cosine of the incidence angle.
+    weights : ndarray (n, n_beamlets)
+        Power fractions.
+    closing_offset : ndarray (n, n_beamlets)
+        Closing speed minus that on the beam's axis [m/s].
+
+    Notes
+    -----
     A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
-    towards the plane's near side, and x across, sees the velocity (v_r + v_t y) / |d| with
-    |d|^2 = 1 + x^2 + y^2. The grazing angle is the axis's to the plane, above 0 to pi/2 [rad].
-    Angles of the beam are full ones at 1/e^2, ``direction_angle`` those along which velocities are
-    seen [rad]. v_r is positive closing, v_t towards the near side [m/s].
-
-    Returns four arrays: (R_b - R_0) / R_0, formed without subtracting the two ranges; the cosine of
-    the incidence angle; power fractions; and closing speed less that of the beam's axis [m/s].
-    A beamlet that passes over the horizon has fraction 0 and offset 0.
+    towards the near side, and x across, sees the closing speed (v_r + v_t y) / |d| with |d|^2 = 1 +
+    x^2 + y^2. A beamlet that passes over the horizon has fraction 0 and offset 0.
     """
     (across, along), weights = place_beamlets(n_beamlets, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4
@@ -190,28 +238,32 @@ def plane_footprint(
 
 
 class OffsetMoments(NamedTuple):
-    """Offsets from the beam's axis, weighted by echo power: sizes of mean, rms and extreme."""
+    """Moments of beamlets' offsets from the beam's axis, weighted by echo power."""
 
     mean: np.ndarray | float
+    """Magnitude of the mean offset."""
     rms: np.ndarray | float
+    """Root mean square offset."""
     extreme: np.ndarray | float
+    """Largest magnitude of an offset."""
 
     def scaled_by(self, factor: np.ndarray) -> "OffsetMoments":
-        """Scale the offsets by a factor; infinite ones may be multiplied by 0."""
+        """Return the moments of offsets times a factor; infinite moments times 0 give 0."""
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def sum_bound(self, other: "OffsetMoments") -> "OffsetMoments":
-        """Bounds on those of sums."""
+        """Return upper bounds on the moments of the sum of two offsets."""
         return OffsetMoments(
             *(value + other_value for value, other_value in zip(self, other, strict=True))
         )
 
 
 NO_SPREAD = OffsetMoments(0.0, 0.0, 0.0)
+"""Moments of offsets that are all 0."""
 
 
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
-    """Largest angle of a beamlet off the axis, in standard deviations."""
+    """Return the largest angle of a beamlet off the axis [standard deviations]."""
     directions, _ = place_beamlets(n_beamlets, pattern)
     return float(np.sqrt((directions**2).sum(axis=0)).max())
 
@@ -226,11 +278,34 @@ def plane_moments(
     pattern: str,
     direction_angle: ArrayLike | None = None,
 ) -> tuple[OffsetMoments, OffsetMoments]:
-    """Bounds for a beam on a plane: (R_b - R_0)/R_0, and radial velocities off the axis's [m/s].
+    """Bound the moments of relative ranges and radial velocities of a beam on a plane.
 
-    Both weighted by echo power. u has the rms q; the rest bounds Taylor's remainders. At a velocity
-    off the beam a beamlet x off the axis sees v_across x / |d| + v_along (1/|d| - 1),
-    |d|^2 = 1 + x^2, with x by `direction_angle` where that is another angle than the places'.
+    Parameters
+    ----------
+    transverse_velocity, radial_velocity : array_like
+        Velocity across the beam and along it [m/s].
+    grazing_angle : array_like
+        Angle between the axis and the plane [rad].
+    beam_divergence : array_like
+        Full 1/e^2 angle of the positions [rad].
+    n_beamlets, pattern
+        Number and pattern, as of :func:`place_beamlets`.
+    direction_angle : array_like, optional
+        Full 1/e^2 angle of the directions along which velocities are seen [rad]; by default
+        `beam_divergence`.
+
+    Returns
+    -------
+    range_moments : OffsetMoments
+        Bounds for (R_b - R_0) / R_0; infinite if a beamlet may pass over the horizon.
+    velocity_moments : OffsetMoments
+        Bounds for radial velocities minus the axis's [m/s].
+
+    Notes
+    -----
+    Both are weighted by echo power. u of the module's description has the rms q; the further terms
+    bound Taylor's remainders. A beamlet x off the axis sees, of a velocity across and along the
+    beam, v_across x / |d| + v_along (1/|d| - 1), with |d|^2 = 1 + x^2.
     """
     radius, sigma = pattern_radius(n_beamlets, pattern), np.asarray(beam_divergence, float) / 4
     transverse_velocity, radial_velocity = np.abs(transverse_velocity), np.abs(radial_velocity)
@@ -282,10 +357,21 @@ def plane_echo_ratio(
     n_beamlets: int,
     pattern: str,
 ) -> np.ndarray:
-    """Echo of all beamlets on a plane over what they would have on the axis, at the most.
+    """Bound the echo of all beamlets on a plane over that of one line on the axis, (n,).
 
-    As u has the mean 0 and this rms, it differs from 1 in the second order, upwards by the slope
-    and downwards by the beamlets' own length: that is taken for more too.
+    Parameters
+    ----------
+    law : str
+        Reflectance law, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`.
+    grazing_angle, beam_divergence : ndarray (n,)
+        Angle between axis and plane, and full 1/e^2 angle of the beam [rad].
+    n_beamlets, pattern
+        Number and pattern, as of :func:`place_beamlets`.
+
+    Notes
+    -----
+    u has mean 0 and a known rms, so the ratio differs from 1 in second order: upwards by the slope,
+    and downwards by the beamlets' greater length. The bound takes the second as an increase too.
     """
     echo_exponent, sigma = 3 if law == "lambert" else 2, beam_divergence / 4
     range_rms = sigma / np.tan(grazing_angle)
@@ -303,7 +389,18 @@ def plane_echo_ratio(
 def bins_per_velocity(
     *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
 ) -> np.ndarray:
-    """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta scales."""
+    """Return the shift of a line in bins for 1 m/s of radial velocity.
+
+    Parameters
+    ----------
+    range, carrier, chirp_rate, bin_width : array_like
+        Range [m], carrier frequency [Hz], chirp rate [Hz/s], width of a bin [Hz].
+
+    Notes
+    -----
+    2/c times the sum of the carrier and of twice the range's beat, which the Doppler ratio beta
+    scales.
+    """
     doubled_range_beat = (
         np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)
     )

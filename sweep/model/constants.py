@@ -1,10 +1,10 @@
-"""Physical constants that more than one module needs, exact by definition of the SI since 2019."""
+"""Physical constants shared by several modules, exact by definition of the SI since 2019."""
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""[m/s]"""
+"""Speed of light in vacuum c [m/s]."""
 ELEMENTARY_CHARGE = 1.602176634e-19
-"""[C]"""
+"""Elementary charge q [C]."""
 PLANCK = 6.62607015e-34
-"""[J s]"""
+"""Planck constant h [J s]."""
 BOLTZMANN = 1.380649e-23
-"""[J/K]"""
+"""Boltzmann constant k [J/K]."""

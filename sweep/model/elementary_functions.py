@@ -1,7 +1,8 @@
-"""Compiled elementary functions that the kernels share: exact products and phases in cycles.
+"""Compiled elementary functions that kernels share: exact products, and phases in cycles.
 
-Phases are counted in cycles and reduced before any sine is taken: an optical phase of 1e10
-cycles keeps its fraction only where the product that makes it is carried in two doubles.
+Phases are counted in cycles and reduced to a fraction of a cycle before any sine is taken. An
+optical phase of 1e10 cycles keeps its fraction only if the product that makes the phase is carried
+in two doubles.
 """
 
 import math
@@ -9,7 +10,8 @@ import math
 from sweep.kernel_cache import njit
 
 _TAU = 2.0 * math.pi
-# Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2; |r| <= 1/8 leaves 5e-17.
+# Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2. For |r| <= 1/8 the truncation error
+# is 5e-17.
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7 = (
     (-1) ** i * _TAU ** (2 * i + 1) / math.factorial(2 * i + 1) for i in range(8)
 )
@@ -20,9 +22,25 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
 
 @njit(inline="always")
 def exact_product(a, b):
-    """Compute a * b as two doubles (high, low) [Veltkamp; Dekker]; |a|, |b| < 1e300."""
+    """Compute a * b exactly as the sum of two doubles.
+
+    Parameters
+    ----------
+    a, b : float
+        Factors, |a|, |b| < 1e300.
+
+    Returns
+    -------
+    high, low : float
+        Rounded product, and its rounding error.
+
+    Notes
+    -----
+    Each factor is split into halves by 2^27 + 1 (Veltkamp), and the products of halves are exact
+    (Dekker).
+    """
     high = a * b
-    scaled = 134217729.0 * a  # 2^27 + 1
+    scaled = 134217729.0 * a  # 2^27 + 1, Veltkamp's constant
     a_high = scaled - (scaled - a)
     a_low = a - a_high
     scaled = 134217729.0 * b
@@ -33,16 +51,30 @@ def exact_product(a, b):
 
 @njit(inline="always")
 def fraction_of_cycle(x):
-    """Signed fraction of a number of cycles, in [-1/2, 1/2]."""
+    """Return the signed fraction of a number of cycles, in [-1/2, 1/2]."""
     return x - math.floor(x + 0.5)
 
 
 @njit(inline="always")
 def product_cycle_fraction(high, low, x):
-    """Fraction of (high + low) * x cycles, right to about 1e-16 up to 1e15 cycles.
+    """Return the signed fraction of (high + low) * x cycles.
 
-    The rounding error of high * x is recovered exactly, so what remains is low * x rounded once:
-    beyond, 1e-32 of all cycles.
+    Parameters
+    ----------
+    high, low : float
+        Factor as two doubles, as of :func:`exact_product`.
+    x : float
+        Second factor.
+
+    Returns
+    -------
+    float
+        Fraction of a cycle, to about 1e-16 for products up to 1e15 cycles.
+
+    Notes
+    -----
+    The rounding error of high * x is recovered exactly. Only the product low * x is rounded, which
+    is 1e-32 of the number of cycles.
     """
     product, remainder = exact_product(high, x)
     remainder += low * x
@@ -51,7 +83,7 @@ def product_cycle_fraction(high, low, x):
 
 @njit(inline="always")
 def exact_quotient(numerator, denominator):
-    """Numerator / denominator in two doubles (high, low)."""
+    """Return the quotient numerator / denominator as two doubles (high, low)."""
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)
     return high, ((numerator - product) - remainder) / denominator
@@ -59,9 +91,17 @@ def exact_quotient(numerator, denominator):
 
 @njit(inline="always")
 def sincos_cycles(x):
-    """(sin, cos) of 2 pi x for |x| up to 1e8 or so, branch-free so that loops vectorise.
+    """Compute sin(2 pi x) and cos(2 pi x), without branches so that loops vectorise.
 
-    Absolute error below 3e-16 plus that of x itself.
+    Parameters
+    ----------
+    x : float
+        Phase [cycles], |x| up to about 1e8.
+
+    Returns
+    -------
+    sine, cosine : float
+        Absolute error below 3e-16, besides the error of `x` itself.
     """
     r = x - math.floor(x + 0.5)
     quadrant = math.floor(4.0 * r + 0.5)

@@ -1,35 +1,36 @@
-"""Every knob of accuracy: what it does, its default, and what turning it costs.
+"""Settings of accuracy: what each does, its default, and the cost of changing it.
 
-The first six are a study's (``accuracy`` and ``draws.interval`` in a spec); the others divide the
-tolerance among the sources of error, or limit the work. They are the same for every study.
+The first five are a study's (``accuracy`` and ``draws.interval`` in a spec). The others divide the
+tolerance among the sources of error, or limit the work, alike in every study.
 
-    tolerance ─┬─ 0.80 or 0.55   effects that are left out (0.55 where beamlets are counted by it)
+    tolerance ─┬─ 0.80 or 0.55   effects that are skipped (0.55 if it also sets the beamlets)
                ├─ 0.25           number of beamlets
-               ├─ 1.0            few lines in place of many   } bounds with lines and bins at their
-               └─ 0.5            leakage not looked for       } worst, so that they hardly add
+               ├─ 1.0            few lines in place of many   } worst-case bounds, so that they
+               └─ 0.5            leakage that is neglected    } hardly add to the total
 
-Try ``tolerance`` first: everything else follows from it.
+Change ``tolerance`` first: everything else follows from it.
 
-Below are intervals of a probability that draws estimate, as counts or as means of conditional
-probabilities. The promise bounds the error of the estimate: :func:`interval_half_width` is the
-distance from it to the farther end of its interval. Near 0 and 1, where intervals lie to one side
-of the estimate, that is up to twice half their length.
+The rest of the module computes intervals of a probability that is estimated by draws, from counts
+or from means of conditional probabilities. The tolerance bounds the error of the estimate:
+:func:`interval_half_width` is its distance to the farther end of the interval. Near 0 and 1, where
+intervals lie on one side of the estimate, it is up to twice half their length.
 
-Of counts: Wilson's score interval [J. Am. Stat. Assoc. 22, 209, 1927], right on the average over
-probabilities, and Clopper and Pearson's [Biometrika 26, 404, 1934], at least right at every one.
+For counts there are two intervals. Wilson's score interval [J. Am. Stat. Assoc. 22, 209, 1927] has
+the stated coverage on average over probabilities. The interval of Clopper and Pearson [Biometrika
+26, 404, 1934] has at least the stated coverage at every probability.
 
-Of a mean m of n values within 0..1 with the variance s^2 of their own, rare values that no draw has
-shown may add any amount; s^2 = 0 after n equal values proves nothing. But a mean that lies d above
-m by rare values between m and 1 has a variance that is larger too, by at most (1 - m) d. One that
-lies d below, by values down to 0, by at most m d. The interval holds all means that such a variance
-makes likely, as the score interval does:
+For a mean m of n values within 0..1, of sample variance s^2, rare values that no draw has shown may
+add any amount. s^2 = 0 after n equal values proves nothing. But if the true mean lies d above m,
+because of rare values between m and 1, the true variance is larger too, by at most (1 - m) d. If it
+lies d below, because of values down to 0, by at most m d. The interval holds all means that are
+likely with such a variance, as the score interval does:
 
     n d^2 = z^2 (s^2 + q d),    q = 1 - m above, m below,
     d = (q z^2 / 2 + sqrt(n s^2 z^2 + q^2 z^4 / 4)) / n.
 
-With s^2 = 0 it is q z^2 / n (3.8 q / n for 95 %), as wide as what n draws can miss; with many
-draws it is z s / sqrt(n). Values of only 0 and 1 make it the score interval, but for terms of
-z^2 / n of its width.
+With s^2 = 0 the half-width is q z^2 / n (3.8 q / n for 95 %), as wide as what n draws can miss.
+With many draws it is z s / sqrt(n). For values of only 0 and 1 it is the score interval, except for
+terms of z^2 / n of its width.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,7 +42,7 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri
 
 AUTOMATIC = -1.0
-"""Stands for an error that follows from the tolerance."""
+"""Value that stands for an error derived from the tolerance."""
 
 
 @dataclass(frozen=True)
@@ -49,85 +50,87 @@ class ErrorBudget:
     """Accuracy with which points are computed; the first five are scalars or one a point."""
 
     tolerance: ArrayLike = 1e-3
-    """Largest error of a probability of detection, of log10 of one of false alarm, or of a relative
-    magnitude. If a point is drawn until it is known, the half-width of its interval. 0 leaves
-    nothing out. A tenth of it rarely doubles the time of a point; where draws decide, it takes a
-    hundred times as many."""
+    """Largest error of a probability of detection, of log10 of a probability of false alarm, or of
+    a relative magnitude. Of points with draws it is the largest half-width of the interval. At 0
+    nothing is skipped. A tenth of it rarely doubles the time of a point; where draws decide, it
+    takes a hundred times as many draws."""
 
     confidence: ArrayLike = 0.95
-    """Confidence of the intervals of what is drawn. Draws grow with the square of the normal
-    quantile: 0.99 takes 1.7 times those of 0.95."""
+    """Confidence of the intervals of estimates by draws. Draws grow with the square of the normal
+    quantile: 0.99 takes 1.7 times the draws of 0.95."""
 
     line_error: ArrayLike = AUTOMATIC
-    """Error of a bin, in noise sigmas, by few lines in place of many beamlets. By default
-    `lines_fraction` of the tolerance. A smaller one takes more lines a segment, slowly."""
+    """Error of a bin, in noise sigmas, due to few lines in place of many beamlets. By default
+    `lines_fraction` of the tolerance. A smaller error slowly increases the lines a segment."""
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Probability of leakage, of all bins far from the lines, that is not looked for. By default
-    `leakage_fraction` of the tolerance. A smaller one looks at more bins."""
+    """Probability of leakage, over all bins far from the lines, that is neglected. By default
+    `leakage_fraction` of the tolerance. With a smaller one more bins are evaluated."""
 
     leakage_floor: ArrayLike = AUTOMATIC
-    """Bins with less leaked signal than so many sigmas count as noise alone, where bins are looked
-    at one by one. By default as `leakage_error` allows. A lower one looks at more bins."""
+    """Leaked signal, in noise sigmas, below which a bin that is evaluated singly counts as noise
+    alone. By default it follows from `leakage_error`. With a lower one more bins are evaluated."""
 
     interval: str = "clopper_pearson"
-    """Interval of a counted share, one of :data:`COUNT_INTERVALS`. Clopper and
-    Pearson's covers at least as often as it says; Wilson's takes fewer draws and covers about as
-    often."""
+    """Interval of a counted share, one of :data:`COUNT_INTERVALS`. The interval of Clopper and
+    Pearson covers at least as often as stated. Wilson's takes fewer draws and covers about as often
+    as stated."""
 
     stopping_check_growth: float = 1.25
-    """Draws at which half-widths are looked at, over those at the look before. Nearer 1 wastes
-    fewer draws past the last look, and looks more often, which costs coverage."""
+    """Ratio of the numbers of draws at successive checks of the half-widths. A ratio nearer 1
+    wastes fewer draws, but checks more often, which costs coverage."""
 
     effects_fraction: float = 0.8
-    """Share of the tolerance for effects that are left out, number of beamlets included. More of it
-    leaves more effects out, and nothing for the lines."""
+    """Fraction of the tolerance for skipped effects, including the number of beamlets. With more of
+    it, more effects are skipped; lines are not affected."""
 
     beamlets_fraction: float = 0.25
-    """Share of the tolerance for the number of beamlets, where that is left to the tolerance; it is
-    taken from that of effects. Half of it is one more step of `COUNTS` at most points."""
+    """Fraction of the tolerance for the number of beamlets, if that number follows from the
+    tolerance. It is taken from `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
+    at most points."""
 
     lines_fraction: float = 1.0
-    """Share of the tolerance for `line_error`: all, as its bounds have lines and bins at their
-    worst."""
+    """Fraction of the tolerance for `line_error`. It is 1, as its bounds are worst cases of lines
+    and bins."""
 
     leakage_fraction: float = 0.5
-    """Share of the tolerance for `leakage_error`."""
+    """Fraction of the tolerance for `leakage_error`."""
 
     single_line_fraction: float = 0.1
-    """Share of the beamlets' tolerance that one line of nodes may miss across the slope before
-    several lines are tried. A smaller one tries them at more points, to the same end."""
+    """Fraction of the beamlets' tolerance by which a single line of nodes may err across the slope
+    before several lines are tried. A smaller one tries several lines at more points, with the same
+    accuracy."""
 
     beamlets_max: int = 4096
-    """Beamlets of a plane's footprint at the most. Points that need more are computed with those
-    that err least, and their ``beamlets_error`` says by how much."""
+    """Largest number of beamlets of a plane's footprint. Points that need more are computed with
+    the number that errs least, and their ``beamlets_error`` states the error."""
 
     thesis_beamlet_count: int = 109
-    """Beamlets of [T 3.3.1], taken where no number is enough: amplitudes that add over a smooth
-    plane all but cancel."""
+    """Number of beamlets of [T 3.3.1], used where no number is enough: the sum of amplitudes over a
+    smooth plane almost cancels."""
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Rays that every shot of a flight has, from a tolerance on. What none of them hits no estimate
-    knows of: fewer miss small objects unseen."""
+    """Least number of rays of a flight's shot, for tolerances from each value on. No estimate can
+    know of objects that no ray hits: fewer rays miss small objects."""
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
-    """Rays that may be cast for a shot: whole shells of the lattice, as only these are alike on
-    opposite sides, which makes smooth ground a hundred times more exact. The fewest are those whose
-    error can be told from themselves; each costs some 80 ns."""
+    """Numbers of rays that may be cast for a shot: full shells of the lattice, which alone are
+    symmetric. Symmetry makes results on smooth ground a hundred times more exact. The smallest is
+    the least from which an error can be estimated. Each ray costs some 80 ns."""
 
     rays_tolerance_min: float = 1e-6
-    """Tighter tolerances call for no more rays than this one."""
+    """Smallest tolerance that has an effect on the number of rays."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any], **overrides: Any) -> "ErrorBudget":
-        """Accuracy that parameters by dotted path ask for."""
+        """Return the accuracy stated by parameters by dotted path; `overrides` set other fields."""
         names = ("tolerance", "confidence", "line_error", "leakage_error", "leakage_floor")
         stated_values = {name: parameters[f"accuracy.{name}"] for name in names
                  if f"accuracy.{name}" in parameters}  # fmt: skip
         return cls(**stated_values, **overrides)
 
     def select(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
-        """Tolerance and confidence of some of `n_points` points."""
+        """Return the budget with the tolerance and confidence of selected points of `n_points`."""
         tolerance, confidence = (
             np.broadcast_to(values, (n_points,))[point_indices]
             for values in (self.tolerance, self.confidence)
@@ -136,57 +139,76 @@ class ErrorBudget:
 
     @property
     def allowed_line_error(self) -> np.ndarray:
-        """Error of a bin over sigma by few lines for many."""
+        """Tolerated error of a bin over sigma, due to few lines in place of many."""
         return self._stated_or_fraction(self.line_error, self.lines_fraction)
 
     @property
     def allowed_leakage(self) -> np.ndarray:
-        """Probability of leakage that need not be looked for."""
+        """Probability of leakage that may be neglected."""
         return self._stated_or_fraction(self.leakage_error, self.leakage_fraction)
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:
-        """Error of pd by the number of beamlets."""
+        """Tolerated error of pd due to the number of beamlets."""
         return self.beamlets_fraction * np.asarray(self.tolerance, float)
 
     def allowed_effects_error(self, *, counts_beamlets: bool) -> np.ndarray:
-        """Change of a probability by all effects that are left out."""
+        """Return the tolerated change of a probability by all effects that are skipped.
+
+        `counts_beamlets`: True if the number of beamlets follows from the tolerance and takes its
+        part.
+        """
         beamlets_part = self.beamlets_fraction if counts_beamlets else 0.0
         return (self.effects_fraction - beamlets_part) * np.asarray(self.tolerance, float)
 
     @property
     def allowed_rays_error(self) -> float:
-        """Error of pd by the number of rays of a flight's shot."""
+        """Tolerated error of pd due to the number of rays of a flight's shot."""
         return max(float(np.asarray(self.tolerance)), self.rays_tolerance_min)
 
     @property
     def has_automatic_errors(self) -> np.ndarray:
-        """True where errors of lines or leakage follow from the tolerance."""
+        """True where the error of lines or of leakage follows from the tolerance."""
         errors = (np.asarray(self.line_error), np.asarray(self.leakage_error))
         return np.logical_or(*(error == AUTOMATIC for error in errors))
 
     def _stated_or_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
+        """Return the stated error, or where it is :data:`AUTOMATIC` a fraction of the tolerance."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == AUTOMATIC, allowed, stated)
 
 
 class ConfidenceInterval(NamedTuple):
-    """Ends, within 0..1, of the broadcast shape of what they are intervals of."""
+    """Ends of intervals, within 0..1, in the shape of their estimates."""
 
     low: np.ndarray
+    """Lower ends."""
     high: np.ndarray
+    """Upper ends."""
 
 
 def wilson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Score interval of the probability of a success, from counts; both sides together."""
+    """Compute Wilson's score interval of the probability of a success, from counts.
+
+    Parameters
+    ----------
+    successes, trials : array_like
+        Numbers of successes and of trials.
+    confidence : array_like
+        Confidence, two-sided, 0..1.
+
+    References
+    ----------
+    .. [1] Wilson, J. Am. Stat. Assoc. 22, 209, 1927.
+    """
     k, n = np.asarray(successes, float), np.asarray(trials, float)
     z = _normal_quantile(confidence)
     mean, squared_z = k / n, z * z
     centre = (k + squared_z / 2) / (n + squared_z)
     half_length = z * np.sqrt(k * (1 - mean) + squared_z / 4) / (n + squared_z)
-    # At 0 and n the two terms cancel exactly only on paper.
+    # At 0 and n the two terms cancel exactly, but not in floating point.
     return _clip_interval(
         np.where(k > 0, centre - half_length, 0.0), np.where(k < n, centre + half_length, 1.0)
     )
@@ -195,7 +217,24 @@ def wilson_interval(
 def clopper_pearson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Interval beyond whose ends counts, or more extreme ones, have (1 - confidence) / 2 each."""
+    """Compute Clopper and Pearson's interval of the probability of a success, from counts.
+
+    Parameters
+    ----------
+    successes, trials : array_like
+        Numbers of successes and of trials.
+    confidence : array_like
+        Confidence, two-sided, 0..1.
+
+    Notes
+    -----
+    At either end the observed count, or a more extreme one, has the probability (1 - confidence) /
+    2.
+
+    References
+    ----------
+    .. [1] Clopper and Pearson, Biometrika 26, 404, 1934.
+    """
     k, n, c = np.broadcast_arrays(
         np.asarray(successes, float), np.asarray(trials, float), np.asarray(confidence, float)
     )
@@ -211,21 +250,35 @@ COUNT_INTERVALS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }
-"""Intervals of counted shares."""
+"""Functions that compute intervals of counted shares, by name."""
 
 
 def bounded_mean_interval(
     *, mean: ArrayLike, variance: ArrayLike, n_values: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Interval of the expectation of values within 0..1, from the mean of independent ones.
+    """Compute an interval of the expectation of values within 0..1 from their mean.
 
-    The variance is that of a single value, unbiased; anything, where there is one value only.
+    Parameters
+    ----------
+    mean : array_like
+        Mean of independent values.
+    variance : array_like
+        Unbiased variance of a single value; it is not used with one value only.
+    n_values : array_like
+        Number of values.
+    confidence : array_like
+        Confidence, two-sided, 0..1.
+
+    Notes
+    -----
+    The module's description derives the interval.
     """
     m, n = np.asarray(mean, float), np.asarray(n_values, float)
     z = _normal_quantile(confidence)
     variance_term = z * z * n * np.where(n > 1, variance, 0.0)
 
     def half_length(distance_to_end: np.ndarray) -> np.ndarray:
+        """Return the distance d from the mean to an end; q of the equation is `distance_to_end`."""
         linear_term = distance_to_end * z * z / 2
         return (linear_term + np.sqrt(variance_term + linear_term * linear_term)) / n
 
@@ -233,7 +286,7 @@ def bounded_mean_interval(
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:
-    """Distance from estimates to the farther end of their intervals."""
+    """Return the distance from estimates to the farther ends of their intervals."""
     estimate = np.asarray(estimate, float)
     return np.maximum(interval.high - estimate, estimate - interval.low)
 
@@ -244,4 +297,5 @@ def _normal_quantile(confidence: ArrayLike) -> np.ndarray:
 
 
 def _clip_interval(low: np.ndarray, high: np.ndarray) -> ConfidenceInterval:
+    """Clip the ends of an interval to 0..1."""
     return ConfidenceInterval(np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0))

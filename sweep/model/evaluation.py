@@ -1,6 +1,7 @@
-"""Shots, one or many: parameters in, detection and false-alarm statistics out.
+"""Evaluation of shots: from parameters to statistics of detection and false alarms.
 
-Bare shots, then the effects that are needed, one by one.
+Shots are prepared with one line on the beam's axis. Then the effects that are needed are applied
+one by one.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -47,7 +48,13 @@ __all__ = [
 
 
 def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
-    """Effects by name in the order in which they act; a ValueError for names that no effect has."""
+    """Return the named effects in the order of their application.
+
+    Raises
+    ------
+    ValueError
+        If a name belongs to no effect.
+    """
     if unknown_names := sorted(set(names) - set(EFFECT_NAMES)):
         raise ValueError(
             f"no effect {', '.join(unknown_names)}: choose from {', '.join(EFFECT_NAMES)}"
@@ -58,10 +65,22 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Shots on a flat plane, split by category: (indices, :class:`Shots`) for each.
+    """Prepare shots on a flat plane, split by category.
 
-    Parameters by dotted path are SI scalars, strings or (n,) arrays: all of instrument, target,
-    footprint and accuracy, and those of effects that are not at their defaults.
+    Parameters
+    ----------
+    parameters : mapping
+        SI scalars, strings or (n,) arrays by dotted path: all of instrument, target, footprint and
+        accuracy, and those of effects that differ from their defaults.
+    effects : collection of str
+        Names of the effects to simulate.
+
+    Yields
+    ------
+    point_indices : ndarray (m,)
+        Points of a category.
+    shots : Shots
+        Prepared shots of these points.
     """
     for point_indices, category_parameters in split_with_beamlet_counts(
         PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_CATEGORY_PATHS
@@ -79,12 +98,20 @@ def prepare_ray_traced_shots(
     effects: Collection[str] = DEFAULT_EFFECTS,
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots of one category with given footprints; parameters as of :func:`prepare_shots`.
+    """Prepare shots of one category whose footprints are given by ray tracing.
 
-    Ranges and radial velocities are those of the beam's centre; grazing angle and law are not
-    looked at. `effect_flags` (n,) uint32 are of the effects that each shot has, where that are not
-    all of them; they may differ in those that are not computed
-    :attr:`~sweep.model.effects.effect.Effect.needs_own_batch`.
+    Parameters
+    ----------
+    parameters : mapping
+        As of :func:`prepare_shots`. Ranges and radial velocities are those of the beam's centre;
+        grazing angle and reflectance law are not used.
+    ground : RayTracedGround
+        Footprints of the shots.
+    effects : collection of str
+        Names of the effects to simulate.
+    effect_flags : ndarray (n,) uint32, optional
+        Bit mask of each shot's enabled effects, if shots differ. They may differ in effects that do
+        not need a batch of their own (:attr:`~sweep.model.effects.effect.Effect.needs_own_batch`).
     """
     parameter_arrays = parameters_as_arrays(PARAMETER_DEFAULTS | dict(parameters))
     return apply_effects(
@@ -99,7 +126,21 @@ def apply_effects(
     effects: Collection[str],
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Bare shots with the effects put to them, but for random ones."""
+    """Prepare shots with one line each, then apply all effects that are not random.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, as arrays.
+    n_points : int
+        Number of shots n.
+    ground : Ground
+        Ground that the beams meet.
+    effects : collection of str
+        Names of the effects to simulate.
+    effect_flags : ndarray (n,) uint32, optional
+        Bit mask of each shot's enabled effects, if shots differ.
+    """
     context = EffectContext(
         parameters, ground, {} if effect_flags is None else _effect_masks(effects, effect_flags)
     )
@@ -112,7 +153,7 @@ def apply_effects(
 
 
 def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[str, np.ndarray]:
-    """Of effects that not all points have: 1.0 for those that do, else 0.0."""
+    """Return masks (n,) of the effects that not all points have: 1.0 where enabled, else 0.0."""
     missing_bits = int(np.bitwise_or.reduce(~effect_flags)) if effect_flags.size else 0
     return {
         effect.name: (effect_flags >> k & 1).astype(float)
@@ -127,10 +168,21 @@ def evaluate(
     *,
     segment_evaluator: Callable[[Shots], np.ndarray] = evaluate_segments,
 ) -> dict[str, np.ndarray]:
-    """Statistics of n shots on a flat plane, by name: :data:`sweep.model.outputs.GRID_OUTPUTS`.
+    """Compute the statistics of n shots on a flat plane.
 
-    Parameters as of :func:`prepare_shots`; `segment_evaluator` finds the peaks in the spectra, by
-    :func:`evaluate_segments` or another way to the same.
+    Parameters
+    ----------
+    parameters : mapping
+        As of :func:`prepare_shots`.
+    effects : collection of str
+        Names of the effects to simulate.
+    segment_evaluator : callable
+        Function that finds the peaks in the spectra; :func:`evaluate_segments` or an equivalent.
+
+    Returns
+    -------
+    dict of str to ndarray (n,)
+        Outputs by name: :data:`sweep.model.outputs.GRID_OUTPUTS`.
     """
     categories = list(prepare_shots(parameters, effects))
     if len(categories) == 1:
@@ -146,9 +198,19 @@ def evaluate(
 def shot_statistics(
     shots: Shots, segment_results: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Compute outputs of prepared shots, each (n,); nan for what is unknown without an echo.
+    """Compute the outputs of prepared shots.
 
-    ``segment_results`` is the result of :func:`evaluate_segments`, if that is known.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    segment_results : ndarray (3, fields, n), optional
+        Result of :func:`evaluate_segments`, if it is known.
+
+    Returns
+    -------
+    dict of str to ndarray (n,)
+        Outputs by name; nan for those that are undefined without an echo.
     """
     segment_results = evaluate_segments(shots) if segment_results is None else segment_results
     pd, miss, magnitude, _, n_exempt, leakage = np.moveaxis(segment_results, 1, 0)
@@ -180,7 +242,7 @@ def shot_statistics(
         )
     if shots.reported_peaks == waveform.STRONGEST_PEAK:
         results |= strongest_peak_probabilities(shots, pd, miss, magnitude)
-        # Both peaks are the echo's, and they are read as another range.
+        # Both peaks are the echo's, but they are resolved to another range.
         pd_misread = np.where(is_range_misread, results["pd_shot"], 0.0)
         results["p_wrong_range_shot"] = results["p_wrong_range_shot"] + pd_misread
     has_no_echo = (shots.echo_power == 0) | np.isnan(segment_results[shots.has_segment, 3]).any(
@@ -194,9 +256,21 @@ def shot_statistics(
 def shot_pd_and_miss(
     shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities that a shot is detected, and that it is missed, (n,).
+    """Return the probabilities that a shot is detected, and that it is missed.
 
-    By the segments' own probabilities and |X| of their bins [V], (3, n) each.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    pd, miss : ndarray (3, n)
+        Probabilities of detection and of a miss of each segment.
+    magnitudes : ndarray (3, n)
+        |X| of the segments' strongest bins [V].
+
+    Returns
+    -------
+    pd_shot, miss_shot : ndarray (n,)
+        A miss is not computed as 1 - pd, so that both keep their precision.
     """
     if shots.any_two:
         if shots.segment_correlations is None:
@@ -232,11 +306,11 @@ def shot_pd_and_miss(
     miss_shot = miss[0] + pd[0] * miss[2]
     if shots.segment_correlations is not None:
         miss_shot = miss[0] + np.maximum(pd[0] - pd_both, 0.0)
-    return pd_both, np.minimum(miss_shot, 1.0)  # of roundings
+    return pd_both, np.minimum(miss_shot, 1.0)  # rounding may exceed 1
 
 
 def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
-    """Range and radial velocity that the peaks of the segments report."""
+    """Return the range and radial velocity that the peaks of the segments report."""
     peak_frequencies, weights = segment_results[:, 3], segment_results[:, 2] ** 2
     if shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
         return fit_peaks(
@@ -257,16 +331,29 @@ def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> wavefor
 
 
 MISREAD_TOLERANCE_BINS = 4
-"""Bins of range or velocity by which what is read of an echo may be off: roundings of three peaks,
-and motion between and within records."""
+"""Tolerated error of a measured range or velocity [bins]: rounding of three peaks, and motion
+between and within records."""
 
 
 def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
-    """Find where peaks without noise are read as another range or velocity than the echo's.
+    """Find shots whose noiseless peaks give another range or velocity than the echo's.
 
-    Result (2, n) bool: of range and of velocity. The footprint's own extent, and what the target
-    does between and within records, are none of it. Beats beyond half the sample rate fold, and
-    readings by an assumption may be wrong.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    measured : RangeVelocity
+        Range and radial velocity of the peaks.
+
+    Returns
+    -------
+    ndarray (2, n) bool
+        Misread range, misread velocity.
+
+    Notes
+    -----
+    Beats beyond half the sample rate fold, and the assumption that resolves them may be wrong. The
+    extent of the footprint, and motion between and within records, are tolerated.
     """
     frequency_tolerance = MISREAD_TOLERANCE_BINS * shots.sample_rate / shots.fft_size
     footprint_rows, last_start = (
@@ -276,7 +363,7 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     shot_time = last_start + np.asarray(shots.chirp_duration) + np.abs(shots.range_walk_time)
     range_change = (np.abs(shots.approach_speed) + np.abs(shots.radial_velocity)) * shot_time
     range_change = range_change + np.abs(shots.acceleration) * shot_time * shot_time
-    # An acceleration shifts beats between segments, which read as range and as velocity.
+    # An acceleration shifts beats between segments, which changes both measured range and velocity.
     velocity_change = np.abs(shots.acceleration) * shot_time
     carrier = np.asarray(shots.carriers[0])
     beat_per_metre = shots.chirp_rate * 2 / SPEED_OF_LIGHT
@@ -293,7 +380,7 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     range_tolerance = (
         range_tolerance + 2 * carrier / SPEED_OF_LIGHT * footprint_velocity / beat_per_metre
     )
-    with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
+    with np.errstate(divide="ignore"):  # direct detection: carrier 0, no velocity
         velocity_per_hertz = SPEED_OF_LIGHT / (2 * carrier)
     velocity_tolerance = (
         (frequency_tolerance + beat_per_metre * range_tolerance) * velocity_per_hertz
@@ -312,10 +399,18 @@ def fit_peaks(
     weights: np.ndarray,
     point_indices: np.ndarray | slice = slice(None),
 ) -> waveform.RangeVelocity:
-    """Measure range and radial velocity at the shot's start, by fitting the beats.
+    """Measure range and radial velocity at the shot's start by fitting the beats.
 
-    Frequencies of peaks [Hz] by segment, (3, n), and weights, 0 where a segment is not detected;
-    ``point_indices`` says which point each is of.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    peak_frequencies : ndarray (3, m)
+        Frequencies of peaks by segment [Hz].
+    weights : ndarray (3, m)
+        Inverse variances in any unit; 0 where a segment is not detected.
+    point_indices : ndarray (m,) or slice
+        Points to which the columns belong.
     """
     carriers, chirp_rates = shots.beat_coefficients
     sample_rate = np.broadcast_to(shots.sample_rate, (shots.size,))[point_indices]

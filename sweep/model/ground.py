@@ -1,18 +1,19 @@
-"""Ground that a beam meets: a flat plane, or whatever rays have found; as one line or as beamlets.
+"""Ground that a beam meets, a flat plane or footprints by ray tracing, as one line or as beamlets.
 
 Reflectance laws: a surface of bidirectional reflectance f [1/sr] that fills a beam of power P at
-incidence i sends the intensity f P cos(i) [W/sr] back along it. The beam spreads over 1/cos(i) of
-its cross-section and the patch, seen from the beam, shrinks to cos(i) of itself again. So Lambert's
-f = rho/pi gives rho cos(i)/pi.
+incidence i returns the intensity f P cos(i) [W/sr] along the beam. The illuminated patch is
+1/cos(i) times the beam's cross-section and, seen from the beam, is foreshortened by cos(i). So
+Lambert's f = rho/pi gives rho cos(i)/pi.
 
-Lommel and Seeliger's law is that of dark, porous ground (regolith), where light that has been
-scattered once outshines all other [Hapke 1981; 2012, ch. 10]:
+The law of Lommel and Seeliger describes dark, porous ground (regolith), where light that is
+scattered once dominates [Hapke 1981; 2012, ch. 10]:
 
     f = w / (4 pi) / (cos i + cos e) * p(g) (1 + B(g))
 
 with the single-scattering albedo w, the phase function p and the opposition surge B of shadows
-that hide behind their grains. A lidar looks at the phase angle g = 0 and i = e, where f cos(i) is
-w p(0) (1 + B(0)) / (8 pi) whatever the incidence. A ball of it shines as evenly as the full Moon.
+hidden behind their grains. A lidar observes at the phase angle g = 0 and i = e, where f cos(i) is w
+p(0) (1 + B(0)) / (8 pi) at any incidence. A sphere of such ground is uniformly bright, like the
+full Moon.
 """
 
 import math
@@ -27,15 +28,30 @@ from sweep.model.beamlets import OffsetMoments
 from sweep.model.constants import SPEED_OF_LIGHT
 
 REFLECTANCE_LAWS = ("thesis", "lambert", "lommel_seeliger")
+"""Names of the reflectance laws, as of :func:`backscatter`."""
 
 
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
-    """Backscattered fraction per steradian of a surface of reflectance 1 [1/sr].
+    """Return the backscattered fraction per steradian of a surface of reflectance 1.
 
-    ``thesis`` is the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence, ``lambert``
-    cos(incidence)/pi, ``lommel_seeliger`` 1/pi whatever the incidence. Its reflectance is the
-    normal albedo w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition
-    surge), which at normal incidence is what Lambert's law means by it.
+    Parameters
+    ----------
+    law : str
+        One of :data:`REFLECTANCE_LAWS`.
+    cos_incidence : ndarray
+        Cosine of the incidence angle.
+
+    Returns
+    -------
+    ndarray
+        Backscatter [1/sr].
+
+    Notes
+    -----
+    ``thesis`` is the diffuse law of [T 4.4], 1/(2 pi) at any incidence. ``lambert`` is
+    cos(incidence)/pi. ``lommel_seeliger`` is 1/pi at any incidence. Its reflectance is the normal
+    albedo w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition surge). At
+    normal incidence this is Lambert's reflectance.
     """
     if law == "thesis":
         return np.full_like(cos_incidence, 0.5 / math.pi)
@@ -45,7 +61,7 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
 
 
 class BeamletTable(NamedTuple):
-    """Places and echoes of beamlets, in rows that points share."""
+    """Positions and echoes of beamlets, in rows that points share."""
 
     row_of_point: np.ndarray
     """(n,) int64: the row of each point."""
@@ -58,24 +74,32 @@ class BeamletTable(NamedTuple):
 
 
 class BeamGradients(NamedTuple):
-    """Changes across a beam for one of its standard deviations, (n,) each."""
+    """Changes across a beam per standard deviation of the beam, (n,) each."""
 
     doppler_ratio: np.ndarray
-    """Of the Doppler ratio 2 v_r / c."""
+    """(n,): change of the Doppler ratio 2 v_r / c."""
     relative_range: np.ndarray
-    """Of the range over that on the axis."""
+    """(n,): change of the range over that on the axis."""
     relative_echo: np.ndarray
-    """Of the echo power over that on the axis."""
+    """(n,): change of the echo power over that on the axis."""
 
 
 class FlatGround:
-    """A flat plane, for `size` points of one category, parameters as arrays.
+    """Flat plane for the points of one category.
 
-    If beamlets see no velocities of their own (`moving`), points that differ in velocity alone
-    share their rows.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, as arrays.
+    n_points : int
+        Number of points n.
+    has_velocities : bool
+        True if beamlets have velocities of their own. Otherwise points that differ only in velocity
+        share their rows.
     """
 
     off_axis_surface = None
+    """A plane is a single surface."""
 
     def __init__(
         self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True
@@ -100,19 +124,22 @@ class FlatGround:
         )
 
     def mean_phasor(self, doppler_cycles: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
-        """Mean of exp(2 pi i (turn dbeta - delay_cycles dR / R)) over the beam, (n,) complex.
+        """Return the mean of a phasor over the beam, (n,) complex.
+
+        The phasor is exp(2 pi i (doppler_cycles dbeta - delay_cycles dR / R)).
 
         Parameters
         ----------
-        doppler_cycles
+        doppler_cycles : array_like
             Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is beta_b - beta_0.
-        delay_cycles
+        delay_cycles : array_like
             Cycles per unit of relative range, (n,) or scalar; dR / R is (R_b - R_0) / R_0.
 
         Notes
         -----
         To second order a beamlet x across and y along the slope, in standard deviations, has the
-        phase t y + c (x^2 + y^2), and its echo goes as 1 + k y. With Gaussian x and y the mean is
+        phase t y + c (x^2 + y^2), and its echo is proportional to 1 + k y. With Gaussian x and y
+        the mean is
 
             (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
@@ -123,7 +150,7 @@ class FlatGround:
         ) / 4
         phase_per_speed = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(
             doppler_cycles, float
-        )  # by 1 m/s
+        )  # for 1 m/s
         t = (
             2
             * np.pi
@@ -147,7 +174,7 @@ class FlatGround:
 
     @property
     def gradients(self) -> "BeamGradients":
-        """Changes for a standard deviation of the beam towards the near side, (n,) each."""
+        """Changes per standard deviation of the beam towards the near side, (n,) each."""
         grazing_angle, position_angles, _, transverse_velocity, *single_mode_columns = (
             self._geometry_columns
         )
@@ -162,7 +189,7 @@ class FlatGround:
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """One line for each point: a row for each distinct grazing angle."""
+        """Return one line for each point: a row for each distinct grazing angle."""
         grazing_angles, angle_index = np.unique(self._geometry_columns[0], return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
         zeros = np.zeros_like(relative_echo)
@@ -170,7 +197,7 @@ class FlatGround:
 
     @cached_property
     def beamlets(self) -> BeamletTable:
-        """The whole footprint: a row for each distinct geometry."""
+        """All beamlets of the footprint: a row for each distinct geometry."""
         first, geometry_of_point = distinct_rows(self._geometry_columns)
         geometries = np.stack(self._geometry_columns)[:, first]
         relative_range_offset, cos_incidence, weights, closing_offset = beamlets.plane_footprint(
@@ -197,7 +224,15 @@ class FlatGround:
 
 
 class RayTracedGround:
-    """Footprints by rays; `off_axis_surface` (rows, beamlets): not on the axis's surface."""
+    """Footprints found by ray tracing.
+
+    Parameters
+    ----------
+    beamlet_table : BeamletTable
+        Positions and echoes of the beamlets.
+    off_axis_surface : ndarray (rows, beamlets) bool, optional
+        Beamlets that are not on the surface that the axis hits.
+    """
 
     def __init__(
         self, beamlet_table: BeamletTable, off_axis_surface: np.ndarray | None = None
@@ -205,7 +240,7 @@ class RayTracedGround:
         self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """One line for each point, with the echo of all its beamlets."""
+        """Return one line for each point, with the total echo of its beamlets."""
         total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
         zeros = np.zeros_like(total_echo)
         return BeamletTable(self.beamlets.row_of_point, zeros, zeros, total_echo)
@@ -216,13 +251,17 @@ Ground = FlatGround | RayTracedGround
 
 
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
-    """Return true if the beamlets of points of one category add as powers."""
+    """Return True if the beamlets of points of one category add as powers."""
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
 
 
 def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
-    """Arrangement of the beamlets: as chosen, or hexagonal where powers add, else unsymmetric."""
+    """Return the pattern of the beamlets.
+
+    It is the stated one; by default hexagonal if powers add, else a sunflower, which has no
+    symmetry.
+    """
     stated = str(parameters["footprint.pattern"])
     if stated != "auto":
         return stated
@@ -230,32 +269,34 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
 
 
 def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
+    """Broadcast row numbers to n points, (n,) int64."""
     return np.broadcast_to(row_of_point.ravel(), n_points).astype(np.int64)
 
 
 class FootprintExtent(NamedTuple):
-    """A footprint and the line on its axis, by point."""
+    """Extent of a footprint, and the line on its axis, by point."""
 
     axis_echo: np.ndarray
-    """Of the bare line, for a reflectance of 1 [1/sr]."""
+    """Echo of the line on the axis for a reflectance of 1 [1/sr]."""
     total_echo_ratio: np.ndarray | float
-    """Echo of all beamlets over that of the bare line."""
+    """Echo of all beamlets over that of the line on the axis."""
     range_offsets: OffsetMoments
-    """Of (R_b - R_0) / R_0."""
+    """Moments of (R_b - R_0) / R_0."""
     axis_surface_range_offsets: OffsetMoments
-    """Likewise, of the beamlets on the axis's surface only."""
+    """Moments of (R_b - R_0) / R_0 of the beamlets on the axis's surface only."""
     velocity_offsets: OffsetMoments
-    """Of the beamlets' radial velocities less the axis's [m/s]."""
+    """Moments of the beamlets' radial velocities minus the axis's [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
-    """Most that all beamlets' amplitudes make over the bare line's: all in phase, or as powers."""
+    """Largest ratio of the beamlets' summed amplitude to that of the line on the axis, in phase or
+    as powers."""
     off_axis_fraction: np.ndarray | float = 0.0
-    """Share of the echo that comes from other surfaces than the axis's, 0..1."""
+    """Fraction of the echo from surfaces other than the axis's, 0..1."""
     off_axis_range_offset_max: np.ndarray | float = 0.0
-    """Largest |R_b - R_0| / R_0 there."""
+    """Largest |R_b - R_0| / R_0 on surfaces other than the axis's."""
 
 
 def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
-    """Footprints that rays have found."""
+    """Return the extent of footprints found by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     off_axis_surface = ground.off_axis_surface
     total_echo = relative_echo.sum(axis=1)
@@ -292,6 +333,7 @@ def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
 
 
 def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
+    """Return the moments of values (n, m) with weights (n, m)."""
     weighted = weights * values
     extreme = np.where(weights > 0, np.abs(values), 0.0).max(axis=1)
     return OffsetMoments(
@@ -300,7 +342,20 @@ def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
 
 
 def distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct rows of columns: a row of each kind (kinds,), and each row's kind (n,)."""
+    """Find the distinct rows of a table given by its columns.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray (n,)
+        Columns of the table.
+
+    Returns
+    -------
+    first_rows : ndarray (kinds,)
+        Number of one row of each kind.
+    kind_of_row : ndarray (n,)
+        Kind of each row.
+    """
     order = np.lexsort(columns)
     rows = np.stack(columns)[:, order]
     is_new = np.append(True, (rows[:, 1:] != rows[:, :-1]).any(axis=0))

@@ -1,4 +1,4 @@
-"""Results of grids, of whole spectra, of flights and of scenes: units, meaning, dimensions."""
+"""Output variables of grids, spectra, flights and scenes: units, meaning, dimensions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,21 +15,25 @@ XYZ_DIM, SECOND_XYZ_DIM = "xyz", "xyz_again"
 
 @dataclass(frozen=True)
 class OutputVariable:
-    """A quantity: its units ("1" where it has none), its name in words, a further comment.
+    """Output variable of a store.
 
-    Floats are nan where there is nothing, signed integers -1, flags 0.
+    Missing values are nan for floats, -1 for signed integers, and 0 for flags.
     """
 
     units: str
+    """Units; "1" if dimensionless."""
     long_name: str
+    """Name in words."""
     comment: str = ""
+    """Comment in words, optional."""
     dtype: str = "float64"
+    """NumPy's name of the data type."""
     dims: tuple[str, ...] = ()
-    """Dimensions beside the study's axes: ``shot``, ``beamlet``, ``cycle``, ``draw`` and
-    ``return_number`` count from 0; ``xyz`` are the world's axes."""
+    """Dimensions in addition to the study's axes. ``shot``, ``beamlet``, ``cycle``, ``draw`` and
+    ``return_number`` count from 0; ``xyz`` are the axes of the world."""
 
     def empty(self, sizes: Mapping[str, int]) -> np.ndarray:
-        """Array to be filled, of these sizes by dimension."""
+        """Return an uninitialised array; `sizes` gives the size of each dimension."""
         return np.empty(tuple(sizes[dim] for dim in self.dims), self.dtype)
 
 
@@ -41,7 +45,10 @@ def _segment_variables(
     separator: str = " ",
     shot_comment: str | None = "",
 ) -> dict[str, OutputVariable]:
-    """Output of each segment and of the shot, with its own comment; None for none of the shot."""
+    """Return an output for each segment and one for the shot, each with its own comment.
+
+    `shot_comment` None leaves out the output of the shot.
+    """
     segment_labels = {
         "up": "up-chirp",
         "down": "down-chirp",
@@ -131,6 +138,7 @@ GRID_OUTPUTS: dict[str, OutputVariable] = {
         f"What is detected then has a wrong range or velocity; {NO_ECHO_NOTE}",
     ),
 }
+"""Outputs of a grid's points, by name; floats, one a point."""
 
 STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "p_wrong_range_{}",
@@ -140,12 +148,13 @@ STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     shot_comment="both chirps report a peak, and one of the echo not both; or both do and are "
     "misread",
 )
-"""Floats, one a point, of studies that report the strongest peak of a segment alone."""
+"""Additional outputs of studies that report only the strongest peak of a segment; floats, one a
+point."""
 
 NAN_WITHOUT_ECHO_OUTPUTS = tuple(
     name for name, output in GRID_OUTPUTS.items() if NO_ECHO_NOTE in output.comment
 )
-"""Outputs without a value where no light comes back."""
+"""Names of outputs that are nan if no light returns."""
 
 _SEGMENT_PHRASES = {
     "up": "the up-chirp segment",
@@ -163,6 +172,7 @@ DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     for segment, segment_phrase in {**_SEGMENT_PHRASES, joint_name: "both chirp segments"}.items()
     if (name, segment) != ("false_alarm", "doppler")
 }
+"""Counts of draws with a detection or a false alarm, by name."""
 
 STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "pd_{}_error",
@@ -170,10 +180,10 @@ STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "over draws; 0 where nothing random is simulated, nan with a single draw",
     separator="; ",
 )
-"""Floats, one a point, of studies with draws; each of the output that it is named after."""
+"""Standard errors in studies with draws, each named after its output; floats, one a point."""
 
 PD_OUTPUTS = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
-"""Outputs of which the accuracy is promised."""
+"""Names of outputs whose accuracy is guaranteed."""
 
 ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
     "n_draws": OutputVariable("1", "number of draws", dtype="int64"),
@@ -189,7 +199,7 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""Results of draws, point by point."""
+"""Accuracy of estimates by draws, for each point."""
 
 RUNNING_SUMS = "running_sums"
 
@@ -198,21 +208,23 @@ RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""Sums of draws of random effects for further ones, a row a point."""
+"""Sums over draws of random effects, to which further draws are added; one row a point."""
 
 IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
+"""(outputs,) bool: outputs of GRID_OUTPUTS that are logarithms."""
 KEEPS_SPREAD = IS_LOGARITHM | np.array(
     [f"{name}_error" in STANDARD_ERROR_OUTPUTS for name in GRID_OUTPUTS]
 )
-"""Outputs whose spread shows in a result."""
+"""(outputs,) bool: outputs of GRID_OUTPUTS whose spread over draws enters a result."""
 
 N_RUNNING_SUMS = len(GRID_OUTPUTS) + int(KEEPS_SPREAD.sum()) + int(IS_LOGARITHM.sum())
-"""Numbers a point that further draws need besides the means: counts, spreads, logarithms."""
+"""Length of a row of running sums: besides the means, further draws need counts, spreads and
+logarithms."""
 
 DETECTOR_INDEPENDENT_OUTPUTS = (
     "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",
 )  # fmt: skip
-"""Of :data:`GRID_OUTPUTS`, what does not depend on the detector."""
+"""Names of :data:`GRID_OUTPUTS` that do not depend on the detector."""
 
 _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that the signal occupies"
 
@@ -220,7 +232,7 @@ _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that 
 def _measurement_variables(
     quantity: str, quantity_label: str, units: str
 ) -> dict[str, OutputVariable]:
-    """Bias, its error, RMSE and bound of what is reported."""
+    """Return bias, error of the bias, RMSE and bound of a measured quantity."""
     detection_note = "over draws in which every segment has a detection; nan with none"
     bound_note = (
         "Cramer-Rao bound for lone tones of the signal's power in the up- and the down-chirp "
@@ -264,13 +276,14 @@ SPECTRA_OUTPUTS: dict[str, OutputVariable] = {
     **_measurement_variables("range", "range", "m"),
     **_measurement_variables("radial_velocity", f"radial velocity, {CLOSING_SIGN_NOTE}", "m s-1"),
 }
-"""Floats, one a point; beside them stand ACCURACY_OUTPUTS and DRAW_OUTPUTS."""
+"""Outputs of studies of full spectra, floats, one a point; ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS
+are stored as well."""
 
 
 def _with_dims(
     dims: tuple[str, ...], variables: dict[str, OutputVariable]
 ) -> dict[str, OutputVariable]:
-    """Put dimensions before those of outputs."""
+    """Return variables with dimensions put before their own."""
     return {
         name: replace(variable, dims=(*dims, *variable.dims))
         for name, variable in variables.items()
@@ -325,7 +338,7 @@ SHOT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""
+"""Geometry of each shot, common to all draws and all radiometry: the truth of a point cloud."""
 
 CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
     "cycle_time": OutputVariable("s", "start of the measurement cycle"),
@@ -347,9 +360,10 @@ BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "cos_incidence": OutputVariable("1", "cosine of the incidence angle"),
     "surface": OutputVariable("1", "surface hit", dtype="int16"),
 })  # fmt: skip
-"""Arrays of an eyepoint store for each beamlet, besides SHOTS and CYCLES."""
+"""Arrays of an eyepoint store by beamlet, besides SHOT_VARIABLES and CYCLE_VARIABLES."""
 
 BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", dims=("beamlet",))
+"""Power fraction of each beamlet in an eyepoint store."""
 
 SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot",),
@@ -386,9 +400,9 @@ SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
 )
 """Probabilities of each shot, before any draw.
 
-If spectra are held against another detector than the fixed threshold, or the strongest peak of a
-segment is reported alone, probabilities are nan. If nothing is seen false alarms are those of the
-noise alone, and all else is nan; so is ``pd_doppler`` without a Doppler segment.
+They are nan with a detector other than the fixed threshold, or if only the strongest peak of a
+segment is reported. If nothing is hit, false alarms are those of noise alone and all else is nan.
+``pd_doppler`` is nan without a Doppler segment.
 """
 
 EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
@@ -400,7 +414,7 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
         "overlap leaves of beamlets farther and nearer than the beam's axis",
     ),
 })  # fmt: skip
-"""Effects that were simulated of each shot; none of the effects where nothing is seen."""
+"""Effects that were simulated in each shot; none if nothing is hit."""
 
 _NAN_IF_FALSE_NOTE = "nan: a false one"
 
@@ -473,7 +487,7 @@ NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), 
     "altitude_status": OutputVariable("1", "how the altitude was solved", dtype="int8"),
     "altitude_beams": OutputVariable("1", "beams in the altitude's solution", dtype="int16"),
 })  # fmt: skip
-"""Navigation from each measurement cycle and draw; only where a cycle has three shots or more."""
+"""Navigation from each measurement cycle and draw; only if a cycle has three shots or more."""
 
 GRID_VARIABLE_NAMES = frozenset().union(
     GRID_OUTPUTS,

@@ -1,10 +1,10 @@
-"""Points made ready for the spectrum: link budget, receiver noise, and one line on the beam's axis.
+"""Preparation of points for the spectrum: link budget, receiver noise, one line on the beam's axis.
 
-This module prepares the least that any shot has. Everything else is an effect
-(:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.evaluation`.
+This module prepares the minimum that every shot has. Everything else is an effect
+(:mod:`sweep.model.effects`), which :mod:`sweep.model.evaluation` applies one by one.
 
-Points that share their categories (architecture, window, law, sizes ...) are prepared together; a
-footprint's geometry is worked out once and serves every point that has it, whatever its radiometry.
+Points that share a category (architecture, window, law, sizes ...) are prepared together. A
+footprint's geometry is computed once for all points that share it, whatever their radiometry.
 """
 
 import math
@@ -44,15 +44,16 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
     for section in ("laser", "chirp", "telescope", "receiver", "processing")
 )
 RECORD_PATH = RECEIVER_PREFIX + "record"
-"""Samples of a record: ``real``, or ``complex`` from I and Q."""
+"""Kind of samples of a record: ``real``, or ``complex`` from I and Q."""
 
 BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
-"""Error of pd that the number of beamlets leaves, where that followed from the tolerance."""
+"""Error of pd due to the number of beamlets, present if that number follows from the tolerance."""
 
 APPROACH_SPEED_PATH = "target.approach"
-"""Speed [m/s] at which the range along the beam falls, where rays have told."""
+"""Speed [m/s] at which the range along the beam falls, present if it was found by ray tracing."""
 
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
+"""Chirp rates of Doppler segment and down-chirp over that of the up-chirp."""
 CATEGORY_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
@@ -61,28 +62,31 @@ CATEGORY_PATHS = (
     LOOKS_VOTES_PATH,
     *CHIRP_SLOPE_PATHS,
 )
-"""Numbers that points must share to be prepared together; words they must share all."""
+"""Numeric parameters that points must share to be prepared together; all text parameters must be
+shared."""
 
 ADC_NOISE_SOURCE = "quantisation"
 """Noise source that does not pass the receiver."""
 
 ECHO_NOISE_SOURCES = frozenset({"signal_shot"})
-"""Noise sources that come with an echo: the threshold is not set on them."""
+"""Noise sources that are present only with an echo; the threshold does not depend on them."""
 
 LINE_APPROXIMATIONS_MAX = 2
-"""Steps of a sum of lines that leave something out, at the most: each may err by as much."""
+"""Largest number of steps of a sum of lines that omit something; each may err by the same amount.
+"""
 
 
 class PhaseError(NamedTuple):
-    """A deterministic phase error over the record, common to the lines of a footprint."""
+    """Deterministic phase error over the record, common to the lines of a footprint."""
 
     phase: Callable[..., np.ndarray]
-    """Phase [cycles], (n, m), at places x (m,) of the record, given ``sign`` and the values."""
+    """Function of positions x (m,) in the record, ``sign`` and `arguments`; returns the phase
+    [cycles], (n, m)."""
     arguments: dict[str, Any]
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Arguments of some points in a segment, as many each."""
+        """Return the arguments of selected points in one segment, (points,) each."""
         selected = {}
         for name, value in self.arguments.items():
             value = value[segment] if isinstance(value, tuple) else value
@@ -98,137 +102,162 @@ class PhaseError(NamedTuple):
 class Shots:
     """Points of one category, ready for the spectrum.
 
-    Arrays are (n,) or scalars unless said otherwise; SI throughout. The fields after
-    ``relative_amplitude`` are there only if an effect has put them there.
+    Arrays are (n,) or scalars unless stated otherwise, in SI units. Segments are in the order up,
+    Doppler, down. The fields from ``relative_amplitude`` on have their defaults unless an effect
+    sets them.
     """
 
     architecture: str
+    """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
     window: Window
+    """Window of the record."""
     fft_size: int
+    """FFT size N."""
     bins_counted: str
+    """Bins that count for false alarms: ``half``, those of the spectrum; ``all`` N of the FFT."""
     search_band: np.ndarray | None
-    """(3, 2, n) int64: first bin and number of bins of the search band."""
+    """(3, 2, n) int64: first bin and number of bins of the search band; None if all bins are
+    searched."""
     noise_bins: str
-    """``correlated``: noise of bins as the record makes it; ``independent``: as [T] has it."""
+    """Noise of adjacent bins: ``correlated``, as the record makes it, or ``independent``, as in
+    [T]."""
     detection: str
-    """``any_bin``: of the echo; ``peak_bin``: the largest alone, as in [T]."""
+    """Bins that detect an echo: ``any_bin`` of the echo, or ``peak_bin``, its largest alone, as in
+    [T]."""
     shot_detection: str
-    """``both_chirps``: a shot is detected in up and down segment; ``any_two``: in any two."""
+    """Rule of detection: ``both_chirps``, up and down segment; ``any_two`` of the segments."""
     reported_peaks: str
-    """``all``: any crossing of a segment is reported; ``strongest``: its largest peak alone."""
+    """Peaks that a segment reports: ``all`` crossings, or only the ``strongest``."""
     two_beat_assumption: str
-    """Assumption by which two beats of real records tell: ``far`` or ``fast``."""
+    """Assumption that resolves two beats of real records: ``far`` or ``fast``."""
     noise_shape: str
-    """``receiver``: noise passes the receiver as signals do; ``white``: none of it, as in [T]."""
+    """Shape of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
+    [T]."""
     segment_order: tuple[str, ...]
-    """Names of the segments that there are, in the order of time."""
+    """Names of the segments that exist, in the order of time."""
     segment_gap: np.ndarray
     """Time from a segment's end to the next one's start [s]."""
     tnr: np.ndarray
+    """Threshold-to-noise ratio."""
     range: np.ndarray
-    """(n,): of the target on the beam's axis."""
+    """(n,): range of the target on the beam's axis [m]."""
     radial_velocity: np.ndarray
-    """(n,): likewise; what the lines show of it is ``doppler_ratio``."""
+    """(n,): radial velocity of the target on the beam's axis [m/s]; the lines use
+    ``doppler_ratio``."""
     acceleration: np.ndarray
     """Rate at which the radial velocity grows [m/s^2]."""
     approach_speed: np.ndarray
     """Speed [m/s] at which the range along the beam falls (:func:`approach_speed`)."""
     chirp_bandwidth: np.ndarray
+    """Bandwidth B of the up-chirp [Hz]."""
     chirp_duration: np.ndarray
+    """Duration T of each segment [s]."""
     chirp_slopes: tuple[float, ...]
-    """Chirp rates of up, Doppler and down segment over :attr:`chirp_rate`, signed."""
+    """Chirp rates of the three segments over :attr:`chirp_rate`, signed."""
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """Frequency of each segment that the delay turns into phase [Hz]."""
     sample_rate: np.ndarray
+    """(n,): sample rate f_s [Hz]."""
     acquisition_delay: np.ndarray
+    """Time from a segment's start to the start of its record [s]."""
     detector_bandwidth: np.ndarray
+    """Bandwidth of the detector's pole [Hz]."""
     amplifier_bandwidth: np.ndarray
+    """Bandwidth of the amplifier's pole [Hz]."""
     leakage_floor: np.ndarray
-    """Given :attr:`negligible_signal_ratio`; :data:`AUTOMATIC` if it follows from the tolerance."""
+    """Stated value of :attr:`negligible_signal_ratio`; :data:`AUTOMATIC` if it follows from the
+    tolerance."""
     leakage_tolerance: np.ndarray
-    """Probability of leakage, of all bins far from the lines, that need not be looked for."""
+    """Probability of leakage, over all bins far from the lines, that may be neglected."""
     line_error_tolerance: np.ndarray
-    """Error of a bin by taking few lines for many, over sigma."""
+    """Tolerated error of a bin due to few lines in place of many, over sigma."""
     beamlets_error: np.ndarray
-    """Error of pd that the number of beamlets leaves; nan where it was not estimated."""
+    """Error of pd due to the number of beamlets; nan where it was not estimated."""
     echo_power_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_amplitude_scale: np.ndarray
     """Amplitude of the beat [V] for a relative amplitude of 1."""
     noise_variance_per_square_ampere: np.ndarray
-    """Noise variance at the ADC [V^2] that 1 A^2 of current makes."""
+    """Noise variance at the ADC [V^2] of a current variance of 1 A^2."""
     shot_noise_variance_per_watt: np.ndarray
-    """Noise variance at the ADC [V^2] that 1 W of light makes."""
+    """Variance at the ADC [V^2] of the shot noise of 1 W of light."""
     noise_variances: dict[str, np.ndarray]
-    """Noise variance of each source at the ADC [V^2]."""
+    """Noise variance at the ADC [V^2], by source."""
     footprint_row: np.ndarray
     """(n,) int64: row of each point in the three arrays that follow, (rows, beamlets)."""
     relative_range_offset: np.ndarray
-    """(R_b - R_0) / R_0."""
+    """(rows, beamlets): range of each beamlet relative to the axis's, (R_b - R_0) / R_0."""
     doppler_ratio_offset: np.ndarray
-    """beta_b - beta_0, beta = 2 v_r / c."""
+    """(rows, beamlets): Doppler ratio minus the axis's, beta_b - beta_0, beta = 2 v_r / c."""
     relative_amplitude: np.ndarray
-    """Relative amplitude: root of the relative echo, for direct detection the echo itself."""
+    """(rows, beamlets): square root of the relative echo; for direct detection the relative echo.
+    """
 
     ground_transmission: np.ndarray | float = 1.0
-    """Share of light from the ground that reaches the receiver."""
+    """Fraction of light from the ground that reaches the receiver."""
     doppler_ratio: np.ndarray | float = 0.0
     """Doppler ratio 2 v_r / c of the line on the axis."""
     adds_powers: bool = True
-    """True where beamlets add as powers."""
+    """True if beamlets add as powers, False if as amplitudes."""
     beamlet_phase_cycles: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
-    """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
+    """(3, rows, beamlets): additional phases [cycles] in up, Doppler and down segment; or empty."""
     segment_starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
-    """Time [s] from the shot's start to each segment's, in which the target moves on."""
+    """Time [s] from the shot's start to each segment's, during which the target moves; 0 if it does
+    not."""
     n_samples_before_echo: np.ndarray | None = None
-    """(segments, n) int64: samples of the record before the echo arrives, up to all of them; None
-    where echoes fill records."""
+    """(3, n) int64: samples of the record before the echo arrives, up to all; None where echoes
+    fill records."""
     phase_errors: tuple[PhaseError, ...] = ()
+    """Deterministic phase errors, which add."""
     line_drift_per_look: np.ndarray | float = 0.0
-    """(segments, n): bins by which lines move on from look to look."""
+    """(3, n): bins by which lines move from look to look."""
     range_walk_time: np.ndarray | float = 0.0
-    """Seconds of closing by which the beats' range is below that at the shot's start, (n,)."""
+    """(n,): time [s] of closing by which the beats' range is below the range at the shot's start.
+    """
     velocity_drift_time: np.ndarray | float = 0.0
-    """Seconds of acceleration by which a beat's velocity is above that at its segment's start."""
+    """Time [s] of acceleration by which a beat's velocity is above that at its segment's start."""
     velocity_bias_fraction: np.ndarray | float = 0.0
-    """Share of the radial velocity by which the beats tell less, (n,)."""
+    """(n,): fractional underestimation of the radial velocity by the beats."""
     shares_phase_errors: bool = False
-    """True where many shots have the same phase errors, as those of a flight do not."""
+    """True if many shots have equal phase errors; False for those of a flight."""
     gaussian_line_width: np.ndarray | None = None
-    """(n,): FWHM [Hz] of the beat's Gaussian line."""
+    """(n,): FWHM [Hz] of the beat's Gaussian line; None without one."""
     lorentzian_line_width: np.ndarray | float = 0.0
-    """FWHM [Hz] of the Lorentzian line of a laser, whose phase walks randomly, (n,)."""
+    """(n,): FWHM [Hz] of the Lorentzian line of a laser whose phase is a random walk."""
     pedestal_variance_beside_lines: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] that stands in bins beside the lines."""
+    """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
     pedestal_variance_under_lines: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] that stands under the lines, and nowhere else."""
+    """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
     noise_variance_gain: np.ndarray | float = 1.0
-    """Factor on the noise variance by what happens to the record after the threshold was set."""
+    """Factor on the noise variance by changes of the record after the threshold was set."""
     complex_record: bool = False
-    """True where the record is I and Q, and its spectrum has signed bins and no images."""
+    """True if the record is I + iQ; its spectrum then has signed bins and no images."""
     antialias_filter: dict[str, np.ndarray] = field(default_factory=dict)
-    """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
+    """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
     image_gain: np.ndarray | float = 0.0
-    """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
+    """(n,): amplitude, 0..1, of the image of a line at its negative frequency, due to imbalance of
+    I and Q."""
     segment_correlations: "SegmentCorrelations | None" = None
-    """Of echoes in developed speckle."""
+    """Correlations between segments of echoes in developed speckle; None without speckle."""
     look_speckle: "LookSpeckle | None" = None
-    """Speckle of looks that share it in part; None where all have the same, or each its own."""
+    """Speckle of looks that share it partly; None if looks have equal or independent speckle."""
     phase_cycles_per_look: np.ndarray | None = None
-    """(3, n): turn of the line's phase from one look to the next [cycles]."""
+    """(3, n): phase [cycles] by which a line turns from one look to the next."""
     line_deviation_bins: np.ndarray | float = 0.0
-    """(segments, n): deviation of the lines of an echo in developed speckle [bins of fs/N]."""
+    """(3, n): standard deviation of the lines of an echo in developed speckle [bins of fs/N]."""
     line_gradients: "LineGradients | None" = None
-    """Their footprints, over which speckle is drawn."""
+    """Gradients across the footprint of the lines of an echo in speckle, for draws of speckle."""
     circulator_leak_amplitude: np.ndarray | None = None
-    """Amplitude of the leaked light's beat [V], (n,) or scalar; None without one."""
+    """Amplitude of the beat of light that leaks through the circulator [V], (n,) or scalar; None
+    without one."""
     circulator_leak_delay: np.ndarray | float = 0.0
-    """Its delay [s]."""
+    """Delay of the light that leaks through the circulator [s]."""
     sums_images: bool = False
-    """True where the lines' images at negative frequencies are summed."""
+    """True if the lines' images at negative frequencies are summed."""
     includes_leakage: bool = False
-    """True where the bins next to the detection are looked at for groups of leaked signal."""
+    """True if bins next to the detection are searched for groups of leaked signal."""
     looks: Looks = Looks()  # noqa: RUF009  # a tuple
-    """Records of each segment, and how they are combined."""
+    """Number of records of each segment, and their combination."""
 
     @property
     def size(self) -> int:
@@ -237,13 +266,13 @@ class Shots:
 
     @property
     def n_bins(self) -> int:
-        """Bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
+        """Number of bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
         return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
     def to_signed_bins(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return bins by their frequency over that of bin 1: 0..N/2, or -N/2..N/2 - 1.
+        """Return bin numbers by signed frequency: 0..N/2, of a complex record -N/2..N/2 - 1.
 
-        A complex record's bins may be numbered from anywhere on, past N and below 0.
+        Bin numbers of a complex record are periodic in N: any integer is accepted.
         """
         if not self.complex_record:
             return np.asarray(bin_numbers)
@@ -251,9 +280,9 @@ class Shots:
         return np.asarray((np.asarray(bin_numbers) + nyquist_bin) % self.fft_size - nyquist_bin)
 
     def bin_indices(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return places of bins in a spectrum whose bins are in the order of their frequencies.
+        """Return the indices of bins in a spectrum sorted by frequency.
 
-        Those of frequency 0 stand at 0, of a complex record at N/2.
+        The bin of frequency 0 has the index 0; in a complex record it has the index N/2.
         """
         zero_frequency_index = self.fft_size // 2 if self.complex_record else 0
         return self.to_signed_bins(bin_numbers) + zero_frequency_index
@@ -275,10 +304,10 @@ class Shots:
 
     @property
     def echo_record_times(self) -> dict[str, Any]:
-        """Start, since the segment's own, and duration [s] of the record that the echo has.
+        """Start and duration [s] of the part of the record that holds the echo.
 
-        By ``start`` and ``chirp_duration``: (n,) or scalars; tuples by segment where it has not
-        all.
+        ``start`` counts from the segment's start. Both are (n,) or scalars; or tuples by segment,
+        if the echo does not fill the record.
         """
         if self.n_samples_before_echo is None:
             return {"start": self.acquisition_delay, "duration": self.record_duration}
@@ -293,14 +322,14 @@ class Shots:
         }
 
     def echo_window_energy(self, segment: int) -> np.ndarray:
-        """Sum w^2 over the samples that the echo has in a segment, (n,)."""
+        """Return the sum of w^2 over the samples that hold the echo in one segment, (n,)."""
         if self.n_samples_before_echo is None:
             return np.full(self.size, self.window.energy)
         return window_energy_from_sample(self.window)[self.n_samples_before_echo[segment]]
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
-        """Echo of all beamlets [1/sr], (n,)."""
+        """Relative echo of all beamlets [1/sr], (n,)."""
         relative_echo = (
             self.relative_amplitude if self.architecture == "direct" else self.relative_amplitude**2
         )
@@ -313,7 +342,7 @@ class Shots:
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
-        """Noise variance without an echo, which the threshold is set on [V^2], (n,)."""
+        """Noise variance at the ADC without an echo, which sets the threshold [V^2], (n,)."""
         variances = (
             v for name, v in self.noise_variances.items() if name not in ECHO_NOISE_SOURCES
         )
@@ -321,11 +350,11 @@ class Shots:
 
     @cached_property
     def whitening_gain(self) -> np.ndarray:
-        """Gain of each segment's lines in a spectrum whose noise is white, (segments, n).
+        """Gain of each segment's lines after the noise of the spectrum is whitened, (segments, n).
 
-        Spectra are divided by the root of the noise's density over that of white noise. It changes
-        little over an echo and is taken on the beam's axis. The noise that the ADC adds is white
-        before.
+        Spectra are divided by the root of the noise density relative to white noise. The gain
+        varies little over an echo and is taken on the beam's axis. Noise added by the ADC is white
+        already.
         """
         return broadcast_rows(
             [self.whitening_gain_at(beat_frequency) for beat_frequency in self.beat_frequencies],
@@ -334,7 +363,7 @@ class Shots:
 
     @property
     def beat_frequencies(self) -> tuple[np.ndarray, ...]:
-        """Beat frequency [Hz] of the line on the beam's axis, by segment, signed."""
+        """Signed beat frequency [Hz] of the line on the beam's axis, by segment."""
         return tuple(
             s.carrier * s.doppler_ratio
             - s.chirp_rate
@@ -345,10 +374,21 @@ class Shots:
     def whitening_gain_at(
         self, beat_frequency: np.ndarray, bin_frequency: np.ndarray | None = None
     ) -> np.ndarray:
-        """Gain of a line at a beat [Hz], (n,), in a spectrum whose noise is white.
+        """Return the gain of a line after the noise of the spectrum is whitened.
 
-        The anti-alias filter's is in it; the poles are none of it, as each line passes them. Its
-        skirts in bins at another frequency ``bin_frequency`` [Hz] are beside the noise of these.
+        Parameters
+        ----------
+        beat_frequency : ndarray (n,)
+            Beat frequency of the line [Hz].
+        bin_frequency : ndarray (n,), optional
+            Frequency [Hz] of the bins whose noise density applies, for skirts of the line; by
+            default that of the line.
+
+        Returns
+        -------
+        ndarray
+            Amplitude gain. It includes the anti-alias filter and excludes the receiver's poles,
+            which are applied to each line.
         """
         if self.noise_shape == "white":
             return np.ones(())
@@ -407,7 +447,7 @@ class Shots:
 
     @property
     def _pedestal_shape_rows(self) -> np.ndarray:
-        """Shape of the pedestal of phase noise where bins beside the lines detect by it, (3, n)."""
+        """Shape of the phase-noise pedestal, (3, n); 0 where it adds no bins that detect."""
         shape_rows = np.zeros((3, self.size))
         if (
             self.detection == "peak_bin"
@@ -431,10 +471,18 @@ class Shots:
         return shape_rows
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
-        """Mean power of a bin's signal over the mean power of its noise, (..., n).
+        """Return the mean signal power over the mean noise power of a bin.
 
-        ``magnitude`` is |X| of the lines in the bin [V]. The pedestal that a laser's phase noise
-        leaves under them is signal as well: it fades with them, and detects with them.
+        Parameters
+        ----------
+        magnitude : ndarray (..., n)
+            |X| of the lines in the bin [V].
+
+        Returns
+        -------
+        ndarray (..., n)
+            |X|^2 / (2 sigma^2) plus the pedestal's power ratio. The pedestal of a laser's phase
+            noise counts as signal: it fades and is detected with the lines.
         """
         line_snr = np.square(magnitude / self.bin_noise_sigma) / 2
         return np.asarray(line_snr + self.pedestal_variance_under_lines / self.noise_variance)
@@ -450,7 +498,7 @@ class Shots:
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
-        """Signal over sigma below which bins that are taken one by one count as noise alone."""
+        """Leaked signal over sigma below which a singly evaluated bin counts as noise alone."""
         from sweep.model.detection import echo_detection
 
         stated_floor, n_bins = self.leakage_floor, self.n_bins
@@ -473,7 +521,21 @@ class Shots:
     def joint_detection_probability(
         self, pd_up: np.ndarray, pd_down: np.ndarray, magnitudes: tuple[np.ndarray, np.ndarray]
     ) -> np.ndarray:
-        """Probability that up and down segment are detected, by their own and |X| [V]; (..., n)."""
+        """Return the probability that both up and down segment are detected.
+
+        Parameters
+        ----------
+        pd_up, pd_down : ndarray (..., n)
+            Probabilities of detection of each segment.
+        magnitudes : tuple of ndarray (..., n)
+            |X| of the strongest bins of up and down segment [V].
+
+        Returns
+        -------
+        ndarray (..., n)
+            The product of the two without speckle. In developed speckle the segments are correlated
+            and the probability is larger.
+        """
         from sweep.model.detection import echo_detection
         from sweep.model.detection.pseudo_variance import mean_over_phases
 
@@ -493,7 +555,7 @@ class Shots:
             )
             if self.speckle_table.ratio_row[
                 [0, 2]
-            ].any():  # of the same share of what can be in common
+            ].any():  # take the shared fraction as far from DC and Nyquist
                 pd_up_far_from_ends, pd_down_far_from_ends = self._pd_in_looks_far_from_ends(
                     signal_up, signal_down, threshold_ratio
                 )
@@ -536,9 +598,16 @@ class Shots:
     def detection_equivalent_bins(
         self, probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
     ) -> np.ndarray | float:
-        """Independent bins as which the echoes of some segments count, on the geometric mean.
+        """Return the number of independent bins equivalent to an echo.
 
-        By the segments' probabilities of detection and |X| [V] of their strongest bins.
+        It is the geometric mean over the segments.
+
+        Parameters
+        ----------
+        probabilities : tuple of ndarray
+            Probabilities of detection of the segments.
+        magnitudes : tuple of ndarray
+            |X| of the segments' strongest bins [V].
         """
         from sweep.model.detection.echo_detection import detection_equivalent_bins
 
@@ -555,7 +624,7 @@ class Shots:
 
     @property
     def any_two(self) -> bool:
-        """True where any two of three segments detect a shot."""
+        """True if a shot is detected by any two of three segments."""
         return self.shot_detection == waveform.ANY_TWO and len(self.segment_order) == 3
 
     def pd_and_miss_in_looks(
@@ -564,9 +633,21 @@ class Shots:
         bins: np.ndarray,
         point_indices: np.ndarray | slice = slice(None),
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities that a bin is detected in several looks, and that it is missed, (..., m).
+        """Return the probabilities that a bin is detected in several looks, and that it is missed.
 
-        ``magnitude`` [V] is nan for none; ``point_indices`` says which points these are.
+        Parameters
+        ----------
+        magnitude : ndarray (..., m)
+            |X| of one look [V]; nan without an echo.
+        bins : ndarray (..., m)
+            Bin numbers.
+        point_indices : ndarray (m,) or slice
+            Points to which the columns belong.
+
+        Returns
+        -------
+        pd, miss : ndarray (..., m)
+            nan where `magnitude` is.
         """
         is_present, sigma_and_threshold = (
             np.isfinite(magnitude),
@@ -591,7 +672,7 @@ class Shots:
     def _pd_in_looks_far_from_ends(
         self, signal_up: np.ndarray, signal_down: np.ndarray, threshold_ratio: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities of up and down segment in several looks, far from DC and Nyquist."""
+        """Compute pd of up and down segment in several looks as far from DC and Nyquist."""
         signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
         pd_up, _, pd_down = np.moveaxis(
             self.looks.pd_and_miss_in_speckle(
@@ -609,7 +690,7 @@ class Shots:
         bins: np.ndarray,
         point_indices: np.ndarray | slice,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute pd and 1 - pd in developed speckle, by signal and threshold over the noise."""
+        """Compute pd and 1 - pd in developed speckle, from signal and threshold over the noise."""
         from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
 
         look_speckle = (
@@ -655,7 +736,7 @@ class Shots:
         return pd, miss
 
     def _look_amplitude_covariance(self, segment: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Covariance of the echo's amplitudes in the looks of segments and points, (m, k, k)."""
+        """Return the covariance of an echo's amplitudes over k looks, (m, k, k) for m segments."""
         from sweep.model.detection.look_speckle import phase_rotated_look_covariances
 
         n_looks = self.looks.number
@@ -676,6 +757,7 @@ class Shots:
         return phase_rotated_look_covariances(correlation_by_lag, look_power, cycles_per_look)
 
     def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
+        """Return a bin's noise sigma per quadrature [V] for a noise variance at the ADC [V^2]."""
         window_energy = np.asarray(self.window.energy)
         mean_variance = variance / self.looks.n_coherent
         return receiver_chain.bin_noise_sigma(
@@ -697,7 +779,11 @@ class Shots:
 
     @cached_property
     def waveform_segments(self) -> tuple[waveform.WaveformSegment, ...]:
-        """Segments of the waveform, one after the other; no output tells of Doppler's leakage."""
+        """Segments of the waveform.
+
+        Leakage is evaluated in up- and down-chirp only, as no output reports that of the Doppler
+        segment.
+        """
         return tuple(
             waveform.WaveformSegment(
                 name,
@@ -720,7 +806,7 @@ class Shots:
 
     @property
     def motion_by_segment(self) -> dict[str, Any]:
-        """Range [m] and radial velocity [m/s], (n,); where they differ, tuples by segment."""
+        """Range [m] and radial velocity [m/s], (n,); tuples by segment where segments differ."""
         motion: dict[str, Any] = {"range": self.range, "radial_velocity": self.radial_velocity}
         if self.target_moves_between_segments:
             motion["range"] = tuple(
@@ -743,7 +829,7 @@ class Shots:
 
     @property
     def mid_record_drifts(self) -> tuple[np.ndarray, ...]:
-        """Hz by which each segment's lines have moved on at the middle of its record, (n,) each."""
+        """Drift [Hz] of each segment's lines at the middle of its record, (n,) each."""
         return tuple(
             self._frequency_drift(segment, self.record_middle_time, self.velocity_drift_time)
             for segment in self.waveform_segments
@@ -751,7 +837,7 @@ class Shots:
 
     @property
     def frequency_drift_rates(self) -> tuple[np.ndarray, ...]:
-        """Hz/s at which each segment's lines move on within its record, (n,) each."""
+        """Drift rate [Hz/s] of each segment's lines within its record, (n,) each."""
         walk_sign, drift_sign = np.sign(self.record_middle_time), np.sign(self.velocity_drift_time)
         return tuple(
             self._frequency_drift(segment, walk_sign, drift_sign)
@@ -761,7 +847,10 @@ class Shots:
     def _frequency_drift(
         self, segment: WaveformSegment, walk_time: np.ndarray, drift_time: np.ndarray | float
     ) -> np.ndarray:
-        """Hz that a segment's lines gain in a time [s] of range walk and one of acceleration."""
+        """Compute the drift [Hz] of a segment's lines in given times [s] of walk and acceleration.
+
+        `walk_time` is the time of range walk, `drift_time` that of acceleration.
+        """
         closing_speed = self.radial_velocity + self.approach_speed
         closing_speed = closing_speed + self.acceleration * (
             2 * segment.start_time + 1.5 * self.velocity_drift_time
@@ -773,10 +862,11 @@ class Shots:
 
     @property
     def beat_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Hz of each segment's beat for a Doppler ratio, and for -2R/c, (3, n): carriers and rates.
+        """Coefficients of each segment's beat, (3, n) each: carriers [Hz] and chirp rates [Hz/s].
 
-        They refer to the shot's start, of a target at a steady speed. A record tells the delay at
-        its middle, and at twice that by the phase's own curve.
+        A beat is the carrier times the Doppler ratio minus the chirp rate times 2R/c. Both refer to
+        the shot's start and to a target at constant speed. A record measures the delay at its
+        middle; the curvature of the phase doubles that time.
         """
         starts, chirp_slopes, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
@@ -793,12 +883,12 @@ class Shots:
 
     @property
     def target_moves_between_segments(self) -> bool:
-        """True where the target moves on between segments."""
+        """True if the target moves between segments."""
         return any(np.any(start) for start in self.segment_starts)
 
     @property
     def has_segment(self) -> np.ndarray:
-        """Segments that exist of up, Doppler and down, (3,) bool."""
+        """(3,) bool: existence of up, Doppler and down segment."""
         return np.array([name in self.segment_order for name in waveform.SEGMENT_NAMES])
 
     @property
@@ -810,14 +900,18 @@ class Shots:
 
     @property
     def look_period(self) -> np.ndarray:
-        """Time [s] from one look to the next: that of the whole waveform."""
+        """Time [s] from one look to the next: the duration of the full waveform."""
         return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
 
     def point_parameter_table(self) -> np.ndarray:
-        """Numbers of each point as compiled code takes them, (COMMON + OWN segments, n).
+        """Return the numbers of each point that compiled code takes, as rows.
 
-        Properties common to all segments, and of each segment the signed chirp rate [Hz/s], the
-        carrier, the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
+        Returns
+        -------
+        ndarray (N_SHARED_COLUMNS + 3 N_SEGMENT_COLUMNS, n)
+            First the properties that all segments share. Then for each segment the signed chirp
+            rate [Hz/s], the carrier [Hz], the whitening gain, the decrease of range [m], the
+            Doppler ratio, and the start time [s].
         """
         shared_columns = (
             self.range,
@@ -855,7 +949,7 @@ class Shots:
 
     @property
     def real_fft_size(self) -> int:
-        """FFT size where noise in bins 0 and N/2 is real, as that of a real record is; else 0."""
+        """FFT size if noise in bins 0 and N/2 is real, as in a real record; else 0."""
         is_real = self.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
 
@@ -866,14 +960,14 @@ class Shots:
 
     @property
     def noise_bin_correlation(self) -> float:
-        """Of the noise of adjacent bins, 0..1."""
+        """Correlation of the noise of adjacent bins, 0..1."""
         if self.noise_bins == "independent":
             return 0.0
         return bin_noise.neighbour_noise_correlation(self.window, self.fft_size)
 
     @property
     def detection_rule(self) -> "DetectionRule":
-        """Return the rule of detection of one record's bins."""
+        """Rule of detection of one record's bins."""
         from sweep.model.detection.echo_detection import DetectionRule
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
@@ -929,7 +1023,8 @@ class Shots:
         line_deviation_bins = np.ascontiguousarray(
             np.broadcast_to(self.line_deviation_bins, shape), float
         )
-        # Without images bins near DC and Nyquist hold half of the echo, and no real number.
+        # Without images, bins near DC and Nyquist hold half of the echo, and their values are not
+        # real.
         if self.segment_correlations is None or self.complex_record or not self.sums_images:
             return SpeckleTable(
                 line_deviation_bins, np.zeros(shape, np.int64), np.zeros((1, 0)), np.ones((1, 1))
@@ -939,7 +1034,20 @@ class Shots:
     def n_searched_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Bins that can raise a false alarm, less the ``n_exempt``, (3, m), by segment."""
+        """Return the number of bins that can raise a false alarm, by segment.
+
+        Parameters
+        ----------
+        n_exempt : ndarray (3, m)
+            Bins that the detection occupies, which are subtracted.
+        point_indices : ndarray (m,) or slice
+            Points to which the columns belong.
+
+        Returns
+        -------
+        ndarray (3, m)
+            Number of bins, 0 or more.
+        """
         n_searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_fft_size:
             n_searched += 1 - 2 * self.first_searched_bin
@@ -957,7 +1065,15 @@ class Shots:
     def alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Independent bins that would raise a false alarm as often as those that can."""
+        """Return the number of independent bins that alarm as often as the searched bins.
+
+        Parameters
+        ----------
+        n_exempt : ndarray (3, m)
+            Bins that the detection occupies, as of :meth:`n_searched_bins`.
+        point_indices : ndarray (m,) or slice
+            Points to which the columns belong.
+        """
         n_searched = self.n_searched_bins(n_exempt, point_indices)
         if self.noise_bins == "independent":
             return n_searched
@@ -975,10 +1091,21 @@ class Shots:
 def split_by_category(
     parameters: Parameters, further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category: (indices, parameters as arrays) for each.
+    """Split points by category.
 
-    Among the parameters is ``record``, the length of the record in samples. ``further_paths`` names
-    numbers that points must share besides :data:`CATEGORY_PATHS`.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path: scalars or (n,) arrays.
+    further_paths : collection of str
+        Numeric parameters that points must share besides :data:`CATEGORY_PATHS`.
+
+    Yields
+    ------
+    point_indices : ndarray (m,)
+        Points of a category.
+    category_parameters : dict
+        Parameters of these points as arrays, including ``record``, the record's length in samples.
     """
     arrays = parameters_as_arrays(parameters)
     n_points = max((a.size for a in arrays.values() if a.ndim), default=1)
@@ -993,7 +1120,7 @@ def split_by_category(
         return
     category_of_point = np.zeros(n_points, np.int64)
     for path in varying_paths:
-        if (arrays[path] == arrays[path][0]).all():  # the rule, and found without sorting
+        if (arrays[path] == arrays[path][0]).all():  # the usual case, needs no sorting
             continue
         distinct_values, value_codes = np.unique(arrays[path], return_inverse=True)
         category_of_point = np.unique(
@@ -1011,7 +1138,7 @@ def split_by_category(
 
 
 def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.ndarray:
-    """Values that broadcast to a shape, as rows."""
+    """Return values broadcast to a shape as the rows of one array."""
     rows = np.empty((len(values), *shape))
     for row, value in zip(rows, values, strict=True):
         row[...] = value
@@ -1019,14 +1146,24 @@ def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...])
 
 
 def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
-    """Parameters as arrays, with the length of the record among them."""
+    """Return the parameters as arrays, together with ``record``, the record's length in samples."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
     arrays["record"] = waveform.record_length(arrays)
     return arrays
 
 
 def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, ground: Ground) -> Shots:
-    """Points of one category with nothing but the echo on the beam's axis and receiver noise."""
+    """Prepare points of one category with only the echo on the beam's axis and receiver noise.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, as arrays.
+    n_points : int
+        Number of points n.
+    ground : Ground
+        Ground that the beams meet.
+    """
     architecture, samples_iq = (
         str(parameters[RECEIVER_PREFIX + "architecture"]),
         str(parameters[RECORD_PATH]) == "complex",
@@ -1099,16 +1236,19 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
 
 @lru_cache(maxsize=8)
 def window_energy_from_sample(window: Window) -> np.ndarray:
-    """Sum w^2 over the samples from each on, (L + 1,)."""
+    """Return the sum of w^2 from each sample to the last, (L + 1,)."""
     return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
 
 
 def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Speed at which the range along the beam falls [m/s], (n,) or scalar.
+    """Return the speed at which the range along the beam falls [m/s], (n,) or scalar.
 
-    This is not the radial velocity if the beam slides over slanting ground. Let V = v d + u e, d
-    along the beam and e across it towards the near side. Then a plane of normal n at the grazing
-    angle g is met at a range that falls by V.n / d.n = v + u cot g.
+    It differs from the radial velocity if the beam slides over sloping ground.
+
+    Notes
+    -----
+    Let V = v d + u e, with d along the beam and e across it towards the near side. The range of a
+    plane of normal n at the grazing angle g then falls at V.n / d.n = v + u cot g.
     """
     if APPROACH_SPEED_PATH in parameters:
         return parameters[APPROACH_SPEED_PATH]
@@ -1122,23 +1262,36 @@ def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Relative amplitude of the beat from the relative echo; direct detection beats with power."""
+    """Return the relative amplitude of the beat for a relative echo.
+
+    It is the square root of the relative echo [1/sr]; with direct detection, where the beat is
+    proportional to power, the relative echo itself.
+    """
     return relative_echo if architecture == "direct" else np.sqrt(relative_echo)
 
 
 def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
-    """Doppler ratio beta = 2 v_r / c."""
+    """Return the Doppler ratio beta = 2 v_r / c of a radial velocity [m/s]."""
     return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
 def echo_power_and_beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Echo power [W] for a backscatter of 1/sr with the whole beam at one range; its beat [A].
+    """Compute the echo power and beat current for a backscatter of 1/sr.
 
-    [T 4.4] without its 1/(2 pi): that belongs to the reflectance law. A beamlet's echo is this
-    times its power fraction, its backscatter [1/sr] and what
-    :func:`sweep.model.beam.range_loss_coefficients` says of its range.
+    Returns
+    -------
+    echo_power : ndarray
+        Echo power [W] with the full beam at ``target.range``.
+    beat_current : ndarray
+        Amplitude of its beat photocurrent [A].
+
+    Notes
+    -----
+    The law is [T 4.4] without its factor 1/(2 pi), which belongs to the reflectance law. A
+    beamlet's echo is this power times its power fraction and its backscatter [1/sr], divided by the
+    range loss of :func:`sweep.model.beam.range_loss_coefficients`.
     """
     power_times_area = (
         parameters[LASER_PREFIX + "power"]
@@ -1154,12 +1307,23 @@ def echo_power_and_beat_current(
 def beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray], power: np.ndarray
 ) -> np.ndarray:
-    """Amplitude of the beat photocurrent [A] that light of a power P [W] makes.
+    """Return the amplitude of the beat photocurrent [A] of received light.
 
-    Coherent architectures: 2 M Re sqrt(eta P_lo P), eta the heterodyne efficiency, a share of
-    power. Direct detection: m M Re P, hence 2 dB of SNR for each dB of light. [T 2.22] takes
-    2 Re^2 P^2 as the mean square current, which is the peak of a fully modulated echo. With P the
-    mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
+    Parameters
+    ----------
+    architecture : str
+        Receiver architecture.
+    parameters : mapping
+        Parameters by dotted path, as arrays.
+    power : ndarray
+        Power P of the light [W].
+
+    Notes
+    -----
+    Coherent architectures: 2 M Re sqrt(eta P_lo P), with the heterodyne efficiency eta, a fraction
+    of power. Direct detection: m M Re P, hence 2 dB of SNR for each dB of light. [T 2.22] takes 2
+    Re^2 P^2 as the mean square current, which is the peak of a fully modulated echo. With the mean
+    echo power P the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
     """
     gain, responsivity = (
         parameters[RECEIVER_PREFIX + "apd_gain"],
@@ -1186,22 +1350,26 @@ _POINT_FIELD_LABELS = {
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
+"""Fields of `Shots`, one value a point, that have to be finite, and their names in messages."""
 _BEAMLET_FIELD_LABELS = {
     "relative_range_offset": "beamlets' ranges",
     "doppler_ratio_offset": "beamlets' velocities",
     "relative_amplitude": "beamlets' echoes",
 }
-"""Fields of shots that have to be finite, and what users call them."""
+"""Fields of `Shots`, one value a beamlet, that have to be finite, and their names in messages."""
 
 
 def require_finite(shots: Shots) -> None:
-    """Refuse shots with a number that is not finite: the spectrum of one has no peak to be found.
+    """Raise an error if a number of the shots is not finite, as their spectrum would have no peak.
 
-    The UnsupportedShot says what is not finite, and of which shot.
+    Raises
+    ------
+    UnsupportedShotError
+        Names the quantity that is not finite, and the shot.
     """
     for name, label in (_POINT_FIELD_LABELS | _BEAMLET_FIELD_LABELS).items():
         values = np.asarray(getattr(shots, name))
-        if math.isfinite(float(values.sum())):  # not so of any nan, nor of an inf
+        if math.isfinite(float(values.sum())):  # the sum is not finite with any nan or inf
             continue
         is_not_finite = ~np.isfinite(values)
         if not is_not_finite.any():

@@ -1,4 +1,4 @@
-"""Receiver: its poles and filter, and the noise in the photocurrent and at the ADC."""
+"""Receiver: its poles and anti-alias filter, and the noise in the photocurrent and at the ADC."""
 
 import math
 from collections.abc import Mapping
@@ -11,10 +11,11 @@ from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 
 RECEIVER_PREFIX = "instrument.receiver."
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
+"""Receiver architectures."""
 
 
 def aperture_area(diameter: np.ndarray) -> np.ndarray:
-    """Area of a circular aperture [m^2] from its diameter [m], [T 4.3]."""
+    """Return the area [m^2] of a circular aperture of a diameter [m], [T 4.3]."""
     return math.pi * (np.asarray(diameter) / 2) ** 2
 
 
@@ -26,49 +27,85 @@ def shot_noise_current_variance(
     responsivity: np.ndarray,
     electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Compute current variance 2 q M^2 F Re P B_e [A^2] of light of power P [W] on the detector."""
+    """Compute the current variance of the shot noise of light on the detector.
+
+    Parameters
+    ----------
+    power : ndarray or float
+        Power P of the light [W].
+    apd_gain, excess_noise_factor : ndarray
+        Gain M and excess noise factor F of an avalanche photodiode; 1 without one.
+    responsivity : ndarray
+        Responsivity Re [A/W].
+    electrical_bandwidth : ndarray
+        Bandwidth B_e [Hz].
+
+    Returns
+    -------
+    ndarray
+        Variance 2 q M^2 F Re P B_e [A^2].
+    """
     squared_gain = np.asarray(apd_gain) ** 2 * excess_noise_factor
     return 2 * ELEMENTARY_CHARGE * squared_gain * responsivity * power * electrical_bandwidth
 
 
 class ReceiverNoise(NamedTuple):
-    """Variances at the ADC [V^2]."""
+    """Variances of the receiver's noise at the ADC [V^2]."""
 
     variance_per_square_ampere: np.ndarray
-    """Of 1 A^2 of current."""
+    """Variance [V^2] of 1 A^2 of current variance."""
     shot_noise_variance_per_watt: np.ndarray
-    """Of the shot noise of 1 W of light."""
+    """Variance [V^2] of the shot noise of 1 W of light."""
     variances: dict[str, np.ndarray]
-    """Of the receiver's own, by source."""
+    """Variance [V^2] of each of the receiver's own sources, by name."""
 
 
 ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
-"""Parameters of the filter before the ADC, none by default, which points need not have."""
+"""Optional parameters of the anti-alias filter; without a filter by default."""
 
 _ALIASES_PER_SIDE = 32
-"""Aliases on either side that pass an anti-alias filter: of order 3 and a bandwidth of the whole
-sample rate those beyond have 1e-8 of the density."""
+"""Number of aliases on either side that are summed behind an anti-alias filter. With order 3 and a
+bandwidth of the full sample rate, the rest has 1e-8 of the density."""
 
 _LOG_ATTENUATION_MAX = 345.0
-"""Natural logarithm of the most that such a filter takes from a power: nothing becomes 0."""
+"""Natural logarithm of the largest attenuation of power by the filter, so that no power becomes 0.
+"""
 
 
 def receiver_noise(
     architecture: str, receiver: Mapping[str, np.ndarray], samples_iq: bool = False
 ) -> ReceiverNoise:
-    """Noise of receivers of an architecture, from :func:`receiver_parameters`, (n,) or scalars.
+    """Compute the noise of a receiver at the ADC.
 
-    The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
-    current squared. Direct detection has no local oscillator and adds its load's thermal noise,
-    4 k T B_e / R_L [T 2.22]. A heterodyne receiver mixes an IF down: noise from both sides of the
-    IF lands in the record, which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the
-    homodyne's. Its RF noise figure multiplies all of it.
+    Parameters
+    ----------
+    architecture : str
+        One of :data:`ARCHITECTURES`.
+    receiver : mapping
+        Parameters, as of :func:`receiver_parameters`, (n,) or scalars.
+    samples_iq : bool
+        True for two receivers that sample I and Q; variances are then stated as those that give a
+        bin of a real record the same noise.
 
-    ``samples_iq``: of two receivers that sample I and Q, as the noise of a bin of a real record.
-    A 90 degree hybrid gives each of them half of echo and local oscillator, and the bins of I + iQ
-    show a line as those of a real record do. Shot noise is the same altogether, each one's own
-    noise twice as much; that of currents which go with the light, a quarter of the variance each,
-    is half.
+    Returns
+    -------
+    ReceiverNoise
+        Variances [V^2].
+
+    Notes
+    -----
+    The sources are the local oscillator's shot noise, the detector's (M Re NEP)^2 B_e, and the
+    square of the amplifier's rms current. Direct detection has no local oscillator and adds the
+    thermal noise of its load, 4 k T B_e / R_L [T 2.22].
+
+    A heterodyne receiver mixes an IF down, and noise from both sides of the IF enters the record.
+    The shot-limited SNR is then Re P / (2 q B_e) [T 2.23], half the homodyne's. The RF noise figure
+    multiplies all of this noise.
+
+    With I and Q, a 90 degree hybrid gives each receiver half of echo and local oscillator. The bins
+    of I + iQ show a line as those of a real record do. The total shot noise is the same, and the
+    receivers' own noise doubles. The variance of currents proportional to the light is a quarter in
+    each receiver and half in total.
     """
     bandwidth = electrical_bandwidth(receiver)
     detector_parameters = {
@@ -77,7 +114,7 @@ def receiver_noise(
     detector_variance = (
         receiver["apd_gain"] * receiver["responsivity"] * receiver["noise_equivalent_power"]
     ) ** 2 * bandwidth
-    # what the anti-alias filter leaves of the rms
+    # fraction of the amplifier's noise that passes the anti-alias filter
     passed_fraction = bandwidth / np.minimum(
         receiver["detector_bandwidth"], receiver["amplifier_bandwidth"]
     )
@@ -121,13 +158,32 @@ def receiver_noise(
 def quantisation_variance(
     *, full_scale: ArrayLike, bits: ArrayLike, samples_iq: bool = False
 ) -> np.ndarray:
-    """Variance lsb^2/12 [V^2] that rounding adds at the ADC, lsb = 2 V / 2^bits; 0 for 0 bits.
+    """Return the variance that rounding adds at the ADC.
 
-    If the noise's deviation s spans a step or so the error is white and independent of the signal
-    [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by exp(-2 pi^2 s^2
-    / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's gain nor its noise
-    figure acts on it. ``full_scale`` is the largest voltage V [V] to either side; the effective
-    number of bits, which need not be whole, makes the noise of a real ADC. Two ADCs sample I and Q.
+    Parameters
+    ----------
+    full_scale : array_like
+        Largest voltage V to either side [V].
+    bits : array_like
+        Effective number of bits, not necessarily an integer, which makes the noise of a real ADC; 0
+        for no rounding.
+    samples_iq : bool
+        True for two ADCs that sample I and Q.
+
+    Returns
+    -------
+    ndarray
+        Variance lsb^2/12 [V^2], lsb = 2 V / 2^bits; twice that with I and Q.
+
+    Notes
+    -----
+    If the standard deviation s of the noise is about a step or more, the error is white and
+    independent of the signal [1]_. It departs from that by exp(-2 pi^2 s^2 / lsb^2): 2.7e-9 for s =
+    lsb and 0.7 % for s = lsb/2. The receiver's gain and noise figure do not act on it.
+
+    References
+    ----------
+    .. [1] Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9.
     """
     bits = np.asarray(bits, float)
     lsb = 2 * np.asarray(full_scale, float) * 2.0**-bits
@@ -135,7 +191,10 @@ def quantisation_variance(
 
 
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
-    """Noise sigma of a bin, per quadrature: sqrt(E_w sigma_x^2 / 2), [T 3.2]."""
+    """Return the noise sigma of a bin, per quadrature: sqrt(E_w sigma_x^2 / 2), [T 3.2].
+
+    `noise_variance` is sigma_x^2 of a sample, `window_energy` is E_w = sum w^2.
+    """
     return np.sqrt(window_energy * noise_variance / 2)
 
 
@@ -145,20 +204,24 @@ def receiver_transfer(
     detector_bandwidth: np.ndarray,
     amplifier_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Complex transfer of the receiver at a signed frequency [Hz], over that at DC.
+    """Return the complex transfer function of the receiver relative to DC.
 
-    Two single-pole low-passes, each 3 dB down at its stated bandwidth. Lines are taken at the
-    frequency they have before the ADC folds them.
+    Parameters
+    ----------
+    frequency : ndarray
+        Signed frequency [Hz], before the ADC folds it.
+    detector_bandwidth, amplifier_bandwidth : ndarray
+        Bandwidths of two single-pole low-passes, each 3 dB down at its bandwidth [Hz].
     """
     poles = (1 + 1j * frequency / detector_bandwidth) * (1 + 1j * frequency / amplifier_bandwidth)
     return 1 / poles
 
 
 def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Bandwidth B_e [Hz] over which noise is counted: the narrowest of all stages.
+    """Return the bandwidth B_e [Hz] that determines the noise: the narrowest of all stages.
 
-    [T] states one figure for detector and amplifier and uses it as the noise bandwidth; so does
-    this. An anti-alias filter counts as a further stage.
+    [T] states one figure for detector and amplifier and uses it as the noise bandwidth, and so does
+    this function. An anti-alias filter counts as another stage.
     """
     narrowest_pole = np.minimum(receiver["detector_bandwidth"], receiver["amplifier_bandwidth"])
     antialias = antialias_filter_parameters(receiver)
@@ -170,7 +233,7 @@ def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Parameters of the receiver, by their names alone."""
+    """Return the receiver's parameters by name, without the prefix of their paths."""
     return {
         path.removeprefix(RECEIVER_PREFIX): value
         for path, value in parameters.items()
@@ -179,7 +242,7 @@ def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Parameters of the filter before the ADC, of the receiver's; empty without one."""
+    """Select the parameters of the anti-alias filter from the receiver's; empty without one."""
     filter_parameters = {
         name: np.asarray(receiver.get(name, default))
         for name, default in ANTIALIAS_DEFAULTS.items()
@@ -190,15 +253,27 @@ def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str,
 def antialias_power_transmission(
     frequency: np.ndarray, *, antialias_bandwidth: np.ndarray, antialias_order: np.ndarray
 ) -> np.ndarray:
-    """Power that passes the anti-alias filter at a signed frequency [Hz], before it folds.
+    """Return the power transmission of the anti-alias filter.
 
-    A Butterworth low-pass of order n, 3 dB down at its bandwidth B [Hz]: 1 / (1 + (f / B)^(2 n)).
+    Parameters
+    ----------
+    frequency : ndarray
+        Signed frequency [Hz], before the ADC folds it.
+    antialias_bandwidth, antialias_order : ndarray
+        Bandwidth B [Hz] and order n.
 
+    Notes
+    -----
+    A Butterworth low-pass, 3 dB down at B: 1 / (1 + (f / B)^(2 n)).
+
+    Examples
+    --------
     >>> given = {"antialias_bandwidth": np.array(1e8), "antialias_order": np.array(6)}
-    >>> [round(10 * float(np.log10(antialias_power(f, **given))), 1) for f in (5e7, 1e8, 2e8)]
+    >>> transmission = antialias_power_transmission(np.array([5e7, 1e8, 2e8]), **given)
+    >>> [round(10 * float(np.log10(power)), 1) for power in transmission]
     [-0.0, -3.0, -36.1]
     """
-    with np.errstate(divide="ignore"):  # ln 0 at DC
+    with np.errstate(divide="ignore"):  # log of 0 at DC
         log_frequency_ratio = np.log(np.abs(frequency) / antialias_bandwidth)
     return np.asarray(
         1
@@ -209,15 +284,26 @@ def antialias_power_transmission(
 def relative_noise_density(
     frequency: np.ndarray, *, sample_rate: np.ndarray, **filters: np.ndarray
 ) -> np.ndarray:
-    """Density of the noise in a record, over that of white noise of the same sources.
+    """Return the density of the noise in a record relative to white noise of the same sources.
 
-    The sources' noise passes |H|^2 and folds: f_s / (2 B_e) sum_m |H(f + m f_s)|^2 at a frequency f
-    [Hz] of any sign, folded or not. With a = 2 pi B / f_s a single pole's sum is
+    Parameters
+    ----------
+    frequency : ndarray
+        Frequency [Hz], of either sign, folded or not.
+    sample_rate : ndarray
+        Sample rate f_s [Hz].
+    **filters : ndarray
+        ``detector_bandwidth``, ``amplifier_bandwidth`` and those of an anti-alias filter.
+
+    Notes
+    -----
+    The sources' noise passes |H|^2 and folds: f_s / (2 B_e) sum_m |H(f + m f_s)|^2. With a = 2 pi B
+    / f_s a single pole's sum is
 
         sum_m 1 / (1 + (f + m f_s)^2 / B^2) = (a / 2) sinh a / (cosh a - cos(2 pi f / f_s))
 
-    and that of two poles follows by partial fractions, or by the derivative where they are equal.
-    Behind an anti-alias filter |H|^2 has its power too, and aliases are summed one by one.
+    and that of two poles follows by partial fractions, or by the derivative if they are equal. With
+    an anti-alias filter |H|^2 includes its transmission, and the aliases are summed one by one.
     """
     poles = {
         name: np.asarray(filters[name], float)
@@ -252,14 +338,14 @@ def relative_noise_density(
     folded_frequency = np.arccos(np.clip(cosine, -1, 1)) * sample_rate / (2 * np.pi)
     unaliased = 1 / (
         (1 + (folded_frequency / bandwidth_1) ** 2) * (1 + (folded_frequency / bandwidth_2) ** 2)
-    )  # where all else rounds
+    )  # rounding may leave less
     return np.asarray(
         np.maximum(density, unaliased) * sample_rate / (2 * np.minimum(bandwidth_1, bandwidth_2))
     )
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum s over the aliases of a single pole, a > 0, and (a / 2) ds/da."""
+    """Return the sum s over the aliases of a single pole, a > 0, and (a / 2) ds/da."""
     q, one_minus_q = np.exp(-a), -np.expm1(-a)
     denominator = one_minus_q * one_minus_q + 2 * q * (1 - cosine)
     hyperbolic_ratio = one_minus_q * (2 - one_minus_q) / denominator

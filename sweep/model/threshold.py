@@ -1,17 +1,17 @@
-"""The threshold: by its ratio to the noise, or by the false alarms that it lets pass.
+"""Threshold, from its ratio to the noise or from a design probability of false alarm.
 
-In a bin of noise alone |X| is Rayleigh distributed, of mean sigma sqrt(pi/2) and standard deviation
-sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
+In a bin of noise alone |X| is Rayleigh distributed, with mean sigma sqrt(pi/2) and standard
+deviation sigma sqrt(2 - pi/2). A threshold of b sigma is stated in one of five ways:
 
-    tnr                  b / sqrt(2 - pi/2), as the thesis has it
+    tnr                  b / sqrt(2 - pi/2), as in the thesis
     threshold_to_mean    b / sqrt(pi/2)
     design_pfa_bin       exp(-b^2 / 2)
-    design_pfa_segment   probability that any bin counted in a segment, the up-chirp's, crosses
-    design_pfa_shot      the same of a shot: of any of its segments, one after the other
+    design_pfa_segment   probability that any bin counted in the up-chirp segment crosses
+    design_pfa_shot      probability that any bin counted in any segment of a shot crosses
 
-Design probabilities are those of noise alone, before a detection takes bins away. In several looks
-(:mod:`sweep.model.detection.looks`) b is that of each record, or of the root of their mean power,
-over sigma of one record, and the probabilities are those of all of them together.
+Design probabilities are those of noise alone, before a detection excludes bins. With several looks
+(:mod:`sweep.model.detection.looks`) b is the threshold of each record, or of the root of their mean
+power, over sigma of one record. The probabilities then refer to all looks together.
 """
 
 import math
@@ -50,18 +50,33 @@ PROCESSING_PREFIX = "instrument.processing."
         "design_pfa_shot",
     )
 )
-"""Parameters of which exactly one is given."""
+"""Parameters that state the threshold; exactly one is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
 
 
 def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Threshold-to-noise ratio of points that share their words and sizes, however it is written.
+    """Return the threshold-to-noise ratio, from any parameter that states the threshold.
 
-    A ValueError where none of the parameters :data:`THRESHOLD_PATHS` is there, or several.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, of points that share text and sizes.
 
-    >>> four_times_the_mean = tnr_of({"instrument.processing.threshold_to_mean": 4.0})
+    Returns
+    -------
+    ndarray
+        Threshold over the standard deviation of |X| in a bin of noise.
+
+    Raises
+    ------
+    ValueError
+        If not exactly one of :data:`THRESHOLD_PATHS` is given.
+
+    Examples
+    --------
+    >>> four_times_the_mean = tnr_from_parameters({"instrument.processing.threshold_to_mean": 4.0})
     >>> round(float(four_times_the_mean), 2)
     7.65
     """
@@ -99,7 +114,7 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
 def _log_pfa_law(
     parameters: Mapping[str, Any], segments: Sequence[str]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Logarithm of the probability that noise alone raises an alarm in segments, by the level."""
+    """Return a function from b to the log probability that noise raises an alarm in segments."""
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
     bin_log_pfa = Looks.from_parameters(parameters).log_pfa
@@ -117,10 +132,20 @@ def _log_pfa_law(
 def segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
-    """Independent bins that alarm as often as those of a segment that a detection takes none of.
+    """Return the number of independent bins that alarm as often as a segment without a detection.
 
-    As :meth:`sweep.model.preparation.Shots.alarm_equivalent_bins`. Segments differ where a band is
-    searched.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, of points that share text and sizes.
+    threshold_ratio : ndarray
+        Threshold b over sigma.
+    segment : str
+        Name of the segment; segments differ if a band is searched.
+
+    See Also
+    --------
+    sweep.model.preparation.Shots.alarm_equivalent_bins : The number less the bins of a detection.
     """
     fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
     counts_all_bins = str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"

@@ -1,12 +1,12 @@
-"""The slow, obviously right simulation: every beamlet, every sample, the whole FFT.
+"""Reference simulation in the time domain: every beamlet, every sample, the full FFT.
 
-The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 2, sample by
-sample; the records add up, are windowed and transformed. Every fast path is held against this.
-It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
-kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
+The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 2, sample by sample.
+The records are summed, windowed and transformed. Tests compare every fast path with this one. It
+shares link budget, noise and footprint with the fast path, but neither lines nor kernels nor bins.
+A shot takes seconds. Its own accuracy, limited by rounding of f t, is 1e-11 of the peak.
 
-With the effect of overlap a beamlet has an echo in samples from its own delay tau(t) on, and until
-the chirp ends.
+With the effect of overlap, a beamlet has an echo in samples from its own delay tau(t) until the
+chirp ends.
 """
 
 from fractions import Fraction
@@ -30,12 +30,26 @@ def time_domain_spectrum(
     with_acceleration: bool = False,
     laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
+    """Compute the noiseless spectrum |X[k]| of one segment of one point.
 
-    Of a complex record for k = -N/2..N/2 - 1, (N,). With incoherent phases: the root of the mean of
-    |X|^2 over independent uniform phases. ``with_range_walk`` keeps the terms of the phase in t^2,
-    the frequency drift while the target moves; ``with_acceleration`` that of its velocity;
-    ``laser_phase`` (L,) is theta(t) - theta(t - tau) in each sample [rad].
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    point, segment : int
+        Indices of the point and of the segment.
+    with_range_walk : bool
+        True to keep the terms of the phase in t^2, the frequency drift while the target moves.
+    with_acceleration : bool
+        True to keep the terms of the phase due to the change of its velocity.
+    laser_phase : ndarray (L,) or float
+        theta(t) - theta(t - tau) in each sample [rad].
+
+    Returns
+    -------
+    ndarray (n_bins,)
+        |X| [V] in bins k = 0..N/2, or -N/2..N/2 - 1 of a complex record. With incoherent phases it
+        is the root of the mean of |X|^2 over independent uniform phases of the beamlets.
     """
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
@@ -69,9 +83,12 @@ def time_domain_spectrum(
 
 
 def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = True) -> np.ndarray:
-    """Evaluate each segment's spectrum as :func:`sweep.model.evaluation.find` does; no leakage.
+    """Evaluate each segment's spectrum in the time domain.
 
-    Range walk is the only change of lines within a record that is included.
+    The result is that of :func:`sweep.model.spectrum.segment_spectra.evaluate_segments`.
+
+    Leakage is not evaluated. Range walk is the only change of lines within a record that is
+    included.
     """
     segment_results = np.full((3, 6, shots.size), np.nan)
     for point in range(shots.size):
@@ -114,11 +131,27 @@ def analytic_record(
     with_range_walk: bool = True,
     with_acceleration: bool = False,
 ) -> np.ndarray:
-    """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled.
+    """Compute the voltage of one beamlet at the ADC as a complex record.
 
-    The ground that the beam meets comes nearer by ``approach``, its scatterers by their own radial
-    velocity; both from the shot's start on. If the two differ the beam slides over the ground:
-    scatterers take each other's place, and the beat has the delay of those that are there.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    point, segment, beamlet : int
+        Indices of the point, the segment and the beamlet.
+    with_range_walk, with_acceleration : bool
+        As of :func:`time_domain_spectrum`.
+
+    Returns
+    -------
+    ndarray (L,) complex
+        Voltage [V]; a real ADC samples its real part.
+
+    Notes
+    -----
+    From the shot's start on, the range of the ground along the beam falls at ``approach_speed``,
+    and that of its scatterers at their own radial velocity. If the two differ, the beam slides over
+    the ground. Scatterers then replace each other, and the beat has the delay of those in the beam.
     """
     chirp_slope, carrier = (
         shots.chirp_slopes[segment],
@@ -188,7 +221,7 @@ def _start_phase(
     range_offset: float,
     range_decrease: float,
 ) -> float:
-    """-f tau_0 + s S tau_0^2 / 2, the phase at t = 0 [cycles], in exact fractions."""
+    """Compute the phase -f tau_0 + s S tau_0^2 / 2 at t = 0 [cycles] in exact fractions."""
     delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
     phase = -Fraction(carrier) * delay + Fraction(chirp_slope) * Fraction(chirp_rate) * delay**2 / 2
@@ -196,6 +229,6 @@ def _start_phase(
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Point i of a column that may be one value for all."""
+    """Return the value of one point of a column, which may be a scalar for all points."""
     column = np.asarray(column)
     return column[point] if column.ndim else column

@@ -1,13 +1,20 @@
-"""Shots that are beyond what the model stands for."""
+"""Error for shots outside the validity of the model."""
 
 
 class UnsupportedShotError(ValueError):
-    """A shot whose parameters, each of them possible, together leave what the model stands for.
+    """Error for a shot whose parameters, each of them valid, together exceed the model's validity.
 
-    Its text is for users: it names the fields, the limit, what was found and what to do.
+    The message is for users. It names the fields, the limit, the value and a remedy.
+
+    Parameters
+    ----------
+    message : str
+        Message for users.
+    point_index : int, optional
+        Index of the shot among those computed together; None if it is unknown.
     """
 
     def __init__(self, message: str, point_index: int | None = None) -> None:
         super().__init__(message)
         self.point_index = point_index
-        """Number of the shot among those computed together; None where it is not known."""
+        """Index of the shot among those computed together; None if it is unknown."""

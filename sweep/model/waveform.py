@@ -1,4 +1,4 @@
-"""The waveform and its segments: beats, their phases, and what a set of peaks says.
+"""Waveform and its segments: beat frequencies, phases, and range and velocity from a set of peaks.
 
 Homodyne beat phase of a segment (PHYSICS section 2), tau(t) = tau_0 - beta t, beta = 2 v_r / c:
 
@@ -12,12 +12,13 @@ Its terms up to t give one line per segment:
 f_seg is the optical frequency at the segment's start: c/lambda for the up-chirp and the Doppler
 segment, c/lambda + B for the down-chirp. To leading order the beats are f_d - f_r, f_d and f_d +
 f_r with f_d = 2 v_r / lambda and f_r = S 2 R / c [T 2.8]. The further terms move the down beat of
-Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of its own. By [T] each
-segment starts with the target at range R; that it moves on in between is an effect too.
+Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, a separate effect. In [T] each
+segment starts with the target at range R; motion between segments is another effect.
 
-A shot has an up- and a down-chirp, in any order, and may have a Doppler segment before, between or
-behind them. All last as long, with equal gaps. Two beats of real records tell both unknowns by an
-assumption (docs/physics.md, *A segment that is missed*); complex records keep the sign of each.
+A shot has an up- and a down-chirp, in either order, and may have a Doppler segment before, between
+or after them. All segments have the same duration, with equal gaps. Two beats of real records give
+both unknowns only with an assumption (docs/physics.md, *A segment that is missed*). Complex records
+keep the sign of each beat.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,12 +31,13 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 SEGMENT_NAMES = ("up", "doppler", "down")
+"""Names of the segments, in the order of rows of arrays by segment."""
 SEGMENT_ORDER_PATH, SEGMENT_GAP_PATH = "instrument.chirp.segments", "instrument.chirp.gap"
 SEGMENT_ORDERS = (
     "up doppler down", "up down", "down up", "down doppler up", "doppler up down",
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
-"""Segments of a shot in the order of time."""
+"""Possible segments of a shot, in the order of time."""
 DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH = (
     "instrument.chirp.doppler_slope",
     "instrument.chirp.down_slope",
@@ -47,7 +49,7 @@ PEAKS_PATH = "instrument.processing.peaks"
 ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS = ("all", "strongest")
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
 DEFAULT_CHIRP_SLOPES = (1, 0, -1)
-"""Chirp rate of up, Doppler and down segment over the up-chirp's, by default."""
+"""Default chirp rates of up, Doppler and down segment over that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
@@ -57,50 +59,74 @@ WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     TWO_BEATS_PATH: FAR_TARGET,
     PEAKS_PATH: ALL_PEAKS,
 }
+"""Default values of the waveform's parameters, by dotted path."""
 
 SEARCH_PREFIX = "instrument.processing.search."
 SEARCH_RANGE_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
 SEARCH_VELOCITY_PATHS = SEARCH_PREFIX + "min_radial_velocity", SEARCH_PREFIX + "max_radial_velocity"
 SEARCH_BAND_PATHS = SEARCH_RANGE_PATHS + SEARCH_VELOCITY_PATHS
-"""Parameters of a search band; it has all four."""
+"""Parameters of a search band; all four are given together."""
 
 
 class WaveformSegment(NamedTuple):
-    """One part of a waveform, in which the frequency rises or falls evenly or stands still."""
+    """One segment of a waveform, in which the frequency rises or falls linearly or is constant."""
 
     name: str
+    """Name, one of :data:`SEGMENT_NAMES`."""
     chirp_slope: float
     """Chirp rate over the up-chirp's, signed: 1, 0 and -1 by default."""
     chirp_rate: np.ndarray
-    """[Hz/s], signed, (n,) or scalar."""
+    """Signed chirp rate [Hz/s], (n,) or scalar."""
     carrier: np.ndarray
     """Frequency that the delay turns into phase [Hz], (n,) or scalar."""
     includes_leakage: bool
-    """Tell whether leakage in it is looked at."""
+    """True if leakage in the segment is evaluated."""
     range_decrease: np.ndarray | float
-    """Range by which the target has come nearer since the shot's start [m], (n,) or scalar."""
+    """Decrease of the target's range since the shot's start [m], (n,) or scalar."""
     doppler_ratio: np.ndarray | float
     """Doppler ratio 2 v_r / c of the line on the axis, (n,) or scalar."""
     start_time: np.ndarray | float
-    """Time since the shot's start [s]; 0 where the target stands still between segments."""
+    """Time since the shot's start [s]; 0 if the target does not move between segments."""
 
 
 class RangeVelocity(NamedTuple):
     """Range and radial velocity that the peaks of a shot report, (n,) each."""
 
     range: np.ndarray
+    """Range [m]."""
     radial_velocity: np.ndarray
+    """Radial velocity [m/s], positive when closing."""
 
 
 def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
     bandwidth: np.ndarray, chirp_slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Frequency f_seg [Hz] that the delay turns into phase, for up, Doppler and down segment.
+    """Return the frequency f_seg that the delay turns into phase, of up, Doppler and down segment.
 
-    The wavelength is that at the start of the up-chirp, the lowest of a segment's: one that falls
-    starts above it by its own bandwidth. Direct detection chirps the light's power, so that there
-    the radio frequency takes the optical one's place.
+    Parameters
+    ----------
+    architecture : str
+        Receiver architecture.
+    wavelength : ndarray
+        Wavelength at the start of the up-chirp [m].
+    start_frequency : ndarray
+        Radio frequency at the start of the up-chirp [Hz], used with direct detection.
+    bandwidth : ndarray
+        Bandwidth of the up-chirp [Hz].
+    chirp_slopes : sequence
+        Chirp rates of the segments over the up-chirp's.
+
+    Returns
+    -------
+    up, doppler, down : ndarray
+        Frequencies at the start of each segment [Hz].
+
+    Notes
+    -----
+    The start of the up-chirp is the lowest frequency of all segments. A falling segment starts
+    above it by its own bandwidth. Direct detection chirps the light's power, so the radio frequency
+    replaces the optical frequency.
     """
     lowest_frequency = (
         start_frequency if architecture == "direct" else SPEED_OF_LIGHT / np.asarray(wavelength)
@@ -115,7 +141,7 @@ def carrier_frequencies(
 
 
 def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
-    """Chirp rate of each segment over the up-chirp's, of points that share them."""
+    """Return the chirp rates of the segments over the up-chirp's, for points that share them."""
     doppler, down = (
         float(np.ravel(parameters.get(x, WAVEFORM_DEFAULTS[x]))[0])
         for x in (DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH)
@@ -124,7 +150,7 @@ def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the frequencies of :func:`carrier_frequencies` from parameters by dotted path."""
+    """Return the frequencies of :func:`carrier_frequencies` for parameters by dotted path."""
     return carrier_frequencies(
         str(parameters["instrument.receiver.architecture"]),
         wavelength=parameters["instrument.laser.wavelength"],
@@ -135,9 +161,9 @@ def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndar
 
 
 def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
-    """Names of the segments of a shot, of :data:`SEGMENT_ORDERS`, in the order of time.
+    """Return the names of a shot's segments in the order of time.
 
-    Direct detection has no optical Doppler segment.
+    `segments` is one of :data:`SEGMENT_ORDERS`. Direct detection has no optical Doppler segment.
     """
     all_names = segments.split()
     return tuple(name for name in all_names if name != "doppler" or architecture != "direct")
@@ -146,7 +172,11 @@ def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     segment_order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return times [s] from the shot's start to each segment's: up, Doppler, down; 0 for none."""
+    """Return the times [s] from the shot's start to the starts of up, Doppler and down segment.
+
+    `duration` and `gap` are those of each segment [s]. A segment that does not exist has the time
+    0.
+    """
     period = np.asarray(duration, float) + gap
     return tuple(
         period * (segment_order.index(name) if name in segment_order else 0)
@@ -162,7 +192,23 @@ def beat_frequency(
     range: np.ndarray,
     radial_velocity: np.ndarray,
 ) -> np.ndarray:
-    """Signed beat [Hz] of a segment whose chirp rate is the slope times B/T [Hz/s]."""
+    """Return the signed beat frequency [Hz] of a segment.
+
+    Parameters
+    ----------
+    chirp_slope : float or ndarray
+        Chirp rate of the segment over the up-chirp's, s.
+    carrier : ndarray
+        Frequency f_seg that the delay turns into phase [Hz].
+    chirp_rate : ndarray
+        Chirp rate of the up-chirp S = B/T [Hz/s].
+    range, radial_velocity : ndarray
+        Range [m] and radial velocity [m/s] of the target.
+
+    Notes
+    -----
+    f_seg beta - s S (2 R / c) (1 + beta), beta = 2 v_r / c.
+    """
     doppler_ratio = 2 * radial_velocity / SPEED_OF_LIGHT
     return carrier * doppler_ratio - chirp_slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (
         1 + doppler_ratio
@@ -170,11 +216,15 @@ def beat_frequency(
 
 
 SAMPLE_TIME_TOLERANCE = 1e-6
-"""Share of a sample by which one on a limit of time counts as within."""
+"""Tolerance, as a fraction of a sample, for a sample at a time limit to count as within it."""
 
 
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the record's length [samples]: the FFT's, or what the chirp leaves after the delay."""
+    """Return the record's length in samples.
+
+    It is the FFT size, or the number of samples that the chirp leaves after the acquisition delay,
+    if fewer.
+    """
     time_left = (
         parameters["instrument.chirp.duration"]
         - parameters["instrument.processing.acquisition_delay"]
@@ -189,10 +239,25 @@ def count_samples_before_echo(
     *, delay: np.ndarray, doppler_ratio: np.ndarray | float, record_start: np.ndarray,
     sample_rate: np.ndarray, length: int,
 ) -> np.ndarray:  # fmt: skip
-    """Count the samples of a record, 0 to all ``length``, that are taken before the echo arrives.
+    """Count the samples of a record that are taken before the echo arrives.
 
-    The delay tau_0 at a segment's start [s] changes as tau(t) = tau_0 - beta t; the record begins
-    at ``record_start`` [s]. The sample at t has an echo where t >= tau(t).
+    Parameters
+    ----------
+    delay : ndarray
+        Delay tau_0 at the segment's start [s].
+    doppler_ratio : ndarray or float
+        Doppler ratio beta; the delay changes as tau(t) = tau_0 - beta t.
+    record_start : ndarray
+        Time from the segment's start to the first sample [s].
+    sample_rate : ndarray
+        Sample rate [Hz].
+    length : int
+        Length of the record [samples].
+
+    Returns
+    -------
+    ndarray of int64
+        Number of samples, 0 to `length`. The sample at t holds an echo if t >= tau(t).
     """
     arrival_samples = (
         np.asarray(delay) / (1 + np.asarray(doppler_ratio)) - record_start
@@ -201,14 +266,15 @@ def count_samples_before_echo(
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Fold a signed frequency into the spectrum of a real record, 0..fs/2."""
+    """Return the frequency 0..fs/2 at which a real record shows a signed frequency."""
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 
 
 FOLD_PENALTY_BINS = 4.0
-"""Bins of mismatch that a reading without folds may have before one with a fold is preferred."""
+"""Mismatch [bins] that a reading without folds may have before one with a fold is preferred."""
 
 N_READINGS = 16
+"""Number of readings of unsigned peaks, as of :func:`read_beats`."""
 
 FAR_READING = 1
 """Reading without folds in which the half difference is the Doppler frequency: |f_d| < f_r."""
@@ -218,19 +284,28 @@ FAST_READING = 0
 
 
 SIGNED_READING = 16
-"""Reading of peaks of a complex record, which keep their signs: 2 f_r = d - u, f_d = u + f_r, each
-up to whole sample rates; range beats up to half of it, Doppler shifts to half of either sign."""
+"""Reading of signed peaks u, d of a complex record: 2 f_r = d - u, f_d = u + f_r, each modulo the
+sample rate. Range beats are positive, up to half the sample rate; Doppler shifts have either sign,
+up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Share of the sample rate by which 2 f_r may be below 0, as that of peaks rounded to bins."""
+"""Fraction of the sample rate by which 2 f_r may be below 0, as peaks rounded to bins may make it.
+"""
 
 
 def read_beats(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
-    """(f_d, f_r): signed Doppler and range beat by one of the readings, in the unit given.
+    """Return signed Doppler frequency and range beat (f_d, f_r) by one reading of two peaks.
 
-    The bits of ``reading`` are, from the highest, folds of up, Doppler and down peak, and whether
-    half sum and half difference are exchanged: in the order in which readings are tried. Or
-    :data:`SIGNED_READING`, of peaks -N/2 .. N/2.
+    Parameters
+    ----------
+    reading : int
+        Bits 8, 4 and 2 say that the up, Doppler and down peak is folded; bit 1 exchanges half sum
+        and half difference. Readings are tried in this order. :data:`SIGNED_READING` reads peaks
+        -N/2 .. N/2.
+    up, down : float or ndarray
+        Peaks of up- and down-chirp, in any unit of frequency.
+    sample_rate : float or ndarray
+        Sample rate in the same unit.
     """
     if reading == SIGNED_READING:
         rate_fraction = (down - up) / sample_rate
@@ -253,7 +328,15 @@ def read_beats(reading, up, down, sample_rate):  # type: ignore[no-untyped-def] 
 def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or compiled
     f_d, f_r, carrier, bandwidth, duration
 ):
-    """(range [m], radial velocity [m/s]) of a Doppler frequency and a range beat [Hz]."""
+    """Return range [m] and radial velocity [m/s] of a Doppler frequency and a range beat [Hz].
+
+    Parameters
+    ----------
+    f_d, f_r : float or ndarray
+        Doppler frequency and range beat [Hz].
+    carrier, bandwidth, duration : float or ndarray
+        Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
+    """
     beta = f_d / (carrier + bandwidth / 2.0)
     delay = (f_r - bandwidth * beta / 2.0) / (bandwidth / duration * (1.0 + beta))
     return SPEED_OF_LIGHT * delay / 2.0, SPEED_OF_LIGHT * beta / 2.0
@@ -272,19 +355,37 @@ def resolve_range_velocity(
     has_signs: bool = False,
     two_beat_assumption: str = FAR_TARGET,
 ) -> RangeVelocity:
-    """Range and velocity from unsigned, folded peak frequencies [Hz], (n,) each.
+    """Resolve range and velocity from the peak frequencies of up, Doppler and down segment.
 
-    Frequencies with signs (``has_signs``), of complex records, are read by :data:`SIGNED_READING`.
-    Without a Doppler segment, ``doppler=None``, others are read by :data:`FAR_READING`, or by
-    :data:`FAST_READING` where a
-    fast target is ``two_beat_assumption``. With it there are two unknowns and three peaks: every
-    reading (each
-    peak as it stands or folded at Nyquist, half sum or half difference being the Doppler frequency)
-    predicts the third peak. The reading that predicts it best is taken, a fold counting as
-    :data:`FOLD_PENALTY_BINS` bins of mismatch. The sign of down - up is the velocity's.
+    Parameters
+    ----------
+    up, doppler, down : ndarray (n,)
+        Peak frequencies [Hz], unsigned and folded, or signed with `has_signs`. None for `doppler`
+        without a Doppler segment.
+    carrier, bandwidth, duration : ndarray
+        Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
+    sample_rate, bin_width : ndarray
+        Sample rate and width of a bin [Hz].
+    has_signs : bool
+        True for peaks of complex records, which are read by :data:`SIGNED_READING`.
+    two_beat_assumption : str
+        Reading without a Doppler segment: ``far`` is :data:`FAR_READING`, ``fast`` is
+        :data:`FAST_READING`.
 
-    PHYSICS section 2 gives the unfolded readings. Half sum and half difference belong to the
-    carrier and to the range at mid-chirp; this is corrected here.
+    Returns
+    -------
+    RangeVelocity
+        Range [m] and radial velocity [m/s], (n,) each.
+
+    Notes
+    -----
+    With a Doppler segment there are two unknowns and three peaks. Every reading predicts the third
+    peak. Each peak is taken as it is or folded at Nyquist, and half sum or half difference is the
+    Doppler frequency. The reading with the best prediction is chosen, a fold counting as
+    :data:`FOLD_PENALTY_BINS` bins of mismatch. The velocity has the sign of down - up.
+
+    PHYSICS section 2 gives the readings without folds. Half sum and half difference belong to the
+    carrier and to the range at mid-chirp, which is corrected here.
     """
     if has_signs or doppler is None:
         reading = (
@@ -326,30 +427,50 @@ def fit_range_velocity(
     has_signs: bool = False,
     two_beat_assumption: str = FAR_TARGET,
 ) -> RangeVelocity:
-    """Range and velocity by weighted least squares over the peaks of two or more segments.
+    """Fit range and velocity by weighted least squares to the peaks of two or more segments.
 
+    Parameters
+    ----------
+    peaks : ndarray (k, n)
+        Peak frequencies of k segments [Hz].
+    weights : ndarray (k, n)
+        Inverse variances in any unit; 0 for a segment that is not detected.
+    carriers : ndarray (k, n)
+        Carriers [Hz]. To refer results to the start of the shot, add to a carrier its chirp rate
+        times the time of its record.
+    chirp_rates : ndarray (k, n)
+        Signed chirp rates [Hz/s].
+    sample_rate, bin_width : ndarray
+        Sample rate and width of a bin [Hz].
+    has_signs : bool
+        True for signed peaks of complex records.
+    two_beat_assumption : str
+        ``far`` or ``fast``, for two peaks without signs.
+
+    Returns
+    -------
+    RangeVelocity
+        Range [m] and radial velocity [m/s], (n,) each; nan where segments of fewer than two
+        different chirp rates are detected.
+
+    Notes
+    -----
     A segment's beat is linear in the Doppler ratio beta and in x = tau (1 + beta),
 
         f_i = carrier_i beta - rate_i x,
 
-    and every assignment of signs (and folds at Nyquist) to the peaks gives a fit. Of three peaks or
-    more that of the least misfit is taken, of those whose range is not negative, a fold counting as
-    :data:`FOLD_PENALTY_BINS` bins. Two peaks fit whatever their signs, and an assumption decides:
+    and every assignment of signs (and folds at Nyquist) to the peaks gives a fit. With three peaks
+    or more, the assignment of least misfit and non-negative range is chosen, a fold counting as
+    :data:`FOLD_PENALTY_BINS` bins. Two peaks fit with any signs, and an assumption decides:
 
-    - ``far``: the range beat exceeds the Doppler shift in every chirp, so that a beat has the
-      sign opposite to its chirp rate; that of a segment without a chirp is positive (closing);
-    - ``fast``: the Doppler shift exceeds every range beat, so that all beats have one sign, that
-      which makes the range positive.
+    - ``far``: the range beat exceeds the Doppler shift in every chirp. A beat then has the sign
+      opposite to its chirp rate; the beat of a segment without a chirp is positive (closing).
+    - ``fast``: the Doppler shift exceeds every range beat. All beats then have one sign, the one
+      that makes the range positive.
 
-    Peaks with signs (``has_signs``), of complex records, are known but for whole sample rates. The
-    two
-    segments of rates furthest apart give the least range that is not negative, and a Doppler shift
-    within half the sample rate.
-
-    Peaks [Hz], inverse variances in any unit (``weights``, 0 for a segment that is not detected),
-    carriers [Hz] and signed chirp rates [Hz/s] are (k, n). To refer results to the start of the
-    shot, add to a carrier its rate times the time of its record. nan where segments of less than
-    two different chirp rates are detected.
+    Signed peaks of complex records are known modulo the sample rate. The two segments whose chirp
+    rates differ most determine the smallest non-negative range, and a Doppler shift within half the
+    sample rate.
     """
     shape = np.shape(peaks)
     carriers, chirp_rates, weights = (
@@ -366,7 +487,7 @@ def fit_range_velocity(
         )
         if pattern.sum() < 2 or not np.all(np.ptp(used_rates, axis=0) > 0):
             continue
-        used_weights = used_weights / used_weights.max(axis=0)  # products of two do not vanish
+        used_weights = used_weights / used_weights.max(axis=0)  # products must not underflow
         solve_beats = _solve_signed_beats if has_signs else _solve_unsigned_beats
         solutions[:, has_pattern] = solve_beats(
             used_peaks,
@@ -384,8 +505,8 @@ def fit_range_velocity(
 def _solve_beats(
     beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Doppler ratio beta and x [s] of signed beats (k, n)."""
-    # The determinant of the normal equations as a sum over pairs: nothing cancels.
+    """Fit the Doppler ratio beta and x [s] to signed beats (k, n), by weighted least squares."""
+    # The determinant of the normal equations as a sum of squares over pairs, without cancellation.
     segment_pairs = [(i, j) for i in range(len(beats)) for j in range(i)]
     pair_weights = [weights[i] * weights[j] for i, j in segment_pairs]
     determinants = [
@@ -396,7 +517,7 @@ def _solve_beats(
     ]
     x_numerators = [carriers[i] * beats[j] - carriers[j] * beats[i] for i, j in segment_pairs]
     total = sum(w * m * m for w, m in zip(pair_weights, determinants, strict=True))
-    with np.errstate(invalid="ignore"):  # carriers of 0 tell no velocity
+    with np.errstate(invalid="ignore"):  # carriers of 0 determine no velocity
         beta, x = (
             sum(w * m * v for w, m, v in zip(pair_weights, determinants, numerators, strict=True))
             / total
@@ -408,10 +529,19 @@ def _solve_beats(
 def range_velocity_response(
     beats: np.ndarray, *, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Change of the fitted range [m] and radial velocity [m/s] by a change of the beats.
+    """Return the change of fitted range [m] and radial velocity [m/s] for a change of the beats.
 
-    Changes of the signed beats [Hz] and the rest are (k, n), as of :func:`fit_range_velocity`; 0
-    where beats tell nothing.
+    Parameters
+    ----------
+    beats : ndarray (k, n)
+        Changes of the signed beats [Hz].
+    weights, carriers, chirp_rates : ndarray (k, n)
+        As of :func:`fit_range_velocity`.
+
+    Returns
+    -------
+    range, radial_velocity : ndarray (n,)
+        0 where the beats do not determine a value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         beta, x = _solve_beats(beats, weights, carriers, chirp_rates)
@@ -424,10 +554,10 @@ def range_velocity_response(
 def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """(beta, x) of unsigned, folded peaks, by the assignment of signs that fits best."""
+    """Solve for (beta, x) of unsigned, folded peaks by the assignment of signs that fits best."""
     n_peaks = len(peaks)
     least_cost, solutions = np.full(peaks.shape[1:], np.inf), np.full((2, *peaks.shape[1:]), np.nan)
-    delay_min = -bin_width / np.abs(chirp_rates).max(axis=0)  # a range of less than 0 by rounding
+    delay_min = -bin_width / np.abs(chirp_rates).max(axis=0)  # rounding may make a range negative
     for signs in product((1, -1), repeat=n_peaks):
         for folds in product((0, 1), repeat=n_peaks) if n_peaks > 2 else ((0,) * n_peaks,):
             sign, is_folded = np.reshape(signs, (-1, 1)), np.reshape(folds, (-1, 1))
@@ -437,7 +567,8 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
             cost = np.sqrt((weights * misfit**2).sum(axis=0) / weights.sum(axis=0)) / bin_width
             cost = np.where(x < delay_min, np.inf, cost + FOLD_PENALTY_BINS * sum(folds))
             if n_peaks == 2:
-                # Where none keeps to what is assumed the first that does but for its range.
+                # If every assignment with the assumed signs has a negative range, the first of them
+                # is taken.
                 matches_far = (sign == np.where(chirp_rates == 0, 1, -np.sign(chirp_rates))).all(
                     axis=0
                 )
@@ -456,7 +587,7 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
 def _solve_signed_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """(beta, x) of peaks with signs, known but for whole sample rates."""
+    """Solve for (beta, x) of signed peaks, which are known modulo the sample rate."""
     point_index = np.arange(peaks.shape[1])
     lowest_segment, highest_segment = chirp_rates.argmin(axis=0), chirp_rates.argmax(axis=0)
     beat_difference = (

@@ -16,38 +16,45 @@ COSINE_SUM_COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "blackmanharris": ("0.35875", "0.48829", "0.14128", "0.01168"),
     "flattop": ("0.21557895", "0.41663158", "0.277263158", "0.083578947", "0.006947368"),
 }
-"""Coefficients c_m, as written in scipy.signal.windows; alternating signs are applied outside."""
+"""Coefficients c_m of cosine sums, as written in scipy.signal.windows; the alternating signs are
+applied elsewhere."""
 
 WINDOW_NAME_ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
+"""Other names of windows."""
 
 ENVELOPE_SAMPLES_PER_BIN = 16
-"""Samples a bin in the tabulated kernel."""
+"""Number of samples per bin [of fs/L] in the transform of a window without a closed form."""
 
 _CLOSED_FORM_LENGTH_MIN = 64
+"""Smallest length [samples] for which the closed form of a cosine sum's transform is used."""
 _WEIGHT_SAMPLES_MAX = 256
+"""Largest number of samples by which :meth:`Window.weights_by_record_position` describes a window.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A window of a given length with all that the spectrum's kernel needs."""
+    """Window of a given length, with all numbers that the spectrum needs."""
 
     name: str
+    """Canonical name, as of :func:`canonical_window_name`."""
     length: int
     """Number of samples L."""
     first_value: float
     """First sample w[0]."""
     sum: float
-    """sum w, W at its peak."""
+    """Sum of w, the peak of its transform W."""
     energy: float
-    """E_w = sum w^2."""
+    """Energy E_w = sum w^2."""
     envelope_distances: np.ndarray
+    """(m,): distances from the line at which the envelope is tabulated [bins of fs/L]."""
     sidelobe_envelope: np.ndarray
-    """(m,): max |W(y)| / sum over |y| >= `envelope_distances` [bins of fs/L]."""
+    """(m,): max |W(y)| / sum over |y| >= `envelope_distances`."""
     n_missing: int = 0
-    """First samples that are 0, as of :func:`zero_first_samples`."""
+    """Number of first samples set to 0 by :func:`zero_first_samples`."""
 
     def samples(self) -> np.ndarray:
-        """All samples (L,)."""
+        """Return all samples (L,)."""
         w = window_samples(self.name, self.length)
         if self.n_missing:
             w = w.copy()
@@ -55,10 +62,19 @@ class Window:
         return w
 
     def weights_by_record_position(self, adds_powers: bool) -> tuple[float, ...]:
-        """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
+        """Return the distribution of |w| over the position in the record.
 
-        Of powers those of its autocorrelation, of transform |W|^2: t is the lag over L. All at the
-        end for other windows than sums of cosines: an upper bound.
+        Parameters
+        ----------
+        adds_powers : bool
+            True for the autocorrelation of |w|, whose transform is |W|^2; the position is then the
+            lag over L.
+
+        Returns
+        -------
+        tuple of float
+            Fractions of the sum at positions |t| evenly spaced over 0..1, where 1 is the record's
+            end. Windows other than cosine sums have all of it at the end, an upper bound.
         """
         if self.name not in COSINE_SUM_COEFFICIENTS or self.length < _CLOSED_FORM_LENGTH_MIN:
             return 0.0, 1.0
@@ -66,14 +82,14 @@ class Window:
         w = np.abs(window_samples(self.name, length if adds_powers else length // 2 * 2))
         if adds_powers:
             weights = np.append(np.correlate(w, w, "full")[w.size - 1 :], 0.0)
-            weights[1:] *= 2  # either sign
+            weights[1:] *= 2  # both signs of the lag
         else:
             n_half = w.size // 2
             weights = np.append(w[n_half:], 0.0) + np.append(0.0, w[n_half - 1 :: -1])
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Half-widths pi h up to which J nodes stand for all lines, by tolerance."""
+        """Return the half-widths pi h up to which J nodes represent all lines, by tolerance."""
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
             POWER_TOLERANCES,
@@ -90,22 +106,36 @@ class Window:
 
 
 def canonical_window_name(name: str) -> str:
-    """One spelling for every window: aliases resolved, blanks dropped, lower case."""
+    """Return the canonical spelling of a window's name: no alias, no blanks, lower case."""
     compact = re.sub(r"\s+", "", name).lower()
     return WINDOW_NAME_ALIASES.get(compact, compact)
 
 
 def window_samples(name: str, length: int) -> np.ndarray:
-    """DFT-even window samples (length,), peak about 1.
+    """Return DFT-even samples of a window, with peak about 1.
 
-    ``name`` is a cosine sum, or any window of scipy.signal.get_window, its parameters in brackets:
-    ``kaiser(8.6)``; a ValueError where scipy knows none such or refuses its parameters.
+    Parameters
+    ----------
+    name : str
+        A cosine sum, or any window of scipy.signal.get_window with its parameters in brackets:
+        ``kaiser(8.6)``.
+    length : int
+        Number of samples.
+
+    Returns
+    -------
+    ndarray (length,)
+
+    Raises
+    ------
+    ValueError
+        If scipy does not know the window or rejects its parameters.
     """
     name = canonical_window_name(name)
     if name in COSINE_SUM_COEFFICIENTS:
         return _cosine_sum_samples(name, length)
 
-    from scipy import signal  # which takes longer to import than all else that a spec needs
+    from scipy import signal  # slow to import
 
     name_and_parameters = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
     if name_and_parameters:
@@ -117,7 +147,7 @@ def window_samples(name: str, length: int) -> np.ndarray:
 
 
 def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
-    """Compute a cosine sum's samples, bit for bit those of scipy.signal."""
+    """Compute the samples of a cosine sum, bit for bit those of scipy.signal."""
     c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
         c[1] = 1.0 - c[0]
@@ -140,13 +170,14 @@ def get_window(name: str, length: int) -> Window:
 
 
 MISSING_STEPS = 32
-"""Steps of the length in which :func:`zero_first_samples` counts the samples that lack."""
+"""Number of steps per record in which :func:`zero_first_samples` counts missing samples."""
 
 
 def zero_first_samples(window: Window, n_missing: int) -> Window:
-    """Return the window with its first samples 0, in steps of :data:`MISSING_STEPS`.
+    """Return a window whose first samples are 0, rounded to one of :data:`MISSING_STEPS` steps.
 
-    For the sums over a window that depend little on how many these are: the envelope stays.
+    It serves sums over a window that depend little on the exact number; the envelope stays that of
+    the full window.
     """
     step = min(round(MISSING_STEPS * n_missing / window.length), MISSING_STEPS - 1)
     return _zero_first_steps(window, step) if step else window
@@ -154,20 +185,34 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
 
 @lru_cache(maxsize=2 * MISSING_STEPS)
 def _zero_first_steps(window: Window, step: int) -> Window:
+    """Return a window whose first `step` of :data:`MISSING_STEPS` parts are 0."""
     shortened = replace(window, n_missing=step * window.length // MISSING_STEPS)
     w = shortened.samples()
     return replace(shortened, sum=float(w.sum()), energy=float((w**2).sum()))
 
 
 def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
-    """W(y) by direct sum over the samples: slow and plain, (n,) complex for (n,) bins of fs/L."""
+    """Compute the transform W(y) by a direct sum over the samples; slow, for tests.
+
+    Parameters
+    ----------
+    window : Window
+        Window of length L.
+    y : ndarray (n,)
+        Frequencies [bins of fs/L].
+
+    Returns
+    -------
+    ndarray (n,) complex
+    """
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     cycles = np.outer(np.asarray(y, float), n) / window.length
-    # A sum, not a product of matrices, whose order depends on the number of threads.
+    # A sum in place of a matrix product, whose order of summation depends on the number of threads.
     return (np.exp(-2j * np.pi * (cycles - np.rint(cycles))) * w).sum(axis=-1)
 
 
 def _cosine_sum_window(name: str, length: int) -> Window:
+    """Prepare a cosine sum's window from closed forms."""
     coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])
     envelope_distances, sidelobe_envelope = _cosine_sum_envelope(coefficients, length)
     first_value = math.fsum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
@@ -189,7 +234,7 @@ def _cosine_sum_window(name: str, length: int) -> Window:
 def _cosine_sum_envelope(
     coefficients: tuple[float, ...], length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Largest |W| / sum at and beyond each distance, from dense samples of the closed form."""
+    """Return the largest |W| / sum at and beyond each distance, from the closed form."""
     near_distances = np.arange(1, min(256, length // 2) * 8) / 8
     far_distances = np.geomspace(256, length / 2, 64) if length > 512 else np.empty(0)
     distances = np.unique(
@@ -211,9 +256,9 @@ def _cosine_sum_envelope(
 
 
 def _thin_envelope(distances: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin the envelope to some 2 % steps of distance, each a bound for all beyond it.
+    """Thin the envelope to steps of some 2 % of distance, each value a bound beyond its own.
 
-    The 3 % on top is for sidelobes whose peaks lie between samples.
+    The factor 1.03 covers sidelobes whose peaks lie between samples.
     """
     kept_indices = np.unique(
         np.searchsorted(distances, np.geomspace(distances[0], distances[-1], 512)).clip(
@@ -224,6 +269,7 @@ def _thin_envelope(distances: np.ndarray, envelope: np.ndarray) -> tuple[np.ndar
 
 
 def _window_from_samples(name: str, length: int) -> Window:
+    """Prepare any window from its samples and their FFT."""
     w = window_samples(name, length)
     fft_size = ENVELOPE_SAMPLES_PER_BIN * length
     distances = np.arange(fft_size // 2 + 1) / ENVELOPE_SAMPLES_PER_BIN
