@@ -1,37 +1,38 @@
-"""Number of a footprint's beamlets: as many as the accuracy asked for needs.
+"""Number of a footprint's beamlets, derived from the accuracy.
 
-``footprint.beamlets`` 0 leaves their number to ``accuracy.tolerance``. If powers add, the
-largest bin's magnitude r is then within a share of itself such that pd is within a quarter of the
-tolerance: with b the threshold over sigma,
+``footprint.beamlets`` 0 leaves the number to ``accuracy.tolerance``. If powers add, the largest
+bin's magnitude r is then accurate to a fraction of itself for which pd is within a quarter of the
+tolerance. With a = r over sigma, and b the threshold over sigma,
 
     |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
 
-in each of three segments. Most of the rest is the effects' (:mod:`.effects.planning`).
-If amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
-what [T] takes, 109, is then taken.
+in each of three segments. Most of the rest of the tolerance is for skipped effects
+(:mod:`.effects.planning`). If amplitudes add over a smooth plane, no number is enough, as the sum
+almost cancels. The number of [T], 109, is then used.
 
-In a flight each beamlet is a ray, and nothing is known of the ground before they are cast. Few are
-(:func:`initial_ray_count`), what these leave is estimated from what they hit (:mod:`.ray_error`),
-and shots of which that is too much are cast again with more (:func:`next_ray_counts`).
+In a flight each beamlet is a ray, and nothing is known of the ground before rays are cast. A few
+rays are cast (:func:`initial_ray_count`), and their error is estimated from what they hit
+(:mod:`sweep.model.pointcloud.ray_error`). Shots whose error is too large are cast again with more
+rays (:func:`next_ray_counts`).
 
-If beamlets add as powers, the mean power of a bin is that of |W(k - f)|^2 over the beam, f being
-nearly proportional to one coordinate along the slope. The function |W|^2 is band-limited. With r
-the window's autocorrelation over lags of -1..1 records, normalised to sum 1, and s the deviation of
-f in bins of fs/L, a rule of nodes x_j and weights w_j is off by
+If beamlets add as powers, the mean power of a bin is that of |W(k - f)|^2 over the beam, where f is
+nearly proportional to one coordinate along the slope. The function |W|^2 is band-limited. Let r be
+the window's autocorrelation over lags of -1..1 records, normalised to sum 1, and s the standard
+deviation of f in bins of fs/L. A rule of nodes x_j and weights w_j errs by at most
 
     integral |r(tau)| |sum_j w_j cos(2 pi s tau x_j) - exp(-(2 pi s tau)^2 / 2)| dtau
 
-at most, in units of the power that one line on a bin has there: by what the rule makes of cosines
-up to 2 pi s. Gauss and Hermite's rule is best for narrow spreads; for wide ones even steps are, as
-they are all but exact up to where they alias.
+in units of the power of one line on a bin. The error is thus that of the rule for cosines up to 2
+pi s. Gauss-Hermite quadrature is best for narrow spreads. Evenly spaced nodes are best for wide
+spreads, as they are almost exact up to the frequency where they alias.
 
 To second order the range rises with the square of the distance from the axis, across the slope as
 along it. So f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of
-nodes at x = 1 has the mean of x^2, and misses (t c)^2 at the most. More lines lie at the positive
+nodes at x = 1 has the mean of x^2, and errs by (t c)^2 at most. More lines lie at the positive
 nodes of a rule of twice as many:
 
     x ^      .  .  .  .  .      3 lines of 5 nodes, weighted by the Gaussians of x and y;
-      |      .  .  .  .  .      as f is even in x, there is no need of their mirror images
+      |      .  .  .  .  .      as f is even in x, their mirror images are not needed
       |      .  .  .  .  .
       +-----------------------> y, along the slope
 """
@@ -69,47 +70,56 @@ from sweep.model.threshold import tnr_from_parameters
 from sweep.model.window import canonical_window_name, window_samples
 
 BEAMLETS_PATH = "footprint.beamlets"
+"""Number of beamlets; 0 if it follows from the tolerance."""
 PATTERN_PATH = "footprint.pattern"
+"""Pattern of the beamlets."""
 
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
-"""Times as many rays at the least, and at the most, as have told that they are too few."""
+"""Smallest and largest ratio of the number of rays to that of the cast before."""
 
 _UNSURE_RAYS_MAX = 19
-"""Rays up to which smooth ground is taken for far rougher than it is: how much is no measure."""
+"""Number of rays up to which the estimated error is no measure: smooth ground then looks far
+rougher than it is."""
 
 _N_SEGMENTS = 3
+"""Number of segments over which errors of pd are summed."""
 
 NODE_COUNTS = np.array([
     2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
     4096,
 ])  # fmt: skip
-"""Numbers of nodes to choose from; wide steps, as points of different numbers go apart."""
+"""Possible numbers of nodes; in wide steps, as points with different numbers are computed
+separately."""
 
 LINE_COUNTS = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
-"""Numbers of parallel lines of nodes to choose from."""
+"""Possible numbers of parallel lines of nodes."""
 
 _UNIFORM_RULE_ERROR = 1e-10
-"""Error of even steps, for what lies beyond their reach."""
+"""Error of evenly spaced nodes due to the Gaussian's tails beyond them."""
 _WINDOW_SAMPLES, _N_LAGS = 1024, 4096
 _CURVATURES = np.geomspace(1e-6, 100.0, 97)
+"""Curvatures c of tables [bins of fs/L]."""
 _N_CURVATURE_LAGS, _CURVATURE_PHASES = 512, np.geomspace(1e-6, 1e3, 512)
+"""Phases t c [rad] of tables."""
 _CURVATURE_RATIOS = np.geomspace(1e-6, 1e3, 97)
+"""Ratios c / s of tables."""
 _CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
+"""Standard deviations in Chebyshev's inequality, of which the best bound is taken."""
 
 
 class LineSpreadBins(NamedTuple):
-    """Places of a footprint's lines, s y + c (x^2 + y^2), in bins of fs/L."""
+    """Positions of a footprint's lines, s y + c (x^2 + y^2), in bins of fs/L."""
 
     deviation: np.ndarray
-    """(n,): most of |s|, steeper where the plane is, over the segments."""
+    """(n,): largest |s| of the segments, larger where the plane is steeper."""
     linear: np.ndarray
-    """(rows, n): |s| of each segment, and of what turns from one to another."""
+    """(rows, n): |s| of each segment, and of the phase that turns from one segment to another."""
     quadratic: np.ndarray
-    """(rows, n): |c| likewise."""
+    """(rows, n): |c|, as `linear`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
-        """Deviation that smooths what lines miss across the slope, (rows, n).
+        """Standard deviation that smooths the error of lines across the slope, (rows, n).
 
         |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
         """
@@ -119,10 +129,24 @@ class LineSpreadBins(NamedTuple):
 def split_with_beamlet_counts(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category, and count the beamlets of each point.
+    """Split points by category, and set the number of beamlets where it follows from the tolerance.
 
-    They are counted where their number is left to the tolerance; without the effect of a footprint
-    one beamlet is all.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, scalars or (n,) arrays.
+    effects : collection of str
+        Names of the effects to simulate; without ``footprint`` one beamlet is enough.
+    further_paths : collection of str
+        Numeric parameters that points must share, as of
+        :func:`sweep.model.preparation.split_by_category`.
+
+    Yields
+    ------
+    indices : ndarray (m,)
+        Points of a category.
+    category_parameters : dict
+        Parameters of these points, with number, pattern and error of the beamlets.
     """
     for indices, category_parameters in split_by_category(parameters, further_paths):
         if int(category_parameters[BEAMLETS_PATH]) > 0:
@@ -136,7 +160,7 @@ def split_with_beamlet_counts(
                 )
             else:
                 n_beamlets, pattern = map(np.asarray, finest_beamlets(category_parameters))
-                beamlets_error = np.asarray(np.nan)  # of amplitudes that add nothing is estimated
+                beamlets_error = np.asarray(np.nan)  # no estimate for sums of amplitudes
         beamlet_parameters = {
             BEAMLETS_PATH: n_beamlets,
             PATTERN_PATH: pattern,
@@ -149,14 +173,14 @@ def split_with_beamlet_counts(
 
 
 def finest_beamlets(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Most beamlets that points with these words may be given, and their pattern."""
+    """Return the largest number of beamlets of points of one category, and the pattern."""
     if beamlets_converge(parameters):
         return ErrorBudget.beamlets_max, "line"
     return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
 
 
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
-    """Rays that every shot of a flight has that leaves their number to the tolerance."""
+    """Return the number of rays of every shot of a flight, if it follows from the tolerance."""
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
     tolerance = float(np.asarray(error_budget.tolerance))
@@ -168,11 +192,22 @@ def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) 
 
 
 def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-    """Rays that shots are to be cast with again, (n,) int64; 0 where they have enough.
+    """Return the number of rays with which shots are to be cast again.
 
-    They have had `n_rays`, one of `accuracy.rays`, which leave `error` (n,)
-    (:func:`sweep.model.pointcloud.ray_error.estimate_ray_error`), falling about as one over their
-    number; nan where nothing is seen.
+    Parameters
+    ----------
+    n_rays : int
+        Number of rays of the last cast, one of `ErrorBudget.ray_counts`.
+    error : ndarray (n,)
+        Estimated error, as of :func:`sweep.model.pointcloud.ray_error.estimate_ray_error`; nan
+        where nothing is hit. It falls about as the reciprocal of the number of rays.
+    error_budget : ErrorBudget
+        Accuracy of the study.
+
+    Returns
+    -------
+    ndarray (n,) int64
+        Number of rays; 0 for shots that have enough.
     """
     larger_counts = np.array(
         [n for n in error_budget.ray_counts if n > _RAY_GROWTH_MIN * n_rays], np.int64
@@ -198,13 +233,13 @@ def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
 
 
 def is_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return true where the tolerance alone sets beamlets, lines or leakage; (n,) or scalar."""
+    """Return True where the tolerance alone sets beamlets, lines or leakage; (n,) or scalar."""
     counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
     return counts_beamlets | ErrorBudget.from_parameters(parameters).has_automatic_errors
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return true if there is a number of beamlets that is enough."""
+    """Return True if a sufficient number of beamlets exists."""
     return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
         "hexagonal",
         "sunflower",
@@ -214,9 +249,23 @@ def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
 def required_beamlets(
     parameters: Mapping[str, np.ndarray], n_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Beamlets of points whose powers add: number, pattern, and error that is left, (n,) each.
+    """Compute the number of beamlets of points whose powers add.
 
-    The error is that of the probabilities of detection, summed over the segments.
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path, as arrays, of points of one category.
+    n_points : int
+        Number of points n.
+
+    Returns
+    -------
+    number : ndarray (n,)
+        Number of beamlets.
+    pattern : ndarray (n,)
+        Pattern, ``line`` or a number of lines.
+    error : ndarray (n,)
+        Remaining error of the probabilities of detection, summed over the segments.
     """
     pd_change_per_power, error_budget = (
         _pd_change_per_power(parameters) + np.zeros(n_points),
@@ -231,7 +280,7 @@ def required_beamlets(
 
 
 def _pd_change_per_power(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Most that pd changes, summed over the segments, for the relative change of a bin's power."""
+    """Return the largest change of pd, over all segments, per relative change of a bin's power."""
     from sweep.model.detection import echo_detection
 
     b = echo_detection.threshold_from_tnr(
@@ -246,7 +295,7 @@ def _pd_change_per_power(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 def _line_spread(
     parameters: Mapping[str, np.ndarray], n_points: int, beamlets_max: int
 ) -> LineSpreadBins:
-    """Spread of the lines of up, Doppler and down segment [bins of fs/L]."""
+    """Compute the spread of the lines of up, Doppler and down segment [bins of fs/L]."""
     grazing_angle, radial_velocity = (
         parameters["target.grazing_angle"],
         np.asarray(parameters["target.radial_velocity"], float),
@@ -269,7 +318,7 @@ def _line_spread(
         pattern="line",
         direction_angle=direction_angles,
     )
-    # Beyond the horizon the ranges' have no bound: there the plain one has to do.
+    # Beyond the horizon the moments of ranges have no bound; the first-order slope is used there.
     range_rms = np.where(np.isfinite(range_moments.rms), range_moments.rms, slope)
     beat_per_metre = (
         2
@@ -288,7 +337,7 @@ def _line_spread(
         chirp_rate=chirp_rate,
         bin_width=bin_width,
     )
-    # Of ranges in the beats.
+    # Chirp slopes weight the contribution of ranges to the beats.
     chirp_slopes, zeros = np.array(waveform.chirp_slopes(parameters))[:, None], np.zeros(n_points)
     spread = LineSpreadBins(
         deviation=abs(chirp_slopes).max() * bins_per_range * range_rms
@@ -308,8 +357,8 @@ def _line_spread(
     )
     if "target.roughness" not in parameters or not np.any(parameters["target.roughness"]):
         return spread
-    # Amplitudes that are drawn turn against each other from segment to segment, by Doppler shifts
-    # and, as the echoes of segments differ in optical frequency, by ranges.
+    # Drawn amplitudes rotate relative to each other from segment to segment: by Doppler shifts and,
+    # as segments differ in optical frequency, by ranges.
     starts = waveform.segment_starts(
         waveform.existing_segments("", str(parameters[waveform.SEGMENT_ORDER_PATH])),
         duration=parameters[CHIRP_PREFIX + "duration"], gap=parameters[waveform.SEGMENT_GAP_PATH],
@@ -317,7 +366,7 @@ def _line_spread(
     last_start_bins = np.maximum.reduce(starts) * bin_width
     delay = 2 / SPEED_OF_LIGHT * parameters["target.range"]
     carrier_difference_cycles = _carrier_difference_max(parameters) * delay
-    # Each by twice as much, as sums over records hardly look at their ends.
+    # The factor 2 is for sums over records, in which the ends hardly count.
     slope = np.vstack(
         [
             spread.linear,
@@ -346,7 +395,7 @@ def _line_spread(
 
 
 def _carrier_difference_max(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Largest difference between two segments of the optical frequency in mid-record [Hz].
+    """Return the largest difference between segments of the optical frequency in mid-record [Hz].
 
     Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
@@ -366,14 +415,30 @@ def _carrier_difference_max(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 def required_nodes(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes with which the largest bin's power is within a tolerance, or as near as any are.
+    """Choose the nodes for which the largest bin's power is within a tolerance.
 
-    The tolerance (n,) is on the largest bin's power, over that power itself, wherever the lines
-    lie. Returns, (n,) each: parallel lines of nodes, 1 for most points; nodes of each line, 2 at
-    least; what they may be off by, 1 where they say nothing.
+    Parameters
+    ----------
+    window_name : str
+        Name of the window.
+    spread : LineSpreadBins
+        Positions of the footprint's lines.
+    tolerance : ndarray (n,)
+        Tolerated error of the largest bin's power relative to that power, wherever the lines lie.
+    error_budget : ErrorBudget
+        Accuracy of the study.
+
+    Returns
+    -------
+    n_lines : ndarray (n,)
+        Number of parallel lines of nodes, 1 for most points.
+    n_nodes : ndarray (n,)
+        Number of nodes of each line, at least 2; the best possible if none meets the tolerance.
+    error : ndarray (n,)
+        Bound of the relative error; 1 if there is no bound.
     """
     tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
-    table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider spread
+    table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider
     single_line_error = _single_line_error(window_name, spread) / largest_bin_powers[table_index]
     counts = NODE_COUNTS[: np.searchsorted(NODE_COUNTS, error_budget.beamlets_max, "right")]
     total_error = tabulated_errors[: counts.size, table_index] + single_line_error
@@ -400,7 +465,7 @@ def required_nodes(
 def _cheapest_row(
     error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Row of the cheapest (rows, n) whose error is tolerated, or of the least error; its error."""
+    """Return the cheapest row of (rows, n) within the tolerance, else of least error; its error."""
     allowed_cost = np.where(error <= tolerance, cost, np.inf)
     row = np.where(
         np.isfinite(allowed_cost).any(axis=0), allowed_cost.argmin(axis=0), error.argmin(axis=0)
@@ -411,11 +476,14 @@ def _cheapest_row(
 def _choose_lines(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row of :data:`NODE_COUNTS`, lines and error for spreads that one line of nodes misses."""
+    """Choose nodes and lines for spreads that need several lines.
+
+    Return the index in NODE_COUNTS, the number of lines, and the error.
+    """
     tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
     errors_along, errors_across = _curvature_errors(window_name)
     quadratic_max, linear_max = spread.quadratic.max(axis=0), spread.linear.max(axis=0)
-    # Where squares alone spread the lines, what the rules make of squares is all that counts.
+    # If curvature alone spreads the lines, only the rules' error for squares counts.
     linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
     largest_bin_power = largest_bin_powers[np.searchsorted(tabulated_spreads, spread.deviation)]
     curvature_index = np.searchsorted(_CURVATURES, quadratic_max)
@@ -442,9 +510,9 @@ def _choose_lines(
 
 
 def _single_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
-    """Error of one line of nodes by squares, over the power of a line on a bin, (n,).
+    """Return the curvature error of one line of nodes, over a line's power on a bin, (n,).
 
-    As much again is for what the fewest nodes along the slope miss of them.
+    The factor 2 includes the same error along the slope, of the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
@@ -459,9 +527,16 @@ def _single_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of each count by deviation, over the largest bin's power; and that power.
+    """Tabulate the error of each number of nodes by standard deviation.
 
-    Deviations (m,), errors (counts, m + 1) up to each and beyond all, largest bins (m + 1,).
+    Returns
+    -------
+    spreads : ndarray (m,)
+        Standard deviations [bins of fs/L].
+    errors : ndarray (counts, m + 1)
+        Largest error up to each standard deviation, and beyond all, over the largest bin's power.
+    largest_bin_powers : ndarray (m + 1,)
+        Power of the largest bin, over that of one line on a bin.
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
@@ -477,7 +552,7 @@ def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 weight * _cosine_rule_error(n_nodes, 2 * np.pi * spread * lag)
             ).sum() / largest_bin_powers[i]
             if rule_error > 1:
-                break  # wider spreads are no better
+                break  # wider spreads have larger errors
             row[i] = rule_error
         row[-1] = _unbounded_error(1e3, n_nodes)
     return (
@@ -488,18 +563,22 @@ def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
-    """Stand-in for errors without a bound, 1 or more: the nodes' distance [bins]."""
+    """Return a substitute, at least 1, for errors without a bound: the distance of nodes [bins]."""
     return np.maximum(1.0, 2 * UNIFORM_RULE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 
 
 @lru_cache(maxsize=32)
 def _curvature_errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Errors by curve, over the power of a line on a bin: of counts along, of lines across."""
+    """Tabulate errors by curvature, over the power of a line on a bin: along and across the slope.
+
+    The first table is by NODE_COUNTS along the slope, the second by LINE_COUNTS across it.
+    """
     lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
     weight = _window_autocorrelation(window_name, lag)
     phase = 2 * np.pi * lag * _CURVATURES[:, None]
 
     def errors_of_rule(n_nodes: int) -> np.ndarray:
+        """Return the errors of a rule for each curvature, and beyond the largest."""
         rule_errors = (
             weight * np.interp(phase, _CURVATURE_PHASES, _quadratic_phase_error(n_nodes))
         ).sum(axis=1)
@@ -515,7 +594,7 @@ def _curvature_errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=1)
 def _smoothed_curvature_errors() -> np.ndarray:
-    """Mean of what lines miss of squares, over a Gaussian 1 / ratio wide, (lines, ratios + 1)."""
+    """Tabulate the mean curvature error over a Gaussian of width 1 / ratio, (lines, ratios + 1)."""
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
     errors = np.full((LINE_COUNTS.size, _CURVATURE_RATIOS.size + 1), np.inf)
@@ -529,7 +608,10 @@ def _smoothed_curvature_errors() -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _quadratic_phase_error(n_nodes: int) -> np.ndarray:
-    """Largest error of a rule's mean of exp(i turn x^2), 1 / sqrt(1 - 2 i turn), up to turns."""
+    """Return the largest error of a rule's mean of exp(i t x^2) up to each phase t.
+
+    The exact mean is 1 / sqrt(1 - 2 i t).
+    """
     x, w = gaussian_rule(n_nodes)
     rule_mean = np.array(
         [(w * np.exp(1j * phase * x**2)).sum() for phase in _CURVATURE_PHASES.tolist()]
@@ -538,7 +620,10 @@ def _quadratic_phase_error(n_nodes: int) -> np.ndarray:
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
-    """Least power of the largest bin, over that of all lines on a bin: as of `power_range`."""
+    """Return a lower bound of the largest bin's power, over that of all lines on a bin.
+
+    See :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
+    """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
     wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min
     return np.maximum(
@@ -550,7 +635,7 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 
 
 def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
-    """|r| at lags [records] of both signs, in shares of their sum with sign."""
+    """Return |r| at lags of either sign [records], as fractions of the signed sum."""
     w = window_samples(window_name, _WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]
     at_lags = np.interp(lag * _WINDOW_SAMPLES, np.arange(_WINDOW_SAMPLES + 1), r)
@@ -559,19 +644,19 @@ def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _autocorrelation_peak(window_name: str) -> float:
-    """Largest density of the autocorrelation over lags [1/record]."""
+    """Return the largest density of the autocorrelation over lags [1/record]."""
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     return float(_window_autocorrelation(window_name, lag).max()) * _N_LAGS
 
 
 def _cosine_rule_error(n_nodes: int, phase: np.ndarray) -> np.ndarray:
-    """Largest error of a rule's mean of cos(turn x), which is exp(-turn^2 / 2)."""
+    """Return the error of a rule's mean of cos(phase x), whose exact value is exp(-phase^2 / 2)."""
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
         x, w = gaussian_rule(n_nodes)
         rule_mean = (w * np.cos(phase[:, None] * x)).sum(axis=1)
         return np.asarray(np.abs(rule_mean - np.exp(-0.5 * phase**2)))
     step = 2 * UNIFORM_RULE_RADIUS_SIGMA / (n_nodes - 1)
-    excess_phase = phase - 2 * np.pi / step  # even steps repeat themselves there
+    excess_phase = phase - 2 * np.pi / step  # evenly spaced nodes alias there
     return np.asarray(
         np.where(excess_phase < 0, np.exp(-0.5 * excess_phase**2), 1.0) + _UNIFORM_RULE_ERROR
     )

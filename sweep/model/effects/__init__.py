@@ -1,1 +1,1 @@
-"""Physical effects, one a module: what each does, and what leaving it out can change at most."""
+"""Physical effects, one a module: the change each makes, and an error bound for leaving it out."""

@@ -4,26 +4,30 @@ An amplifier of gain G and inversion factor n_sp emits, besides the light that i
 
     N = n_sp (G - 1) h nu                                                       [W/Hz]
 
-into the mode of that light, in its polarisation [Desurvire, Erbium-Doped Fiber Amplifiers, 1994,
-ch. 2; its noise figure is 2 n_sp (G - 1) / G + 1 / G]. The part of it that reaches the detector
-beats with the local oscillator's power P_lo: a signal-spontaneous beat noise, of current variance
+into the mode of that light, in its polarisation [1]_. Its noise figure is 2 n_sp (G - 1) / G + 1 /
+G. The part of the emission that reaches the detector beats with the local oscillator's power P_lo.
+This signal-spontaneous beat noise has the current variance
 
-    4 (M Re)^2 P N' B_e                     [Olsson, J. Lightwave Technol. 7, 1071, 1989, eq. 12]
+    4 (M Re)^2 P N' B_e                                                         [2]_, eq. 12
 
-within the electrical bandwidth B_e, for light P and a density N' that has twice that bandwidth on
-either side of it. Two ways lead there:
+within the electrical bandwidth B_e, for light of power P and emission of density N' on both sides
+of it. The emission takes two paths:
 
-- **With what is sent.** A circulator of the isolation I, a window or a splice puts 1 / I of the
-  sent light, and of the emission with it, onto the detector. P is the part eta P_lo that mixes, and
-  N' = N / I. A balanced receiver sees the beat in full.
-- **With the local oscillator**, where that is tapped behind the amplifier. Emission and light go
-  with each other, N' = N P_lo / P_sent, and beat on each diode as a fluctuation of the local
-  oscillator does, of a relative intensity noise of 4 N / P_sent. The common-mode rejection divides
-  it.
+- **With the transmitted light.** A circulator of isolation I, a window or a splice sends 1 / I of
+  the transmitted light, and of its emission, onto the detector. P is the part eta P_lo that mixes,
+  and N' = N / I. A balanced receiver sees this beat in full.
+- **With the local oscillator**, if that is tapped behind the amplifier. N' = N P_lo / P_sent, and
+  the emission beats on each diode as a fluctuation of the local oscillator does, of a relative
+  intensity noise of 4 N / P_sent. The common-mode rejection divides it.
 
-Emission that comes back with the echo is left out: it is below the echo's own beat by P_sent / (2 N
-B_e), some 60 dB before the FFT. The beat of emission with itself is left out too, below these by N
+Emission that returns with the echo is neglected: it is below the echo's own beat by P_sent / (2 N
+B_e), some 60 dB before the FFT. The beat of emission with itself is neglected too; it is lower by N
 B_e / P_lo. Direct detection has no local oscillator.
+
+References
+----------
+.. [1] Desurvire, Erbium-Doped Fiber Amplifiers, 1994, ch. 2.
+.. [2] Olsson, J. Lightwave Technol. 7, 1071, 1989.
 """
 
 from collections.abc import Mapping
@@ -51,10 +55,10 @@ SENT_LIGHT, SENT_AND_OSCILLATOR_LIGHT = "sent", "sent and local oscillator"
 
 
 def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Density n_sp (G - 1) h nu [W/Hz] of spontaneous emission, in one polarisation.
+    """Return the density n_sp (G - 1) h nu [W/Hz] of spontaneous emission in one polarisation.
 
-    >>> given = {_INVERSION: 1.0, _GAIN: 1001.0, LASER + "wavelength": 1550e-9}
-    >>> f"{emission(given):.3g}"
+    >>> given = {_INVERSION_PATH: 1.0, _GAIN_PATH: 1001.0, LASER_PREFIX + "wavelength": 1550e-9}
+    >>> f"{spontaneous_emission_density(given):.3g}"
     '1.28e-16'
     """
     photon_energy = PLANCK * SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"]
@@ -64,7 +68,20 @@ def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.nda
 def beat_noise_current_variance(
     parameters: Mapping[str, np.ndarray], amplified_light: str
 ) -> np.ndarray:
-    """Return the current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission."""
+    """Compute the current variance of the beat of light with spontaneous emission.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    amplified_light : str
+        Light that passes the amplifier: `SENT_LIGHT` or `SENT_AND_OSCILLATOR_LIGHT`.
+
+    Returns
+    -------
+    ndarray
+        Variance 4 (M Re)^2 P N' B_e [A^2], summed over both paths.
+    """
     oscillator_power = parameters[RECEIVER_PREFIX + "local_oscillator_power"]
     mixing_factor = parameters[RECEIVER_PREFIX + "mixing_efficiency"] / parameters[_ISOLATION_PATH]
     if amplified_light == SENT_AND_OSCILLATOR_LIGHT:
@@ -84,7 +101,7 @@ def beat_noise_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the beat noise, exactly; the threshold is set on it."""
+    """Return the exact relative noise of spontaneous emission; the threshold follows it."""
     if points.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
     current_variance = beat_noise_current_variance(
@@ -98,7 +115,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Beat noise of spontaneous emission; direct detection has none."""
+    """Add the beat noise of spontaneous emission; direct detection has none."""
     if shots.architecture == "direct":
         return shots
     current_variance = beat_noise_current_variance(
@@ -149,3 +166,4 @@ SPONTANEOUS_EMISSION = Effect(
         ),
     ),
 )
+"""Effect of an optical amplifier's spontaneous emission."""

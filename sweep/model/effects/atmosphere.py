@@ -1,20 +1,20 @@
-"""The air between lidar and target: it dims the light on its way, and sends some of it back.
+"""Atmosphere between lidar and target: extinction of the light, and backscatter.
 
-The extinction coefficient alpha [1/m] is a table over height above the ground. Between two
-heights it goes as an exponential (as a straight line where one end is 0), below the first it
-stays, above the last there is none. An exponential atmosphere so is a table of two rows, and its
-optical depth comes out in closed form. The path is straight and the ground level, which holds for
-paths short against a planet's radius.
+The extinction coefficient alpha [1/m] is a table over height above the ground. Between two heights
+it is exponential (linear if one end is 0). Below the first height it is constant, above the last it
+is 0. An exponential atmosphere is thus a table of two rows, and its optical depth has a closed
+form. The path is straight and the ground level, which holds for paths short against a planet's
+radius.
 
 Sources of the tables:
 
 - Earth: Koschmieder's law with the wavelength exponent of Kruse, McGlauchlin and McQuistan
-  (Elements of Infrared Technology, 1962) as revised by Kim, McArthur and Korevaar (Proc. SPIE
-  4214, 2001) below 6 km; visibility 23 km (clear) and 5 km (haze); aerosol scale height 1.2 km
-  (Elterman, AFCRL-68-0153, 1968). Molecules add less than 2e-7/m at 1.55 um.
+  (Elements of Infrared Technology, 1962) as revised by Kim, McArthur and Korevaar (Proc. SPIE 4214,
+  2001) below 6 km; visibility 23 km (clear) and 5 km (haze); aerosol scale height 1.2 km (Elterman,
+  AFCRL-68-0153, 1968). Molecules add less than 2e-7/m at 1.55 um.
 - Mars: well-mixed dust of scale height 11 km (Conrath, Icarus 24, 1975). Optical depths are 0.5 (a
   usual season), 1 and 5 (a global storm), after the record of Lemmon et al., Icarus 251, 2015, at
-  0.88 um. Grains of 1.5 um dim 1.55 um alike to some 10 %.
+  0.88 um. Extinction by grains of 1.5 um is the same at 1.55 um to some 10 %.
 - Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
 """
 
@@ -41,20 +41,25 @@ from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
 from sweep.model.receiver_chain import aperture_area
 
 _HEIGHT_DIFFERENCE_MIN = 1e-9
-"""Difference in height [m] given to level paths, about their middle, so that there is a mean."""
+"""Difference of height [m] assigned to level paths, about their middle, so that a mean is defined.
+"""
 
 
 class ExtinctionProfile(NamedTuple):
-    """Extinction over height, as a table."""
+    """Table of extinction over height."""
 
     height: tuple[float, ...]
-    """Heights above the ground [m], rising; twice the same for a step."""
+    """Heights above the ground [m], ascending; a height appears twice for a step."""
     extinction: tuple[float, ...]
-    """Extinction coefficient at each [1/m], >= 0."""
+    """Extinction coefficient at each height [1/m], >= 0."""
 
 
 def exponential_profile(*, surface_extinction: float, scale_height: float) -> ExtinctionProfile:
-    """Atmosphere whose extinction [1/m] falls by e over each scale height [m], 40 of them high."""
+    """Return an exponential atmosphere, 40 scale heights high.
+
+    `surface_extinction` is the extinction at the ground [1/m]; it falls by e over each
+    `scale_height` [m].
+    """
     top_scale_heights = 40.0
     return ExtinctionProfile(
         (0.0, top_scale_heights * scale_height),
@@ -63,15 +68,29 @@ def exponential_profile(*, surface_extinction: float, scale_height: float) -> Ex
 
 
 def layer_profile(*, optical_depth: float, depth: float) -> ExtinctionProfile:
-    """Even layer on the ground, of this optical depth seen from straight above, `depth` m high."""
+    """Return a uniform layer on the ground, `depth` [m] high, of a vertical optical depth."""
     return ExtinctionProfile((0.0, depth), (optical_depth / depth, optical_depth / depth))
 
 
 def extinction_from_visibility(*, visibility: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
-    """Extinction [1/m] of haze from the visibility [m] (2 % contrast at 0.55 um), Kruse and Kim.
+    """Return the extinction of haze from the visibility, after Kruse and Kim.
 
-    3.912/V (wavelength / 0.55 um)^-q with q = 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34
-    above 1 km, V - 0.5 above 0.5 km (V in km), 0 in fog.
+    Parameters
+    ----------
+    visibility : array_like
+        Visibility V [m], 2 % contrast at 0.55 um.
+    wavelength : array_like
+        Wavelength [m].
+
+    Returns
+    -------
+    ndarray
+        Extinction coefficient [1/m].
+
+    Notes
+    -----
+    3.912/V (wavelength / 0.55 um)^-q with q = 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34 above
+    1 km, V - 0.5 above 0.5 km (V in km), 0 in fog. The module's description has the sources.
     """
     visibility_m = np.asarray(visibility, float)
     visibility_km = visibility_m / 1e3
@@ -88,11 +107,13 @@ def extinction_from_visibility(*, visibility: ArrayLike, wavelength: ArrayLike) 
 
 
 def _haze_profile(visibility: float) -> ExtinctionProfile:
+    """Return the extinction profile of haze on Earth for a visibility [m]."""
     surface_extinction = extinction_from_visibility(visibility=visibility, wavelength=1.55e-6)
     return exponential_profile(surface_extinction=float(surface_extinction), scale_height=1.2e3)
 
 
 def _dust_profile(optical_depth: float) -> ExtinctionProfile:
+    """Return the extinction profile of Martian dust of a vertical optical depth."""
     return exponential_profile(surface_extinction=optical_depth / 11e3, scale_height=11e3)
 
 
@@ -103,17 +124,28 @@ EXTINCTION_PROFILES = {
     "mars_dusty": _dust_profile(1.0),
     "mars_storm": _dust_profile(5.0),
 }
+"""Extinction profiles by name."""
 
 
 def optical_depth(
     profile: ExtinctionProfile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
 ) -> np.ndarray:
-    """Optical depth of a straight path `range` [m] long between two heights [m], one way."""
+    """Compute the one-way optical depth of a straight path.
+
+    Parameters
+    ----------
+    profile : ExtinctionProfile
+        Extinction over height.
+    start_height, end_height : array_like
+        Heights of the path's ends [m].
+    range : array_like
+        Length of the path [m].
+    """
     end_heights = np.broadcast_arrays(
         np.asarray(start_height, float), np.asarray(end_height, float)
     )
     low, high = np.minimum(*end_heights), np.maximum(*end_heights)
-    # So high up that float64 knows no such difference, by what it does know.
+    # At great heights, where float64 cannot resolve this difference, the smallest that it can.
     difference_min = np.maximum(
         _HEIGHT_DIFFERENCE_MIN, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high)))
     )
@@ -133,7 +165,7 @@ def optical_depth(
 def _mean_extinction(
     start: np.ndarray, end: np.ndarray, z0: float, z1: float, a0: float, a1: float
 ) -> np.ndarray | float:
-    """Mean of the extinction between two heights within one row of the table."""
+    """Return the mean extinction between two heights within one row of the table."""
     if a0 == a1 or z0 == z1 or not math.isfinite(z0):
         return a0
     if a0 > 0 and a1 > 0:
@@ -145,11 +177,11 @@ def _mean_extinction(
 
 
 BEAM_ELEVATION_PATH = "path.elevation"
-"""Angle of the beam below the horizon [rad] by shot; only of scenes."""
+"""Angle of the beam below the horizon [rad], by shot; present only in scenes."""
 
 
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
-    """Extinction over height for points of one category; None without an atmosphere."""
+    """Return the extinction profile of points of one category; None without an atmosphere."""
     name = str(parameters["atmosphere.profile"])
     surface_extinction, depth = (
         float(parameters["atmosphere.extinction"]),
@@ -165,7 +197,7 @@ def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfil
 def path_heights(
     parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights of lidar and target above the ground [m], (n,) each."""
+    """Return the heights of lidar and target above the ground [m], (n,) each."""
     target_height = np.asarray(parameters["atmosphere.target_height"], float) + np.zeros_like(range)
     if str(parameters["atmosphere.path"]) == "level":
         return target_height, target_height
@@ -176,12 +208,16 @@ def path_heights(
 def _path_geometry(
     parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> dict[str, np.ndarray]:
+    """Return heights and length of the path, as arguments of :func:`optical_depth`."""
     lidar_height, target_height = path_heights(parameters, range)
     return {"start_height": lidar_height, "end_height": target_height, "range": range}
 
 
 def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
-    """Echoes dimmed by T^2 [T 4.4], light from the ground, such as the sun's, by T."""
+    """Attenuate echoes by T^2 [T 4.4], and light from the ground, such as sunlight, by T.
+
+    T is the one-way transmission exp(-optical depth).
+    """
     profile = extinction_profile(context.parameters)
     if profile is None:
         return shots
@@ -198,7 +234,7 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Loss of the echo by the air, and of the shot noise of light from the target."""
+    """Bound the loss of the echo by extinction, and of the shot noise of light from the target."""
     profile = extinction_profile(points.parameters)
     if profile is None:
         return None
@@ -208,7 +244,7 @@ def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
     light_noise_ratio = points.echo_noise_ratio
     if (solar_bound := noise_sources.solar_background_bound(points)) is not None:
         light_noise_ratio = light_noise_ratio + solar_bound.noise_variance_change
-    # the threshold follows the sun's part and not the echo's: the worse is taken
+    # The threshold follows the sunlight's part, not the echo's. The worse case is assumed for both.
     return ErrorBound(
         magnitude_change=1 - (transmission**2 if points.architecture == "direct" else transmission),
         noise_variance_change=-(1 - transmission**2) * light_noise_ratio / (1 + light_noise_ratio),
@@ -264,13 +300,14 @@ EXTINCTION = Effect(
         ),
     ),
 )
+"""Effect of the extinction of light by air, haze and dust."""
 
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
 _CUT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
-"""Cuts of a row of the table for the integral, in e-foldings of its extinction."""
+"""Positions at which the integral splits a row of the table, in e-foldings of its extinction."""
 _CUT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
-"""Cuts of the path for the integral, in units of r_0."""
+"""Positions at which the integral splits the path, in units of r_0."""
 
 
 def backscatter_integral(
@@ -281,15 +318,36 @@ def backscatter_integral(
     range: ArrayLike,
     near_range: ArrayLike,
 ) -> np.ndarray:
-    """Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], r_0 = D/Theta = `near_range`.
+    """Integrate the backscatter that a continuous beam sends to the detector.
 
-    A continuous beam has P_tx A tau_o / S times it sent back by the air to the detector [W], S the
-    lidar ratio [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its
-    own receiver. Nearer than r_0 a point's image is larger than the field of view. For a beam at
-    the limit of diffraction, Theta = 4 lambda / (pi D), it is the coherent lidar's of Sonnenschein
-    and Horrigan (Appl. Opt. 10, 1971, 1600, focus at infinity). By Gauss's rule over atan(r / r_0)
-    between the rows of the profile that the path crosses, those cut where the extinction or the
-    overlap has fallen; within 1e-8. Heights as of :func:`optical_depth`.
+    Parameters
+    ----------
+    profile : ExtinctionProfile
+        Extinction alpha over height.
+    start_height, end_height, range : array_like
+        Heights of the path's ends and its length R [m], as of :func:`optical_depth`.
+    near_range : array_like
+        r_0 = D/Theta [m]: diameter of the aperture over full angle of the field of view.
+
+    Returns
+    -------
+    ndarray
+        Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], to 1e-8.
+
+    Notes
+    -----
+    The air returns P_tx A tau_o / S times the integral to the detector [W], with the lidar ratio S
+    [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
+    nearer than r_0, the image of a point is larger than the field of view. For a
+    diffraction-limited beam, Theta = 4 lambda / (pi D), it is that of a coherent lidar focused at
+    infinity [1]_.
+
+    Gauss-Legendre quadrature over atan(r / r_0) is applied between the rows of the profile that the
+    path crosses, split further where extinction or overlap has fallen.
+
+    References
+    ----------
+    .. [1] Sonnenschein and Horrigan, Appl. Opt. 10, 1971, 1600.
     """
     columns = (np.asarray(value, float) for value in (start_height, end_height, range, near_range))
     lidar_height, target_height, target_range, near_range = (
@@ -322,7 +380,7 @@ def backscatter_integral(
 
 
 def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
-    """Heights between which extinction is smooth and falls by a few e-foldings at most."""
+    """Return heights between which extinction is smooth and falls by at most a few e-foldings."""
     cuts = [profile.height[0]]
     rows = [*zip(profile.height, profile.extinction, strict=True)]
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
@@ -334,7 +392,7 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
 
 
 def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
-    """Light [W] that the air sends back, from :func:`backscatter_integral`."""
+    """Return the backscattered light [W] from :func:`backscatter_integral`."""
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
         beam.receiving_aperture_and_angle(parameters)[0]
     )
@@ -343,10 +401,10 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 
 
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
-    """Shot noise of the light that the air sends back.
+    """Add the shot noise of backscattered light.
 
     Its beat with the local oscillator, from ever new grains, is spread over the bins from the
-    nearest range to the target's and is left out; [T 3.3.1] counts it among the noise too.
+    nearest range to the target's, and is neglected. [T 3.3.1] counts it as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)
@@ -367,8 +425,8 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
 def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return an upper bound on backscatter; the threshold follows it.
 
-    It is the lesser of two: the whole path with the air of its lower end, without extinction; or
-    all the light that is lost on the path, sent back from the beam's near end.
+    It is the smaller of two bounds: the path filled with the air of its lower end, without
+    extinction; or all the light lost on the path, returned from the beam's near end.
     """
     parameters = points.parameters
     profile = extinction_profile(parameters)
@@ -408,3 +466,4 @@ BACKSCATTER = Effect(
         ),
     ),
 )
+"""Effect of the shot noise of light that the air returns."""

@@ -1,4 +1,4 @@
-"""All effects, in the order in which they act, and the flags that stand for them in a store."""
+"""Catalogue of all effects, in the order of their application, and their flags in a store."""
 
 from typing import Any
 
@@ -59,18 +59,20 @@ EFFECTS: tuple[Effect, ...] = (
     speckle.SPECKLE,
     scintillation.SCINTILLATION,
 )
+"""All effects, in the order of their application; the bit of an effect in flags is its index."""
 
 EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
+"""Names of the effects, in the order of EFFECTS."""
 
 EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
     parameter for effect in EFFECTS for parameter in effect.parameters
 )
-"""Fields that effects bring into a spec."""
+"""Fields that effects add to a spec."""
 
 EFFECT_CATEGORY_PATHS = tuple(
     parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
 )
-"""Numbers of effects that points must share to be prepared together."""
+"""Numeric parameters of effects that points must share to be prepared together."""
 
 PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.BEAM_DEFAULTS
@@ -79,33 +81,33 @@ PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     | {RECORD_PATH: "real"}
     | {parameter.path: parameter.default for parameter in EFFECT_PARAMETERS}
 )
-"""Of the beams' parameters, the waveform's, the looks', the record's and the effects'."""
+"""Default values of parameters of beam, waveform, looks, record and effects, by dotted path."""
 
 DEFAULT_EFFECTS = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
-"""Effects that the model's functions simulate if nothing is said: pure lines and their noise."""
+"""Effects that the model's functions simulate by default: ideal lines and their noise."""
 
 OWN_BATCH_FLAGS = np.uint32(
     sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_own_batch)
 )
-"""Flags of effects that points with and without them are computed apart by."""
+"""Bit mask of effects for which points with and without the effect are computed separately."""
 
 
 def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
-    """Pack effects that are kept, (effects, m) bool in the catalogue's order, as (m,) uint32."""
+    """Pack enabled effects, (effects, m) bool in the order of EFFECTS, as bit masks (m,) uint32."""
     flag_masks = np.uint32(1) << np.arange(is_kept.shape[0], dtype=np.uint32)
     return np.bitwise_or.reduce(np.where(is_kept, flag_masks[:, None], np.uint32(0)), axis=0)
 
 
 def unpack_effect_flags(flags: int) -> tuple[str, ...]:
-    """Names of the effects that flags stand for."""
+    """Return the names of the effects whose bits are set."""
     return tuple(name for k, name in enumerate(EFFECT_NAMES) if flags >> k & 1)
 
 
 def effect_flag_attributes() -> dict[str, Any]:
-    """Meaning of the flags in the words of the CF conventions."""
+    """Return attributes that describe the flags by the CF conventions."""
     return {
         "units": "1",
         "long_name": "effects that were simulated",

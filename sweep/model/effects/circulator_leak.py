@@ -1,38 +1,37 @@
-"""Light that leaks from the transmitter to the detector, by circulator, splice or window.
+"""Light that leaks from the transmitter to the detector, through circulator, splice or window.
 
-A share 1 / I of the sent light P_tx (I the isolation) reaches the detector after a path d beyond
-the local oscillator's, at the delay tau = d / c. It is there in every record:
+A fraction 1 / I of the transmitted light P_tx (I is the isolation) reaches the detector over a path
+d longer than the local oscillator's, with the delay tau = d / c. It is present in every record:
 
-- **A line.** It beats with the local oscillator as an echo does, with the photocurrent
-  i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0 in the Doppler segment. With
-  the window's transform W, and the receiver's transfer H
+- **A line.** It beats with the local oscillator as an echo does. Its photocurrent is i = 2 M Re
+  sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0 in the Doppler segment. With the window's
+  transform W and the receiver's transfer function H,
 
       L_k = i H / 2 (e^{j phi} W(k - nu) + e^{-j phi} W(k + nu)),   nu = S tau N / fs
 
-  of a real record; a complex one has the first term alone, at -nu or nu by the chirp's sign. The
-  phase phi drifts with the path's temperature and is taken to be uniform.
+  in a real record. A complex record has only the first term, at -nu or nu by the chirp's sign. The
+  phase phi drifts with the path's temperature and is assumed to be uniform.
 - **Shot noise** 2 q M^2 F Re P_tx / I B_e.
-- **Intensity noise**. A balanced receiver rejects that of the light, and sees that of the beat in
-  full: of variance RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
+- **Intensity noise**. A balanced receiver rejects that of the light, but not that of the beat. The
+  variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
 - **Phase noise** of a Lorentzian laser of width v. The beat carries theta(t) - theta(t - tau), of
-  density 4 v sin^2(pi f tau) / (pi f^2), 4 pi v tau^2 at all f << 1 / tau [Richter et al., IEEE J.
-  Quantum Electron. 22, 2070, 1986], which a line makes a noise of i^2 / 2 times that. It is taken
-  to be white within B_e, and no more than 2 pi v tau altogether.
+  density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [Richter et al.,
+  IEEE J. Quantum Electron. 22, 2070, 1986]. A line turns it into noise of i^2 / 2 times that
+  density. It is assumed to be white within B_e, and at most 2 pi v tau in total.
 
-The line is there from its own delay tau on, as an echo is (:mod:`sweep.model.effects.overlap`): a
-path of a metre takes 3 ns of a record that begins with the chirp. Records that are taken as whole
-have it whole.
+The line begins at its own delay tau, as an echo does (:mod:`sweep.model.effects.overlap`): a path
+of a metre takes 3 ns of a record that begins with the chirp. With overlap off the line fills the
+record.
 
-The processing knows the line, as it is always there: bins in which it comes to
-:data:`MASK_THRESHOLD_FRACTION` of the threshold, at whatever phase, are **masked**. They raise no
-alarm, and an
-echo whose largest bin is among them is not detected. In other bins the line's skirts, as powers
-add, help an echo over the threshold. They help noise as well, which counts as leakage
-(`p_leakage_up`, `p_leakage_down`): the mean over the phase, in which all bins share. An echo that
+The line is always present, so the processing knows it. Bins in which it reaches
+:data:`MASK_THRESHOLD_FRACTION` of the threshold, at any phase, are **masked**. They raise no alarm,
+and an echo whose largest bin is masked is not detected. In other bins the line's skirts, which add
+as powers, help an echo over the threshold. They also help noise, which counts as leakage
+(`p_leakage_up`, `p_leakage_down`): the mean over the phase, which all bins share. An echo that
 fades in developed speckle crosses with Q_1(L / s, Th / s), s^2 = sigma^2 + |X|^2 / 2.
 
-Left out: saturation of the ADC by the line; the line's own image of I and Q; and the echo's and the
-line's skirts raising one bin together. The spectrum of
+Neglected are saturation of the ADC by the line, the line's own image of I and Q, and skirts of echo
+and line that together raise one bin. The spectrum of
 :func:`sweep.model.spectrum.segment_spectra.segment_spectrum` is that of the echo alone.
 """
 
@@ -65,17 +64,18 @@ from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 
 MASK_THRESHOLD_FRACTION = 0.5
-"""Share of the threshold from which on a bin's line has it masked: less raises few alarms."""
+"""Fraction of the threshold from which a bin's line masks it; a smaller line raises few alarms."""
 N_PHASES = 16
-"""Phases of the line over which alarms are averaged."""
+"""Number of phases of the line over which alarms are averaged."""
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
+"""Optical path of the leaked light beyond that of the local oscillator."""
 
 
 def _leaked_power_and_current(
     parameters: Mapping[str, np.ndarray], architecture: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
+    """Return the power of the leaked light [W] and the amplitude of its beat's photocurrent [A]."""
     power = np.asarray(parameters[LASER_PREFIX + "power"] / parameters[ISOLATION_PATH])
     return power, beat_current(architecture, parameters, power)
 
@@ -83,7 +83,21 @@ def _leaked_power_and_current(
 def beat_noise_current_variance(
     parameters: Mapping[str, np.ndarray], architecture: str, line_shape: str
 ) -> np.ndarray:
-    """Compute the current variance [A^2] of the beat's noise; direct detection has no beat."""
+    """Compute the current variance [A^2] of the noise of the leaked light's beat.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    architecture : str
+        Receiver architecture; direct detection has no beat.
+    line_shape : str
+        Shape of the laser's line; only ``lorentzian`` has phase noise.
+
+    Notes
+    -----
+    Intensity noise and phase noise of the module's description.
+    """
     if architecture == "direct":
         return np.zeros(())
     leaked_power, beat_current = _leaked_power_and_current(parameters, architecture)
@@ -117,7 +131,7 @@ def beat_noise_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the leak's noise, exactly; its line may hide any echo, and always counts."""
+    """Return the exact noise of the leak, and an error of 1, as its line may hide any echo."""
     if not points.any_nonzero(LEAK_LENGTH_PATH):
         return None
     parameters, receiver_noise = points.parameters, points.receiver_noise
@@ -138,7 +152,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Add the leaked light's noise and its line."""
+    """Add the noise and the line of the leaked light."""
     parameters = context.parameters
     power, beat_current = _leaked_power_and_current(parameters, shots.architecture)
     beat_noise = (
@@ -158,21 +172,21 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
 
 class LeakLine(NamedTuple):
-    """A line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
+    """Line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
 
     transforms: np.ndarray
-    """(2, bins) complex: at its frequency, and at the negative one."""
+    """(2, bins) complex: transform of the line at its frequency, and at the negative frequency."""
     magnitude_max: np.ndarray
-    """Its largest magnitude at any phase."""
+    """(bins,): largest magnitude at any phase."""
     magnitude_rms: np.ndarray
-    """Root mean square of its magnitude over the phase."""
+    """(bins,): root mean square of the magnitude over the phase."""
 
 
 @lru_cache(maxsize=16)
 def _leak_line(
     window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
 ) -> LeakLine:
-    """Return the line at a place [bins] that lacks the first samples of the record."""
+    """Return the line at a frequency [bins] without the record's first `n_missing` samples."""
     cycles = line_bin * np.arange(window.length) / fft_size
     record = window_samples(window.name, window.length) * np.exp(
         2j * np.pi * (cycles - np.rint(cycles))
@@ -192,10 +206,23 @@ def _leak_line(
 def leak_line_of_point(
     shots: Shots, i: int, segment: int, noise_frequency: float | None = None
 ) -> tuple[float, LeakLine]:
-    """Return half of the amplitude [V] of point i's line in a segment, and that line.
+    """Return the leaked light's line in one segment of one point.
 
-    The amplitude is over the noise at the line; or at a frequency ``noise_frequency`` [Hz], for
-    skirts there.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    i, segment : int
+        Indices of the point and of the segment.
+    noise_frequency : float, optional
+        Frequency [Hz] whose noise density whitens the line, for skirts; by default the line's.
+
+    Returns
+    -------
+    half_amplitude : float
+        Half of the line's amplitude [V].
+    line : LeakLine
+        Line of amplitude 2.
     """
     shot_columns = (
         shots.circulator_leak_amplitude,
@@ -252,13 +279,21 @@ def line_alarm_probability(
     amplitude_ratio: float,
     threshold_ratio: float,
 ) -> float:
-    """Probability that a line raises an alarm in some of its bins where noise alone does not.
+    """Return the probability that a line raises an alarm in its bins where noise alone does not.
 
-    ``amplitude_ratio`` and ``threshold_ratio`` are half of the line's amplitude and the threshold,
-    over the noise.
+    Parameters
+    ----------
+    looks : Looks
+        Number and combination of records.
+    line : LeakLine
+        Line of amplitude 2.
+    bins : ndarray of int
+        Bins that may raise an alarm.
+    amplitude_ratio, threshold_ratio : float
+        Half of the line's amplitude, and the threshold, over the noise sigma.
     """
     positive_term, negative_term = amplitude_ratio * line.transforms[:, bins]
-    phases = np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES  # its magnitude has this period
+    phases = np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES  # period of the magnitude
     log_no_alarm = [
         np.log1p(
             -np.minimum(
@@ -277,12 +312,29 @@ def line_alarm_probability(
 def line_bin_masks(
     shots: Shots, i: int, line: LeakLine, *, half_amplitude: float, echo_bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tell which bins of a segment of point i a line masks, and in which it raises alarms.
+    """Return the bins of a segment that a line masks, and those in which it raises alarms.
 
-    ``half_amplitude`` is half of the line's amplitude [V], ``echo_bins`` the bins of the echo.
-    Results are bool,
-    (bins,): bins that are masked; bins that are searched for alarms, masked or not; bins in which
-    the line may raise one.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    i : int
+        Index of the point.
+    line : LeakLine
+        Line of amplitude 2.
+    half_amplitude : float
+        Half of the line's amplitude [V].
+    echo_bins : ndarray of int
+        Bins of the echo.
+
+    Returns
+    -------
+    is_masked : ndarray (bins,) bool
+        Masked bins.
+    is_searched : ndarray (bins,) bool
+        Bins searched for alarms, masked or not.
+    may_raise_alarm : ndarray (bins,) bool
+        Bins in which the line may raise an alarm.
     """
     noise_sigma, threshold, floor = (
         float(np.broadcast_to(value, shots.size)[i])
@@ -308,14 +360,25 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """|X| of an echo's bins that cross as often as those with the line in them do, (m,).
+    """Return |X| of an echo alone whose bins cross as often as those of echo and line together.
 
-    ``echo_magnitude`` is |X| of the echo, the root mean square of one that ``in_speckle``;
-    ``line_rms`` the root mean
-    square of the line's [V]; ``noise_sigma`` and ``threshold`` noise per quadrature and threshold
-    [V].
+    Parameters
+    ----------
+    echo_magnitude : ndarray (m,)
+        |X| of the echo [V]; its root mean square in speckle.
+    line_rms : ndarray (m,)
+        Root mean square of the line over its phase [V].
+    noise_sigma, threshold : float
+        Noise per quadrature, and threshold [V].
+    in_speckle : bool
+        True for an echo in developed speckle.
+
+    Notes
+    -----
+    Without speckle powers add. In speckle the echo crosses with Q_1(L / s, Th / s), s^2 = sigma^2 +
+    |X|^2 / 2.
     """
-    from sweep.model.detection.marcum import marcum_q1  # needs the compiler, too
+    from sweep.model.detection.marcum import marcum_q1  # imports the compiler
 
     if not in_speckle:
         return np.hypot(echo_magnitude, line_rms)
@@ -331,7 +394,20 @@ def raised_magnitude(
 
 
 def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
-    """Apply the leaked light's line to spectra: it masks bins, and raises others."""
+    """Apply the leaked light's line to spectra: it masks some bins and raises others.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    bin_spans : BinSpans
+        Spectra around the echoes, as of :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
+
+    Returns
+    -------
+    BinSpans
+        Spectra with changed magnitudes, probabilities, exempt bins and leakage.
+    """
     from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at, pd_and_miss
 
     magnitudes = bin_spans.magnitudes.copy()
@@ -423,3 +499,4 @@ CIRCULATOR_LEAK = Effect(
         ),
     ),
 )
+"""Effect of light that leaks from transmitter to detector."""

@@ -1,15 +1,15 @@
-"""Doppler: the shift 2 v_r / lambda of every line, its spread over the beam, turning bodies.
+"""Doppler: the shift 2 v_r / lambda of every line, its spread over the beam, rotating bodies.
 
-Without the shift nothing is known of velocity at all, whatever the detection probability says: it
-is left out only where lines would not move by any share of a bin that matters. The spread matters
-where 2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad: 1.4 bins of 4.6
-kHz). So does v (1 - cos theta) of a velocity along a wide beam.
+Without the shift, nothing is measured of velocity, whatever the detection probability. It is
+skipped only if lines would not move by a significant fraction of a bin. The spread matters if
+2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad: 1.4 bins of 4.6 kHz).
+So does v (1 - cos theta) of a velocity along a wide beam.
 
-The surface of a turning body moves with V + omega x (P - X). A beamlet along d_b that meets it at
-P_b = O + R_b d_b, seen from O, has from the rotation the closing speed -omega x (P_b - X) . d_b =
--omega x (O - X) . d_b: R_b falls out. Rotation is thus what a velocity -omega x (O - X) of the
-instrument would be, whatever the body's form: a shift by its component along the beam, a spread by
-that across it.
+The surface of a rotating body moves with V + omega x (P - X). A beamlet from O along d_b meets it
+at P_b = O + R_b d_b. The rotation contributes the closing speed -omega x (P_b - X) . d_b = -omega x
+(O - X) . d_b, in which R_b cancels. Rotation is thus equivalent to a velocity -omega x (O - X) of
+the instrument, whatever the body's shape. Its component along the beam shifts the lines, and its
+component across the beam spreads them.
 """
 
 from dataclasses import replace
@@ -22,14 +22,17 @@ from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_f
 from sweep.model.preparation import Shots, doppler_ratio
 
 OMITTED_SHIFT_MAX_BINS = 0.1
-"""Bins by which the Doppler effect may move lines and yet be left out; further, it counts whole."""
+"""Largest shift of lines [bins] for which the Doppler effect may be skipped; a larger shift counts
+as an error of 1."""
 
 
 def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by the shift: another transfer, another place between two bins.
+    """Bound the change of the largest bin by the shift.
 
-    The shift in bins counts besides, as velocity is measured by it. A line that goes elsewhere is
-    not left out.
+    The shift changes the receiver's transfer and the line's position between two bins.
+
+    The shift in bins counts as well, as it is the measure of velocity. A line that moves further
+    than :data:`OMITTED_SHIFT_MAX_BINS` is never skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None
@@ -37,7 +40,21 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
-    """Change of the largest bin by lines that all move by so many bins, by segment."""
+    """Bound the change of the largest bin by a common shift of all lines.
+
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of a tile.
+    shift_bins : ndarray (segments, n)
+        Shift of the lines of each segment [bins].
+
+    Returns
+    -------
+    ErrorBound
+        A shift above :data:`OMITTED_SHIFT_MAX_BINS` in any segment counts as 1 bin, so that the
+        effect is kept.
+    """
     is_far = (shift_bins > OMITTED_SHIFT_MAX_BINS).any(axis=0)
     omitted_shift_bins = np.where(is_far, 1.0, shift_bins.max(axis=0))
     if is_far.all():
@@ -52,7 +69,7 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
     if points.adds_amplitudes:
         stretched_shift_bins = shift_bins * (
             1 + points.line_spread.extreme
-        )  # the beat of a range stretches too
+        )  # the Doppler ratio scales range beats as well
         coherent_change = np.where(is_far, 0.0, points.coherent_sum_bound(stretched_shift_bins))
     return ErrorBound(
         magnitude_change=magnitude_change,
@@ -62,7 +79,12 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
 
 
 def apply_doppler(shots: Shots, context: EffectContext) -> Shots:
-    """Lines shifted by the radial velocity on the axis."""
+    """Shift all lines by the radial velocity on the axis.
+
+    Notes
+    -----
+    The Doppler ratio of the line on the axis becomes beta = 2 v_r / c.
+    """
     return replace(shots, doppler_ratio=doppler_ratio(shots.radial_velocity))
 
 
@@ -73,12 +95,13 @@ DOPPLER = Effect(
     error_bound=doppler_bound,
     apply=apply_doppler,
 )
+"""Effect of the radial velocity on all lines."""
 
 
 def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by differences of velocity.
+    """Bound the change of the largest bin by differences of velocity over the footprint.
 
-    Of amplitudes that add, lines in phase change by their own moves.
+    If amplitudes add, the bound of a sum in phase follows from the lines' own shifts.
     """
     velocity_spread = points.velocity_spread
     if not np.any(velocity_spread.extreme):
@@ -96,7 +119,7 @@ def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
-    """Beamlets at their own radial velocities, where there are beamlets."""
+    """Give beamlets their own radial velocities, if the footprint has beamlets."""
     doppler_ratios = context.ground.beamlets.doppler_ratio_offset
     if shots.doppler_ratio_offset.shape != doppler_ratios.shape:
         return shots
@@ -126,10 +149,14 @@ DOPPLER_SPREAD = Effect(
     ),
     parent="footprint",
 )
+"""Effect of radial velocities that differ over the footprint."""
 
 
 def rotation_bound(points: PlannerInputs) -> ErrorBound | None:
-    """All or nothing: velocities of turning surfaces are in the scene, and not left out."""
+    """Return an error of 1 if a body rotates, so that the effect is kept; None otherwise.
+
+    The velocities of rotating surfaces are part of the scene.
+    """
     return ErrorBound(probability_change=1.0) if points.has_rotating_body else None
 
 
@@ -139,3 +166,4 @@ ROTATION = Effect(
     stage="lines",
     error_bound=rotation_bound,
 )
+"""Effect of rotating bodies; their surface velocities are part of the scene."""

@@ -1,8 +1,8 @@
-"""Physical effects to the rest of the model: where each acts, what it changes, what it does.
+"""Interface of physical effects: stage, change of the shots, and error bound.
 
-Its parameters become fields of a spec. The planner asks for its size at the points of each tile;
-:mod:`sweep.model.evaluation` applies it where some point needs it, and nothing of it is computed
-elsewhere. All effects are listed in :mod:`sweep.model.effects.catalogue`.
+The parameters of an effect become fields of a spec. The planner evaluates its error bound at the
+points of each tile. :mod:`sweep.model.evaluation` applies it where a point needs it; otherwise
+nothing of it is computed. :mod:`sweep.model.effects.catalogue` lists all effects.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,57 +19,82 @@ if TYPE_CHECKING:
     from sweep.model.effects.planner_inputs import PhaseErrorBound, PlannerInputs
 
 EFFECT_MODES = ("auto", "on", "off")
+"""Settings of an effect in a spec: planned by its error bound, always on, or off."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """A field that an effect brings into a spec: a number with a unit, or one of several words."""
+    """Field that an effect adds to a spec: a number with a unit, or one of several words."""
 
     path: str
+    """Dotted path."""
     description: str
+    """Description for users."""
     default: float | int | str = 0.0
-    """In SI; 0 or ``none`` means that there is nothing of the effect."""
+    """Default value, in SI units; 0 or ``none`` disables the effect."""
     example: str = ""
+    """Example of a value, as a user would write it."""
     limits: tuple[str, str | None] = ("", None)
-    """Least and largest value, as a user would write them."""
+    """Smallest and largest value, as a user would write them."""
     si_unit: str | None = None
-    """By default that of the least value."""
+    """SI unit; by default the unit of the smallest value."""
     options: tuple[str, ...] = ()
+    """Possible words; empty for a number."""
     is_table: bool = False
     """True for a table over time, given as text (:mod:`sweep.model.effects.sweep_error_table`)."""
     is_sole_cause: bool = True
-    """Tell whether nothing else can bring the effect."""
+    """True if the effect is absent unless this parameter, or another with this flag, differs from
+    its default."""
     is_category_key: bool = False
-    """True where points are computed together only if they share it; words always are."""
+    """True if points must share the value to be computed together; words always are shared."""
 
     @property
     def unit(self) -> str:
-        """SI unit, empty for words and plain numbers."""
+        """SI unit; empty for words and dimensionless numbers."""
         return self.limits[0].partition(" ")[2] if self.si_unit is None else self.si_unit
 
     @property
     def enables_effect(self) -> bool:
-        """True if other values than the default bring the effect; else it says how it acts."""
+        """True if the default disables the effect and other values enable it.
+
+        False if the parameter only modifies the effect.
+        """
         return self.is_sole_cause and self.default in ((1.0,) if self.unit == "dB" else (0, "none"))
 
 
 class EffectContext(NamedTuple):
-    """Parameters and ground that an effect may use besides the shots."""
+    """Parameters and ground that an effect may use in addition to the shots."""
 
     parameters: Mapping[str, np.ndarray]
-    """By dotted path, (n,) or scalar."""
+    """Parameters by dotted path, (n,) or scalar."""
     ground: Ground
+    """Ground that the beams meet."""
     presence: Mapping[str, np.ndarray] = MappingProxyType({})
-    """Of effects that not all points have: 1.0 for those that do, else 0.0; (n,)."""
+    """Masks (n,) of effects that not all points have: 1.0 where enabled, else 0.0."""
 
     def presence_factor(self, effect: str) -> np.ndarray | float:
-        """1 for points that have an effect, 0 for others: (n,), or one number for all."""
+        """Return 1 for points with an effect and 0 for others: (n,), or one number for all."""
         return self.presence.get(effect, 1.0)
 
     def select_beamlets(
         self, effect: str, row: np.ndarray, with_effect: np.ndarray, without_effect: np.ndarray
     ) -> np.ndarray:
-        """Numbers of beamlets, (rows, beamlets), by whether the rows' points have an effect."""
+        """Select values of beamlets by the presence of an effect.
+
+        Parameters
+        ----------
+        effect : str
+            Name of the effect.
+        row : ndarray (n,)
+            Row of each point.
+        with_effect, without_effect : ndarray (rows, beamlets)
+            Values with and without the effect.
+
+        Returns
+        -------
+        ndarray (rows, beamlets)
+            `with_effect` in rows whose points have the effect, else `without_effect`.
+        """
         if effect not in self.presence:
             return with_effect
         has_effect = np.ones((len(with_effect), 1), np.bool_)
@@ -78,7 +103,7 @@ class EffectContext(NamedTuple):
 
 
 class DrawAddresses(NamedTuple):
-    """Random draws of some points: point i has those of its own key."""
+    """Addresses of the random numbers of points: each point has its own key."""
 
     point_keys: np.ndarray
     """(n, 2) uint64: random key of each point."""
@@ -90,72 +115,83 @@ ArrayOrFloat = np.ndarray | float
 
 
 class ErrorBound(NamedTuple):
-    """Changes by leaving an effect out at each point, by segment or alike in all."""
+    """Upper bound on the output change at each point if an effect is omitted.
+
+    Values are scalars, (n,), or (segments, n).
+    """
 
     magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude; from 1 on nothing is known of it."""
+    """Relative change of the largest bin's magnitude; 1 or more means no knowledge of it."""
     coherent_sum_change: ArrayOrFloat = 0.0
-    """Besides, what is added to that magnitude or taken from it, as a share of what all amplitudes
-    make in phase: sums that may cancel have no relative change."""
+    """Additional absolute change of the largest bin's magnitude, as a fraction of the sum of all
+    amplitudes in phase. Sums that may cancel have no relative change."""
     noise_variance_change: ArrayOrFloat = 0.0
     """Relative change of a bin's noise variance."""
     threshold_follows_noise: bool = True
-    """True where the threshold is set on the changed noise, as for noise that is always there; else
-    it stays where it was, as for noise that comes with the signal."""
+    """True if the threshold is set on the changed noise, as for noise that is always present; False
+    for noise that comes with the signal."""
     shift_bins: ArrayOrFloat = 0.0
-    """Bins by which what is measured moves; they count as a change of a probability does."""
+    """Shift of measured frequencies [bins]; it counts like a change of a probability."""
     log10_pfa_change: ArrayOrFloat = 0.0
-    """Change of log10 of a shot's probability of a false alarm, by bins that cross the level."""
+    """Change of log10 of a shot's probability of a false alarm, due to bins that cross the
+    threshold."""
     leaking_bin_change_sigma: ArrayOrFloat = 0.0
-    """Sigmas by which bins that leak move, besides what the largest moves by."""
+    """Change of bins with leaked signal [sigma], in addition to their share of the largest bin's
+    change."""
     probability_change: ArrayOrFloat = 0.0
-    """Change of a probability itself, summed over the segments where there is one of each."""
+    """Change of a probability itself, summed over the segments if there is one for each."""
     residual_magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude that remains where the effect is simulated."""
+    """Relative change of the largest bin's magnitude that remains when the effect is simulated."""
     residual_coherent_sum_change: ArrayOrFloat = 0.0
-    """The same as a share of what all amplitudes make in phase; the less of both counts."""
+    """Residual change as a fraction of the sum of all amplitudes in phase; the smaller of the two
+    residuals counts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
-    """A physical effect, the same as no other."""
+    """Physical effect, with its error bound and its change of the shots; compared by identity."""
 
     name: str
+    """Name in specs and stores."""
     description: str
     """Description in a few words, for tables and help."""
     stage: str
-    """Stage at which it acts, in this order: on the ``lines`` of a footprint; on the ``light`` that
-    comes back; on the ``noise``; on the ``record`` and its phases; on the ``spectrum``; on the
-    ``detection``; and, in ``draws``, on all of these at random."""
+    """Stage of application, in this order: ``lines`` of a footprint; returning ``light``;
+    ``noise``; ``record`` and its phases; ``spectrum``; ``detection``; and ``draws``, random changes
+    of any of these."""
     error_bound: "Callable[[PlannerInputs], ErrorBound | None]"
-    """Change at each point by leaving it out. None: the scene has nothing of it."""
+    """Function that returns the upper bound on the output change if the effect is omitted; None if
+    it is absent."""
     phase_error_bound: "Callable[[PlannerInputs], PhaseErrorBound | None] | None" = None
-    """Change of lines over the record; all smears are known before any size is asked for."""
+    """Function that returns the bound of the phase error over the record. All phase-error bounds
+    are known before any `error_bound` is evaluated."""
     apply: Callable[[Shots, EffectContext], Shots] | None = None
-    """Change of shots, once."""
+    """Function that changes prepared shots."""
     perturb_parameters: (
         Callable[[dict[str, np.ndarray], DrawAddresses], dict[str, np.ndarray]] | None
     ) = None
-    """Random change of parameters, before any shot is prepared."""
+    """Function that draws a random change of parameters, before shots are prepared."""
     perturb_shots: Callable[[Shots, EffectContext, DrawAddresses], Shots] | None = None
-    """Random change of shots, after all else but spectrum and detection."""
+    """Function that draws a random change of shots, after all other effects except spectrum and
+    detection."""
     parameters: tuple[Parameter, ...] = ()
+    """Fields that the effect adds to a spec."""
     parent: str = ""
-    """An effect that this is part of: kept wherever this is; where it is off, so is this."""
+    """Name of the effect that this one is part of. The parent is kept wherever this effect is, and
+    this effect is off where the parent is."""
     needs_own_batch: bool = True
-    """True if points that have it are computed apart from those that don't. If not, `apply` looks
-    at :attr:`EffectContext.presence`, and leaves the bits of other points as they would be without
-    it."""
+    """True if points with and without the effect are computed separately. If False, `apply` uses
+    :attr:`EffectContext.presence` and leaves the bits of points without the effect unchanged."""
     required_effects: tuple[str, ...] = ()
-    """Effects that this one is simulated with, however little they change by themselves."""
+    """Names of effects that are simulated with this one, however small their own change is."""
 
     @property
     def is_random(self) -> bool:
-        """True if it is simulated by draws."""
+        """True if the effect is simulated by draws."""
         return self.perturb_parameters is not None or self.perturb_shots is not None
 
     def is_absent(self, parameters: Parameters) -> np.ndarray:
-        """Return true for points without it, by the parameters that bring it; (n,) or scalar."""
+        """Return True for points whose parameters disable the effect; (n,) or scalar."""
         enabling_parameters = [
             parameter for parameter in self.parameters if parameter.enables_effect
         ]
@@ -166,5 +202,5 @@ class Effect:
 
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
-    """Shots with further sources of noise: variances at the ADC [V^2] by source."""
+    """Return shots with additional noise sources: variances at the ADC [V^2] by source."""
     return replace(shots, noise_variances=shots.noise_variances | variances)

@@ -1,7 +1,7 @@
-"""Footprint: beamlets at ranges of their own, on one surface or several, with or without phases.
+"""Footprint: beamlets at their own ranges, on one surface or several, with or without phases.
 
-A beam without it has one line, on its axis, of all its echo's power. It matters where
-S 2/c R div cot(grazing) N/fs is not small.
+Without the effect, a beam has one line on its axis, with all of its echo's power. The effect
+matters if S 2/c R div cot(grazing) N/fs is not small.
 """
 
 from dataclasses import replace
@@ -17,11 +17,11 @@ from sweep.model.preparation import CHIRP_PREFIX, Shots, relative_amplitude
 
 
 def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by the ranges of the footprint, and by how much more it echoes.
+    """Bound the change of the largest bin by the ranges of the footprint and by its larger echo.
 
-    Of powers, without velocities, other surfaces or phases: these are within it. In direct
-    detection the echoes' beats always add as amplitudes, with the phases that the ranges give to
-    the radio frequency.
+    The bound is for powers, without velocities, other surfaces or phases, which are separate
+    effects. In direct detection the echoes' beats always add as amplitudes, with the phases that
+    the ranges give to the radio frequency.
     """
     if points.n_beamlets == 1:
         return None
@@ -41,7 +41,11 @@ def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
-    """Beamlets at their own ranges, those on other surfaces at the axis's, all of its velocity."""
+    """Give beamlets their own ranges.
+
+    Beamlets on other surfaces keep the axis's range, and all keep its velocity: those are separate
+    effects.
+    """
     row, range_offset, _, echo = context.ground.beamlets
     if context.ground.off_axis_surface is not None:
         range_offset = np.where(context.ground.off_axis_surface, 0.0, range_offset)
@@ -72,16 +76,19 @@ FOOTPRINT = Effect(
         ),
     ),
 )
+"""Effect of beamlets at their own ranges."""
 
 
 def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by optical phases: it may fade, or gain as a sum in phase does.
+    """Bound the change of the largest bin by optical phases, which may cancel or amplify lines.
 
+    Notes
+    -----
     The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. If that is not small
-    against 1 the sum may be anything from nothing to sqrt(N) times (Cauchy and Schwarz) what the
-    powers make. If it is small, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2) times that,
-    which is no less of a change. So the effect is kept wherever there are several beamlets. One
-    beamlet's line adds to its own image.
+    against 1, the sum may be anything from 0 to sqrt(N) times (Cauchy and Schwarz) the sum of
+    powers. If it is small, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2) times that, which
+    is as large a change. So the effect is kept wherever there are several beamlets. The line of a
+    single beamlet adds to its own image.
     """
     if not points.adds_field_amplitudes:
         return None
@@ -91,7 +98,7 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
-    """Beamlets that add as amplitudes, where the spec says that their phases follow the surface."""
+    """Add beamlets as amplitudes, if the spec states that their phases follow the surface."""
     if str(context.parameters["footprint.phases"]) != "coherent":
         return shots
     return replace(shots, adds_powers=False)
@@ -105,15 +112,18 @@ FOOTPRINT_PHASE = Effect(
     apply=apply_footprint_phase,
     parent="footprint",
 )
+"""Effect of the optical phases of a smooth surface."""
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by the ranges of other surfaces than the axis's.
+    """Bound the change of the largest bin by the ranges of other surfaces than the axis's.
 
-    As powers, with a share f off the axis's surface, whose own lines put a in their largest bin.
-    With the effect that bin holds a at the least, and no bin more than a + f. Without it the
-    largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that add
-    nothing is known but that no bin holds more than all in phase.
+    Notes
+    -----
+    Let a fraction f of the power be off the axis's surface, and let the lines of the axis's surface
+    have the power a in their largest bin. With the effect the largest bin holds at least a, and no
+    bin holds more than a + f. Without it the largest bin holds at least a, and at most a and f's
+    line on the axis. If amplitudes add, only the sum in phase is a bound.
     """
     off_axis_fraction = np.minimum(points.footprint_extent.off_axis_fraction, 1.0)
     if not (off_axis_fraction > 0).any():
@@ -146,9 +156,9 @@ def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
-    """Beamlets on other surfaces than the axis's at ranges of their own, where there are any.
+    """Give beamlets on other surfaces than the axis's their own ranges, if there are any.
 
-    Without the effect they send their power back from the axis's own range.
+    Without the effect they return their power from the axis's range.
     """
     range_offset = context.ground.beamlets.relative_range_offset
     if (
@@ -171,3 +181,4 @@ SEVERAL_RETURNS = Effect(
     parent="footprint",
     needs_own_batch=False,
 )
+"""Effect of more than one surface in a footprint."""

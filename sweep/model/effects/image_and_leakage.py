@@ -1,32 +1,33 @@
-"""Light far from its line: images at negative frequencies, and leakage into further bins.
+"""Light far from its line: images at negative frequencies, and leakage into other bins.
 
-**Images**: the real record's line at -f, which reaches the bins of f near DC and Nyquist.
+**Images**: a real record has the line also at -f, which reaches the bins of f near DC and Nyquist.
 
-X[k] has W(k - nu) and, conjugated, W(k + nu); past Nyquist the line that is seen is the image of
-one that is not. Without the effect only the kernel of the folded line itself is summed, where it is
-seen. It acts on the spectrum. Its size follows from the envelope E of the window's sidelobes. Let
-all light of a line, wherever footprint and record put it, be e bins from the edge (DC or Nyquist)
-or further. Then bins within e/2 have images at most E(3/2 e) high, and all others at most E(e/2) +
-E(e) altogether.
+X[k] contains W(k - nu) and, conjugated, W(k + nu). Past Nyquist the visible line is itself an
+image. Without the effect only the transform of the folded line is summed, where it is visible. The
+effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
+Let all light of a line, wherever footprint and record put it, be at least e bins from the edge (DC
+or Nyquist). Then bins within e/2 have images of at most E(3/2 e), and all others at most E(e/2) +
+E(e).
 
-A bin at the threshold, far down the lines' sidelobes, is smaller than the largest by far, and moved
-by an image that the largest does not feel. It then belongs to the detection, or does no more, and
-of the bins that may raise a false alarm there is one fewer or more. With lines d bins away such a
-bin has images at 2 e - d; if these move it by a share x of the threshold, it must lie that near.
-Bins whose sidelobes fall no slower than 1/d lie there with a probability of x d.
+A bin at the threshold, far down the lines' sidelobes, is much smaller than the largest bin. An
+image too small to change the largest bin may still move it across the threshold. It then joins the
+bins of the detection or leaves them, and the number of bins that may raise a false alarm changes by
+one. If lines are d bins away, such a bin has images at 2 e - d. If these move it by a fraction x of
+the threshold, it must lie that near to the threshold. Bins whose sidelobes fall no slower than 1/d
+lie there with a probability of x d.
 
-**Leakage**: extra groups raised by the signal's own bins below the threshold.
+**Leakage**: additional groups of bins raised by the signal in bins below the threshold.
 
-It changes no detecting bin, and so no detection probability; it is what ``p_leakage`` holds. It
-acts on the detection: without it only bins of the groups are evaluated. By the union bound
+It changes no detecting bin, and so no detection probability, but ``p_leakage``. It acts on the
+detection: without the effect only bins of the echo's groups are evaluated. By the union bound
 
     p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E_k, b),
 
-over the bins that may leak, with A the magnitude of all lines together, E_k the largest |W| at
-the distances that light may have from bin k, and b the threshold, all over sigma. Not among them
-are the detecting bin and its neighbours. By Parseval's theorem the bins have no more power together
-than ENBW times A^2, and the probability rises faster than a^2. So the sum is at most ENBW times
-that of one bin of A, or A^2 / b^2 times that of one at the threshold.
+over the bins that may leak, with the magnitude A of all lines together, the largest |W| at the
+distances that light may have from bin k, E_k, and the threshold b, all over sigma. The detecting
+bin and its neighbours are excluded. By Parseval's theorem the bins together have at most ENBW times
+the power A^2, and the probability rises faster than a^2. So the sum is at most ENBW times that of
+one bin of A, or A^2 / b^2 times that of one at the threshold.
 """
 
 import math
@@ -44,15 +45,16 @@ from sweep.model.window import get_window
 
 _LN_10 = math.log(10)
 _RATIO_MAX = 1e12
+"""Upper limit of signal ratios, against overflow."""
 _EXPECTED_BINS_MIN = 1e-4
-"""Expected bins at the threshold of a shot that are not reckoned with."""
+"""Expected number of a shot's bins at the threshold below which they are neglected."""
 
 
 def image_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by images; complex records have none.
+    """Bound the change of the largest bin by images; complex records have none.
 
-    If amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
-    most E(e) of all lines in phase.
+    If amplitudes add, the sum may be anything; images add at most E(e) of all lines in phase to any
+    bin of 0..N/2.
     """
     if points.option(RECORD_PATH) == "complex":
         return None
@@ -86,10 +88,13 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
-    """Change of leakage by images that add as powers: of a bin at the threshold, or of all bins.
+    """Bound the change of leakage by images that add as powers.
 
-    These cross with probabilities of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no
-    slower than 1 / k from ``apart`` on, so all bins have ``apart`` times the nearest's a^2.
+    It is the change of one bin at the threshold, or of all bins, whichever is larger.
+
+    For small a, bins cross with probabilities of y e^-y a^2 / 2, y = b^2 / 2. Images fall at least
+    as 1 / k from ``bins_to_image`` on, so all bins together have ``bins_to_image`` times the a^2 of
+    the nearest.
     """
     image_ratio = (
         points.line_signal_ratio
@@ -109,10 +114,10 @@ def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
 
 
 def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
-    """Change of log10 pfa of a shot by the bins that images move across the threshold.
+    """Bound the change of log10 pfa of a shot due to bins that images move across the threshold.
 
-    That of one bin, or of as many as are to be expected were lines anywhere between two bins; 0
-    where fewer than ``_EXPECTED_BINS_MIN`` are.
+    It is the change by the expected number of such bins, with lines anywhere between two bins, and
+    at least that of one bin. It is 0 if fewer than ``_EXPECTED_BINS_MIN`` are expected.
     """
     if points.option(PROCESSING_PREFIX + "bins_counted") == "all":
         return 0.0
@@ -127,7 +132,7 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
     threshold_distance = np.minimum(
         response.distance_below(points.threshold_ratio / total_ratio), nyquist_bin
     )
-    if points.missing_samples is not None:  # sidelobes of an echo that begins with a step
+    if points.missing_samples is not None:  # sidelobes of an echo that begins within the record
         step_ratio = np.maximum(total_ratio * points.missing_samples.step_sidelobe_factor, 1e-300)
         rectangular_response = window_response("rectangular", points.window.length, points.fft_size)
         threshold_distance = np.minimum(
@@ -162,7 +167,7 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
 
 
 def apply_image(shots: Shots, context: EffectContext) -> Shots:
-    """Images summed with the lines, where the record is real."""
+    """Sum images with the lines, if the record is real."""
     return replace(shots, sums_images=not shots.complex_record)
 
 
@@ -173,22 +178,24 @@ IMAGE = Effect(
     error_bound=image_bound,
     apply=apply_image,
 )
+"""Effect of lines at negative frequencies, near DC and Nyquist."""
 
 
 _TABULATED_REACH_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
-"""Bins that light may be moved by, up to which there is a table each."""
+"""Shifts of light [bins] up to which there is one table each."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
-"""Rows an octave of A over the threshold, and where they begin and end."""
+"""Number of rows per octave of A over the threshold, and the first and last octave."""
 _THRESHOLD_STEP = 1.04
-"""Thresholds have the table of the next lower of some, so far apart."""
+"""Ratio of the thresholds of successive tables; a threshold uses the table of the next lower one.
+"""
 _SINGLE_BINS, _FAR_STRETCHES = 48, 24
-"""Bins that are looked at one by one, and stretches beyond."""
+"""Number of bins evaluated singly, and number of intervals of bins beyond."""
 _IMAGE_FACTOR = 1.1
-"""Factor that images may put to sidelobes far from the edge; near it twice as much."""
+"""Factor for images added to sidelobes far from the edge; near the edge it is 2."""
 
 
 def leakage_bound(points: PlannerInputs) -> ErrorBound:
-    """Probability that leaked signal raises an extra group, in all segments together."""
+    """Bound the probability that leaked signal raises an additional group in any segment."""
     threshold_ratio, is_near_image = points.threshold_ratio, points.is_near_image
     ratio_to_threshold = (
         points.line_signal_ratio
@@ -206,7 +213,7 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
                 points, points.window.name, ratio_to_threshold, reach_bins
             )
         )
-    # Sidelobes of two kinds, of which one is the larger in any bin.
+    # Sidelobes of the window and of the step; in each bin one of the two is the larger.
     step_ratio = 2 * ratio_to_threshold * points.missing_samples.step_sidelobe_factor
     probability = _leakage_probability(
         points, points.window.name, 2 * ratio_to_threshold, reach_bins
@@ -222,9 +229,18 @@ def leakage_bound(points: PlannerInputs) -> ErrorBound:
 def _leakage_probability(
     points: PlannerInputs, window_name: str, ratio_to_threshold: np.ndarray, reach_bins: np.ndarray
 ) -> np.ndarray:
-    """Probability in all segments together, of sidelobes of a window.
+    """Bound the probability of leakage in all segments together, for the sidelobes of one window.
 
-    By their lines' magnitude over the threshold, and the bins that light may be moved by.
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of a tile.
+    window_name : str
+        Window whose sidelobes count.
+    ratio_to_threshold : ndarray
+        Magnitude of the lines over the threshold.
+    reach_bins : ndarray
+        Distance by which light may be shifted [bins].
     """
     threshold_ratio, row = (
         points.threshold_ratio,
@@ -262,7 +278,24 @@ def _leakage_probability(
 def leakage_table(
     window_name: str, length: int, fft_size: int, threshold_ratio: float, looks: Looks = SINGLE_LOOK
 ) -> np.ndarray:
-    """Probabilities by reach and octaves of A over the threshold, the last row by Parseval."""
+    """Tabulate bounds of the probability of leakage.
+
+    Parameters
+    ----------
+    window_name : str
+        Name of the window.
+    length, fft_size : int
+        Length of the record and FFT size.
+    threshold_ratio : float
+        Threshold b over sigma.
+    looks : Looks
+        Number and combination of records.
+
+    Returns
+    -------
+    ndarray (reaches + 1, rows)
+        By shift of light and by octaves of A over the threshold; the last row is Parseval's bound.
+    """
     response, n_rows = (
         window_response(window_name, length, fft_size),
         (_OCTAVE_MAX - _OCTAVE_MIN) * _ROWS_PER_OCTAVE + 1,
@@ -306,13 +339,13 @@ def leakage_table(
 def _added_crossing_probability(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
-    """Probability to cross the threshold that a bin of some signal has more than one without."""
+    """Return by how much a signal raises a bin's probability to cross the threshold."""
     crossing = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio))[0]
     return np.maximum(crossing - noise_crossing, 0.0) / max(1 - noise_crossing, 1e-12)
 
 
 def apply_leakage(shots: Shots, context: EffectContext) -> Shots:
-    """Bins evaluated on either side of the detection."""
+    """Evaluate bins on either side of the detection."""
     return replace(shots, includes_leakage=True)
 
 
@@ -323,3 +356,4 @@ LEAKAGE = Effect(
     error_bound=leakage_bound,
     apply=apply_leakage,
 )
+"""Effect of additional groups raised by sidelobes below the threshold."""

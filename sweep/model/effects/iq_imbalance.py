@@ -1,11 +1,12 @@
-"""Imbalance of I and Q: a complex record shows each line's image at the negative frequency.
+"""Imbalance of I and Q: a complex record shows an image of each line at its negative frequency.
 
 With I = cos(w t) and Q = g sin(w t + p), the record is
 
     I + i Q = (1 + g e^(i p)) / 2 e^(i w t) + (1 - g e^(-i p)) / 2 e^(-i w t),
 
-so that the image's amplitude is |1 - g e^(i p)| / |1 + g e^(i p)| of the line's; what is lost of
-the line itself is its gain's, and noise has it too. It acts on the lines: each has a second one.
+so the image has |1 - g e^(i p)| / |1 + g e^(i p)| of the line's amplitude. The change of the line's
+own gain applies to noise as well and is neglected. The effect acts on the lines: each has a second
+one.
 """
 
 from dataclasses import replace
@@ -24,10 +25,21 @@ GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
 
 
 def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
-    """Amplitude of the image over the line's, 0..1.
+    """Return the amplitude of the image over that of the line, 0..1.
 
-    By the power of Q over that of I, and their phase's departure from 90 degrees [rad].
+    Parameters
+    ----------
+    gain : array_like
+        Power of Q over that of I, g^2.
+    phase : array_like
+        Departure p of their phase from 90 degrees [rad].
 
+    Notes
+    -----
+    |1 - g e^(i p)| / |1 + g e^(i p)|.
+
+    Examples
+    --------
     >>> leak = image_gain(gain=10**0.05, phase=0.0523598776)  # 0.5 dB and 3 deg
     >>> round(float(20 * np.log10(leak)), 1)
     -28.2
@@ -37,7 +49,7 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Anything, where there is an image: it may be a peak of its own."""
+    """Return an error of 1 where there is an image, which may be a peak of its own."""
     image_amplitude = image_gain(
         gain=points[GAIN_IMBALANCE_PATH], phase=points[PHASE_IMBALANCE_PATH]
     )
@@ -49,7 +61,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Images of the lines, where the record is complex."""
+    """Add images of the lines, if the record is complex."""
     if not shots.complex_record:
         return shots
     image_amplitude = image_gain(
@@ -81,3 +93,4 @@ IQ_IMBALANCE = Effect(
         ),
     ),
 )
+"""Effect of unequal I and Q."""

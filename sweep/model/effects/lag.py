@@ -1,9 +1,9 @@
-"""Beams that part: the sent one and the local oscillator's are not in the same place at the target.
+"""Lag: the axes of transmitted and received beam are apart at the target.
 
-A scanner has turned on by omega 2R/c before the light is back, so that the receiver looks where it
-no longer transmits. The parallax of a bistatic pair and a misalignment do the same. Of the light
-that one mode collects exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d the distance of the axes
-(:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing is lost.
+A scanner has turned by omega 2R/c when the light returns, so the receiver looks to the side of the
+transmitted beam. The parallax of a bistatic pair and a misalignment have the same effect. Of the
+light that one mode collects, the fraction exp(-2 d^2 / (w_T^2 + w_L^2)) remains, where d is the
+distance of the axes (:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing is lost.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from sweep.model.preparation import Shots
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Loss of the echo, and of its shot noise."""
+    """Return the loss of the echo and of its shot noise; None without offset or single mode."""
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
         return None
@@ -31,7 +31,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Echoes that the local oscillator misses in part."""
+    """Reduce echoes by the offset between the axes of transmitted and received beam.
+
+    Notes
+    -----
+    Power by exp(-2 d^2 / (w_T^2 + w_L^2)), the beat's amplitude by the square root of that.
+    """
     if not beam.is_single_mode(context.parameters):
         return shots
     kept_fraction = beam.axis_offset_transmission(context.parameters, shots.range)
@@ -74,3 +79,4 @@ LAG = Effect(
         ),
     ),
 )
+"""Effect of the offset between transmitted and received beam."""
