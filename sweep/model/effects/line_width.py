@@ -1,29 +1,34 @@
 """Laser line width: the mean power of bins under a line that is not a pure tone.
 
-Two models, both as the mean of |X|^2 over records, with the window's actual kernel.
+There are two models. Both give the mean of |X|^2 over records, with the window's actual transform.
 
-**Gaussian** [T, section 3.2]: the power spectrum convolved with a Gaussian of the given FWHM, at
+**Gaussian** [T, section 3.2]: the power spectrum is convolved with a Gaussian of the given FWHM, at
 any delay. This is exactly the mean over records that each have one random normal frequency, common
 to all beamlets: jitter slow against the record. The mean over the frequency is a sum over equally
-spaced shifts, to a stated error. |X|^2 of a record of L samples has lags below L only. The
-trapezium rule misses a Gaussian's aliases alone.
+spaced shifts, to a stated error. |X|^2 of a record of L samples has only lags below L, so the
+trapezium rule errs only by a Gaussian's aliases.
 
-**Lorentzian**: a laser whose phase is a random walk (FWHM dnu, Gamma = 2 pi dnu), mixed with
-itself after a delay tau [Gallion and Debarge 1984; Richter et al. 1986]. The beat's factor
-exp(i (theta(t - tau) - theta(t))) has the autocorrelation
+**Lorentzian**: a laser whose phase is a random walk (FWHM dnu, Gamma = 2 pi dnu), mixed with itself
+after a delay tau [1]_ [2]_. The beat's factor exp(i (theta(t - tau) - theta(t))) has the
+autocorrelation
 
     exp(-Gamma min(|T|, tau)) = exp(-Gamma tau) + [exp(-Gamma |T|) - exp(-Gamma tau)]_{|T| < tau}
 
-a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest, which is taken at its
-height under the line. A record shorter than the delay sees lags below its
-own length only: there the record's length takes the delay's place in the split.
+which is a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest. The pedestal
+is taken at its height under the line. A record shorter than the delay has only lags below its own
+length; there the record's length replaces the delay.
 
-|X| does not tell a phase that the whole record has, and of what turns with it little at all: of the
-phase, less its mean under the window, the mean of exp(i phi) is the line that |X| sees, and only
-the part of the pedestal in phase with that changes |X| (:func:`apparent_line_and_pedestal`). Both
-are drawn as they
-are where whole spectra are (:func:`phase_walk`). An echo that arrives within the record has the
-line and the pedestal of the samples that it has, told to a 32nd of the record.
+|X| does not depend on a phase common to the full record, and little on the part of the pedestal in
+quadrature to the line. With the phase less its mean under the window, the mean of exp(i phi) is the
+line that |X| shows. Only the part of the pedestal in phase with it changes |X|
+(:func:`apparent_line_and_pedestal`). Full spectra are drawn with both parts (:func:`phase_walk`).
+An echo that arrives within the record has the line and the pedestal of its own samples, in steps of
+1/32 of the record.
+
+References
+----------
+.. [1] Gallion and Debarge, 1984.
+.. [2] Richter et al., IEEE J. Quantum Electron. 22, 2070, 1986.
 """
 
 import math
@@ -55,32 +60,33 @@ MEAN_POWER_TOLERANCE = 1e-12
 """Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
 
 LINE_DEVIATION_MAX_WINDOW_BINS = 500
-"""Standard deviation of a Gaussian line [bins of fs/L] that shifts stand for."""
+"""Largest standard deviation of a Gaussian line [bins of fs/L] that can be simulated."""
 
 
 _gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
 _DECAY_EXPONENT_MAX = 40.0
-"""Gamma T from where exp(-Gamma T) is nothing."""
+"""Gamma T from which exp(-Gamma T) is neglected."""
 
 _DECAY_PER_SAMPLE_MIN = 0.1
-"""Gamma over the sample rate from where lags are taken one by one: 400 of them, then none."""
+"""Gamma over the sample rate above which lags are summed one by one; after 400 lags nothing is
+left."""
 
 _LINE_REACH_DEVIATIONS = 6.0
-"""Standard deviations of a Gaussian line beyond which there is no light to speak of."""
+"""Standard deviations of a Gaussian line beyond which its light is neglected."""
 
 _N_PHASE_NODES = 256
-"""Places of the record at which the mean phase is taken off."""
+"""Number of positions in the record at which the mean phase is subtracted."""
 
 _TINY = 1e-100
-"""Share of a line's power that is none, and by which it can be divided."""
+"""Smallest fraction of a line's power, so that divisions are defined."""
 
 _DENSEST_PEDESTAL_EXPONENT = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
 
 
 class FrequencyShifts(NamedTuple):
-    """Frequencies over which |X|^2 is averaged."""
+    """Frequency shifts over which |X|^2 is averaged."""
 
     offset_window_bins: np.ndarray
     """(n, k): shifts of all lines [bins of fs/L]."""
@@ -89,14 +95,30 @@ class FrequencyShifts(NamedTuple):
 
 
 def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> FrequencyShifts:
-    """Shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
+    """Return shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
 
-    The FWHM is that of the beat's line [Hz], the duration that of the record [s], (n,) each. One
-    shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
-    deviation; weights of 0 fill rows with fewer than k. With step h the error is exp(-2 pi^2 s^2
-    (1/h - 1)^2) at the record's longest lag, by Poisson's summation formula; the Gaussian's tails
-    are cut where they hold as much. An UnsupportedShot for more than
-    :data:`LINE_DEVIATION_MAX_WINDOW_BINS` bins of standard deviation.
+    Parameters
+    ----------
+    fwhm : ndarray (n,)
+        FWHM of the beat's line [Hz].
+    duration : ndarray (n,)
+        Length of the record [s].
+
+    Returns
+    -------
+    FrequencyShifts
+        One shift for a width of 0, 19 for lines narrow against a bin, and 15 more per bin of
+        standard deviation. Weights of 0 fill rows with fewer than k shifts.
+
+    Raises
+    ------
+    UnsupportedShotError
+        If the standard deviation exceeds :data:`LINE_DEVIATION_MAX_WINDOW_BINS` bins.
+
+    Notes
+    -----
+    With step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
+    summation formula. The Gaussian's tails are cut where they hold as much.
     """
     deviation = np.atleast_1d(DEVIATION_PER_FWHM * np.asarray(fwhm, float) * duration)
     if deviation.max(initial=0.0) > LINE_DEVIATION_MAX_WINDOW_BINS:
@@ -117,7 +139,7 @@ def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Freq
         0.0,
     )
     weight[deviation == 0] = np.arange(-n_steps, n_steps + 1) == 0
-    # One after the other, so that zeros beside them, and thus other rows, change no bit.
+    # A cumulative sum, so that padding with zeros, and thus other rows, changes no bit.
     weight /= np.cumsum(weight, axis=1)[:, -1:]
     return FrequencyShifts(deviation[:, None] * position, weight)
 
@@ -125,23 +147,38 @@ def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Freq
 def coherent_power_fraction(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
 ) -> np.ndarray:
-    """Share of the beat's power in the pure line, exp(-2 pi dnu tau), (n,), 0..1.
+    """Return the fraction of the beat's power in the pure line, exp(-2 pi dnu tau), 0..1.
 
-    By the FWHM dnu of the laser's Lorentzian line [Hz], the echo's delay tau [s], and the length of
-    the record [s], which counts where it is shorter.
+    Parameters
+    ----------
+    line_width : ndarray (n,)
+        FWHM dnu of the laser's Lorentzian line [Hz].
+    delay : ndarray (n,)
+        Delay tau of the echo [s].
+    duration : ndarray (n,)
+        Length of the record [s], which replaces a longer delay.
     """
     return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
 
 
 def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Power density of the pedestal under a line of power 1, 2 (1 - e^-g (1 + g)) / Gamma [1/Hz].
+    """Return the power density of the pedestal under a line of power 1 [1/Hz].
 
-    dnu [Hz], > 0, and tau [s]; g = Gamma tau.
+    Parameters
+    ----------
+    line_width : ndarray
+        FWHM dnu [Hz]; 0 gives 0.
+    delay : ndarray
+        Delay tau of the echo [s].
+
+    Notes
+    -----
+    2 (1 - e^-g (1 + g)) / Gamma with g = Gamma tau.
     """
     gamma = 2 * np.pi * np.asarray(line_width, float)
     g = gamma * delay
     bracket = -np.expm1(-g) - g * np.exp(-g)
-    # the bracket would cancel for small g
+    # A series in place of the bracket, which cancels for small g.
     bracket = np.where(g < 0.02, g * g * (1 / 2 - g * (1 / 3 - g * (1 / 8 - g / 30))), bracket)
     return np.where(gamma > 0, 2 * gamma * bracket / np.where(gamma > 0, gamma**2, 1.0), 0.0)
 
@@ -149,16 +186,29 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 def pedestal_power_under_line(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
-    """Mean |X|^2 that the pedestal leaves in its line's bin, over |C|^2 of the line, (n,), >= 0.
+    """Return the mean |X|^2 of the pedestal in its line's bin, over |C|^2 of the line.
 
-    A line of weight C (|C| = a/2) has mean bin power |C|^2 times (coherent share x |W(0)|^2 +
-    this). It adds as noise does: circular, and new in every record. Arguments as of
-    :func:`coherent_power_fraction`.
+    Parameters
+    ----------
+    line_width, delay, duration : ndarray (n,)
+        As of :func:`coherent_power_fraction`.
+    window : Window
+        Window of the record.
 
-    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], r the window's autocorrelation, is taken as it
-    stands where few lags are left of it. Else it is the integral over the lag, by Gauss and
-    Legendre's rule, and what its kinks at no lag and at the delay alias to, in closed form. This is
-    within 2e-5 for delays from 20 samples, 1 % for a delay of less than one sample.
+    Returns
+    -------
+    ndarray (n,)
+        >= 0. A line of weight C (|C| = a/2) has the mean bin power |C|^2 times (coherent fraction x
+        |W(0)|^2 + this). The pedestal adds as noise does: circular, and independent in every
+        record.
+
+    Notes
+    -----
+    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], with the window's autocorrelation r, is summed
+    directly if few lags contribute. Otherwise it is an integral over the lag by Gauss-Legendre
+    quadrature, plus a closed-form correction for aliasing of the integrand's kinks at lag 0 and at
+    the delay. The result is accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a
+    delay below one sample.
     """
     duration = np.asarray(duration, float)
     gamma = 2 * np.pi * np.asarray(line_width, float) * duration
@@ -185,10 +235,10 @@ def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) 
 
 
 def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Integrate over the lag, and correct for what the integrand's kinks alias to.
+    """Integrate over the lag, and correct for the aliasing of the integrand's kinks.
 
-    The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with
-    B_2(x) = x^2 - x + 1/6.
+    The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with B_2(x) = x^2 -
+    x + 1/6.
     """
     length = window.length
     lag_max = np.minimum(lag, _DECAY_EXPONENT_MAX / np.maximum(gamma, 1e-300))
@@ -199,7 +249,7 @@ def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Wind
     )
     correlation = window_autocorrelation(window)
     integrand *= correlation(lag_at_nodes * length) * length * lag_max[:, None] * weight
-    # Jumps of the slope: r'(0) is the window's edge, the rest the bracket's.
+    # Jumps of the slope: r'(0) is that of the window's edge, the others are those of the bracket.
     decay_per_sample, decay_at_delay = gamma / length, np.exp(-gamma * lag)
     kink_at_zero = 2 * (
         correlation(0.0, 1) * (1 - decay_at_delay) - decay_per_sample * correlation(0.0)
@@ -220,17 +270,34 @@ def apparent_line_and_pedestal(
     window: Window,
     looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
+    """Return the line and the pedestal in the line's bin as |X| shows them.
 
-    Returns two values, (n,) each. The first is the share of the power |C W(0)|^2 in the line, more
-    than :func:`coherent_power_fraction`. The second is the mean square of what is in phase with it,
-    over |C|^2 of the line. As noise, half of this is the pedestal's share. If looks are added in
-    amplitude the phase of a record counts too: each has its own.
+    A phase common to the full record is excluded.
 
+    Parameters
+    ----------
+    line_width, delay, duration : ndarray (n,)
+        As of :func:`coherent_power_fraction`.
+    window : Window
+        Window of the record.
+    looks : int
+        Number of looks that are added in amplitude. With several, the phase of each record counts
+        as well.
+
+    Returns
+    -------
+    line_fraction : ndarray (n,)
+        Fraction of the power |C W(0)|^2 in the line; larger than :func:`coherent_power_fraction`.
+    in_phase_pedestal : ndarray (n,)
+        Mean square of the pedestal in phase with the line, over |C|^2. As noise, half of this
+        counts.
+
+    Notes
+    -----
     C(t, s) is the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
-    window w. The line is m = sum w E, and its fellow sum w E w E cosh C - m^2. C(t, s) is
-    c(t - s) - q(t) - q(s), with the triangle c of Gamma (tau - |t|). So each exponential is one of
-    a lag times one of t and one of s: autocorrelations of w and of w exp(2 q), on 256 places.
+    window w. The line is m = sum w E, and the pedestal sum w E w E cosh C - m^2. C(t, s) is c(t -
+    s) - q(t) - q(s), with the triangle c = Gamma (tau - |t|). So each exponential is a product of
+    functions of the lag, of t and of s: autocorrelations of w and of w exp(2 q), at 256 positions.
     """
     power = pedestal_power_under_line(
         line_width=line_width, delay=delay, duration=duration, window=window
@@ -245,6 +312,7 @@ def apparent_line_and_pedestal(
     )
 
     def double_integral_at(t: np.ndarray) -> np.ndarray:
+        """Return the window's double integral at t [records], extended linearly past the record."""
         return np.where(
             t > 1,
             double_integral(1.0) + (t - 1) * double_integral(1.0, 1),
@@ -258,7 +326,7 @@ def apparent_line_and_pedestal(
         + double_integral_at(position - lag_column)
     )
     mean_exponent -= 0.5 * (w * mean_exponent).sum(axis=1)[:, None]
-    # a line that is gone needs no care
+    # A line with no power left needs no correction.
     mean_exponent = np.where(
         (phase_variance[:, None] < _DECAY_EXPONENT_MAX) & (looks == 1), mean_exponent, 0.0
     )
@@ -266,7 +334,7 @@ def apparent_line_and_pedestal(
     sums = (w * single_factor).sum(axis=1), double_factor.sum(axis=1)
     nodes, weight = _gauss_legendre(128)
     lag_at_nodes = 0.5 * (nodes + 1) * lag[:, None]
-    # A transform at a time: bits do not depend on how many there are.
+    # One transform at a time, so that bits do not depend on the number of rows.
     spectra = [np.abs(np.fft.rfft(row, 2 * w.size)) ** 2 for row in double_factor]
     correlation = np.array(
         [
@@ -303,9 +371,9 @@ def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
 
 
 def n_phase_walk_steps(*, delay: float, length: int) -> int:
-    """Return the steps that :func:`phase_walk` takes for a delay [samples], an even number.
+    """Return the even number of steps that :func:`phase_walk` takes for a delay [samples].
 
-    A delay beyond the record counts as its length: the delayed record then shares none of it.
+    A delay beyond the record counts as its length: the delayed record then shares nothing with it.
     """
     return 2 * (length + min(math.floor(delay), length))
 
@@ -313,15 +381,28 @@ def n_phase_walk_steps(*, delay: float, length: int) -> int:
 def phase_walk(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
-    """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
+    """Return the phase theta(t) - theta(t - tau) [rad] of a laser over a record.
 
-    `steps` (walk_steps,) are standard normal numbers, `variance_per_sample` the variance of theta's
-    change
-    from sample to sample, Gamma / fs. `delay` is tau [samples]. With `from_first_sample` the result
-    has the
-    first sample's as well, for a delay shorter than the record. Each step between samples is taken
-    in two, before and after the place in it at which delayed samples lie. So delays need not be
-    whole.
+    Parameters
+    ----------
+    steps : ndarray (n_steps,)
+        Standard normal numbers; :func:`n_phase_walk_steps` gives their number.
+    variance_per_sample : float
+        Variance of theta's change from sample to sample, Gamma / fs [rad^2].
+    delay : float
+        Delay tau [samples].
+    from_first_sample : bool
+        True to include the first sample's phase, for a delay shorter than the record. Otherwise the
+        phase is relative to the first sample's.
+
+    Returns
+    -------
+    ndarray (L,)
+
+    Notes
+    -----
+    Each step between samples is taken in two parts, before and after the time of the delayed
+    sample. So delays need not be integers.
     """
     step_before, step_after = steps.reshape(2, -1)
     fraction = delay - math.floor(delay)
@@ -339,7 +420,7 @@ def phase_walk(
 
 @lru_cache(maxsize=16)
 def window_autocorrelation(window: Window) -> "CubicSpline":
-    """Sum_n w_n w_(n+j) as a function of the lag j, 0..L [samples]."""
+    """Return the function sum_n w_n w_(n+j) of the lag j, 0..L [samples], as a spline."""
     from scipy.interpolate import CubicSpline  # slow to import
 
     spectrum = np.abs(np.fft.rfft(window.samples(), 2 * window.length)) ** 2
@@ -356,7 +437,7 @@ def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Reach of a Gaussian line."""
+    """Return the reach of a Gaussian line; None for other lines."""
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
     return PhaseErrorBound(
@@ -365,12 +446,15 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the detecting bins by leaving the width out.
+    """Bound the change of the detecting bins if the line width is omitted.
 
+    Notes
+    -----
     The mean power under a Gaussian line departs from |X|^2 by at most (2 pi s)^2 var_w (sum |w|)^2,
-    s the deviation and var_w the variance of the place in the record under |w|. A Lorentzian one's
-    pure line keeps exp(-g) of its power, g = Gamma min(tau, T_w); the pedestal is in no bin above
-    sum w^2 (fs S(0) + 1 - exp(-g)), and is noise that comes with the signal.
+    with the standard deviation s of the line and the variance var_w of the position in the record
+    under |w|. The pure line of a Lorentzian keeps exp(-g) of its power, g = Gamma min(tau, T_w).
+    The pedestal is in no bin above sum w^2 (fs S(0) + 1 - exp(-g)), and is noise that comes with
+    the signal.
     """
     if not points.any_nonzero(_WIDTH_PATH):
         return None
@@ -398,6 +482,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
+    """Bound the loss of the pure line and the noise of the pedestal, for a Lorentzian line."""
     line_width, delay = points[_WIDTH_PATH], np.minimum(points.delay, points.record_duration)
     coherent_fraction = coherent_power_fraction(
         line_width=line_width, delay=delay, duration=np.asarray(np.inf)
@@ -408,7 +493,7 @@ def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
     beat_amplitude = points.beat_amplitude * (
         echo_ratio if points.architecture == "direct" else np.sqrt(echo_ratio)
     )
-    cnr = beat_amplitude**2 / points.receiver_noise_variance  # with its image
+    cnr = beat_amplitude**2 / points.receiver_noise_variance  # including its image
     return ErrorBound(
         magnitude_change=1 - np.sqrt(coherent_fraction),
         noise_variance_change=cnr * (points.sample_rate * density + (1 - coherent_fraction)),
@@ -417,7 +502,7 @@ def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
 
 
 def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the apparent line and the pedestal, by the part of the record that an echo has."""
+    """Return the apparent line and pedestal, for the part of the record that holds the echo."""
     looks = shots.looks.n_coherent
     if shots.n_samples_before_echo is None:
         return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
@@ -438,7 +523,14 @@ def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.nda
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Give the beat a Gaussian line; or dim the pure line and add a pedestal of noise."""
+    """Give the beat a Gaussian line; or attenuate the pure line and add a pedestal of noise.
+
+    Raises
+    ------
+    UnsupportedShotError
+        For coherently added looks of a Lorentzian laser, if an echo returns after the record's
+        length.
+    """
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":
         return replace(shots, gaussian_line_width=line_width + np.zeros(shots.size))
@@ -495,3 +587,4 @@ LINE_WIDTH = Effect(
         ),
     ),
 )
+"""Effect of the width of the laser's line."""

@@ -1,6 +1,6 @@
-"""Noise besides the receiver's own: of the echo, the sun, the local oscillator and the ADC.
+"""Noise in addition to the receiver's own: of the echo, the sun, the local oscillator and the ADC.
 
-Each adds a variance at the ADC, and its size is that variance over the receiver's.
+Each effect adds a variance at the ADC. Its error bound is that variance over the receiver's.
 """
 
 from collections.abc import Mapping
@@ -26,17 +26,18 @@ from sweep.model.preparation import (
     Shots,
 )
 
-# The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
-# oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
+# The echo's own shot noise is 2 q M^2 F Re P B_e of the total echo. At short range it is as large
+# as the local oscillator's. It explains the rise of false alarms below some 5 m that [T 4.2]
+# reports.
 
 
 def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
-    """Shot noise of the echo, which the threshold does not follow."""
+    """Return the shot noise of the echo, which the threshold does not follow."""
     return ErrorBound(noise_variance_change=points.echo_noise_ratio, threshold_follows_noise=False)
 
 
 def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
-    """Shot noise of the whole echo."""
+    """Add the shot noise of the total echo, 2 q M^2 F Re P B_e."""
     variance = (
         shots.shot_noise_variance_per_watt
         * shots.echo_power
@@ -53,6 +54,7 @@ SIGNAL_SHOT_NOISE = Effect(
     apply=apply_signal_shot_noise,
     needs_own_batch=False,
 )
+"""Effect of the echo's own shot noise."""
 
 
 _IRRADIANCE_PATH, _SUN_DISTANCE_PATH = "target.solar_irradiance", "target.sun_distance"
@@ -61,19 +63,35 @@ _SUN_ELEVATION_PATH, _FIELD_OF_VIEW_PATH = "target.sun_elevation", RECEIVER_PREF
 SUN_TEMPERATURE = 5772.0
 """Effective temperature of the sun [K], IAU 2015 resolution B3."""
 SUN_RADIUS = 6.957e8
-"""Nominal radius of the sun [m], likewise."""
+"""Nominal radius of the sun [m], IAU 2015 resolution B3."""
 
 
 def solar_irradiance(
     *, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
 ) -> np.ndarray:
-    """Spectral irradiance [W/m^3] of a level surface by a black sun; 0 for a distance of 0.
+    """Return the spectral irradiance of a level surface by the sun as a black body.
 
-    Planck's radiance pi B(wavelength, T) (R / d)^2 sin(elevation).
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m].
+    distance : array_like
+        Distance d from the sun [m]; 0 for no sun.
+    elevation : array_like
+        Elevation of the sun [rad].
+
+    Returns
+    -------
+    ndarray
+        Spectral irradiance [W/m^3]; 0 for a distance of 0.
+
+    Notes
+    -----
+    Planck's radiance: pi B(wavelength, T) (R / d)^2 sin(elevation).
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
-    # 1 / (e^u - 1), written so that it fades to 0 where e^u exceeds what a float holds.
+    # 1 / (e^u - 1), in a form that underflows to 0 where e^u would overflow.
     photons = np.exp(-exponent) / -np.expm1(-exponent)
     exitance = 2 * np.pi * PLANCK * SPEED_OF_LIGHT**2 / x**5 * photons
     dilution = np.where(d > 0, (SUN_RADIUS / np.where(d > 0, d, 1.0)) ** 2, 0.0)
@@ -81,10 +99,13 @@ def solar_irradiance(
 
 
 def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Sunlight [W] that a diffuse surface sends onto the detector, without extinction.
+    """Return the sunlight [W] that a diffuse surface sends to the detector, without extinction.
 
-    Radiance E rho / pi of a surface that fills the field of view, through the aperture, over the
-    field's solid angle and the optical passband; E is the spectral irradiance on it [W/m^3].
+    Notes
+    -----
+    The surface fills the field of view with the radiance E rho / pi, where E is the spectral
+    irradiance [W/m^3]. It is multiplied by the aperture's area, the field's solid angle and the
+    optical passband.
     """
     irradiance = parameters[_IRRADIANCE_PATH] + solar_irradiance(
         wavelength=parameters[LASER_PREFIX + "wavelength"],
@@ -103,7 +124,7 @@ def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Shot noise of sunlight, without the air; the threshold is set on it."""
+    """Return the shot noise of sunlight, without extinction; the threshold follows it."""
     if not points.any_nonzero(_IRRADIANCE_PATH, _SUN_DISTANCE_PATH):
         return None
     return ErrorBound(
@@ -114,7 +135,7 @@ def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
-    """Shot noise of sunlight; the air dims it on its way up."""
+    """Add the shot noise of sunlight, attenuated by the air between target and receiver."""
     presence = context.presence_factor("solar_background")
     light = received_sunlight(context.parameters) * shots.ground_transmission * presence
     return add_noise_sources(
@@ -152,6 +173,7 @@ SOLAR_BACKGROUND = Effect(
         ),
     ),
 )
+"""Effect of the shot noise of sunlight on the target."""
 
 
 _RIN_PATH, _REJECTION_PATH = (
@@ -161,12 +183,15 @@ _RIN_PATH, _REJECTION_PATH = (
 
 
 def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Compute the current variance [A^2] from intensity noise of the local oscillator.
+    """Compute the current variance [A^2] due to intensity noise of the local oscillator.
 
-    One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
-    fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
-    of the ratio of their currents) divides the variance. Both are taken to be flat over the
-    electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
+    Notes
+    -----
+    One diode has (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
+    fluctuation and subtract it, except for their mismatch. The common-mode rejection (in dB 20
+    log10 of the ratio of their currents) divides the variance. Both are assumed to be constant over
+    the electrical bandwidth. The echo's own intensity noise is neglected: it is smaller by P /
+    P_lo.
     """
     current = (
         parameters[RECEIVER_PREFIX + "apd_gain"] * parameters[RECEIVER_PREFIX + "responsivity"]
@@ -178,7 +203,7 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 
 
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Intensity noise, exactly; the threshold is set on it."""
+    """Return the exact intensity noise; the threshold follows it."""
     if points.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
     current_variance = intensity_noise_current_variance(points.parameters)
@@ -190,7 +215,7 @@ def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shots:
-    """Intensity noise of the local oscillator; direct detection has none."""
+    """Add the intensity noise of the local oscillator; direct detection has none."""
     if shots.architecture == "direct":
         return shots
     current_variance = intensity_noise_current_variance(context.parameters)
@@ -222,6 +247,7 @@ RELATIVE_INTENSITY_NOISE = Effect(
         ),
     ),
 )
+"""Effect of fluctuations of the local oscillator's power."""
 
 
 _BITS_PATH = PROCESSING_PREFIX + "bits"
@@ -230,14 +256,14 @@ _BITS_PATH = PROCESSING_PREFIX + "bits"
 def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the noise of rounding, without clipping; the threshold follows it.
 
-    It is white, and is compared with the density of the receiver's noise at the line. A spectrum
-    in which all noise is made white scales a line by the root of both together, where the
-    receiver's alone is left out.
+    It is white, and is compared with the density of the receiver's noise at the line. If a spectrum
+    is whitened, its lines are scaled by the root of both densities together; without the effect, by
+    that of the receiver's alone.
     """
     if not points.any_nonzero(_BITS_PATH):
         return None
     white_noise_ratio = points.quantisation_variance / points.receiver_noise_variance
-    density_min = np.finfo(float).tiny  # the density where filters let nothing pass
+    density_min = np.finfo(float).tiny  # density where filters pass nothing
     relative_density = np.maximum(points.relative_noise_density, density_min)
     magnitude_factor = np.sqrt((1 + white_noise_ratio) / (1 + white_noise_ratio / relative_density))
     return ErrorBound(
@@ -247,7 +273,7 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
-    """White noise of lsb^2/12, where the ADC has a number of bits."""
+    """Add white noise of variance lsb^2/12, if the ADC has a number of bits."""
     parameters, samples_iq = context.parameters, shots.complex_record
     variance = receiver_chain.quantisation_variance(
         full_scale=parameters[PROCESSING_PREFIX + "full_scale"],
@@ -272,3 +298,4 @@ QUANTISATION = Effect(
         ),
     ),
 )
+"""Effect of the ADC's quantisation."""

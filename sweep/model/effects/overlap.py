@@ -1,41 +1,39 @@
-"""Overlap: the echo exists from its delay on and until the chirp ends, within its segment.
+"""Overlap: within its segment, the echo exists from its delay until the chirp ends.
 
-A record of L samples begins at the acquisition delay t_0. The laser's chirp, sent from 0 to T,
-comes back from tau = 2 R / c on, and beats with the chirp that is being sent until this ends. So
-the sample at t holds an echo where
+A record of L samples begins at the acquisition delay t_0. The laser's chirp, transmitted from 0 to
+T, returns from tau = 2 R / c on, and beats with the chirp being transmitted until this ends. So the
+sample at t holds an echo if
 
     tau(t) = tau_0 - beta t <= t <= T.
 
-Records end by T, so that what may lack are the first samples, up to all of them: those before
-t = tau_0 / (1 + beta). They hold noise alone. The window and its sum, the noise of bins and the
-threshold are those of the whole record. Before tau the ground still sends back the segment before
-this one. Its beat sweeps through the receiver's band in nanoseconds, and is left out.
+Records end by T, so only first samples can be missing, up to all of them: those before t = tau_0 /
+(1 + beta). They hold only noise. The window and its sum, the noise of bins and the threshold are
+those of the full record. Before tau the ground still returns the preceding segment. Its beat sweeps
+through the receiver's band in nanoseconds and is neglected.
 
-The line shape is that of the samples that the echo has, with what the window is there:
+The line shape is that of the samples that hold the echo, with the window's values there:
 
     G(y) = sum_{n >= n_0} w_n exp(-2 pi i y n / N),    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s).
 
 For a cosine sum this is a sum of partial Dirichlet kernels. :mod:`sweep.model.spectrum.line_shape`
-has it
-for all phase errors. The peak falls by the window's share before n_0: for a rectangular window to
-1 - n_0 / L of its amplitude. The line grows wider, and its sidelobes fall as 1/y, as the echo
-begins with a step. [T] takes chirps to be far longer than delays, where records that begin at 0 are
-whole (``overlap: off``).
+evaluates it with all phase errors. The peak falls by the window's fraction before n_0: for a
+rectangular window to 1 - n_0 / L of its amplitude. The line becomes wider, and its sidelobes fall
+as 1/y, because the echo begins with a step. [T] assumes chirps far longer than delays, and records
+that begin at 0 and are complete (``overlap: off``).
 
-One n_0 serves all lines of a footprint's segment: that of the beam's axis. A beamlet that is d
-farther away has 2 d f_s / c samples fewer. It serves all looks of a shot as well, that of the
-middle one, between which the range changes. This is left out, and :func:`residual_bound` bounds it.
-It counts
-in what a point's effects leave out (``effects_error``). Places between bins are corrected for n_0
+One n_0, that of the beam's axis, serves all lines of a footprint's segment. A beamlet that is d
+farther away has 2 d f_s / c samples fewer. One n_0, that of the middle look, serves all looks of a
+shot, between which the range changes. Both differences are neglected; :func:`residual_bound` bounds
+the error, which counts in ``effects_error``. Positions between bins are corrected for n_0
 (:func:`sweep.model.detection.sub_bin_interpolation.late_echo_correction`).
 
-Size: c is the largest bin's magnitude over that of all lines on a bin, and b the share of sum |w|
-in the samples that lack. No bin changes by more than b, and so the largest by b / c of itself at
-most. The planner takes sidelobes of leakage and images to be those of the window, and those of a
-rectangular one times the step at n_0. If no sample has an echo nothing is detected, while a bin
-without signal crosses as noise does: there the effect is always kept.
+Error bound: let c be the largest bin's magnitude over that of all lines on a bin, and b the
+fraction of sum |w| in the missing samples. No bin changes by more than b, so the largest changes by
+at most b / c of itself. The planner bounds sidelobes of leakage and images by those of the window
+plus those of a rectangular window times the step at n_0. If no sample holds an echo, nothing is
+detected, while a bin without signal crosses as noise does. The effect is then always kept.
 
-Checks: :mod:`sweep.model.time_domain_truth` gates each sample of each beamlet by its own delay.
+Check: :mod:`sweep.model.time_domain_truth` gates each sample of each beamlet by its own delay.
 """
 
 from dataclasses import replace
@@ -55,7 +53,7 @@ _IMAGED_LINE_MIN = 0.9
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Upper bound on the output change if missing samples are ignored; None if none are missing."""
+    """Bound the output change if missing samples are ignored; None if none are missing."""
     missing = points.missing_samples
     if missing is None:
         return None
@@ -83,7 +81,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if not points.amplitudes_may_add:
         line_share = (
             points.window_response.scalloping_gain(points.bin_offset) - missing.lost_fraction
-        )  # powers: each line by its own share
+        )  # each line loses its own share of power
         lone_bound = np.where(
             line_share > 0, np.minimum(bound / np.maximum(line_share, 1e-300), 1.0), 1.0
         )
@@ -107,9 +105,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Bound the error of one first sample, the axis's at the middle look, for all beamlets.
+    """Bound the error of a common first sample, the axis's at the middle look, for all beamlets.
 
-    Relative to the magnitude that all lines make on a bin, by segment.
+    Returns
+    -------
+    ndarray (segments, n)
+        Error relative to the magnitude that all lines together have on a bin.
     """
     missing = points.missing_samples
     assert missing is not None
@@ -129,14 +130,14 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
     extra_samples_mean = (
         points.sample_rate * points.delay * np.minimum(mean_range, 1e3) + look_drift_samples
     )
-    # Numbers of samples are whole: those of two delays differ by up to one more.
+    # Numbers of samples are integers: those of two delays differ by up to one more.
     whole_samples = np.where(extra_samples_max > 0, extra_samples_mean + 1, 0.0)
-    # Of none of the samples, and of all, the same lack at delays that are close.
+    # If no samples or all samples are missing, the same are missing at nearby delays.
     samples_to_echo = points.sample_rate * (points.delay - points.acquisition_delay)
     record_starts_inside = (samples_to_echo + extra_samples_max > -1) & (
         samples_to_echo - extra_samples_max < points.window.length + 1
     )
-    # The few samples change all bins alike, and the image at negative frequency does so as well.
+    # A few samples change all bins equally; the factor 2 includes the image at negative frequency.
     bound = (
         2 * window_max_near(points.window, missing.n_missing, extra_samples_max + 1) * whole_samples
     )
@@ -145,7 +146,7 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Set ``first_sample``: the number of record samples before the echo, by segment."""
+    """Set ``n_samples_before_echo``: the number of record samples before the echo, by segment."""
     n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]
@@ -170,3 +171,4 @@ OVERLAP = Effect(
     error_bound=error_bound,
     apply=apply,
 )
+"""Effect of echoes that arrive after the record has begun."""

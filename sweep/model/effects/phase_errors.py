@@ -1,52 +1,54 @@
-"""Phase errors over the record: the target moves, its velocity drifts, the sweep is not straight.
+"""Phase errors over the record: range walk, acceleration, and nonlinearity of the sweep.
 
-Each has a phase psi(t) [cycles], added to the beat of every line (PHYSICS section 2), and a smear,
-its polynomial in the place x in the record, from which its size follows.
+Each effect has a phase psi(t) [cycles], added to the beat of every line (PHYSICS section 2). It
+also has a phase-error bound, a polynomial in the position x in the record, from which its error
+bound follows.
 
-Range walk and acceleration are all terms in t^2 and beyond of a target whose delay is
-tau(t) = tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
+Range walk and acceleration are all terms in t^2 and beyond of a target whose delay is tau(t) =
+tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
 
     psi(t) = s S beta (1 + beta / 2) t^2                                                range walk
     psi(t) = f_seg alpha t^2 + s S [ -tau_0 alpha t^2 + alpha (1 + beta) t^3 + alpha^2 t^4 / 2 ]
 
-the first a frequency drift of 2 s S (2 v_r / c), of opposite sign in up and down chirp, none in the
-Doppler segment. The second is mostly one of 2 a / lambda, positive when the radial velocity grows.
-Half of the first comes from the range, half from the chirp's rising Doppler shift. If the range
-along the beam falls at another speed u than v_r, as the beam slides over slanting ground, its own
-half follows u: s S (u - v_r) / c t^2 more. Time runs from the segment's start: the line moves by
-the drift up to the middle of the record and spreads over what drifts within it.
+Range walk is a frequency drift of 2 s S (2 v_r / c), of opposite sign in up- and down-chirp, and 0
+in the Doppler segment. Half of it comes from the range, half from the chirp's rising Doppler shift.
+Acceleration is mostly a drift of 2 a / lambda, positive when the radial velocity grows. If the beam
+slides over sloping ground, the range along the beam falls at a speed u that differs from v_r. The
+range's half then follows u, which adds s S (u - v_r) / c t^2. Time starts at the segment's start:
+the line moves by the drift up to the middle of the record and spreads over the drift within it.
 
 A sweep departs from a straight line by e(x) [Hz], a property of the laser's tuning. It is a
-function of the place u along the sweep, -1 at the lowest and 1 at the highest frequency, so that
-the down-chirp runs through it backwards:
+function of the position u along the sweep, -1 at the lowest and 1 at the highest frequency, so that
+the down-chirp passes it backwards:
 
     e = q T_2(u) + k T_3(u) + p sin(pi m u),    u = s (2 t / T - 1)
 
-T_2 = 2 u^2 - 1 and T_3 = 4 u^3 - 3 u are a square and a cube less the best straight line, with peak
-1. The number m is the number of periods over the sweep. With E the integral of e over time, the
-beat (delayed wave less local oscillator) gains exactly
+T_2 = 2 u^2 - 1 and T_3 = 4 u^3 - 3 u are a square and a cube less their best straight lines, with
+peak 1. The number m is the number of periods over the sweep. With E the integral of e over time,
+the beat (delayed wave less local oscillator) gains exactly
 
     psi(t) = E(t - tau(t)) - E(t),    tau(t) = tau_0 - beta t
 
-about -tau e(t): nothing at no range, and the more the farther. The Doppler segment has no sweep.
-An error that was measured comes as a table, of frequency errors by the time in the up-chirp. It is
-fitted once by a Chebyshev series (:mod:`sweep.model.effects.sweep_error_table`), whose integral
-over the delay is exact.
+about -tau e(t): 0 at range 0, and growing with range. The Doppler segment has no sweep. A measured
+error is a table of frequency errors over the time in the up-chirp. It is fitted once by a Chebyshev
+series (:mod:`sweep.model.effects.sweep_error_table`), whose integral over the delay is exact.
 
-Sizes: w is real and even about the record's middle. A phase error has an odd and an even part, phi
-= o(x) + e(x); a constant does not matter. It changes a line's spectrum W(y), real but for the
-factor exp(-i pi y) and the unpaired first sample w_0, by A + i B, all relative to sum w:
+Error bounds: w is real and even about the record's middle. A phase error has an odd and an even
+part, phi = o(x) + e(x); a constant does not matter. A line's spectrum W(y) is real except for the
+factor exp(-i pi y) and the unpaired first sample w_0. The phase error changes it by A + i B, where
+relative to sum w
 
     |A| <= a = <|o| + e^2 / 2>      |B| <= b = <|e|>      < > the mean weighted with |w| / sum w
 
-The largest bin has M >= c: the scalloping loss for one line; for several that add as powers the
-root of the largest bin's share of all power, by the triangle inequality of their bins. So
+The largest bin has M >= c. For one line c is the scalloping loss. For several lines that add as
+powers it is the root of the largest bin's fraction of all power, by the triangle inequality of
+their bins. So
 
     1 - (a + b |w_0| / c) / c  <=  M' / M  <=  sqrt((1 + a/c)^2 + (2 b |w_0| + b^2) / c^2)
 
-An even error, as a drift has within the record, thus counts in the second order. Lines that add as
+An even error, as a drift within the record, thus counts in second order. Lines that add as
 amplitudes, or with their own images, change by <|phi|> of the sum of their amplitudes, whatever
-they make together.
+their sum is.
 """
 
 import math
@@ -66,31 +68,34 @@ from sweep.model.preparation import CHIRP_PREFIX, PhaseError, Shots
 from sweep.model.window import Window, window_samples
 
 _N_NODES = 256
+"""Number of positions in the record for means under the window."""
 _RADIANS_PER_CYCLE = 2 * math.pi
+"""Factor 2 pi."""
 _IMAGED_LINE_MIN = 0.9
-"""Least that an image far away leaves of a line whose amplitude it adds to."""
+"""Smallest fraction of a line's amplitude that remains when a distant image is added to it."""
 
 
 class WindowMoments(NamedTuple):
-    """Means of powers of x over a window's |w| / sum w, by power 1..4, and what else is needed."""
+    """Means of powers 1..4 of the position x under a window's |w| / sum w, and related numbers."""
 
     mean_absolute: tuple[float, ...]
-    """<|x^k|> of odd powers, <|x^k - <x^k>|> of even ones."""
+    """<|x^k|> of odd powers, <|x^k - <x^k>|> of even powers."""
     root_mean_square: tuple[float, ...]
-    """Root of <(x^k - <x^k>)^2> of even powers, 0 of odd ones."""
+    """Square root of <(x^k - <x^k>)^2> of even powers, 0 of odd powers."""
     linear_slope: tuple[float, ...]
-    """Slope of the best straight line of odd powers, 0 of even ones; last, of what is within 1."""
+    """Slope of the best straight line to odd powers, 0 for even powers; last, that to any function
+    within -1..1."""
     magnitude_sum: float
     """Sum |w| over sum w, >= 1."""
     first_weight: float
     """|w_0| over sum w."""
     position_variance: float
-    """Of the place in the record, in records, under |w|."""
+    """Variance of the position in the record under |w| [records^2]."""
 
 
 @lru_cache(maxsize=16)
 def window_moments(window: Window) -> WindowMoments:
-    """Means that sizes of phase errors need of a window."""
+    """Compute the means under a window that bounds of phase errors need."""
     node = (2 * np.arange(_N_NODES) + 1) / _N_NODES - 1
     w = window_samples(window.name, window.length)
     sample_position = 2 * np.arange(window.length + 1) / window.length - 1
@@ -121,7 +126,20 @@ def window_moments(window: Window) -> WindowMoments:
 def phase_over_record(
     points: PlannerInputs, coefficient_by_power: Mapping[int, np.ndarray]
 ) -> PhaseErrorBound:
-    """Polynomial in the place in the record of a phase sum_j c_j t^j, c_j [cycles/s^j] by j."""
+    """Return the polynomial in the record's position x of a phase sum_j c_j t^j.
+
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of a tile.
+    coefficient_by_power : mapping
+        Coefficients c_j [cycles/s^j] by power j of the time since the segment's start.
+
+    Returns
+    -------
+    PhaseErrorBound
+        Magnitudes of the coefficients of x^0..x^4.
+    """
     half_duration = 0.5 * points.record_duration
     record_middle = points.acquisition_delay + half_duration
     polynomial: list[np.ndarray | float] = [0.0] * 5
@@ -135,7 +153,7 @@ def phase_over_record(
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
-    """<|phi|>, by which any bin of a line changes at most, relative to its peak."""
+    """Return <|phi|>, the largest change of any bin of a line relative to its peak."""
     moments = window_moments(window)
     total = phase_bound.non_polynomial * moments.magnitude_sum
     for value, mean in zip(phase_bound.coefficients, moments.mean_absolute, strict=True):
@@ -144,10 +162,10 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 
 
 def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
-    """Part of a phase error in sums of amplitudes, lines and images, as of :class:`ErrorBound`.
+    """Return a phase error's change of sums of amplitudes of lines and images, as of `ErrorBound`.
 
-    Lines next to their images change by the phase in the record's middle too, and so does a line by
-    what an image far away adds to it.
+    Lines next to their images also change by the phase in the record's middle, and so does a line
+    to which a distant image is added.
     """
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
@@ -165,7 +183,20 @@ def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -
 
 
 def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
-    """Size of one of the phase errors, whichever of the others are there."""
+    """Bound the change if one of the phase errors is omitted, whichever of the others are present.
+
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of a tile, whose `phase_error_bounds` are known.
+    name : str
+        Name of the effect.
+
+    Returns
+    -------
+    ErrorBound or None
+        None if the effect is absent. The module's description has the equations.
+    """
     own_bound = points.phase_error_bounds.get(name)
     if own_bound is None:
         return None
@@ -195,7 +226,8 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
         )
         turned_by_others = mean_phase_bound(own_bound, points.window) * np.minimum(others_far, 2.0)
     missing = points.missing_samples
-    if missing is not None:  # what lacks of the record is not turned; the rest has another middle
+    # Missing samples have no phase error, and the centroid of the remaining samples moves.
+    if missing is not None:
         others_phase = others_phase + missing.lost_fraction
         turned_by_others = turned_by_others + missing.lost_fraction * np.minimum(
             _RADIANS_PER_CYCLE * (sum(own_bound.coefficients) + own_bound.non_polynomial), 2.0
@@ -236,18 +268,19 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
 def _add_phase_error(
     shots: Shots, phase_function: Callable[..., np.ndarray], **values: Any
 ) -> Shots:
-    """Shots with a further phase error."""
+    """Return shots with an additional phase error."""
     phase_error = PhaseError(phase_function, values | shots.echo_record_times)
     return replace(shots, phase_errors=(*shots.phase_errors, phase_error))
 
 
 def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
-    """Time since the segment's start [s] at places x of the record, (n, m)."""
+    """Return the times since the segment's start [s] at positions x of the record, (n, m)."""
     start, duration = np.atleast_1d(start), np.atleast_1d(duration)
     return start[:, None] + duration[:, None] * (np.asarray(position) + 1) / 2
 
 
 def _as_column(value: np.ndarray) -> np.ndarray:
+    """Return a value as a column, (n, 1) or (1, 1)."""
     return np.atleast_1d(np.asarray(value, float))[:, None]
 
 
@@ -261,10 +294,28 @@ def range_walk_phase(
     duration: np.ndarray,
     slide: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Phase [cycles] that range walk adds to the line's, (n, m), at places x (m,) of the record.
+    """Return the phase that range walk adds to the line's.
 
-    ``slide`` is the speed [m/s] by which the range along the beam falls faster than at the radial
-    velocity at the segment's start.
+    Parameters
+    ----------
+    position : ndarray (m,)
+        Positions x in the record, -1..1.
+    sign : int
+        Sign s of the chirp; 0 for the Doppler segment.
+    chirp_rate : ndarray
+        Chirp rate S [Hz/s].
+    radial_velocity : ndarray (n,)
+        Radial velocity v_r [m/s].
+    start, duration : ndarray
+        Start since the segment's start, and duration, of the echo's record [s].
+    slide : ndarray or float
+        Speed u - v_r [m/s] by which the range along the beam falls faster than at the radial
+        velocity at the segment's start.
+
+    Returns
+    -------
+    ndarray (n, m)
+        s S (beta (1 + beta / 2) + (u - v_r) / c) t^2 [cycles].
     """
     doppler_ratio = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
     drift_rate = (
@@ -277,7 +328,7 @@ def range_walk_phase(
 
 
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that range walk adds over the record; None where there is none."""
+    """Return the phase that range walk adds over the record; None without range walk."""
     slide_speed = points.approach_speed - points.radial_velocity
     doppler_ratio = points.doppler_ratio + points.doppler_ratio_growth
     drift_ratio = doppler_ratio * (1 + doppler_ratio / 2) + slide_speed / SPEED_OF_LIGHT
@@ -289,7 +340,13 @@ def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
-    """Let the beats of the two chirps drift over the record: at t, to that of R - 2 v_r t."""
+    """Let the beats of the two chirps drift over the record, as the range falls.
+
+    Notes
+    -----
+    The beat at t is that of the range R - 2 v_r t: half of the drift comes from the range, half
+    from the chirp's rising Doppler shift.
+    """
     velocity, slide = (
         shots.motion_by_segment["radial_velocity"],
         shots.approach_speed - shots.radial_velocity,
@@ -301,9 +358,10 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
 
 
 def chirp_drift_time(shots: Shots) -> np.ndarray:
-    """Slope of t^2 over the records that the echo has of both chirps [s], (n,) or scalar.
+    """Return the mean slope of t^2 over the records of both chirps [s], (n,) or scalar.
 
-    That of the best straight line under the window: twice the time of the middle of a whole record.
+    It is the slope of the best straight line under the window, over the samples that hold the echo.
+    For a full record this is twice the time of its middle.
     """
     drift_time = 2 * shots.acquisition_delay + shots.record_duration
     if shots.n_samples_before_echo is None:
@@ -316,9 +374,10 @@ def chirp_drift_time(shots: Shots) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _square_slope_by_first_sample(window: Window) -> np.ndarray:
-    """Slope of the best line to x^2 over the samples from each on, (L + 1,), under the window.
+    """Return the slope of the best line to x^2 over the samples from each one on, (L + 1,).
 
-    The places x of all samples are -1..1, whose slope is 0.
+    Samples are weighted by the window. The positions x of all samples are -1..1, for which the
+    slope is 0.
     """
     position = 2 * np.arange(window.length) / window.length - 1
     powers = (window.samples() * position**exponent for exponent in range(4))
@@ -343,6 +402,7 @@ RANGE_WALK = Effect(
     phase_error_bound=range_walk_phase_bound,
     apply=apply_range_walk,
 )
+"""Effect of the drift of the beat as the target moves."""
 
 
 _ACCELERATION_PATH = "target.acceleration"
@@ -360,7 +420,26 @@ def acceleration_phase(
     start: np.ndarray,
     duration: np.ndarray,
 ) -> np.ndarray:
-    """Phase [cycles] that acceleration adds to the beat, (n, m); values at the segment's start."""
+    """Return the phase that acceleration adds to the beat.
+
+    Parameters
+    ----------
+    position : ndarray (m,)
+        Positions x in the record, -1..1.
+    sign : int
+        Sign s of the chirp; 0 for the Doppler segment.
+    carrier, chirp_rate : ndarray
+        Carrier f_seg [Hz] and chirp rate S [Hz/s].
+    range, radial_velocity, acceleration : ndarray (n,)
+        Values at the segment's start [m, m/s, m/s^2].
+    start, duration : ndarray
+        Start since the segment's start, and duration, of the echo's record [s].
+
+    Returns
+    -------
+    ndarray (n, m)
+        alpha t^2 (f_seg + s S (-tau_0 + (1 + beta) t + alpha t^2 / 2)) [cycles].
+    """
     alpha = _as_column(np.asarray(acceleration) / SPEED_OF_LIGHT)
     beta = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT)
@@ -371,7 +450,7 @@ def acceleration_phase(
 
 
 def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that acceleration adds over the record; None where there is none."""
+    """Return the phase that acceleration adds over the record; None without acceleration."""
     if not points.any_nonzero(_ACCELERATION_PATH):
         return None
     alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT
@@ -385,7 +464,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin by its drift, in a record and over looks that are added."""
+    """Bound the change of the largest bin by drift within a record and over coherent looks.
+
+    The loss of looks that are added in amplitude is exact.
+    """
     bound = phase_omission_bound(points, "acceleration")
     if bound is None or points.looks.n_coherent == 1:
         return bound
@@ -434,6 +516,7 @@ ACCELERATION = Effect(
         ),
     ),
 )
+"""Effect of the drift of the Doppler frequency."""
 
 
 _ERROR_SHAPES = ("quadratic", "cubic", "sinusoidal")
@@ -453,17 +536,39 @@ def error_table_phase(
     start: np.ndarray,
     duration: np.ndarray,
 ) -> np.ndarray:
-    """Phase [cycles] that a measured error of the sweep adds to the beat, (n, m).
+    """Return the phase that a measured error of the sweep adds to the beat.
 
-    The down-chirp runs through the table backwards. Before its first row and after its last the
-    error stays what it is there.
+    Parameters
+    ----------
+    position : ndarray (m,)
+        Positions x in the record, -1..1.
+    table : SweepErrorTable
+        Measured frequency error over the time in the up-chirp.
+    sign : int
+        Sign s of the chirp; 0 for the Doppler segment.
+    chirp_duration : ndarray
+        Duration of the chirp [s].
+    range, radial_velocity : ndarray (n,)
+        Values at the segment's start [m, m/s].
+    start, duration : ndarray
+        Start since the segment's start, and duration, of the echo's record [s].
+
+    Returns
+    -------
+    ndarray (n, m)
+        E(t - tau(t)) - E(t) [cycles].
+
+    Notes
+    -----
+    The down-chirp passes the table backwards. Before the first row and after the last the error is
+    constant.
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
     t = record_times(position, start=start, duration=duration)
     doppler_ratio = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _as_column(2 * np.asarray(range) / SPEED_OF_LIGHT) - doppler_ratio * t
-    sweep_time = t if sign > 0 else _as_column(chirp_duration) - t  # in the up-chirp
+    sweep_time = t if sign > 0 else _as_column(chirp_duration) - t  # time in the up-chirp
     return -sign * table.integrate_error(sweep_time - sign * delay, sweep_time)
 
 
@@ -481,9 +586,29 @@ def chirp_nonlinearity_phase(
     start: np.ndarray,
     duration: np.ndarray,
 ) -> np.ndarray:
-    """Phase [cycles] that the sweep's error adds to the beat, (n, m).
+    """Return the phase that the sweep's analytic error adds to the beat.
 
-    Peaks q, k and p [Hz], either sign, and periods m > 0 of the last over a sweep of length T [s].
+    Parameters
+    ----------
+    position : ndarray (m,)
+        Positions x in the record, -1..1.
+    sign : int
+        Sign s of the chirp; 0 for the Doppler segment.
+    chirp_duration : ndarray
+        Duration T of the chirp [s].
+    range, radial_velocity : ndarray (n,)
+        Values at the segment's start [m, m/s].
+    quadratic, cubic, sinusoidal : ndarray
+        Peaks q, k and p of the error [Hz], of either sign.
+    periods : ndarray
+        Number m > 0 of periods of the sine over the sweep.
+    start, duration : ndarray
+        Start since the segment's start, and duration, of the echo's record [s].
+
+    Returns
+    -------
+    ndarray (n, m)
+        E(t - tau(t)) - E(t) [cycles].
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
@@ -493,8 +618,9 @@ def chirp_nonlinearity_phase(
     sweep_duration, periods = _as_column(chirp_duration), _as_column(periods)
     u = sign * (2 * t / sweep_duration - 1)
     h = -sign * 2 * (delay - doppler_ratio * t) / sweep_duration
-    # The integral of e over u from u to u + h, in forms whose terms do not cancel for small h: the
-    # mean of T_2 and T_3 over a step about its middle; that of a sine is sinc times it.
+    # The integral of e from u to u + h, in forms that do not cancel for small h: h times the mean
+    # of T_2 and T_3 over the step about its middle; the mean of a sine is sinc times its middle
+    # value.
     step_middle, squared_step = u + h / 2, h * h
     mean_error = _as_column(quadratic) * (2 * step_middle**2 - 1 + squared_step / 6)
     mean_error = mean_error + _as_column(cubic) * step_middle * (
@@ -506,10 +632,10 @@ def chirp_nonlinearity_phase(
 
 
 def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that the sweep's error adds over the record; None where there is none.
+    """Return the phase that the sweep's error adds over the record; None without an error.
 
-    Square and cube are polynomials in the place in the record; the sine and what a table departs
-    from the middle of its span are taken at their largest.
+    Square and cube are polynomials in the position in the record. The sine, and a table's departure
+    from the middle of its span, are taken at their largest.
     """
     table_text = points.option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_ERROR_PEAK_PATHS):
@@ -562,7 +688,7 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
 
 
 def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> PhaseErrorBound:
-    """Phase of a table's error e, about -tau e, by the middle of its span, the rest and e'."""
+    """Bound the phase -tau e of a table's error e, by the middle of its span, the rest, and e'."""
     position = np.cos(np.linspace(0, np.pi, 16 * table.chebyshev_coefficients.size + 1))
     errors, slope_coefficients = (
         table.frequency_error(position),
@@ -591,7 +717,7 @@ def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> P
 def _polynomial_product(
     first: Sequence[ArrayOrFloat], second: Sequence[ArrayOrFloat]
 ) -> list[ArrayOrFloat]:
-    """Coefficients of a product of polynomials, lowest power first."""
+    """Return the coefficients of a product of polynomials, lowest power first."""
     product: list[ArrayOrFloat] = [0.0] * (len(first) + len(second) - 1)
     for i, a in enumerate(first):
         for j, b in enumerate(second):
@@ -600,7 +726,7 @@ def _polynomial_product(
 
 
 def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
-    """Add the sweep's error to the record of the two chirps."""
+    """Add the sweep's error to the records of the two chirps."""
     parameters, phase_inputs = (
         context.parameters,
         {"chirp_duration": shots.chirp_duration, **shots.motion_by_segment},
@@ -659,3 +785,4 @@ CHIRP_NONLINEARITY = Effect(
         ),
     ),
 )
+"""Effect of the sweep's departure from a straight line."""

@@ -1,20 +1,21 @@
-"""Pointing jitter over a plane: a random turn of the beam, draw by draw.
+"""Pointing jitter over a plane: a random rotation of the beam in each draw.
 
-The beam is thrown off by two independent normal angles of deviation sigma, a in the plane of
-incidence (towards grazing) and b across it. From the same height over the same plane it then meets
+The beam is deflected by two independent normal angles of standard deviation sigma: a in the plane
+of incidence (towards grazing) and b across it. From the same height over the same plane it then
+meets
 
     sin(grazing') = sin(grazing) cos(t) - a cos(grazing) sin(t)/t,     t^2 = a^2 + b^2
     range' = range sin(grazing) / sin(grazing'),
 
-to first order range (1 + a cot(grazing)); along the normal, range (1 + t^2/2). The instrument
-knows nothing of it: its reports are of the turned beam.
+to first order range (1 + a cot(grazing)); along the normal, range (1 + t^2/2). The instrument does
+not know the deflection: its reports are those of the deflected beam.
 
-It acts before everything else, on the geometry of a draw, from which echo, lines and noise follow
-as ever; the footprint turns with its axis. If phases follow the geometry, the footprint of
-every draw fades anew.
+The effect changes the geometry of a draw before anything else, and echo, lines and noise follow
+from that geometry. The footprint turns with its axis. If phases follow the geometry, the footprint
+of every draw fades independently.
 
-Of the velocity, a plane's target gives what lies along the beam. The velocity across may be given
-too. The turned beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
+The target's radial velocity is the component along the beam; the component across it may be stated
+too. The deflected beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
 """
 
 import math
@@ -32,24 +33,24 @@ from sweep.model.effects.planner_inputs import (
 )
 
 RARE_DRAW_PROBABILITY = 1e-6
-"""Probability of a draw whose beam is further off than its size takes it to be."""
+"""Probability of a draw whose deflection exceeds that assumed by the error bound."""
 
 _JITTER_PATH = "target.pointing_jitter"
 
 
 class PerturbedGeometry(NamedTuple):
-    """Geometry of a turned beam, each of the broadcast shape; nan where it misses the plane."""
+    """Geometry of a deflected beam, in the broadcast shape; nan where the beam misses the plane."""
 
     range: np.ndarray
-    """[m]"""
+    """Range [m]."""
     grazing_angle: np.ndarray
-    """[rad]"""
+    """Grazing angle [rad]."""
     radial_velocity: np.ndarray
-    """[m/s], positive when closing."""
+    """Radial velocity [m/s], positive when closing."""
 
 
 def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
-    """Angles (a, b) by which beams of this standard deviation are off, (n, 2) [rad]."""
+    """Draw the deflection angles (a, b) of beams for a standard deviation [rad], (n, 2) [rad]."""
     from sweep.model.sampling.philox import STREAM_POINTING_JITTER, to_normals_by_row, uniforms
 
     uniform_draws = uniforms(
@@ -66,11 +67,22 @@ def perturb_geometry(
     jitter_angles: np.ndarray,
     transverse_velocity: ArrayLike = (0.0, 0.0),
 ) -> PerturbedGeometry:
-    """Geometry of beams that are off by some angles (..., 2) [rad].
+    """Compute the geometry of deflected beams.
 
-    Range, grazing angle and velocity [m, rad, m/s] are those of the axis as aimed; they broadcast
-    against the angles' leading axes. The angles are a, positive towards grazing (upwards), and b,
-    and `transverse_velocity` (..., 2) the instrument's velocity along their directions [m/s].
+    Parameters
+    ----------
+    range, grazing_angle, radial_velocity : array_like
+        Values of the axis as aimed [m, rad, m/s]; they broadcast against the leading axes of the
+        angles.
+    jitter_angles : ndarray (..., 2)
+        Deflections [rad]: a, positive towards grazing (upwards), and b across.
+    transverse_velocity : array_like (..., 2)
+        Velocity of the instrument along the directions of a and b [m/s].
+
+    Returns
+    -------
+    PerturbedGeometry
+        Equations of the module's description.
     """
     aimed_grazing, offsets = np.asarray(grazing_angle, float), np.asarray(jitter_angles, float)
     total_angle = np.hypot(offsets[..., 0], offsets[..., 1])
@@ -91,9 +103,10 @@ def perturb_geometry(
 
 
 def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
-    """Ratio of ranges, less 1, and bins by which lines move, by the furthest turn but for few.
+    """Return the largest relative change of range and shift of lines [bins], in all but rare draws.
 
-    Down to the lowest beamlets; infinite where one may pass over the horizon.
+    The lowest beamlets are included; the change of range is infinite if one may pass over the
+    horizon.
     """
     turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
     rim_angle: np.ndarray | float = 0.0
@@ -123,18 +136,20 @@ def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Reach of lines that draws throw off."""
+    """Return the reach of lines that draws shift; None without jitter."""
     if not points.any_nonzero(_JITTER_PATH):
         return None
     return PhaseErrorBound(extra_shift_window_bins=_largest_turn(points)[1] / points.padding_factor)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change by leaving jitter out in all draws but few.
+    """Bound the change if jitter is omitted, in all but rare draws.
 
-    Echo powers go by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
-    footprint whose phases follow its geometry may fade altogether, or not any more, and so may
-    lines with their images: of those nothing is known.
+    Notes
+    -----
+    Echo powers change by the cube of the ratio of ranges (1/R^2 and at most Lambert's cosine). A
+    footprint whose phases follow its geometry may start or stop fading, and so may lines with their
+    images. Nothing is known of those.
     """
     if not points.any_nonzero(_JITTER_PATH):
         return None
@@ -145,7 +160,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     )
     is_unknown = points.may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0
-    if points.amplitudes_may_add:  # a line turns against its image as the range changes
+    if points.amplitudes_may_add:  # the phase between line and image changes with range
         turned_cycles = points.carriers * points.delay * np.minimum(range_ratio, 1e6)
         coherent_change = points.image_bound * np.minimum(4 * math.pi * turned_cycles, 2.0)
     return ErrorBound(
@@ -159,12 +174,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def perturb_parameters(
     parameters: dict[str, np.ndarray], draw_addresses: DrawAddresses
 ) -> dict[str, np.ndarray]:
-    """Range, grazing angle and velocities of beams that are off; no echo where they miss."""
+    """Draw range, grazing angle and velocity of deflected beams; no echo if they miss the plane."""
     jitter_angles = draw_jitter_angles(draw_addresses, parameters[_JITTER_PATH])
     transverse_velocity = np.zeros_like(jitter_angles)
     transverse_velocity[:, 0] = -parameters[
         "target.transverse_velocity"
-    ]  # towards the near side is off grazing
+    ]  # towards the near side is away from grazing
     aimed_geometry = {name: parameters[f"target.{name}"] for name in PerturbedGeometry._fields}
     perturbed = perturb_geometry(
         jitter_angles=jitter_angles, transverse_velocity=transverse_velocity, **aimed_geometry
@@ -195,3 +210,4 @@ POINTING_JITTER = Effect(
         ),
     ),
 )
+"""Effect of random deflections of the beam from shot to shot."""

@@ -1,18 +1,19 @@
 """Saturation: a record beyond the ADC's full scale is clipped.
 
-A beat of amplitude A with Gaussian noise of deviation s is cut at +-V. As a memoryless law on a
-sine it leaves [Blachman, IRE Trans. Inf. Theory 10 (1964) 162, in the manner of Bussgang]
+A beat of amplitude A with Gaussian noise of standard deviation s is clipped at +-V. As a memoryless
+nonlinearity on a sine, clipping leaves [Blachman, IRE Trans. Inf. Theory 10 (1964) 162, in the
+manner of Bussgang]
 
-- the line, by the gain  2/A <m(A sin t) sin t>, where m(x) is the mean of x + n once clipped and
-  < > the mean over the phase t;
-- odd harmonics, amplitudes 2 <m(A sin t) sin(k t)>, folded at Nyquist, which are left out;
-- noise, white still, by the mean of the clipped noise's variance over s^2.
+- the line, with the gain  2/A <m(A sin t) sin t>, where m(x) is the mean of x + n after clipping
+  and < > the mean over the phase t;
+- odd harmonics of amplitudes 2 <m(A sin t) sin(k t)>, folded at Nyquist, which are neglected;
+- noise, still white, by the mean of the clipped noise's variance over s^2.
 
-For s -> 0 and r = V/A < 1 the gain is 2/pi (asin r + r sqrt(1 - r^2)) and noise passes for the
-share 2/pi asin(r) of the time.
+For s -> 0 and r = V/A < 1 the gain is 2/pi (asin r + r sqrt(1 - r^2)), and noise passes during the
+fraction 2/pi asin(r) of the time.
 
-The record is taken for one sine of constant amplitude; a footprint that spreads over bins makes
-an envelope that changes over the record, which clips less than its peak says.
+The record is taken as one sine of constant amplitude. A footprint that spreads over bins has an
+envelope that varies over the record, which clips less than its peak indicates.
 """
 
 import math
@@ -33,19 +34,19 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
 _CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
-"""Point at which the quarter of a period is cut, in deviations of the noise off full scale: the
-integrands are smooth in between.
-"""
+"""Voltages at which the quarter period is split, in noise deviations from full scale; the
+integrands are smooth in between."""
 _TINY = 1e-30
-"""Stands for what is no more than positive."""
+"""Smallest amplitude, which stands for 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100
+"""Voltage that stands for no limit."""
 _AMPLITUDE_MIN_SIGMA = 1e-5
-"""Deviations of the noise below which beats are taken for that strong: their gain is the same to
-the square of this, and could not be told from the rounding of 1."""
+"""Smallest amplitude [noise deviations]. The gain of weaker beats is the same to the square of this
+number, and could not be separated from the rounding of 1."""
 
 
 class ClippingGains(NamedTuple):
-    """A sine with noise once it is clipped, (n,) each."""
+    """Gains of a sine with noise due to clipping, (n,) each."""
 
     signal_gain: np.ndarray
     """Factor on the line's amplitude, 0..1."""
@@ -56,10 +57,21 @@ class ClippingGains(NamedTuple):
 def clipping_gains(
     *, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike
 ) -> ClippingGains:
-    """Gain of line and noise by clipping, from voltages at the ADC [V], > 0, (n,) or scalars.
+    """Compute the gains of line and noise by clipping.
 
-    They are the beat's amplitude, the noise's deviation, and the largest voltage that does not
-    clip, to either side.
+    Parameters
+    ----------
+    amplitude : array_like
+        Amplitude A of the beat at the ADC [V], > 0.
+    deviation : array_like
+        Standard deviation s of the noise at the ADC [V], > 0.
+    full_scale : array_like
+        Largest voltage V to either side that does not clip [V], > 0.
+
+    Returns
+    -------
+    ClippingGains
+        Equations of the module's description.
     """
     voltages = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
     a, s, v = (value[..., None] for value in np.broadcast_arrays(*voltages))
@@ -67,7 +79,7 @@ def clipping_gains(
     phase, weight = _phase_rule(a, s, v)
     sine = np.sin(phase)
     voltage_loss, variance_left = _clipping_loss(a * sine, s, v)
-    amplitude_loss = 2 * (weight * voltage_loss * sine).sum(axis=-1)  # off the line's amplitude
+    amplitude_loss = 2 * (weight * voltage_loss * sine).sum(axis=-1)  # loss of the line's amplitude
     return ClippingGains(
         signal_gain=1 - amplitude_loss / a[..., 0],
         noise_gain=(weight * variance_left).sum(axis=-1) / s[..., 0] ** 2,
@@ -75,7 +87,7 @@ def clipping_gains(
 
 
 def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Phases in a quarter of a period and weights whose sum is 1, (n, nodes) each."""
+    """Return phases in a quarter period and weights whose sum is 1, (n, nodes) each."""
     cut_phases = np.arcsin(np.clip((v + _CUT_DEVIATIONS * s) / a, 0.0, 1.0))
     zeros = np.zeros(a.shape)
     cuts = np.concatenate([zeros, cut_phases, zeros + math.pi / 2], axis=-1)
@@ -87,10 +99,10 @@ def _phase_rule(a: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
 
 
 def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of what clipping takes off x + n, x >= 0, and the variance of what it leaves.
+    """Return the mean loss of x + n by clipping, x >= 0, and the variance that remains.
 
-    In units of s, with ends a = (V - x)/s and b = (-V - x)/s: clipped noise is a above a, b below
-    b. What is cut off above has the mean f(a) - a Q(a), below likewise.
+    In units of s, with a = (V - x)/s and b = (-V - x)/s, clipped noise is a above a, and b below b.
+    The mean loss above is f(a) - a Q(a), and likewise below.
     """
     a, b = (v - x) / s, (-v - x) / s
     density = [np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi) for z in (a, b)]
@@ -118,14 +130,19 @@ NOISE_EFFECTS = (
 """Effects that add noise before the ADC clips, besides the shot noise of the echo."""
 
 FULL_SCALE_EXCESS_MAX = 1e6
-"""Signal or noise over full scale; what clipping leaves has lost as many digits as this has."""
+"""Largest ratio of signal or noise to full scale; the result loses as many digits as the ratio has.
+"""
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Line and noise as clipping leaves them.
+    """Reduce line and noise by clipping at the ADC's full scale.
 
-    The record is taken for one sine with the power of all lines. An UnsupportedShot for records
-    that exceed full scale more than :data:`FULL_SCALE_EXCESS_MAX` times.
+    The record is taken as one sine with the power of all lines.
+
+    Raises
+    ------
+    UnsupportedShotError
+        If a record exceeds full scale more than :data:`FULL_SCALE_EXCESS_MAX` times.
     """
     full_scale = np.asarray(context.parameters[_FULL_SCALE_PATH], float)
     is_limited = full_scale > 0
@@ -135,7 +152,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     amplitude = np.maximum(total_beat_amplitude(shots) * light_fraction, _TINY)
     deviation = np.sqrt(shots.noise_variance * light_fraction)
     voltage_limit = np.where(is_limited, full_scale, _UNLIMITED_VOLTAGE)
-    with np.errstate(over="ignore"):  # a denormal limit is exceeded endlessly
+    with np.errstate(over="ignore"):  # a denormal limit overflows the ratio
         excess = float((np.maximum(amplitude, deviation) / voltage_limit).max())
     if excess > FULL_SCALE_EXCESS_MAX:
         raise UnsupportedShotError(
@@ -152,9 +169,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
 
 def total_beat_amplitude(shots: Shots) -> np.ndarray:
-    """Amplitude at the ADC [V] of a sine with the power of all lines, (n,).
+    """Return the amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
-    In the segment that passes the receiver best, of those that there are: at its lowest frequency.
+    It is that of the existing segment with the lowest beat frequency, which passes the receiver
+    best.
     """
     beat_inputs = {
         "chirp_rate": shots.chirp_rate, "range": shots.range,
@@ -182,10 +200,12 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change by leaving clipping out, whatever else is noise or dims the echo.
+    """Bound the change if clipping is omitted, whatever else adds noise or attenuates the echo.
 
-    Line and noise lose no more than the probability that the highest sample is clipped, as the mean
-    slope of what is left is one less that probability; the threshold stays.
+    Notes
+    -----
+    Line and noise lose at most the probability that the highest sample is clipped, because the mean
+    slope of the clipped signal is 1 less that probability. The threshold does not follow.
     """
     if not points.any_nonzero(_FULL_SCALE_PATH):
         return None
@@ -224,3 +244,4 @@ SATURATION = Effect(
         ),
     ),
 )
+"""Effect of clipping at the ADC's full scale."""

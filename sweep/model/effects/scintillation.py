@@ -1,19 +1,23 @@
-"""Scintillation: turbulent air makes the echo's power twinkle from shot to shot.
+"""Scintillation: turbulent air makes the echo's power fluctuate from shot to shot.
 
 The strength of turbulence C_n^2(h) gives the Rytov variance of a plane or a spherical wave over the
-path. This gives the variances of the logarithms of large and small eddies' factors, averaged over
-an aperture, at any strength [Andrews and Phillips, Laser Beam Propagation through Random Media, 2nd
-ed. 2005, ch. 9, 10; zero inner scale, infinite outer scale].
+path. From it follow the log variances of the factors of large and small eddies, averaged over an
+aperture, at any strength [1]_, for zero inner scale and infinite outer scale.
 
-The irradiance, of unit mean, is the product of the two factors: log-normal (weak turbulence) or
-each gamma-distributed, the gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001),
-for any strength.
+The irradiance, of unit mean, is the product of the two factors. They are log-normal (weak
+turbulence), or gamma-distributed, which gives the gamma-gamma distribution [2]_ for any strength.
 
-The beam goes there and back. On the way out a plane wave twinkles on the target, averaged over the
-footprint. On the way back a spherical wave twinkles in the receiver's aperture. The two are
-independent. Their product multiplies the power of the whole echo, so its root the amplitudes, alike
-in all segments of a shot (milliseconds). Eddies that both pass (enhanced backscatter of small rough
-targets near the axis), the spreading of the beam and the loss of mixing are left out.
+The light travels out and back. On the way out a plane wave scintillates on the target, averaged
+over the footprint. On the way back a spherical wave scintillates in the receiver's aperture. The
+two are independent. Their product multiplies the power of the total echo, and its root the
+amplitudes, equally in all segments of a shot (milliseconds). Neglected are eddies that both paths
+share (enhanced backscatter of small rough targets near the axis), the spreading of the beam, and
+the loss of mixing.
+
+References
+----------
+.. [1] Andrews and Phillips, Laser Beam Propagation through Random Media, 2nd ed. 2005, ch. 9, 10.
+.. [2] Al-Habash, Andrews and Phillips, Opt. Eng. 40, 2001.
 """
 
 import math
@@ -33,21 +37,24 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
 
 _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
-"""Powers of the distances to receiver and source in the integral over the path."""
+"""Exponents of the distances to receiver and source in the integral over the path."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
+"""Coefficients of the aperture and of the strength in the log variance of large eddies."""
 
 
 class TurbulenceProfile(NamedTuple):
     """Profile of the refractive index's structure constant over height above the ground."""
 
     uniform: float = 0.0
-    """Part that is the same at all heights [m^(-2/3)]: alone, a constant C_n^2."""
+    """Part that is constant over height [m^(-2/3)]; alone, a constant C_n^2."""
     surface_layer: float = 0.0
-    """Hufnagel and Valley's A [m^(-2/3)] on the ground, e-folding over 100 m: 1.7e-14."""
+    """Hufnagel and Valley's A, the value on the ground [m^(-2/3)]: 1.7e-14; it falls by e over 100
+    m."""
     wind_speed: float = 0.0
-    """Their rms wind speed aloft [m/s]: 21."""
+    """Hufnagel and Valley's rms wind speed aloft [m/s]: 21."""
     mid_altitude: float = 0.0
-    """Their [m^(-2/3)] of e-folding height 1500 m: 2.7e-16."""
+    """Hufnagel and Valley's coefficient at middle altitudes [m^(-2/3)]: 2.7e-16; it falls by e over
+    1500 m."""
 
 
 HUFNAGEL_VALLEY = TurbulenceProfile(surface_layer=1.7e-14, wind_speed=21.0, mid_altitude=2.7e-16)
@@ -58,11 +65,13 @@ class LogIrradianceVariances(NamedTuple):
     """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
 
     large_eddies: np.ndarray
+    """(n,): log variance by large eddies."""
     small_eddies: np.ndarray
+    """(n,): log variance by small eddies."""
 
 
 def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.ndarray:
-    """C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground that on it."""
+    """Return C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground, that on it."""
     h = np.maximum(np.asarray(height, float), 0.0)
     aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
     mid_altitude = turbulence.mid_altitude * np.exp(-h / 1.5e3)
@@ -78,12 +87,29 @@ def rytov_variance(
     start_height: ArrayLike,
     end_height: ArrayLike,
 ) -> np.ndarray:
-    """Variance of the log irradiance of weak turbulence along a straight path, (n,).
+    """Compute the Rytov variance: the log variance of irradiance in weak turbulence.
 
+    Parameters
+    ----------
+    wave : str
+        ``plane`` or ``spherical``.
+    turbulence : TurbulenceProfile
+        Turbulence over height.
+    wavelength, range : array_like
+        Wavelength and length L of the straight path [m], (n,) or scalar.
+    start_height, end_height : array_like
+        Heights of the wave's source and of the receiver [m], (n,) or scalar.
+
+    Returns
+    -------
+    ndarray (n,)
+
+    Notes
+    -----
     2.25 k^(7/6) integral of C_n^2 (L - z)^(5/6) [(z/L)^(5/6) for a spherical wave] over z from
-    source to receiver; 1.23 and 0.50 C_n^2 k^(7/6) L^(11/6) in even turbulence. By a rule of
-    Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height. `wave` is
-    ``plane`` or ``spherical``, all else in [m], (n,) or scalar; it starts at the wave's source.
+    source to receiver. In uniform turbulence it is 1.23 and 0.50 C_n^2 k^(7/6) L^(11/6) for plane
+    and spherical waves. A Gauss-Jacobi rule includes the powers exactly; paths may span 20 km of
+    height.
     """
     path_fraction, weights = _path_quadrature(wave)
     h0, h1 = (np.asarray(h, float)[..., None] for h in (start_height, end_height))
@@ -101,7 +127,7 @@ def rytov_variance(
 
 @lru_cache(maxsize=2)
 def _path_quadrature(wave: str) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the way from source to receiver and weights that hold the powers."""
+    """Return fractions of the path from source to receiver, and weights that include the powers."""
     to_receiver, to_source = _DISTANCE_EXPONENTS[wave]
     nodes, weights = special.roots_jacobi(64, to_receiver, to_source)
     return (1 + nodes) / 2, weights / 2 ** (1 + to_receiver + to_source)
@@ -115,13 +141,31 @@ def log_irradiance_variances(
     range: ArrayLike,
     aperture: ArrayLike,
 ) -> LogIrradianceVariances:
-    """Log variances of the irradiance averaged over an aperture, by large and small eddies.
+    """Compute the log variances of the irradiance averaged over an aperture.
 
+    Parameters
+    ----------
+    wave : str
+        ``plane`` or ``spherical``.
+    rytov_variance : array_like
+        Rytov variance sigma_R^2 of that wave.
+    wavelength, range : array_like
+        Wavelength and length L of the path [m].
+    aperture : array_like
+        Diameter D of the aperture [m]; 0 for a point.
+
+    Returns
+    -------
+    LogIrradianceVariances
+        Log variances by large and by small eddies, (n,) each.
+
+    Notes
+    -----
     exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
-    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. Because it serves any
-    strength, the published fit averages too little over wide apertures. In weak turbulence it is
-    1.3 times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where
-    it is 10. The Rytov variance is that of `wave`; the aperture's diameter [m] is 0 for a point.
+    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong turbulence. The published fit
+    serves any strength and averages too little over wide apertures. In weak turbulence it is 1.3
+    times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) times where
+    it is 10.
     """
     rytov = np.asarray(rytov_variance, float)
     wavenumber = 2 * math.pi / np.asarray(wavelength, float)
@@ -140,7 +184,9 @@ def log_irradiance_variances(
 
 
 IRRADIANCE_DISTRIBUTIONS = ("log_normal", "gamma_gamma")
+"""Names of the irradiance's distributions."""
 _GAMMA_VARIANCE_MIN = 1e-5
+"""Variance below which a gamma distribution is approximated by Wilson and Hilferty."""
 _PD_SLOPE_MAX, _PD_CURVATURE_MAX = 0.5, 0.5
 """Suprema over a of |dQ_1(a, b)/d ln a| over 1 + b, and of its second derivative over 1 + b^2."""
 
@@ -148,10 +194,25 @@ _PD_SLOPE_MAX, _PD_CURVATURE_MAX = 0.5, 0.5
 def draw_scintillation_factors(
     distribution: str, legs: Sequence[LogIrradianceVariances], draw_addresses: DrawAddresses
 ) -> np.ndarray:
-    """Random factors of unit mean on the echo's power, (n,), of legs that are independent.
+    """Draw factors of unit mean on the echo's power.
 
-    Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies, turned into factors
-    by the inverse of their distribution.
+    Parameters
+    ----------
+    distribution : str
+        One of :data:`IRRADIANCE_DISTRIBUTIONS`.
+    legs : sequence of LogIrradianceVariances
+        Log variances of the ways out and back, which are independent.
+    draw_addresses : DrawAddresses
+        Random keys and draw numbers of n points.
+
+    Returns
+    -------
+    ndarray (n,)
+
+    Notes
+    -----
+    Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies. The inverse of their
+    distribution turns them into factors.
     """
     from sweep.model.sampling import philox
 
@@ -169,10 +230,10 @@ def draw_scintillation_factors(
 def _log_amplitude_moments(
     distribution: str, legs: Sequence[LogIrradianceVariances]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """|E L| and E L^2, or more, of half the logarithm of the whole factor.
+    """Return |E L| and E L^2, or upper bounds, of half the logarithm L of the total factor.
 
-    A gamma law of shape 1/s has ln I of mean above -(s/2 + s^2/12) and a variance below
-    s + s^2/2 + s^3/6, of the digamma function's and its derivative's enveloping series.
+    ln I of a gamma distribution of shape 1/s has a mean above -(s/2 + s^2/12) and a variance below
+    s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its derivative.
     """
     variances = [np.asarray(v, float) for leg in legs for v in leg]
     if distribution == "log_normal":
@@ -188,11 +249,11 @@ def _log_amplitude_moments(
 def _inverse_distribution(
     distribution: str, probability: np.ndarray, variance: np.ndarray
 ) -> np.ndarray:
-    """Value that a factor of unit mean and this log variance falls below with a given probability.
+    """Return the quantile of a factor of unit mean and a given log variance.
 
-    A gamma law of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5, which
-    the library's inverse can get wrong, go by Wilson and Hilferty's cube of a normal number,
-    there within 1e-3 standard deviations.
+    A gamma distribution of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5,
+    for which the library's inverse can be wrong, use Wilson and Hilferty's cube of a normal number,
+    accurate there to 1e-3 standard deviations.
     """
     normal_quantile = special.ndtri(probability)
     if distribution == "log_normal":
@@ -217,7 +278,7 @@ _DISTRIBUTION_PATH = "atmosphere.scintillation_law"
 
 
 def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfile | None:
-    """Turbulence over height for points of one category; None in still air."""
+    """Return the turbulence over height for points of one category; None in still air."""
     name = str(parameters[_TURBULENCE_PATH])
     if name == "uniform":
         return TurbulenceProfile(uniform=float(parameters[_STRUCTURE_CONSTANT_PATH]))
@@ -227,7 +288,10 @@ def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfil
 def two_way_log_variances(
     turbulence: TurbulenceProfile, parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[LogIrradianceVariances, LogIrradianceVariances]:
-    """Log variances of the way out, averaged over the footprint, and back, over the aperture."""
+    """Return the log variances of the way out, averaged over the footprint, and of the way back.
+
+    Those of the way back are averaged over the aperture.
+    """
     lidar_height, target_height = path_heights(parameters, range)
     aperture = np.asarray(parameters[TELESCOPE_PREFIX + "aperture"], float)
     footprint_diameter = aperture + beam.far_field_divergence(parameters) * range
@@ -251,11 +315,13 @@ def two_way_log_variances(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of mean probabilities by leaving twinkling out.
+    """Bound the change of mean probabilities if scintillation is omitted.
 
-    With L half the logarithm of the factor I, E I = 1, and h the probability over the logarithm of
-    the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2. In a product of
-    segments, which twinkle alike, the suprema of two slopes, times E L^2, come on top.
+    Notes
+    -----
+    Let L be half the logarithm of the factor I, E I = 1, and h the probability over the logarithm
+    of the amplitude. Then |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2. In a product
+    over segments, which share one factor, the suprema of two slopes times E L^2 are added.
     """
     if (
         points.option(_TURBULENCE_PATH) == "none"
@@ -332,3 +398,4 @@ SCINTILLATION = Effect(
         ),
     ),
 )
+"""Effect of turbulence on the power of the echo."""

@@ -1,29 +1,28 @@
-"""Motion between segments: the target moves on from one to the next.
+"""Motion between segments: range and velocity of the target change from segment to segment.
 
-A segment that starts at t finds the target at R - u t - a t^2 / 2 and v_r + a t, with u the speed
-at which the range along the beam falls. This is 7.5 cm nearer after 500 us at 150 m/s. [T] has all
+A segment that starts at t finds the target at R - u t - a t^2 / 2 and v_r + a t, where u is the
+speed at which the range along the beam falls. At 150 m/s this is 7.5 cm after 500 us. [T] has all
 segments begin at one range (``segment_motion: off``).
 
-Two speeds (docs/physics.md, *The beam slides*). Doppler shifts are those of the scatterers in the
-beam, v_r = V.d for the velocity V and the direction d. The range falls by u = (V + R d').n / d.n on
-a plane of normal n, as the beam, which turns by d', slides over it. Likewise a = d(V.d)/dt is that
-of the beam, V'.d + V.d'.
+There are two speeds (docs/physics.md, *The beam slides*). Doppler shifts are those of the
+scatterers in the beam, v_r = V.d for the velocity V and the direction d. The range falls by u = (V
++ R d').n / d.n on a plane of normal n, as the beam, which turns by d', slides over it. Likewise a =
+d(V.d)/dt is that of the beam, V'.d + V.d'.
 
-Beamlets keep their scatterers: their ranges differ by what their own velocities have made of it.
+Beamlets keep their scatterers: their ranges change by their own velocities.
 
-Up and down beat are those of R at the middle t_m of their starts, but for what they mix. Let t_d be
-the time from up to down segment, negative if the down-chirp comes first. Their half sum is short of
-2 v_r / lambda by the share S t_d / 2 of the optical frequency at mid-chirp. The acceleration
-changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2 for Table 4.1. Range and velocity that are
-interpolated are put right for the velocity that is measured with them (as they are for range walk),
-by v_r t_m and by that share. Nothing in the beats tells of the acceleration, or of a beam that
-slides over slanting ground.
+Up and down beat are those of the range at the middle t_m of their starts, except for coupling of
+range and velocity. Let t_d be the time from up to down segment, negative if the down-chirp comes
+first. The half sum of the beats is below 2 v_r / lambda by the fraction S t_d / 2 of the optical
+frequency at mid-chirp. The acceleration changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2
+for Table 4.1. Interpolated range and velocity are corrected with the measured velocity (as for
+range walk), by v_r t_m and by that fraction. The beats contain no information on the acceleration,
+or on a beam that slides over sloping ground.
 
-In several looks (:mod:`sweep.model.detection.looks`) segments start as those of the middle look do,
-to whose
-time interpolated ranges are put right, and lines move on by the same number of bins from look to
-look. Averaged powers are smeared by that; looks that are counted, added in amplitude or that fade
-apart are not followed, and must lie within :data:`LOOK_DRIFT_MAX_WINDOW_BINS`.
+With several looks (:mod:`sweep.model.detection.looks`) segments start as those of the middle look,
+to whose time interpolated ranges are corrected. Lines move by the same number of bins from look to
+look. Averaged powers are smeared by this drift. Looks that are counted, added in amplitude, or that
+fade independently do not model the drift, and must lie within :data:`LOOK_DRIFT_MAX_WINDOW_BINS`.
 """
 
 import math
@@ -40,15 +39,16 @@ from sweep.model.preparation import Shots, doppler_ratio
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 LOOK_DRIFT_MAX_WINDOW_BINS = 0.25
-"""Bins of fs/L from the first look to the last that leave all of them alike: 1 % of the power."""
+"""Largest drift from the first look to the last [bins of fs/L] that counts as none: 1 % of the
+power."""
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Change of the largest bin as its line moves, with the phases of lines that add up.
+    """Bound the change of the largest bin as its line moves, including phases of lines that add.
 
-    A line meets its image at the phase of where it has come to. Beamlets with velocities of their
-    own turn against each other. If it is off segments begin at one range, by
-    the law of [T]: that is no error of the simulation.
+    A line meets its image at the phase of its new position. Beamlets with velocities of their own
+    turn against each other. If the effect is off, segments begin at one range, by the law of [T]:
+    that is not an error of the simulation.
     """
     if points.ignores_segment_motion or not any(
         np.any(speed)
@@ -70,7 +70,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Segments that start one after the other."""
+    """Let the segments start one after the other, while the target moves."""
     starts, n_looks = shots.scheduled_segment_starts, shots.looks.number
     middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
     if n_looks > 1:
@@ -91,12 +91,17 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
 
 def line_drift_per_look(shots: Shots) -> np.ndarray:
-    """Bins by which lines of each segment move on from look to look, (segments, n).
+    """Compute the bins by which lines of each segment move from look to look.
+
+    Returns
+    -------
+    ndarray (segments, n)
+        Drift [bins of fs/N], signed as the beat.
 
     Raises
     ------
-    UnsupportedShot
-        Of looks that are not followed: they move too far.
+    UnsupportedShotError
+        If looks drift too far to be modelled.
     """
     doppler_ratio_rate = doppler_ratio(shots.acceleration)
     drift_bins = np.zeros((len(shots.waveform_segments), shots.size))
@@ -127,7 +132,7 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
         if looks.n_power_averaged == 1 or fade_independently
         else math.inf
     )
-    if last_look >= DRIFT_POSITIONS_MAX:  # as few places stand for all
+    if last_look >= DRIFT_POSITIONS_MAX:  # few positions represent all looks
         drift_limit = min(drift_limit, DRIFT_POSITIONS_MAX / 2)
     turned_cycles = np.abs(shots.doppler_ratio_offset).max(initial=0.0) * np.max(
         shots.carriers[0] * shots.look_period
@@ -157,7 +162,7 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
 
 
 def split_looks(shots: Shots) -> list[Shots]:
-    """Shots as each of their looks finds them; themselves where all are alike."""
+    """Return the shots as each look sees them; copies of the same shots if looks do not differ."""
     if not np.any(shots.line_drift_per_look):
         return [shots] * shots.looks.number
     looks_from_middle = np.arange(shots.looks.number) - (shots.looks.number - 1) / 2
@@ -180,3 +185,4 @@ SEGMENT_MOTION = Effect(
     error_bound=error_bound,
     apply=apply,
 )
+"""Effect of range and velocity that change from segment to segment."""

@@ -1,7 +1,7 @@
-"""Measured frequency error of a sweep: a table, the series that stands for it, and its integral.
+"""Measured frequency error of a sweep: a table, its Chebyshev series, and the series' integral.
 
-The series is that of Chebyshev, fitted by least squares, of the least degree that leaves no more
-than :data:`RESIDUAL_MAX_OVER_SPAN` of the span of the table's values.
+The Chebyshev series is fitted by least squares. Its degree is the smallest that leaves a residual
+of at most :data:`RESIDUAL_MAX_OVER_SPAN` of the span of the table's values.
 """
 
 import math
@@ -13,26 +13,34 @@ import numpy as np
 RESIDUAL_MAX_OVER_SPAN = 1e-3
 """Largest residual of a table's Chebyshev series, over the span of the table's values."""
 CHEBYSHEV_DEGREE_MAX = 64
-"""Degree of that series at the most."""
+"""Largest degree of the Chebyshev series."""
 
 
 class SweepErrorTable(NamedTuple):
-    """Measured frequency error of the sweep, by the time in the up-chirp."""
+    """Measured frequency error of the sweep over the time in the up-chirp."""
 
     first_time: float
+    """Time of the first row [s]."""
     last_time: float
-    """Times of the first and the last row [s]."""
+    """Time of the last row [s]."""
     chebyshev_coefficients: np.ndarray
     """Chebyshev coefficients of the error [Hz] over those times."""
 
     def frequency_error(self, position: np.ndarray | float) -> np.ndarray:
-        """Error [Hz] at places -1..1 over the table's times."""
+        """Return the error [Hz] at positions -1..1 over the table's times."""
         return np.asarray(np.polynomial.chebyshev.chebval(position, self.chebyshev_coefficients))
 
     def integrate_error(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Integral of the error between two times [cycles]; held beyond the table's ends.
+        """Integrate the error between two times [cycles].
 
-        Gauss's rule is exact for the series, and cancels nothing where the times are close.
+        Parameters
+        ----------
+        start, end : ndarray
+            Times in the up-chirp [s]; beyond the table's ends the error is constant.
+
+        Notes
+        -----
+        Gauss-Legendre quadrature is exact for the series and does not cancel for close times.
         """
         half_span = (self.last_time - self.first_time) / 2
         start_position, end_position = (
@@ -55,13 +63,24 @@ class SweepErrorTable(NamedTuple):
 
 @lru_cache(maxsize=16)
 def fit_sweep_error(table_text: str) -> SweepErrorTable:
-    """Fit a table of rows ``time error`` [s, Hz], separated by commas, by least squares.
+    """Fit a Chebyshev series to a table of frequency errors by least squares.
 
-    A ValueError where no series whose degree suits the number of rows leaves so little as
-    :data:`RESIDUAL_MAX_OVER_SPAN`. Degrees above twice the root of the number would swing between
-    rows.
+    Parameters
+    ----------
+    table_text : str
+        Rows ``time error`` [s, Hz], separated by commas.
 
-    >>> sweep_table("0.0 0.0, 1.0 1.0, 2.0 2.0").series.round(12).tolist()  # a straight line
+    Raises
+    ------
+    ValueError
+        If no series of a degree suitable for the number of rows has a residual below
+        :data:`RESIDUAL_MAX_OVER_SPAN`. Degrees above twice the root of that number would oscillate
+        between rows.
+
+    Examples
+    --------
+    >>> table = fit_sweep_error("0.0 0.0, 1.0 1.0, 2.0 2.0")  # a straight line
+    >>> table.chebyshev_coefficients.round(12).tolist()
     [1.0, 1.0]
     """
     time, error = np.array([row.split() for row in table_text.split(",")], float).T

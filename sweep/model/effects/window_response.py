@@ -1,17 +1,17 @@
-"""Main lobe of a window, and bounds on how its power changes, for the sizes of effects.
+"""Main lobe of a window, and bounds on the change of its power, for error bounds of effects.
 
 F(x) = |W(x r)|^2 / (sum w)^2 is the power of a bin x FFT bins away from a line, r = L/N. It is a
 cosine series in the autocorrelation of the window,
 
     F(x) = sum_{n,m} w_n w_m cos(2 pi (n - m) x / N) / (sum w)^2,
 
-so that |F''| <= (2 pi r)^2 2 V, V the variance of n/L under the weights |w_n| (times
-(sum|w| / sum w)^2), and |F'| <= the root of it times sum|w| / sum w. Near the peak W follows from
+so that |F''| <= (2 pi r)^2 2 V, with the variance V of n/L under the weights |w_n| (times (sum|w| /
+sum w)^2). |F'| is at most the root of that bound times sum|w| / sum w. Near the peak W follows from
 the window's moments,
 
     |W(y)| = hypot(sum_n w_n cos(2 pi y (n/L - 1/2)), w_0 sin(pi y)).
 
-Over all bins F adds up to ENBW / r (Parseval), wherever the line lies.
+Over all bins F sums to ENBW / r (Parseval), wherever the line lies.
 """
 
 import math
@@ -23,18 +23,22 @@ import numpy as np
 from sweep.model.window import Window, get_window, window_samples
 
 _ROUNDING_ERROR = 1e-6
+"""Relative margin for rounding of the smallest scalloping gain."""
 _SERIES_TERMS = 28
+"""Number of terms of the main lobe's series."""
 _MAIN_LOBE_STEPS = 1024
+"""Number of steps of the main lobe's table over half a bin."""
 _ENVELOPE_CELLS, _ENVELOPE_KNEE_WINDOW_BINS = 8192, 16.0
-"""Cells of the table of sidelobes, even in d / (d + knee), and its knee [bins of fs/L]."""
+"""Number of cells of the table of sidelobes, even in d / (d + knee), and its knee [bins of fs/L].
+"""
 _CELLS_PER_OCTAVE = 64
-"""Cells an octave of the table of how far lines reach."""
+"""Number of cells per octave of magnitude in the table of distances."""
 _OCTAVE_MIN = -80
-"""Octaves below the peak at which that table ends."""
+"""Last octave of the table of distances, relative to the peak."""
 
 
 class WindowResponse(NamedTuple):
-    """A window over an FFT's bins; powers and magnitudes relative to the peak's."""
+    """Response of a window over an FFT's bins; powers and magnitudes are relative to the peak."""
 
     main_lobe: np.ndarray
     """(m,): magnitude at distances of 0..1/2 bin in equal steps."""
@@ -43,36 +47,46 @@ class WindowResponse(NamedTuple):
     curvature_max: float
     """Bound on |F''| [1/bin^2]."""
     padding_factor: float
-    """Bins to either side that are counted for ``central_energy_min``: 1/r, one of the window's."""
+    """Bins of the FFT per bin of fs/L, 1/r; ``central_energy_min`` counts as many bins to either
+    side."""
     central_energy_min: float
-    """Least sum of F over the bins within ``padding_factor`` of a line."""
+    """Smallest sum of F over the bins within ``padding_factor`` of a line."""
     sidelobe_envelope: np.ndarray
     """(cells + 1,): largest magnitude at or beyond distances even in d / (d + knee)."""
     distance_by_octave: np.ndarray
-    """(cells,): distance [bins] from which on all are smaller, by octaves of magnitude."""
+    """(cells,): distance [bins] beyond which all magnitudes are smaller, by octaves of magnitude.
+    """
     scalloping_gain_min: float
-    """Least magnitude of the bin nearest to a line."""
+    """Smallest magnitude of the bin nearest to a line."""
 
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
-        """Magnitude of a bin at a distance from a line, 0..1/2 bin."""
+        """Return the magnitude of a bin at a distance from a line, 0..1/2 bin."""
         clipped_distance = np.fmin(distance, 0.5)
         return self.main_lobe[(clipped_distance * (2 * _MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
-        """Largest magnitude of a bin at least ``distance`` [bins] from a line."""
+        """Return the largest magnitude of a bin at least ``distance`` [bins] from a line."""
         knee = _ENVELOPE_KNEE_WINDOW_BINS * self.padding_factor
         table_position = 1 - knee / (np.fmax(distance, 0.0) + knee)
         return self.sidelobe_envelope[(table_position * _ENVELOPE_CELLS).astype(np.int64)]
 
     def distance_below(self, magnitude: np.ndarray) -> np.ndarray:
-        """Distance [bins] from which on all bins are smaller; infinite where none is known."""
+        """Return the distance [bins] beyond which all bins are smaller; inf if none is known."""
         octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_OCTAVE_MIN), 1.0))
         return self.distance_by_octave[np.ceil(-octave * _CELLS_PER_OCTAVE).astype(np.int64)]
 
 
 @lru_cache(maxsize=32)
 def window_response(window_name: str, length: int, fft_size: int) -> WindowResponse:
-    """Return the lobe of the window of this name over an FFT, prepared once and cached."""
+    """Return the response of a window over an FFT's bins, prepared once and cached.
+
+    Parameters
+    ----------
+    window_name : str
+        Name of the window.
+    length, fft_size : int
+        Length L of the record and FFT size N.
+    """
     fft_window = get_window(window_name, length)
     w = window_samples(fft_window.name, length)
     position = np.arange(length) / length - 0.5
@@ -117,7 +131,7 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
 
 
 def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Coefficients of S(y) / sum w in powers of y^2, from the window's even moments."""
+    """Return the coefficients of S(y) / sum w in powers of y^2, from the window's even moments."""
     moments = np.empty(_SERIES_TERMS)
     weighted_power = w / w.sum()
     for k in range(_SERIES_TERMS):
@@ -129,7 +143,7 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """|W(y)| / sum w for |y| <= 1.5 bins of fs/L, by its series."""
+    """Return |W(y)| / sum w for |y| <= 1.5 bins of fs/L, from its series."""
     real_part = np.polynomial.polynomial.polyval(np.asarray(y, float) ** 2, coefficients)
     return np.hypot(
         real_part, fft_window.first_value / fft_window.sum * np.sin(np.pi * np.asarray(y, float))
@@ -139,7 +153,7 @@ def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndar
 def _central_energy_min(
     fft_window: Window, coefficients: np.ndarray, record_fraction: float, slope_max: float
 ) -> float:
-    """Least sum of F over the bins within one window bin of a line, over where the line lies."""
+    """Return the smallest sum of F over bins within one window bin of a line, wherever it lies."""
     reach_bins = math.floor(1 / record_fraction) + 1
     bin_offset = np.arange(64) / 64
     distance = (np.arange(-reach_bins, reach_bins + 1)[:, None] - bin_offset) * record_fraction
@@ -149,6 +163,7 @@ def _central_energy_min(
         0.0,
     )
     if reach_bins <= 2:
-        # a bin leaves the sum where it crosses the margin, the others change by their slope
+        # A bin leaves the sum where it crosses the margin; the others change at most by their
+        # slope.
         return float(max(power.sum(axis=0).min() - 2 * reach_bins * slope_max / 128, 0.5))
     return float(0.98 * power.sum(axis=0).min())
