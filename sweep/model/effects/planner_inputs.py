@@ -1,9 +1,9 @@
-"""Link budget, lines and footprints of many points at once, for the sizes of effects.
+"""Link budget, lines and footprints of many points at once, for the error bounds of effects.
 
-The formulas are those that shots are prepared with, for arrays that broadcast over the points;
-values are computed on first use. Arrays by segment have one more axis, in front, of the segments
-that exist. All points share words and the parameters that :meth:`PlannerInputs.shared_integer`
-reads.
+The formulas are those by which shots are prepared, for arrays that broadcast over the points.
+Values are computed on first use. Arrays by segment have an additional first axis over the existing
+segments. All points share text parameters, and the parameters that
+:meth:`PlannerInputs.shared_integer` reads.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,33 +39,38 @@ from sweep.model.threshold import tnr_from_parameters
 from sweep.model.window import Window, canonical_window_name, get_window, window_samples
 
 _CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
+"""Half-widths t in standard deviations for Chebyshev's inequality, of which the best bound is
+taken."""
 _NEAR_IMAGE_WINDOW_BINS = 8.0
-"""Window bins from line to image beyond which F is below 0.4 % of the bin's, F', F'' below 5 %."""
+"""Distance from line to image [window bins] beyond which F is below 0.4 % of the bin's, and F', F''
+below 5 %."""
 
 
 class PhaseErrorBound(NamedTuple):
-    """Change of lines over the record by an effect: a phase, or places in their own right.
+    """Bound of an effect's change of lines over the record: a phase, or a shift of positions.
 
-    Sizes by segment, or scalars; powers are of the place x in the record, -1..1, in cycles.
+    Values are by segment, or scalars. Coefficients are those of powers of the position x in the
+    record, -1..1, in cycles.
     """
 
     coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """Of x, x^2, x^3, x^4."""
+    """Magnitudes of the coefficients of x, x^2, x^3, x^4 [cycles]."""
     non_polynomial: np.ndarray | float = 0.0
-    """Of all phase that is no such power."""
+    """Largest magnitude of the phase that is no polynomial [cycles]."""
     constant: np.ndarray | float = 0.0
-    """In the record's middle, which matters to lines beside their images."""
+    """Magnitude of the phase in the record's middle [cycles], which matters to lines near their
+    images."""
     extra_shift_window_bins: np.ndarray | float = 0.0
-    """Bins of fs/L that light may be moved by besides the slopes of the powers."""
+    """Shift of light in addition to the slopes of the polynomial [bins of fs/L]."""
 
     @property
     def shift_window_bins(self) -> np.ndarray | float:
-        """Bins of fs/L that light may be moved by."""
+        """Largest shift of light [bins of fs/L]."""
         slope_window_bins = sum(2 * (k + 1) * value for k, value in enumerate(self.coefficients))
         return slope_window_bins + self.extra_shift_window_bins
 
     def plus(self, other: "PhaseErrorBound") -> "PhaseErrorBound":
-        """Both together."""
+        """Return the bound for the sum of two phase errors."""
         coefficients = tuple(
             a + b for a, b in zip(self.coefficients, other.coefficients, strict=True)
         )
@@ -75,29 +80,39 @@ class PhaseErrorBound(NamedTuple):
 
 
 NO_PHASE_ERROR = PhaseErrorBound()
+"""Bound of no phase error."""
 
 
 class MissingSamples(NamedTuple):
     """Samples of the record that are taken before the echo arrives, by segment."""
 
     lost_fraction: np.ndarray
-    """Sum |w| over them, over sum w."""
+    """Sum |w| over the missing samples, over sum w."""
     step_sidelobe_factor: np.ndarray
-    """Factor on the sidelobes of a rectangular window that bounds what their lack adds to others,
-    relative to sum w."""
+    """Factor on the sidelobes of a rectangular window, relative to sum w, that bounds the sidelobes
+    added by the missing samples."""
     n_missing: np.ndarray
-    """Number of these samples."""
+    """Number of missing samples."""
     centroid_bound: np.ndarray
-    """Bound on the mean place, -1..1, of what is left in the record."""
+    """Bound on the mean position, -1..1, of the remaining samples."""
     all_missing: np.ndarray
-    """True where all samples lack."""
+    """True where all samples are missing."""
 
 
 def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
-    """Bounds for records of which the first samples have no echo.
+    """Compute bounds for records whose first samples have no echo.
 
-    The transform of the samples that lack is at most their variation over 2 sin(pi y / L), and so
-    is that of the samples that are left, which is what the sidelobes are where these are fewer.
+    Parameters
+    ----------
+    window : Window
+        Window of the record.
+    n_missing : ndarray of int
+        Number of missing samples.
+
+    Notes
+    -----
+    The transform of the missing samples is at most their variation over 2 sin(pi y / L). The same
+    holds for the remaining samples, and bounds the sidelobes where these are fewer.
     """
     lost_fraction_by_count, bound_by_missing, bound_by_remaining = _bounds_by_missing_count(window)
     lost_fraction = lost_fraction_by_count[n_missing]
@@ -114,11 +129,15 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
 
 @lru_cache(maxsize=8)
 def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bounds of :func:`missing_sample_bounds` by the number of samples that lack, (L + 1,) each."""
+    """Tabulate bounds of :func:`missing_sample_bounds` by missing samples, (L + 1,) each.
+
+    They are the lost fraction, and the factors by the variation of missing and of remaining
+    samples.
+    """
     w = window_samples(window.name, window.length)
     magnitude = np.abs(w)
     lost_fraction = np.append(0.0, np.cumsum(magnitude)) / window.sum
-    variation = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # up to each sample
+    variation = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # variation up to each sample
     bound_by_missing = 0.5 * (magnitude[0] + variation + magnitude)
     bound_by_remaining = 0.5 * (magnitude + variation[-1] - variation + magnitude[-1])
     bound_by_missing, bound_by_remaining = (
@@ -131,7 +150,7 @@ def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np
 def window_max_near(
     window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
 ) -> np.ndarray:
-    """Largest |w| of samples less than ``reach_samples`` away from the first one, over sum w."""
+    """Return the largest |w| within ``reach_samples`` of a first sample, over sum w."""
     exponents = np.ceil(np.log2(np.clip(reach_samples, 1, window.length))).astype(int)
     window_max = np.empty(np.broadcast_shapes(first_sample.shape, exponents.shape))
     first_sample, exponents = np.broadcast_arrays(first_sample, exponents)
@@ -145,7 +164,7 @@ def window_max_near(
 
 @lru_cache(maxsize=64)
 def _window_max_within(window: Window, exponent: int) -> np.ndarray:
-    """Largest |w| within 2^power samples of each place of a record, (L + 1,), over sum w."""
+    """Return the largest |w| within 2^exponent samples of each position, (L + 1,), over sum w."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     magnitude = np.abs(window_samples(window.name, window.length))
@@ -154,17 +173,22 @@ def _window_max_within(window: Window, exponent: int) -> np.ndarray:
 
 
 def magnitude_change_from_power(power_change: np.ndarray) -> np.ndarray:
-    """Relative change of a magnitude by that of its power, downwards, which is the larger one."""
+    """Return the relative decrease of a magnitude for one of its power, larger than an increase."""
     return np.asarray(1 - np.sqrt(1 - np.minimum(power_change, 1.0)))
 
 
 class PlannerInputs:
-    """Some points that share every word.
+    """Points that share all text parameters, with quantities for error bounds.
 
-    `parameters` are words, numbers or arrays by dotted path, those that effects bring among them;
-    arrays broadcast against each other and have as many axes each. `extent` is what rays have
-    found, by default that of a flat plane; `has_rotating_body` tells whether any surface belongs to
-    a body that turns.
+    Parameters
+    ----------
+    parameters : mapping
+        Text, numbers or arrays by dotted path, including parameters of effects. Arrays broadcast
+        against each other and have equal numbers of axes.
+    extent : FootprintExtent, optional
+        Extent of footprints found by ray tracing; by default that of a flat plane.
+    has_rotating_body : bool
+        True if any surface belongs to a rotating body.
     """
 
     def __init__(
@@ -180,13 +204,13 @@ class PlannerInputs:
         self.architecture = self.option(RECEIVER_PREFIX + "architecture")
         self.fft_size = self.shared_integer(PROCESSING_PREFIX + "fft_size")
         self.ignores_doppler = False
-        """True where the Doppler effect is off."""
+        """True if the Doppler effect is off."""
         self.ignores_segment_motion = False
-        """True where the target stands still between segments."""
+        """True if the effect of motion between segments is off."""
         self.ignores_overlap = False
-        """True where the effect of overlap is off."""
+        """True if the effect of overlap is off."""
         self.phase_error_bounds: dict[str, PhaseErrorBound] = {}
-        """Of the effects that smear lines, by name."""
+        """Bounds of phase errors by name of the effect."""
         n_beamlets = self.shared_integer(beamlet_counts.BEAMLETS_PATH)
         self.n_beamlets, self.beamlet_pattern = beamlet_counts.finest_beamlets(self.parameters)
         if n_beamlets:
@@ -202,15 +226,15 @@ class PlannerInputs:
         self.acquisition_delay = self[PROCESSING_PREFIX + "acquisition_delay"]
         """Acquisition delay t_0 [s]."""
         self.bin_width = self.sample_rate / self.fft_size
-        """[Hz]."""
+        """Width of a bin fs/N [Hz]."""
         self.chirp_rate = self[CHIRP_PREFIX + "bandwidth"] / self[CHIRP_PREFIX + "duration"]
         self.range, self.radial_velocity = self["target.range"], self["target.radial_velocity"]
-        """On the beam's axis [m, m/s], positive when closing."""
+        """Range [m] and radial velocity [m/s] on the beam's axis, positive when closing."""
         self.delay = 2 / SPEED_OF_LIGHT * self.range
         self.doppler_ratio = 2 * self.radial_velocity / SPEED_OF_LIGHT
-        """Doppler ratio."""
+        """Doppler ratio 2 v_r / c."""
         self.acceleration = self["target.acceleration"]
-        """[m/s^2]."""
+        """Rate at which the radial velocity grows [m/s^2]."""
         self.looks = Looks.from_parameters(parameters)
         self.relative_chirp_rates: tuple[np.ndarray | float, ...] = (
             1.0,
@@ -226,31 +250,31 @@ class PlannerInputs:
         is_coherent = self.option("footprint.phases") == "coherent"
         self.adds_amplitudes = is_coherent or is_direct
         self.adds_field_amplitudes = is_coherent and not is_direct
-        """True where roots of echoes add."""
+        """True if amplitudes, the roots of echoes, add."""
 
     def __getitem__(self, path: str) -> np.ndarray:
-        """Return a parameter that is a number."""
+        """Return a numeric parameter."""
         return self.parameters[path]
 
     def option(self, path: str) -> str:
-        """Return a parameter that is a word."""
+        """Return a text parameter."""
         return str(self.parameters[path])
 
     def shared_integer(self, path: str) -> int:
-        """Return a whole number that all points share."""
+        """Return an integer that all points share."""
         return int(self.parameters[path].flat[0])
 
     def any_nonzero(self, *paths: str) -> bool:
-        """Return true if any of some numbers is other than 0 anywhere."""
+        """Return True if any of several numeric parameters is nonzero at any point."""
         return any(bool(self.parameters[path].any()) for path in paths)
 
     def _of_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
-        """Values of the segments that there are: up, Doppler, down."""
+        """Select the values of existing segments from those of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
         return [value for name, value in named_values if name in self.segment_order]
 
     def stack_segments(self, *values: np.ndarray | float) -> np.ndarray:
-        """Values by segment, one behind the other."""
+        """Stack values of segments along a new first axis."""
         template = np.zeros((1,) * self.ndim)
         return np.stack(np.broadcast_arrays(template, *values)[1:]).astype(float)
 
@@ -266,12 +290,12 @@ class PlannerInputs:
 
     @cached_property
     def window_response(self) -> WindowResponse:
-        """Its transform over the FFT's bins."""
+        """Response of the window over the FFT's bins."""
         return window_response(self.window.name, self.window.length, self.fft_size)
 
     @property
     def padding_factor(self) -> float:
-        """Bins of the FFT to one of fs/L."""
+        """Bins of the FFT per bin of fs/L."""
         return self.window_response.padding_factor
 
     @cached_property
@@ -301,7 +325,7 @@ class PlannerInputs:
 
     @cached_property
     def quantisation_variance(self) -> np.ndarray:
-        """Noise of the ADC's steps [V^2]."""
+        """Noise variance of the ADC's quantisation [V^2]."""
         full_scale, bits = (self[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
         samples_iq = self.option(RECORD_PATH) == "complex"
         return receiver_chain.quantisation_variance(
@@ -310,7 +334,7 @@ class PlannerInputs:
 
     @cached_property
     def receiver_noise_variance(self) -> np.ndarray:
-        """Of the receiver alone, at the ADC [V^2]."""
+        """Noise variance of the receiver alone, at the ADC [V^2]."""
         return np.asarray(sum(self.receiver_noise.variances.values()))
 
     @cached_property
@@ -334,9 +358,9 @@ class PlannerInputs:
 
     @property
     def noise_peak_ratio(self) -> float | None:
-        """Magnitude over sigma that any bin's noise exceeds with a probability of 0.001 at most.
+        """Magnitude over sigma that any bin's noise exceeds with a probability of at most 0.001.
 
-        None where segments report all peaks that cross the threshold.
+        None if segments report all peaks that cross the threshold.
         """
         if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -351,7 +375,7 @@ class PlannerInputs:
 
     @cached_property
     def footprint_extent(self) -> FootprintExtent:
-        """Extent of the footprint, as given for all beams or on a plane."""
+        """Extent of the footprint, as given, or on a plane."""
         if (extent := self._given_extent) is not None:
             return extent if self.adds_field_amplitudes else extent._replace(amplitude_gain_max=1.0)
         grazing_angle = self["target.grazing_angle"]
@@ -385,20 +409,20 @@ class PlannerInputs:
 
     @cached_property
     def echo_and_beat_scales(self) -> tuple[np.ndarray, np.ndarray]:
-        """Echo power [W] for a relative echo of 1/sr; amplitude of the beat [V] for that of 1."""
+        """Echo power [W] for a relative echo of 1/sr; beat [V] for a relative amplitude of 1."""
         echo_power, beat_current = echo_power_and_beat_current(self.architecture, self.parameters)
         return echo_power, beat_current * self[RECEIVER_PREFIX + "transimpedance"]
 
     @cached_property
     def beat_amplitude(self) -> np.ndarray:
-        """Amplitude of the bare line's beat at the ADC [V], before the receiver's poles."""
+        """Amplitude of the beat of the line on the axis [V], before the receiver's poles."""
         return self.echo_and_beat_scales[1] * relative_amplitude(
             self.architecture, self.footprint_extent.axis_echo
         )
 
     @cached_property
     def echo_noise_ratio(self) -> np.ndarray:
-        """Shot noise of the whole echo over the receiver's noise variance."""
+        """Shot noise of the total echo over the receiver's noise variance."""
         total_echo = self.footprint_extent.axis_echo * np.maximum(
             self.footprint_extent.total_echo_ratio, 1.0
         )
@@ -431,7 +455,7 @@ class PlannerInputs:
 
     @cached_property
     def segment_starts(self) -> np.ndarray:
-        """Time from the shot's start to each segment's, of the middle look [s]."""
+        """Time from the shot's start to each segment's start, of the middle look [s]."""
         segment_starts = waveform.segment_starts(
             self.segment_order,
             duration=self[CHIRP_PREFIX + "duration"],
@@ -467,7 +491,7 @@ class PlannerInputs:
 
     @cached_property
     def missing_samples(self) -> MissingSamples | None:
-        """Samples of the record without an echo; None where echoes fill all records."""
+        """Samples of the record without an echo; None if echoes fill all records."""
         if self.ignores_overlap:
             return None
         delay = self.delay
@@ -498,9 +522,9 @@ class PlannerInputs:
         )
 
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
-        """Largest magnitude of a bin at least ``distance`` [bins] from a line, over its peak's.
+        """Return the largest relative magnitude of a bin at least ``distance`` [bins] from a line.
 
-        The peak is that of a whole record.
+        It is relative to the peak of a full record.
         """
         response_max = self.window_response.sidelobe_max(distance)
         if self.missing_samples is None:
@@ -515,20 +539,23 @@ class PlannerInputs:
         )
 
     def power_without_missing(self, power: np.ndarray) -> np.ndarray:
-        """Least power of the largest bin, by that of a whole record, over that of all on a bin."""
+        """Return a lower bound of the largest bin's power, from that of a full record.
+
+        Both are relative to the power of all lines on a bin.
+        """
         if self.missing_samples is None:
             return power
         return np.asarray(np.maximum(np.sqrt(power) - self.missing_samples.lost_fraction, 0.0) ** 2)
 
     @cached_property
     def range_drift_max(self) -> np.ndarray:
-        """Most metres by which the target moves from the shot's start to a segment's own."""
+        """Upper bound of the target's motion from the shot's start to a segment's start [m]."""
         end_time = self.segment_starts + self.middle_look_delay
         return (np.abs(self.approach_speed) + np.abs(self.acceleration) * end_time / 2) * end_time
 
     @cached_property
     def line_drift_max_bins(self) -> np.ndarray:
-        """Most bins by which its line moves in that time."""
+        """Upper bound of the line's motion from the shot's start to a segment's start [bins]."""
         velocity_change = np.abs(self.acceleration) * (self.segment_starts + self.middle_look_delay)
         bins_per_metre = (
             np.abs(self.existing_chirp_rates)
@@ -541,7 +568,7 @@ class PlannerInputs:
 
     @cached_property
     def bin_offset(self) -> np.ndarray:
-        """Distance from the nearest bin [bins], 0..1/2."""
+        """Distance of the line from the nearest bin [bins], 0..1/2."""
         bin_position = self.beat_frequency / self.bin_width
         return np.abs(bin_position - np.rint(bin_position))
 
@@ -554,7 +581,7 @@ class PlannerInputs:
 
     @cached_property
     def transfer_gain(self) -> np.ndarray:
-        """|H| at the line over that at DC."""
+        """Receiver's gain |H| at the line relative to DC."""
         bandwidths = [
             self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
         ]
@@ -572,14 +599,14 @@ class PlannerInputs:
 
     @cached_property
     def antialias_filter(self) -> dict[str, np.ndarray]:
-        """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
+        """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
         return receiver_chain.antialias_filter_parameters(
             receiver_chain.receiver_parameters(self.parameters)
         )
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
-        """Bound on the relative change of |H|^2 a bin [1/bin]."""
+        """Bound on the relative change of |H|^2 per bin [1/bin]."""
         bandwidths = (
             self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
         )
@@ -587,7 +614,7 @@ class PlannerInputs:
 
     @cached_property
     def line_signal_ratio(self) -> np.ndarray:
-        """Magnitude of the bare line on a bin over sigma, by segment."""
+        """Magnitude over sigma of the line on the axis, if it lay on a bin, by segment."""
         signal_ratio = (
             self.beat_amplitude
             * (0.5 * self.window.sum)
@@ -597,7 +624,8 @@ class PlannerInputs:
         if self.option(RECEIVER_PREFIX + "noise_shape") == "white":
             return signal_ratio
         relative_density = self.relative_noise_density
-        if self.antialias_filter:  # where next to no noise passes, that of the ADC is what there is
+        # Where filters pass almost no noise, the ADC's noise remains.
+        if self.antialias_filter:
             relative_density = (
                 relative_density + self.quantisation_variance / self.receiver_noise_variance
             )
@@ -618,18 +646,18 @@ class PlannerInputs:
 
     @cached_property
     def peak_ratio(self) -> np.ndarray:
-        """Magnitude of the largest bin of the bare line over sigma, by segment."""
+        """Magnitude over sigma of the largest bin of the line on the axis, by segment."""
         return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
 
     @cached_property
     def bins_per_relative_range(self) -> np.ndarray:
-        """Bins for a relative difference of range of 1, by segment."""
+        """Shift of a line [bins] per relative change of range, by segment."""
         beat_per_relative_range = self.chirp_rate * self.delay * (1 + np.abs(self.doppler_ratio))
         return np.abs(self.existing_chirp_rates) * (beat_per_relative_range / self.bin_width)
 
     @cached_property
     def bins_per_velocity(self) -> np.ndarray:
-        """Bins for 1 m/s, by segment."""
+        """Shift of a line [bins] per 1 m/s, by segment."""
         return bins_per_velocity(
             range=self.range, carrier=self.carriers, chirp_rate=self.chirp_rate,
             bin_width=self.bin_width,
@@ -637,29 +665,29 @@ class PlannerInputs:
 
     @cached_property
     def axis_surface_spread(self) -> OffsetMoments:
-        """Bins off the axis's line by the ranges of beamlets on the axis's surface."""
+        """Moments of lines' offsets [bins] due to the ranges of beamlets on the axis's surface."""
         return self.footprint_extent.axis_surface_range_offsets.scaled_by(
             self.bins_per_relative_range
         )
 
     @cached_property
     def range_spread(self) -> OffsetMoments:
-        """Bins off the axis's line by the ranges of all beamlets."""
+        """Moments of lines' offsets [bins] due to the ranges of all beamlets."""
         return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
 
     @cached_property
     def velocity_spread(self) -> OffsetMoments:
-        """Bins off the axis's line by the velocities of beamlets."""
+        """Moments of lines' offsets [bins] due to the velocities of beamlets."""
         return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
 
     @cached_property
     def line_spread(self) -> OffsetMoments:
-        """Bins off the axis's line by ranges and velocities of beamlets."""
+        """Bounds of moments of lines' offsets [bins] due to ranges and velocities of beamlets."""
         return self.range_spread.sum_bound(self.velocity_spread)
 
     @cached_property
     def total_phase_error_bound(self) -> PhaseErrorBound:
-        """All that smears lines over the record."""
+        """Bound of the sum of all phase errors over the record."""
         total = NO_PHASE_ERROR
         for bound in self.phase_error_bounds.values():
             total = total.plus(bound)
@@ -667,22 +695,22 @@ class PlannerInputs:
 
     @cached_property
     def phase_error_shift_bins(self) -> np.ndarray | float:
-        """Bins that light may be moved by over the record."""
+        """Largest shift of light by phase errors over the record [bins]."""
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
     def bins_to_image(self) -> np.ndarray:
-        """Bins from DC and Nyquist to the nearest light of a line."""
+        """Distance from DC and Nyquist to the nearest light of a line [bins]."""
         return self.bins_to_edge - self.line_spread.extreme - self.phase_error_shift_bins
 
     @cached_property
     def is_near_image(self) -> np.ndarray:
-        """True where lines and their images are so close that they may add up, or cancel."""
+        """True where lines and their images are so close that they may add up or cancel."""
         return ~(2 * self.bins_to_image >= _NEAR_IMAGE_WINDOW_BINS * self.padding_factor)
 
     @cached_property
     def image_bound(self) -> np.ndarray:
-        """Most that images add to the largest bin, over the magnitude that lines make in phase."""
+        """Largest addition of images to the largest bin, over the magnitude of lines in phase."""
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
         gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
         image_response = self.sidelobe_max(self.bins_to_image) * np.sqrt(smear_factor)
@@ -692,27 +720,39 @@ class PlannerInputs:
 
     @property
     def amplitudes_may_add(self) -> bool:
-        """True if amplitudes add, or may."""
+        """True if beamlets add as amplitudes, always or in draws of speckle."""
         return self.adds_amplitudes or self.any_nonzero("target.roughness")
 
     @cached_property
     def may_cancel(self) -> np.ndarray:
-        """True where amplitudes that add, or may, might nearly cancel."""
+        """True where amplitudes that add might nearly cancel."""
         if not self.amplitudes_may_add:
             return np.zeros_like(self.is_near_image)
         return self.is_near_image | (self.n_beamlets > 1)
 
     @cached_property
     def peak_power_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest power of the largest bin, over that of all lines on a bin."""
+        """Lower and upper bound of the largest bin's power, over that of all lines on a bin."""
         return self.peak_power_bounds_for(self.line_spread)
 
     def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the largest bin's power for lines of a spread, over that of all lines on a bin.
+        """Bound the largest bin's power for lines of a given spread.
 
-        Images are included. The bounds come from Taylor's series, the line of the strongest
-        beamlet, and Chebyshev's inequality: a share 1 - 1/t^2 of the power lies within t s, whose
-        largest bin holds the mean at least.
+        Parameters
+        ----------
+        moments : OffsetMoments
+            Moments of the lines' offsets from the axis's line [bins].
+
+        Returns
+        -------
+        power_min, power_max : ndarray
+            Bounds over the power of all lines on a bin, with images included.
+
+        Notes
+        -----
+        The bounds follow from Taylor's series, the line of the strongest beamlet, and Chebyshev's
+        inequality: a fraction 1 - 1/t^2 of the power lies within t s, and the largest bin there
+        holds at least the mean.
         """
         response, gain_slope, (mean, rms, extreme) = (
             self.window_response,
@@ -752,13 +792,25 @@ class PlannerInputs:
         present_moments: OffsetMoments,
         shift_bins: np.ndarray | float = 0.0,
     ):
-        """Relative change of the largest bin's power as lines are moved, or spread further.
+        """Bound the relative change of the largest bin's power as lines move or spread further.
 
-        P_k = sum_b p_b F(k - x_0 - X_b), and with F1, F2 the bounds on |F'| and |F''|
+        Parameters
+        ----------
+        added_moments : OffsetMoments
+            Moments of the added offsets X [bins].
+        present_moments : OffsetMoments
+            Moments of the offsets x_b without the change [bins].
+        shift_bins : ndarray or float
+            Common shift of all lines [bins].
+
+        Notes
+        -----
+        P_k = sum_b p_b F(k - x_0 - X_b), and with bounds F1, F2 on |F'| and |F''|
 
             |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s
 
-        for the mean m and the rms s of X, added to lines of rms S, and c of the receiver's poles.
+        for the mean m and the rms s of X, added to lines of rms S, with c due to the receiver's
+        poles.
         """
         response, power_min = self.window_response, self.peak_power_bounds_for(present_moments)[0]
         power_change = response.slope_max * (added_moments.mean + shift_bins)
@@ -773,9 +825,10 @@ class PlannerInputs:
         return image_factor * np.exp(np.minimum(gain_exponent, 50.0)) * power_change / power_min
 
     def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
-        """Bound the relative change of a sum of amplitudes whose lines move by some bins.
+        """Bound the relative change of a sum of amplitudes whose lines move by ``shift_bins``.
 
-        Relative to the sum in phase; by |W'|, |H'| and the phase at mid-record, line and image.
+        It is relative to the sum in phase, and follows from |W'|, |H'| and the phase at mid-record,
+        of line and image.
         """
         phase_per_bin = (
             2 * np.pi * (self.acquisition_delay + 0.5 * self.record_duration) * self.bin_width

@@ -1,22 +1,22 @@
-"""Effects to be simulated in each tile: those that any of its points needs.
+"""Planning: the effects that are simulated in each tile are those that any of its points needs.
 
-The change by leaving an effect out is estimated at each point, and is a tile's largest. The
-smallest are left out as long as their sum is within the tolerance: a tighter one keeps all that a
-looser one does.
+The change if an effect is omitted is bounded at each point; a tile has the largest of its points.
+The effects with the smallest changes are omitted, as long as the sum of their changes is within the
+tolerance. A tighter tolerance keeps all effects that a looser one keeps.
 
-With x = ln a, a and the threshold b over sigma, dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2} is at
-most sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}. This has one maximum, at a (a - b) = 1/2. It is taken
-at its largest between the least and the largest a that all effects together may leave. An addition
-to a magnitude counts by dQ_1/da <= 1/2 e^{-(a - b)^2 / 2}, noise that the threshold does not follow
-by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
+With x = ln a, and signal a and threshold b over sigma, dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2} is
+at most sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}. This has one maximum, at a (a - b) = 1/2. It is
+evaluated at its largest value between the smallest and the largest a that all effects together may
+leave. An absolute change of a magnitude counts by dQ_1/da <= 1/2 e^{-(a - b)^2 / 2}. Noise that the
+threshold does not follow counts by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
 
     |d log10 P^2| <= |d b^2| / ln 10
 
-for the probability P^2 of a false alarm in a shot. If pd is 1 whatever happens bins still have
-magnitudes: |X| counts by its change over itself, or over sigma where it is below that.
+for the probability P^2 of a false alarm in a shot. If pd is 1 in any case, bins still have
+magnitudes: |X| counts by its relative change, or by its change over sigma if it is below sigma.
 
-If segments report their strongest peak alone an echo has to exceed the largest noise too: b is
-the level at which pd is steepest, of those between the threshold and that.
+If segments report only their strongest peak, an echo also has to exceed the largest noise. Then b
+is the level at which pd is steepest, between the threshold and that noise.
 """
 
 import math
@@ -31,29 +31,30 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 
 _LN_10 = math.log(10.0)
 _CHANGE_MAX = 1e12
+"""Upper limit of changes and ratios, against overflow."""
 _BIN_MOVING_STAGES = ("lines", "record", "spectrum")
-"""Stages of effects that move light from bins to others."""
+"""Stages of effects that move light from bin to bin."""
 
 
 class EffectPlan(NamedTuple):
-    """Plan of the effects that are simulated in each tile."""
+    """Effects that are simulated in each tile."""
 
     effect_names: tuple[str, ...]
-    """Effects in the order in which they act."""
+    """Names of the effects, in the order of their application."""
     is_kept: np.ndarray
-    """(effects, tiles) bool: whether it is simulated."""
+    """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
-    """(effects, tiles): largest change that it may make, 0..1."""
+    """(effects, tiles): largest change if the effect is omitted, 0..1."""
     total_error: np.ndarray
-    """(tiles,): sum of omissions' bounds, and :attr:`residual_error`; above the tolerance only by
-    this, and by what is off."""
+    """(tiles,): sum of the changes of omitted effects, and :attr:`residual_error`. It exceeds the
+    tolerance only by the latter, and by effects that are off."""
     residual_error: np.ndarray
-    """(tiles,): change by what effects that are simulated leave out."""
+    """(tiles,): change due to what simulated effects neglect."""
     keeps_all_optional: np.ndarray
-    """(tiles,) bool: whether nothing is left out that any mode leaves a choice about."""
+    """(tiles,) bool: True if every effect is kept that is not forced on or off."""
 
     def select(self, tile_mask: np.ndarray) -> "EffectPlan":
-        """Of some of the tiles, by a mask."""
+        """Return the plan of the tiles of a mask."""
         is_kept, omission_error = self.is_kept[:, tile_mask], self.omission_error[:, tile_mask]
         total_error, residual_error = self.total_error[tile_mask], self.residual_error[tile_mask]
         return EffectPlan(
@@ -73,21 +74,36 @@ def plan_effects(
     tolerance: float = 0.0,
     effects: Sequence[Effect] = EFFECTS,
 ) -> EffectPlan:
-    """Effects to be simulated in each tile of some points.
+    """Choose the effects to simulate in each tile.
 
-    ``tile_max`` gives the largest value in each tile, (tiles,), of values that broadcast over the
-    points. ``modes`` are ``auto`` (by default), ``on`` or ``off`` by name. An effect that the scene
-    has nothing of is left out, even if it is on. With one that is off go those that are within it;
-    a ValueError where one of these is on. ``tolerance`` is on the sum of the changes by all that is
-    left out, 0..1: of pd in the three segments together, of log10 of a false alarm's probability,
-    of a relative magnitude.
+    Parameters
+    ----------
+    points : PlannerInputs
+        Points of all tiles.
+    tile_max : callable
+        Function that returns the largest value in each tile, (tiles,), of values that broadcast
+        over the points.
+    modes : mapping, optional
+        ``auto`` (default), ``on`` or ``off`` by name of the effect. An effect that is absent from
+        the scene is omitted even if it is on. An effect that is off switches off the effects that
+        are part of it.
+    tolerance : float
+        Tolerated sum of the changes by all omitted effects, 0..1: of pd in the three segments
+        together, of log10 of a probability of false alarm, or of a relative magnitude.
+    effects : sequence of Effect
+        Effects to choose from.
+
+    Raises
+    ------
+    ValueError
+        If an effect is on that is part of one that is off.
     """
     effect_names = tuple(effect.name for effect in effects)
     forced_modes = _forced_modes(effects, modes or {})
     points.ignores_doppler = forced_modes.get("doppler") == "off"
     points.ignores_segment_motion = forced_modes.get("segment_motion") == "off"
     points.ignores_overlap = forced_modes.get("overlap") == "off"
-    with np.errstate(all="ignore"):  # of what exceeds all numbers nothing is known: it is kept
+    with np.errstate(all="ignore"):  # an effect whose bound overflows is kept
         bounds = error_bounds(points, effects)
         moves_light = None
         if forced_modes.get("leakage") == "on" and "leakage" in bounds:
@@ -126,7 +142,7 @@ def plan_effects(
 def error_bounds(
     points: PlannerInputs, effects: Sequence[Effect] = EFFECTS
 ) -> dict[str, ErrorBound]:
-    """Sizes of the effects that some points have, by name."""
+    """Return the error bounds of the effects that are present, by name."""
     phase_bounds = (
         (effect.name, effect.phase_error_bound(points))
         for effect in effects
@@ -140,7 +156,7 @@ def error_bounds(
 
 
 def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
-    """Effects that are on or off whatever their sizes, and what these take with them."""
+    """Return the effects that are on or off by their mode, or by that of a parent or a child."""
     forced_modes = {name: mode for name, mode in modes.items() if mode != "auto"}
     for name, parent in _child_parent_pairs(effects):
         if forced_modes.get(parent) == "off":
@@ -154,7 +170,10 @@ def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[s
 
 
 def _child_parent_pairs(effects: Sequence[Effect]) -> list[tuple[str, str]]:
-    """Effects that are part of others, and these, which stand before them in the list."""
+    """Return pairs of names: an effect that is part of another, and that other effect.
+
+    A parent precedes its children in the catalogue.
+    """
     effect_names = {effect.name for effect in effects}
     return [(effect.name, effect.parent) for effect in effects if effect.parent in effect_names]
 
@@ -168,9 +187,10 @@ def _select_effects(
 ) -> np.ndarray:
     """Choose the effects to keep, (effects, tiles) bool, of those that the scene has, `is_present`.
 
-    The smallest are left out first, as long as their sum is within what the tolerance leaves; an
-    effect never before those within it, last ones first where they are alike. Those that cost
-    nothing, as a number added to the noise does, are never left out.
+    The effects with the smallest changes are omitted first, as long as the sum is within the
+    remaining tolerance. Children are omitted before their parents, and equal changes in reverse
+    order of the catalogue. Effects without cost, such as a number added to the noise, are never
+    omitted.
     """
     row_by_name = {effect.name: row for row, effect in enumerate(effects)}
     forced_mode = np.array([forced_modes.get(name, "") for name in row_by_name])
@@ -204,17 +224,31 @@ def omission_errors(
     points: PlannerInputs,
     moves_light: Mapping[str, bool] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Change of pd, log10 pfa or |X| by each effect, whichever is most, 0..1, over the points.
+    """Compute the change of pd, log10 pfa or |X| if an effect is omitted, whichever is largest.
 
-    Of pd it is the sum of the changes in all segments, which bounds that of their product. If
-    leakage is asked for, `moves_light` tells of each effect whether it moves light from bins to
-    others.
-    Bins that leak are then taken to be off by as many sigmas as the largest; that counts up to the
-    leakage's own size.
+    Parameters
+    ----------
+    bounds : mapping
+        Error bounds by name of the effect.
+    points : PlannerInputs
+        Points of all tiles.
+    moves_light : mapping, optional
+        True for effects that move light from bin to bin; given if leakage is simulated.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Change 0..1 over the points, by name.
+
+    Notes
+    -----
+    The change of pd is the sum over all segments, which bounds that of their product. If
+    `moves_light` is given, bins that leak change by as many sigmas as the largest bin; this counts
+    up to the leakage's own error.
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
-    if points.noise_peak_ratio is not None:  # which an echo has to exceed as well
+    if points.noise_peak_ratio is not None:  # an echo has to exceed the noise as well
         threshold = np.maximum(threshold, np.minimum(signal_ratio_max, points.noise_peak_ratio))
     b = points.looks.equivalent_threshold_ratio(threshold)
     steepest_signal = 0.5 * (b + np.sqrt(b * b + 2))
@@ -266,7 +300,7 @@ def omission_errors(
 def residual_errors(
     bounds: Mapping[str, ErrorBound], points: PlannerInputs
 ) -> dict[str, np.ndarray]:
-    """Bound the change of pd or |X| that each effect leaves where it is simulated."""
+    """Bound the change of pd or |X| that remains although an effect is simulated, by name."""
     residuals = {
         name: bound.residual_magnitude_change
         for name, bound in bounds.items()
@@ -285,7 +319,7 @@ def residual_errors(
     near_threshold = np.exp(-0.5 * (signal - b) ** 2)
     errors_by_effect = {}
     for name, relative_change in residuals.items():
-        # of itself, and of the magnitude that all lines make together in a whole record
+        # Relative to the magnitude itself, and to that of all lines together in a full record.
         coherent_change = (
             bounds[name].residual_coherent_sum_change
             * points.line_signal_ratio
@@ -308,7 +342,7 @@ def residual_errors(
 def signal_ratio_bounds(
     bounds: Mapping[str, ErrorBound], points: PlannerInputs
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest magnitude of the largest bin over sigma that all effects may leave."""
+    """Bound the largest bin's magnitude over sigma, below and above, for any set of effects."""
     signal_ratio_min = signal_ratio_max = points.peak_ratio * points.looks.amplitude_gain_max
     coherent_change: np.ndarray | float = 0.0
     for bound in bounds.values():
@@ -332,16 +366,17 @@ def signal_ratio_bounds(
 
 
 def _is_nonzero(value: np.ndarray | float) -> bool:
+    """Return False for the number 0; an array counts as nonzero."""
     return isinstance(value, np.ndarray) or value != 0.0
 
 
 def _sum_over_segments(value: np.ndarray | float, points: PlannerInputs) -> np.ndarray | float:
-    """Over the segments."""
+    """Return the sum over the segments; values without an axis of segments are equal in all."""
     if np.ndim(value) <= points.ndim:
         return value * (len(points.existing_chirp_rates) if np.ndim(value) else 1)
     return np.asarray(value).sum(axis=0)
 
 
 def _max_over_segments(value: np.ndarray | float, points: PlannerInputs) -> np.ndarray | float:
-    """In any segment."""
+    """Return the largest value of any segment."""
     return np.asarray(value).max(axis=0) if np.ndim(value) > points.ndim else value

@@ -1,35 +1,40 @@
-"""Speckle: random amplitudes that a rough surface sends back from each beamlet.
+"""Speckle: random amplitudes that a rough surface returns from each beamlet.
 
 A patch whose heights scatter by more than lambda/(4 pi) about their mean returns the sum of many
-waves of unrelated phase: a circular complex Gaussian amplitude [Goodman, Speckle Phenomena in
-Optics, ch. 2]. A beamlet's patch here takes the factor
+waves of unrelated phase: a circular complex Gaussian amplitude [1]_. A beamlet's patch has the
+factor
 
     g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b,     z_b complex normal with E|z_b|^2 = 1,
 
-whose mean power is 1. kappa = exp(-(4 pi sigma_h / lambda)^2) is the share of power that stays
-coherent when the round trip has normal phases of deviation 4 pi sigma_h / lambda. Further, u_b is 1
-where the footprint's phases follow its geometry, and a random phase where they do not. kappa = 0 is
-a Swerling-1 target, any other a Rician one.
+whose mean power is 1. kappa = exp(-(4 pi sigma_h / lambda)^2) is the fraction of power that stays
+coherent if the round trip has normal phases of standard deviation 4 pi sigma_h / lambda. u_b is 1
+if the footprint's phases follow its geometry, and a random phase otherwise. kappa = 0 is a
+Swerling-1 target, any other a Rician one.
 
 The three segments of a shot see the same heights, so one g_b serves all three. Amplitudes at
-frequencies df apart have the correlation exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and
-heights of 10 um. With the instrument moving across the beam the Doppler shifts differ over the
-footprint, which turns the beamlets against each other from one segment to the next. Motion between
-segments has that in the lines' phases. If it is left out it is done here, but for coherent
-footprints with a share kappa left, whose segments are then more alike than they are.
+frequencies df apart have the correlation exp(-(4 pi sigma_h df / c)^2 / 2), which is 1 to 1e-6 for
+1 GHz and heights of 10 um. If the instrument moves across the beam, Doppler shifts differ over the
+footprint, and beamlets turn against each other from one segment to the next. With the effect of
+motion between segments, the lines' phases contain this rotation. Otherwise this effect applies it,
+except to coherent footprints with a coherent part, whose segments are then more similar than in
+reality.
 
-It acts on the lines' amplitudes alone; the mean echo, and so its shot noise, stays.
+The effect changes only the lines' amplitudes. The mean echo, and so its shot noise, stay.
 
 **Fading**: developed speckle (kappa = 0) without draws, the default for surfaces. A sum of circular
-complex Gaussian amplitudes is one itself, in every bin; its mean power is what beamlets make that
-add as powers. A bin then crosses the threshold with Swerling's first probability, and two segments'
-bins as two correlated ones do. Their correlation falls with the Doppler shifts and the ranges that
-differ over the beam, by :mod:`sweep.model.detection.speckle_correlation`. It is in
-closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
-the detection, and on leakage: what an echo leaks fades with it, in closed form
-(:mod:`sweep.model.spectrum.leakage`) as where false peaks are drawn
-(:mod:`sweep.model.pointcloud.leaked_peaks`). Of
-several looks it is a mean over the mean power of all.
+complex Gaussian amplitudes is circular complex Gaussian in every bin. Its mean power is that of
+beamlets that add as powers. A bin then crosses the threshold with the probability of Swerling's
+first case, and two segments' bins as two correlated ones. Their correlation falls with the Doppler
+shifts and ranges that differ over the beam (:mod:`sweep.model.detection.speckle_correlation`). It
+is in closed form, because a number of beamlets that is enough for the power of a bin may be too
+small for the correlation. The effect acts on the detection and on leakage. The leaked signal of an
+echo fades with it, in closed form (:mod:`sweep.model.spectrum.leakage`) and in draws of false peaks
+(:mod:`sweep.model.pointcloud.leaked_peaks`). With several looks, the probability is a mean over the
+mean power of all.
+
+References
+----------
+.. [1] Goodman, Speckle Phenomena in Optics, ch. 2.
 """
 
 import math
@@ -57,16 +62,24 @@ from sweep.model.preparation import Shots
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
 _DIFFUSE_RATIO_MAX = 5.0
-"""Bound on a bin's diffuse amplitude over its root mean square; exceeded in one of a million
-draws."""
+"""Bound on a bin's diffuse amplitude over its root mean square; exceeded in one of a million draws.
+"""
 
 
 def coherent_power_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
     """Return the fraction kappa of the mean echo power that keeps its phase, 0 .. 1.
 
-    ``roughness`` [m] is the standard deviation of the surface's height along the line of sight: for
-    a plane, that normal to it times the sine of the grazing angle; infinite for developed speckle.
-    ``wavelength`` is in m.
+    Parameters
+    ----------
+    roughness : array_like
+        Standard deviation sigma_h of the surface's height along the line of sight [m]. For a plane
+        it is that normal to it times the sine of the grazing angle; infinite for developed speckle.
+    wavelength : array_like
+        Wavelength lambda [m].
+
+    Notes
+    -----
+    kappa = exp(-(4 pi sigma_h / lambda)^2).
     """
     phase = 4 * math.pi * np.asarray(roughness, float) / np.asarray(wavelength, float)
     return np.asarray(np.exp(-(phase**2)))
@@ -79,23 +92,28 @@ def draw_speckle_factors(
     coherent_fraction: np.ndarray,
     random_phases: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the factors g_b on beamlet amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
+    """Draw the factors g_b on beamlet amplitudes.
 
     Parameters
     ----------
-    draw_addresses
+    draw_addresses : DrawAddresses
         Random keys and draw numbers of n points.
-    n_beamlets
+    n_beamlets : int
         Number of beamlets.
-    coherent_fraction
+    coherent_fraction : ndarray
         Fraction kappa, (n,) or scalar.
-    random_phases
+    random_phases : bool
         True if u_b has a uniform phase; else it is 1.
+
+    Returns
+    -------
+    magnitude, phase : ndarray (n, n_beamlets)
+        |g_b|, and its phase [cycles].
 
     Notes
     -----
-    A factor depends on key, draw and beamlet alone: pair b of ``STREAM_SPECKLE`` makes z_b, number
-    b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b.
+    A factor depends only on key, draw and beamlet: pair b of ``STREAM_SPECKLE`` makes z_b, and
+    number b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b.
     """
     from sweep.model.sampling import philox
 
@@ -104,7 +122,7 @@ def draw_speckle_factors(
     )
     point_keys, draw_numbers = draw_addresses.point_keys, draw_addresses.draw_numbers
     uniform_draws = philox.uniforms(point_keys, draw_numbers, philox.STREAM_SPECKLE, 2 * n_beamlets)
-    # In one piece each: bits do not depend on how many draws there are.
+    # Contiguous copies, so that bits do not depend on the number of draws.
     exceedance, cycles = (np.ascontiguousarray(uniform_draws[:, lane::2]) for lane in range(2))
     coherent_amplitude, diffuse_amplitude = (
         np.sqrt(point_fraction)[:, None],
@@ -128,10 +146,12 @@ def draw_speckle_factors(
 
 
 def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Upper bound on the output change if speckle is omitted, in all but 1e-6 of draws.
+    """Bound the output change if speckle is omitted, in all but 1e-6 of draws; None if inactive.
 
-    A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa)
-    |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within 1 +- 5 (4 pi sigma_h /
+    Notes
+    -----
+    A bin of magnitude |X| becomes sqrt(kappa) X + D, with D complex normal of power (1 - kappa)
+    |X|^2. Between smooth and rough, 4 pi sigma_h << lambda, it lies within 1 +- 5 (4 pi sigma_h /
     lambda). In incoherent footprints the coherent part has random phases. If a sum of amplitudes
     may cancel, the bound is relative to the sum of powers.
     """
@@ -160,9 +180,10 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 _DECORRELATED_KAPPA_MAX = 1e-6
-"""Coherent fraction kappa of coherent footprints below which segments' speckles are decorrelated
-here."""
+"""Coherent fraction kappa of coherent footprints below which the segments' speckles are
+decorrelated."""
 _TINY = 1e-300
+"""Smallest power, so that divisions are defined."""
 
 
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
@@ -198,9 +219,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
         )
     )
     amplitude = mean_amplitude * magnitude
-    # The steady share of a smooth shape is at the start of each segment what it is in the others.
+    # The coherent part of a smooth surface has the same phase at the start of every segment.
     is_decorrelated = shots.adds_powers | (coherent_fraction < _DECORRELATED_KAPPA_MAX)
-    is_decorrelated &= not shots.target_moves_between_segments  # else their lines have it
+    is_decorrelated &= not shots.target_moves_between_segments  # else lines contain it
     phase = np.empty((3, *cycles.shape))
     for segment_index, (carrier, start) in enumerate(
         zip(shots.carriers, shots.scheduled_segment_starts, strict=True)
@@ -224,7 +245,10 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
 
 
 def fading_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Error in pd from using mean instead of fluctuating power (Swerling); None if inactive."""
+    """Return an error of 1, as fading changes the detection law; None if inactive.
+
+    It is the error in pd of mean in place of fluctuating power (Swerling).
+    """
     is_smooth = points.adds_field_amplitudes or points.architecture == "direct"
     return (
         None
@@ -234,7 +258,7 @@ def fading_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_fading(shots: Shots, context: EffectContext) -> Shots:
-    """Set up detection in developed speckle, if the spec asks for it and beamlets add as powers."""
+    """Set up detection in developed speckle, if the spec selects it and beamlets add as powers."""
     from sweep.model.detection.echo_detection import SegmentCorrelations
 
     speckle_law = str(context.parameters[_SPECKLE_PATH])
@@ -274,7 +298,8 @@ def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
 
 
 _N_LINE_NODES, _LINE_DEVIATIONS_MAX = 81, 4.0
-"""Lines of a footprint, evenly spaced: few would be a comb where they spread over bins."""
+"""Number of lines of a footprint, evenly spaced so that they do not form a comb, and their extent
+[deviations]."""
 _DECORRELATION_MIN = 1e-9
 """Loss of correlation between looks below which all looks share one speckle."""
 
@@ -282,7 +307,7 @@ _DECORRELATION_MIN = 1e-9
 def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     """Set the correlation of the speckle between the looks of a shot, from the motion between them.
 
-    Looks that are added coherently get a smaller amplitude (``beat_scale``) instead.
+    Looks that are added coherently get a smaller amplitude (``beat_amplitude_scale``) instead.
     """
     looks = shots.looks
     n_looks, n_points = looks.number, shots.size
@@ -306,7 +331,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
                 shots, (segment, segment), phase
             )
     if looks.n_coherent > 1:
-        # Added amplitudes of speckles that differ are, on the mean, a smaller amplitude.
+        # The sum of amplitudes of different speckles has a smaller mean amplitude.
         lags = np.arange(1, n_looks)
         unwinding = np.exp(-1j * np.angle(correlation_by_lag[0, :, 1]))[:, None] ** lags
         squared_sum = (2 * (n_looks - lags) * (correlation_by_lag[0, :, 1:] * unwinding).real).sum(
@@ -354,7 +379,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
             np.sqrt(squared_sum)
             / (squared_sum_by_segment[pair[0]] * squared_sum_by_segment[pair[1]]) ** 0.25
         )
-    from sweep.model.detection.look_speckle import LookSpeckle  # kernels, which specs need not
+    from sweep.model.detection.look_speckle import LookSpeckle  # imports kernels
 
     look_speckle = LookSpeckle.from_correlations(
         correlation_by_lag, look_power, np.minimum(segment_correlation, 1.0)
@@ -396,16 +421,29 @@ class BeamSpread(NamedTuple):
     """Spread of ranges and Doppler ratios over the beam on the ground."""
 
     slopes: BeamGradients
+    """Gradients across the beam."""
     plane: FlatGround | None
-    """The plane; None for ray-traced ground."""
+    """Plane; None for ray-traced ground."""
     moments: "BeamletMoments"
+    """Moments of the beamlets' Doppler ratio and relative range."""
 
     def correlation(
         self, shots: Shots, pair: tuple[int, int], phase: "PhaseDifference"
     ) -> np.ndarray:
-        """Return the correlation of the speckle in two records, (n,) complex.
+        """Return the correlation of the speckle in two records.
 
-        ``pair``: segments of the two records; ``phase``: phase difference between the records.
+        Parameters
+        ----------
+        shots : Shots
+            Prepared shots.
+        pair : tuple of int
+            Segments of the two records.
+        phase : PhaseDifference
+            Phase difference between the records.
+
+        Returns
+        -------
+        ndarray (n,) complex
         """
         if self.plane is not None:
             correlations = self.plane.mean_phasor(*phase).astype(complex)
@@ -516,10 +554,10 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
 
 
 def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
-    """Optical frequencies F of the echo in the middle of each segment's record, and its times.
+    """Return the optical frequency F of the echo at mid-record in each segment, and the time of it.
 
-    That is the centroid of the window over the samples that the echo has: there the phase of a bin
-    is that of the line, to first order in their distance.
+    The time is the centroid of the window over the samples that hold the echo. There the phase of a
+    bin is that of the line, to first order in their distance.
     """
     delay = 2 * shots.range / SPEED_OF_LIGHT
     middle_shift = (
@@ -552,7 +590,7 @@ def _line_pair_gradients(
             1 + segment.doppler_ratio
         )
         bin_position = beat / window_bin_width * padding_factor
-        # Any bins of two echoes may detect them: of these the middles stand for all.
+        # With any_bin, bins at the middles of two echoes represent all bins that may detect them.
         shift_hertz = (
             segment.carrier * slopes.doppler_ratio
             - segment.chirp_rate * delay * slopes.relative_range
@@ -581,11 +619,11 @@ may make another bin the strongest."""
 def _strongest_bins_with_images(
     shots: Shots, line_positions: np.ndarray, line_deviation_bins: np.ndarray
 ) -> np.ndarray:
-    """Return the strongest bins of echoes at a place, with its sign and folds [bins], (n,).
+    """Return the strongest bins of echoes at given positions, signed and unfolded [bins], (n,).
 
-    That is the nearest one, unless a line near DC or Nyquist of a real record has its image there:
-    of bins 0 and 1 that at DC then has the light of both. ``line_deviation_bins`` is that of the
-    lines [bins].
+    It is the nearest bin, unless a line near DC or Nyquist of a real record overlaps with its
+    image: of bins 0 and 1, bin 0 then has the light of both. ``line_deviation_bins`` is the
+    standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
     if not shots.real_fft_size or not shots.sums_images:
@@ -608,7 +646,7 @@ def _strongest_bins_with_images(
     inward_sign = np.where(line_positions[:, 0] < spectrum_ends, -1.0, 1.0)
     first_distance = np.maximum(inward_sign * (nearest_bins[near_end] - spectrum_ends) - 1, 0.0)
     powers = []
-    for extra_distance in range(3):  # the nearest bin and those beside it, on this side of the end
+    for extra_distance in range(3):  # the nearest bin and its neighbours
         bin_ = (spectrum_ends + inward_sign * (first_distance + extra_distance))[:, None]
         line_transform = window_transform(shots.window, (bin_ - node_positions) / padding_factor)
         image_transform = window_transform(
@@ -705,6 +743,7 @@ FADING = Effect(
         ),
     ),
 )
+"""Effect of developed speckle of a rough surface, in closed form."""
 
 
 SPECKLE = Effect(
@@ -713,7 +752,7 @@ SPECKLE = Effect(
     stage="draws",
     error_bound=speckle_bound,
     perturb_shots=perturb_shots,
-    required_effects=("footprint", "doppler_spread"),  # by them the segments' speckles differ
+    required_effects=("footprint", "doppler_spread"),  # these decorrelate the segments' speckle
     parameters=(
         Parameter(
             path=_ROUGHNESS_PATH,
@@ -723,3 +762,4 @@ SPECKLE = Effect(
         ),
     ),
 )
+"""Effect of random amplitudes of a rough surface, by draws."""
