@@ -1,1 +1,1 @@
-"""The geometry that a moving lidar sees: meshes, the rays cast into them, paths and scanners."""
+"""Geometry of a moving lidar: meshes, ray casting, trajectories and scanners."""

@@ -1,8 +1,8 @@
-"""Platform of the instrument: position, velocity and attitude against time.
+"""Platform of the instrument: position, velocity and attitude over time.
 
-Velocity and acceleration are the exact derivatives of the position; every law of attitude gives
-the quaternion (body to world) and the angular velocity that is its derivative. A moving target is
-a `MovingBody` too. Body frame: x forward, y left, z up.
+Velocity and acceleration are exact derivatives of the position. Every attitude law returns the
+quaternion (body to world) and its exact derivative, the angular velocity. A moving target is a
+`MovingBody` too. Body frame: x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -18,30 +18,32 @@ from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
 
 _HORIZONTAL_FRACTION_MIN, _HORIZONTAL_SPEED_MIN = 1e-9, 1e-100
-"""Horizontal share of the speed, and horizontal speed [m/s], under which there is no heading."""
+"""Smallest horizontal fraction of the speed, and smallest horizontal speed [m/s], for which a
+heading is defined."""
 
 
 FloatSequence = Sequence[float] | np.ndarray
+"""Sequence or array of numbers."""
 
 AttitudeAndRate = tuple[np.ndarray, np.ndarray]
 """Quaternion (n, 4), body to world, and angular velocity (n, 3) [rad/s] in the world frame.
 
-What a law of attitude makes of times (n,) [s], velocities and accelerations (n, 3) [m/s, m/s^2].
+An attitude law returns them for times (n,) [s], velocities and accelerations (n, 3) [m/s, m/s^2].
 """
 
 
 @dataclass(frozen=True)
 class NadirAttitude:
-    """Level, so that a beam along -z points straight down."""
+    """Level attitude, so that a beam along -z points straight down."""
 
     heading: float | None = 0.0
-    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]; None
-    follows the track over the ground, which a vertical movement does not have."""
+    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]. None
+    follows the track over the ground, which is undefined for a vertical motion."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         if self.heading is not None:
             return np.tile(quat.axis_angle(2, self.heading), (len(times), 1)), np.zeros(
                 (len(times), 3)
@@ -52,15 +54,15 @@ class NadirAttitude:
 
 @dataclass(frozen=True)
 class AlongTrackAttitude:
-    """Forward axis along the velocity, wings level but for a bank."""
+    """Attitude with the forward axis along the velocity, and the wings level except for a bank."""
 
     roll: float = 0.0
-    """Left side up [rad], constant."""
+    """Constant roll angle, positive with the left side up [rad]."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
         horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
         pitch = np.arctan2(velocity[:, 2], horizontal_speed)
@@ -79,7 +81,7 @@ class AlongTrackAttitude:
 def _heading_and_rate(
     velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Heading [rad] and its rate [rad/s], (n,) each."""
+    """Return the heading [rad] and its rate [rad/s], (n,) each."""
     vx, vy = velocity[:, 0], velocity[:, 1]
     horizontal_speed = np.hypot(vx, vy)
     speed = np.linalg.norm(velocity, axis=1)
@@ -94,32 +96,34 @@ def _heading_and_rate(
 
 @dataclass(frozen=True, eq=False)
 class FixedAttitude:
-    """One attitude throughout: (w, x, y, z), body to world, scaled to length 1."""
+    """Constant attitude."""
 
     quaternion: FloatSequence
+    """(4,): quaternion (w, x, y, z), body to world; it is normalised to length 1."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         q = quat.normalise(np.asarray(self.quaternion, float))
         return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
 
 
 @dataclass(frozen=True, eq=False)
 class SpinningAttitude:
-    """Turning at a constant rate about an axis that is fixed in the body and in the world."""
+    """Rotation at a constant rate about an axis that is fixed in the body and in the world."""
 
     angular_velocity: FloatSequence
     """(3,): angular velocity in the world frame [rad/s]."""
     initial_quaternion: FloatSequence = (1.0, 0.0, 0.0, 0.0)
-    """Attitude at `initial_time` [s]."""
+    """(4,): attitude at `initial_time`, body to world."""
     initial_time: float = 0.0
+    """Time of the initial attitude [s]."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         angular_velocity = np.asarray(self.angular_velocity, float)
         rotation = quat.from_rotation_vector(
             (times - self.initial_time)[:, None] * angular_velocity
@@ -130,14 +134,18 @@ class SpinningAttitude:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeTrack:
-    """Attitudes (n, 4) at rising times (n,) [s], joined by the shorter turns at constant rates.
+    """Attitudes at given times, interpolated by the shorter rotation at a constant rate (slerp).
 
-    Slerp; before the first and after the last the attitude stays. q and -q are one.
+    Before the first and after the last time the attitude is constant. q and -q are the same
+    attitude.
     """
 
     times: FloatSequence
+    """(n,): ascending times [s]."""
     quaternions: Sequence[Sequence[float]] | np.ndarray
+    """(n, 4): attitudes at these times, body to world."""
     _rotation_steps: np.ndarray = field(init=False, repr=False)
+    """(n - 1, 3): rotation vectors between successive attitudes [rad]."""
 
     def __post_init__(self) -> None:
         times, quaternions = checked_rising_times(self.times), np.asarray(self.quaternions, float)
@@ -159,7 +167,7 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
         interval_duration = np.diff(times)[interval]
@@ -177,21 +185,24 @@ class AttitudeTrack:
 
 @dataclass(frozen=True, eq=False)
 class MountedAttitude:
-    """An instrument turned, from its frame to the body's, with respect to its carrier."""
+    """Attitude of an instrument that is mounted with a constant rotation on its carrier."""
 
     carrier: AttitudeLaw
+    """Attitude law of the carrier."""
     mounting: FloatSequence
+    """(4,): quaternion from the instrument's frame to the carrier's."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Attitude and angular velocity."""
+        """Return attitude and angular velocity."""
         q, angular_velocity = self.carrier.attitude_and_rate(times, velocity, acceleration)
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 
 
 _TIME_TOLERANCE = 1e-9
-"""Share of the duration by which a time may lie outside the path, for rounding's sake."""
+"""Fraction of the duration by which a time may lie outside the trajectory, to allow for rounding.
+"""
 
 
 AttitudeLaw = (
@@ -202,33 +213,43 @@ AttitudeLaw = (
     | AttitudeTrack
     | MountedAttitude
 )
+"""Attitude over time."""
 
 
 class Motion(NamedTuple):
-    """Movement of a point: position [m], velocity [m/s], acceleration [m/s^2], each (n, 3)."""
+    """Motion of a point, (n, 3) each."""
 
     position: np.ndarray
+    """Position [m]."""
     velocity: np.ndarray
+    """Velocity [m/s]."""
     acceleration: np.ndarray
+    """Acceleration [m/s^2]."""
 
 
 class BodyState(NamedTuple):
-    """Pose of a body in the world frame, (n, 3) or (n, 4) each.
-
-    Position [m] and velocity [m/s] of the instrument, unit quaternion (w, x, y, z) from body to
-    world, angular velocity [rad/s]; acceleration of the instrument [m/s^2], as if that angular
-    velocity stayed as it is.
-    """
+    """Pose and motion of the instrument on a body, in the world frame."""
 
     position: np.ndarray
+    """(n, 3): position of the instrument [m]."""
     velocity: np.ndarray
+    """(n, 3): velocity of the instrument [m/s]."""
     attitude: np.ndarray
+    """(n, 4): unit quaternion (w, x, y, z) from body to world."""
     angular_velocity: np.ndarray
+    """(n, 3): angular velocity of the body [rad/s]."""
     acceleration: np.ndarray
+    """(n, 3): acceleration of the instrument [m/s^2], for a constant angular velocity."""
 
 
 def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Return times, those just off the path's ends clipped to it; a ValueError for others."""
+    """Return the times, clipped to the trajectory within rounding.
+
+    Raises
+    ------
+    ValueError
+        If a time lies outside the trajectory.
+    """
     times = np.atleast_1d(np.asarray(times, float))
     tolerance = _TIME_TOLERANCE * max(stop - start, 1.0)
     if not ((times >= start - tolerance) & (times <= stop + tolerance)).all():
@@ -238,16 +259,18 @@ def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class ConstantAcceleration:
-    """Path of a point under a constant acceleration; a straight line where that is 0.
-
-    Position, velocity and acceleration (3,) at time 0 [m, m/s, m/s^2]; duration [s], > 0.
-    """
+    """Trajectory of a point under constant acceleration; a straight line if that is 0."""
 
     position: FloatSequence
+    """(3,): position at time 0 [m]."""
     velocity: FloatSequence
+    """(3,): velocity at time 0 [m/s]."""
     acceleration: FloatSequence
+    """(3,): acceleration [m/s^2]."""
     duration: float
+    """Duration [s], > 0."""
     start: float = field(default=0.0, init=False)
+    """First time [s]."""
 
     def __post_init__(self) -> None:
         if not (self.duration > 0 and math.isfinite(self.duration)):
@@ -259,7 +282,7 @@ class ConstantAcceleration:
         return self.duration
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Movement at times (n,) [s] from start to stop."""
+        """Return the motion at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, 0.0, self.duration)[:, None]
         x0, v0, a = np.array([self.position, self.velocity, self.acceleration], float)
         return Motion(x0 + (v0 + 0.5 * a * times) * times, v0 + a * times, a + 0 * times)
@@ -272,10 +295,19 @@ def straight_trajectory(
     initial_speed: float,
     final_speed: float | None = None,
 ) -> ConstantAcceleration:
-    """Straight line between two points (3,) [m], the speed changing at a constant rate.
+    """Return a straight trajectory between two points, with a constant rate of change of the speed.
 
-    The speeds [m/s] are >= 0 and not both 0; the final one is the initial one by default. A
-    ValueError for equal points, or speeds that never cover the distance.
+    Parameters
+    ----------
+    start_point, end_point : array_like (3,)
+        Points [m].
+    initial_speed, final_speed : float
+        Speeds [m/s], >= 0 and not both 0; by default the final speed is the initial one.
+
+    Raises
+    ------
+    ValueError
+        For equal points, or speeds that never cover the distance.
     """
     end_speed = initial_speed if final_speed is None else final_speed
     first_point = np.asarray(start_point, float)
@@ -293,25 +325,30 @@ def straight_trajectory(
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Path through positions (n, 3) [m] at rising times (n,) [s], at least two."""
+    """Trajectory through positions at given times."""
 
     times: FloatSequence
+    """(n,): ascending times [s], at least two."""
     positions: Sequence[Sequence[float]] | np.ndarray
+    """(n, 3): positions at these times [m]."""
     is_smooth: bool = True
-    """A cubic spline, whose velocity and acceleration are steady (through two or three points,
-    the line or parabola); False joins the points by straight lines at constant velocities."""
+    """True for a cubic spline, whose velocity and acceleration are continuous (a line or a parabola
+    through two or three points); False for straight lines at constant velocities."""
     _interpolant: Any = field(init=False, repr=False)
+    """Piecewise polynomial of the positions relative to the first."""
     _origin: np.ndarray = field(init=False, repr=False)
+    """(3,): first position [m]."""
 
     def __post_init__(self) -> None:
-        from scipy.interpolate import CubicSpline, PPoly  # which takes longer than all else here
+        from scipy.interpolate import CubicSpline, PPoly  # slow to import
 
         times, positions = checked_rising_times(self.times), np.asarray(self.positions, float)
         if positions.shape != (len(times), 3) or not np.isfinite(positions).all():
             raise ValueError(
                 f"waypoints need three finite coordinates a time, not {positions.shape}"
             )
-        # Far-off positions would cost the spline its last digits: it runs from the first one.
+        # Positions are relative to the first, because large coordinates would cost the spline its
+        # last digits.
         origin, positions = positions[0], positions - positions[0]
         if self.is_smooth:
             interpolant = CubicSpline(times, positions)
@@ -334,7 +371,7 @@ class Waypoints:
         return float(self._interpolant.x[-1])
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Movement at times (n,) [s] from start to stop."""
+        """Return the motion at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, self.start, self.stop)
         return Motion(
             self._interpolant(times) + self._origin,
@@ -344,7 +381,13 @@ class Waypoints:
 
 
 def checked_rising_times(time: FloatSequence) -> np.ndarray:
-    """Return times as an array; a ValueError for fewer than two, or where they do not rise."""
+    """Return times as an array.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two times, or times that do not ascend.
+    """
     times = np.asarray(time, float)
     if (
         times.ndim != 1
@@ -357,15 +400,17 @@ def checked_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Movement of a point from `start` to `stop` [s]."""
+"""Motion of a point from `start` to `stop` [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBody:
-    """A body whose reference point is on a path, with an attitude, carrying the instrument."""
+    """Body on a trajectory, with an attitude, that carries the instrument."""
 
     trajectory: Trajectory
+    """Trajectory of the body's reference point."""
     attitude_law: AttitudeLaw
+    """Attitude over time."""
     lever_arm: FloatSequence = (0.0, 0.0, 0.0)
     """(3,): position of the instrument in the body frame [m]."""
 
@@ -380,9 +425,12 @@ class MovingBody:
         return self.trajectory.stop
 
     def state(self, times: np.ndarray) -> BodyState:
-        """Pose at times (n,) [s] from start to stop.
+        """Return pose and motion of the instrument at times (n,) [s] from start to stop.
 
-        A ValueError for a time outside the path, or an attitude that the movement leaves undefined.
+        Raises
+        ------
+        ValueError
+            For a time outside the trajectory, or an attitude that the motion leaves undefined.
         """
         motion = self.trajectory.motion(times)
         clipped_times = _clip_to_duration(times, self.start, self.stop)

@@ -1,16 +1,20 @@
-"""Nearest triangles of bundles of rays: a tree of boxes, eight to a node, and its walk.
+"""Nearest triangles of bundles of rays: an eight-way tree of boxes and its traversal.
 
-The hit of a ray is a property of the ray and the mesh alone: of the triangles hit the nearest
-counts, and of equally near ones the first in the mesh. The order of the rays, their grouping and
-the tree's shape change no bit of it.
+The hit of a ray depends only on the ray and the mesh. The nearest of the triangles hit counts; of
+equally near ones, the first in the mesh. The order of the rays, their grouping and the shape of the
+tree change no bit of it.
 
-A triangle counts as hit where the three edge functions of the sheared triangle (Woop, Benthin and
-Wald, JCGT 2 (1), 2013) have no opposite signs. Each is a difference of two products that the
-neighbour across the edge forms with the sign reversed, and rounding is monotone, so a difference
-can round to zero but not to the wrong sign. Between triangles that share an edge or a vertex there
-is no crack. This holds as long as no fused multiply-add contracts the difference, so there is no
-fastmath here. The boxes are float32, rounded outwards and widened a little, so that no rounding of
-that test can hit what its box missed; the triangles themselves stay float64.
+A triangle counts as hit if the three edge functions of the sheared triangle [1]_ have no opposite
+signs. Each edge function is a difference of two products. The neighbour across the edge computes
+the same difference with reversed sign. Rounding is monotone, so the difference can round to zero
+but not to the wrong sign. Between triangles that share an edge or a vertex there is no gap. This
+holds only without contraction to fused multiply-add, so fastmath is not used here. The boxes are
+float32, rounded outwards and widened slightly, so that no rounding of the test can hit a triangle
+whose box is missed. The triangles themselves are float64.
+
+References
+----------
+.. [1] Woop, Benthin and Wald, JCGT 2 (1), 2013.
 """
 
 from typing import NamedTuple
@@ -23,32 +27,33 @@ NODE_WIDTH = 8
 """Children of a node: one vector of float64 with AVX-512, two with AVX2."""
 
 LEAF_TRIANGLES_MAX = 2
-"""Triangles in a leaf at most; fewer than WIDTH, so that start and count share one integer."""
+"""Largest number of triangles in a leaf; below NODE_WIDTH, so that start and count share one
+integer."""
 
 _BOX_SLACK = 2.0**-30
-"""Widening of the boxes in units of the largest coordinate: far above what rounding moves a hit
-sideways (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and below float32."""
+"""Widening of the boxes in units of the largest coordinate. It is far above the sideways rounding
+of a hit (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and below float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
-"""Begin of the empty box; it ends at minus this."""
+"""Lower bound of the empty box; its upper bound is minus this."""
 
 _TRIANGLES_PER_BATCH = 1 << 20
-"""Triangles whose boxes are made together."""
+"""Number of triangles whose boxes are computed together."""
 
 _STACK_SIZE = 8 * 16
-"""Entries that the deepest tree can leave behind: seven a level."""
+"""Entries that the deepest tree can leave on the stack: seven a level."""
 
 _DIRECTION_MIN = 1e-200
 """Direction components below this count as possibly zero, so that their reciprocal is finite."""
 
 _ENTRY_SLACK = 1.0 + 1e-14
-"""Above the rounding of a box's entry and exit, which is some 5e-16 of them."""
+"""Factor above the rounding of a box's entry and exit, which is some 5e-16 of them."""
 
 _TIE_SLACK = 1.0 + 1e-12
-"""Above the rounding of a hit's distance: a box is left out only if it cannot hold a tie."""
+"""Factor above the rounding of a hit's distance: a box is skipped only if it cannot hold a tie."""
 
 _BUNDLE_TESTS_MAX, _UNLIMITED_TESTS = np.array([128, 1 << 62])
-"""Triangles tested against a whole bundle before its rays are better walked one by one."""
+"""Number of triangles tested against a full bundle before its rays are traversed one by one."""
 
 
 class BoxTree(NamedTuple):
@@ -67,9 +72,14 @@ class BoxTree(NamedTuple):
 
 
 def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
-    """Tree of a mesh: leaves along Hilbert's curve, eight neighbours to a node, level by level.
+    """Build the tree of a mesh: leaves by recursive halving, eight neighbours a node.
 
-    Vertices (n, 3) float64 [m] are finite and best centred; faces (m, 3) int, m >= 1.
+    Parameters
+    ----------
+    vertices : ndarray (n, 3) float64
+        Finite vertices [m], best centred about 0.
+    faces : ndarray (m, 3) int
+        Vertices of each triangle, m >= 1.
     """
     leaves = _fill_leaves(_triangle_centres(vertices, faces))
     bounds, children = _build_nodes(vertices, faces, leaves)
@@ -80,11 +90,9 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
 
 
 def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return twice the middles of triangles' boxes, (m, 3) float32: they only order the tree."""
+    """Return twice the centres of triangles' boxes, (m, 3) float32; they only order the tree."""
     centres = np.empty((len(faces), 3), np.float32)
-    for begin in range(
-        0, len(faces), _TRIANGLES_PER_BATCH
-    ):  # the corners of all at once take much memory
+    for begin in range(0, len(faces), _TRIANGLES_PER_BATCH):  # in batches, to save memory
         rows = slice(begin, begin + _TRIANGLES_PER_BATCH)
         corners = vertices[faces[rows]]
         centres[rows] = corners.min(axis=1) + corners.max(axis=1)
@@ -114,7 +122,7 @@ def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> 
 def _build_nodes(
     vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds and children of all nodes, level by level above the leaves, the root last."""
+    """Return bounds and children of all nodes, level by level above the leaves, the root last."""
     boxes = _leaf_boxes(vertices, faces, leaves)
     triangle_count = (
         (leaves < len(faces)).reshape(-1, LEAF_TRIANGLES_MAX).sum(axis=1, dtype=np.int32)
@@ -146,7 +154,10 @@ def _build_nodes(
 
 
 def _fill_leaves(centres: np.ndarray) -> np.ndarray:
-    """Triangles in the order of full leaves, as many as a power of two, int32; m for none."""
+    """Return the triangles in the order of the leaves, int32, in a power of two of slots.
+
+    An empty slot has the number m of triangles.
+    """
     n_triangles, n_slots = len(centres), LEAF_TRIANGLES_MAX
     while n_slots < n_triangles:
         n_slots *= 2
@@ -154,16 +165,16 @@ def _fill_leaves(centres: np.ndarray) -> np.ndarray:
     slot_order = np.arange(n_slots, dtype=np.int32)
     _sort_into_halves(centres[triangle_of_slot], slot_order)
     triangle_of_slot[1:][triangle_of_slot[1:] == triangle_of_slot[:-1]] = (
-        n_triangles  # a place too many, beside the triangle before
+        n_triangles  # an empty slot
     )
     return np.asarray(triangle_of_slot[slot_order])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _renumber_by_first_use(faces, triangle_order, n_vertices):
-    """Faces in an order, with vertices renumbered as they are first used; old numbers of these.
+    """Return faces in a given order with vertices renumbered by first use, and their old numbers.
 
-    A leaf's triangles then lie together in memory.
+    The data of a leaf's triangles then lie together in memory.
     """
     new_faces = np.empty((triangle_order.size, 3), np.int32)
     new_number, vertex_order = np.full(n_vertices, -1, np.int32), np.empty(n_vertices, np.int32)
@@ -184,7 +195,7 @@ def _renumber_by_first_use(faces, triangle_order, n_vertices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort_into_halves(points, order):
-    """Sort `order` of points (n, 3) so that each half is on one side, and each half of that."""
+    """Sort `order` of points (n, 3) so that its halves are separated in space, recursively."""
     part_size = order.size
     while part_size > LEAF_TRIANGLES_MAX:
         for start in range(0, order.size, part_size):
@@ -219,28 +230,41 @@ def _sort_into_halves(points, order):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _larger(a, b):
-    """Larger of two numbers: one instruction, where max() would also look for nan."""
+    """Return the larger of two numbers: one instruction, where max() would also check for nan."""
     return a if a > b else b
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _smaller(a, b):
-    """Smaller of two numbers, likewise."""
+    """Return the smaller of two numbers: one instruction, where min() would also check for nan."""
     return a if a < b else b
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_nearest_triangles(tree, origins, directions, distance, face_index, distance_min=0.0):
-    """Nearest triangle of each ray of each bundle that lies nearer than what is known.
+    """Find the nearest triangle of each ray of each bundle, if nearer than the known distance.
 
-    A bundle, rays from one origin in neighbouring directions, walks the tree once. A box is entered
-    where the interval of the directions may reach it. A leaf's triangles are tested against all
-    rays together. If they spread too far, each ray walks alone.
+    Parameters
+    ----------
+    tree : BoxTree
+        Tree of a mesh.
+    origins : ndarray (n, 3)
+        Origins of bundles in the tree's frame [m].
+    directions : ndarray (n, b, 3)
+        Directions of the rays of each bundle.
+    distance : ndarray (n, b)
+        Nearest known distance, in lengths of the direction (inf: none); it is replaced if a
+        triangle is nearer.
+    face_index : ndarray (n, b)
+        Index in the mesh of the nearest triangle; it is replaced with `distance`.
+    distance_min : float
+        Rays pass through triangles up to this distance, >= 0.
 
-    Origins (n, 3) [m] are in the tree's frame, directions (n, b, 3). `distance` (n, b), in lengths
-    of the direction, is the nearest known before (inf: none), and is replaced where a triangle is
-    nearer; so is `face_index` (n, b), by the triangle's index in the mesh. A ray lies at distances
-    above `distance_min`, which is 0 or more: what is nearer is passed through.
+    Notes
+    -----
+    A bundle, rays from one origin in neighbouring directions, traverses the tree once. A box is
+    entered if the interval of the directions may reach it. A leaf's triangles are tested against
+    all rays together. If the rays spread too far, each ray traverses the tree alone.
     """
     scratch = np.empty((3, directions.shape[1])), np.empty((6, 3)), np.empty(NODE_WIDTH)
     stack_arrays = np.empty(_STACK_SIZE, np.int64), np.empty(_STACK_SIZE)
@@ -274,10 +298,11 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_arrays, walk_limits):
-    """Nearest triangles of all rays of a bundle in one walk; False where it was given up.
+    """Find the nearest triangles of all rays of a bundle in one traversal; return False if aborted.
 
-    Given up with all triangles tested so far accounted for, so that single walks may go on.
-    `walk_limits` are the number of triangles that may be tested, and the least distance of a hit.
+    After an abort, the results include all triangles tested so far, so that single rays can
+    continue. `walk_limits` are the number of triangles that may be tested, and the least distance
+    of a hit.
     """
     bounds, children, tree_faces, triangle_order, vertices = tree
     shears, planes, child_entry = scratch
@@ -305,7 +330,7 @@ def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_ar
                 bounds, node, origin[0], origin[1], origin[2], planes, farthest_hit, child_entry
             )
             stack_base = top
-            for child in range(NODE_WIDTH):  # those that may be entered, the nearest last
+            for child in range(NODE_WIDTH):  # push the boxes that may be entered, the nearest last
                 if child_entry[child] < np.inf:
                     slot = top
                     while slot > stack_base and entry_stack[slot - 1] < child_entry[child]:
@@ -335,14 +360,25 @@ def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_ar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _prepare_bundle(directions, shears, planes):
-    """Axis of the largest component of all directions (b, 3), -1 where they differ; what it makes.
+    """Return the axis of the largest component of all directions, -1 if they differ; fill tables.
 
-    `shears` (3, >= b): directions over that component, the other two axes in cyclic order, and 1
-    over it. `planes` (6, 3): constants of the box test across each axis for directions between
-    `low` and `high` along it. The rays o + t d can reach between the box's lower and upper plane
-    only if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
-    by the sign of its factor. They are the factors' reciprocals, and what is added to make the two
-    bounds idle from below, and from above.
+    Parameters
+    ----------
+    directions : ndarray (b, 3)
+        Directions of the rays.
+    shears : ndarray (3, >= b)
+        Filled with the directions' other two components, in cyclic order, over the largest, and 1
+        over the largest.
+    planes : ndarray (6, 3)
+        Filled with the constants of the box test for each axis, for directions between `low` and
+        `high` along it.
+
+    Notes
+    -----
+    The rays o + t d can lie between the box's lower and upper plane only if t high >= lower - o and
+    t low <= upper - o. Each condition bounds t from below or from above, by the sign of its factor.
+    The first two rows of `planes` are the reciprocals of the factors. The others are added to make
+    the two bounds idle, from below and from above.
     """
     axis = -1
     for beamlet in range(directions.shape[0]):
@@ -379,15 +415,15 @@ def _prepare_bundle(directions, shears, planes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _box_entry_distances(bounds, node, ox, oy, oz, planes, distance_max, child_entry):
-    """Least distance at which the rays may enter each child's box; inf where they cannot."""
-    # Numbers, not an array: the compiler could not know that `entry` is no part of it.
+    """Compute the smallest distance at which rays may enter each child's box; inf if none can."""
+    # Scalars, not an array: the compiler could not exclude that `child_entry` overlaps with it.
     rx, ry, rz = planes[0, 0], planes[0, 1], planes[0, 2]
     sx, sy, sz = planes[1, 0], planes[1, 1], planes[1, 2]
     bx, by, bz = planes[2, 0], planes[2, 1], planes[2, 2]
     cx, cy, cz = planes[3, 0], planes[3, 1], planes[3, 2]
     fx, fy, fz = planes[4, 0], planes[4, 1], planes[4, 2]
     gx, gy, gz = planes[5, 0], planes[5, 1], planes[5, 2]
-    for child in range(child_entry.size):  # a number known when compiling would not be vectorised
+    for child in range(child_entry.size):  # a constant bound would not be vectorised
         x0, x1 = (bounds[node, 0, child] - ox) * rx, (bounds[node, 3, child] - ox) * sx
         y0, y1 = (bounds[node, 1, child] - oy) * ry, (bounds[node, 4, child] - oy) * sy
         z0, z1 = (bounds[node, 2, child] - oz) * rz, (bounds[node, 5, child] - oz) * sz
@@ -401,10 +437,10 @@ def _box_entry_distances(bounds, node, ox, oy, oz, planes, distance_max, child_e
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _test_triangle(a, b, c, index, shears, distance_min, distance, face_index):
-    """Test one triangle against all rays of a bundle; keeps the nearer hits.
+    """Test one triangle against all rays of a bundle, and keep nearer hits.
 
-    A hit's distance is a weighted mean of the corners' depths: between them, however flat the
-    ray lies.
+    A hit's distance is a weighted mean of the corners' depths, and so lies between them at any
+    incidence.
     """
     ax, ay, az = a
     bx, by, bz = b

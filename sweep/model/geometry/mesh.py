@@ -1,9 +1,9 @@
-"""Surfaces, meshes that rays can be cast at, and the planes of their facets.
+"""Surfaces, meshes for ray casting, and the planes of their facets in double-double arithmetic.
 
-A micrometre of wavelength at kilometres of range asks for the last bits of float64, and grazing
-incidence divides them away. So a facet's normal, the ray's origin relative to a corner and their
-products are carried as two float64 each (high + low, Dekker's and Knuth's exact sums and products).
-The error that remains is the rounding of the range itself, half a unit in its last place.
+A wavelength of a micrometre at kilometres of range needs the last bits of float64, and grazing
+incidence amplifies rounding. So a facet's normal, the ray's origin relative to a corner, and their
+products are carried as two float64 each (high + low, by the exact sums and products of Dekker and
+Knuth). The remaining error is the rounding of the range itself, half a unit in its last place.
 """
 
 from __future__ import annotations
@@ -19,26 +19,31 @@ class SurfaceMaterial:
     """Optical properties of one kind of surface."""
 
     name: str
+    """Name."""
     reflectance: float
-    """Reflectance as its law takes it, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`; 0..1."""
+    """Reflectance by the definition of its law, 0..1."""
     reflectance_law: str = "lambert"
+    """Reflectance law, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles around an origin of their own, so that far-off coordinates keep their digits.
+    """Triangles relative to an origin, so that large coordinates keep their digits.
 
-    A ValueError for shapes that do not fit, no triangle, or a vertex that is not finite or missing.
+    Raises
+    ------
+    ValueError
+        For shapes that do not fit, no triangle, or a vertex that is not finite or missing.
     """
 
     vertices: np.ndarray
     """(n, 3) float64 [m], relative to `origin`."""
     faces: np.ndarray
-    """(m, 3) int32: vertices of each triangle; either winding, since both sides are seen."""
+    """(m, 3) int32: vertices of each triangle, in either winding, since both sides are visible."""
     surface_index: np.ndarray
-    """(m,) int16: which of the scene's surfaces each triangle belongs to."""
+    """(m,) int16: index of each triangle's surface in the scene."""
     origin: np.ndarray
-    """(3,) float64 [m]: where the vertices' zero lies in the frame of the scene or the body."""
+    """(3,) float64 [m]: position of the vertices' zero in the frame of the scene or the body."""
 
     def __post_init__(self):
         require_shapes(self.vertices, self.faces, self.surface_index)
@@ -54,7 +59,7 @@ class Mesh:
 
 
 def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """All triangles of several meshes of one frame as one mesh, in the order given."""
+    """Merge several meshes of one frame into one mesh, in the order given."""
     corners = [
         mesh.origin + corner_function(mesh.vertices, axis=0)
         for mesh in meshes
@@ -66,7 +71,7 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
     vertices = np.empty((sum(len(mesh.vertices) for mesh in meshes), 3))
     faces = np.empty((sum(len(mesh.faces) for mesh in meshes), 3), np.int32)
     n_vertices = n_faces = 0
-    for mesh in meshes:  # copies of all, one after the other, would take twice the memory
+    for mesh in meshes:  # in place: copies of all would take twice the memory
         rows = slice(n_faces, n_faces + len(mesh.faces))
         np.add(mesh.faces, n_vertices, out=faces[rows])
         rows = slice(n_vertices, n_vertices + len(mesh.vertices))
@@ -76,7 +81,13 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.ndarray) -> None:
-    """Refuse arrays of a mesh that do not fit each other, and faces without their vertices."""
+    """Check that the arrays of a mesh fit together and that faces refer to existing vertices.
+
+    Raises
+    ------
+    ValueError
+        If they do not.
+    """
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices are of shape (n, 3), not {vertices.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
@@ -88,12 +99,12 @@ def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.nd
 
 
 def exact_centre(vertices: np.ndarray) -> np.ndarray:
-    """Middle of the bounding box, chosen so that subtracting it from any vertex is exact.
+    """Return the centre of the bounding box, rounded so that subtracting it is exact.
 
-    Zero along an axis where zero is no farther off than the mesh is large, since small numbers
-    would lose their last digits there. Else rounded to a power of two not below 1/1024 of the
-    extent. A coordinate and the centre are then both multiples of the coordinate's last place, and
-    their difference is no larger than the coordinate.
+    Along an axis it is zero if zero is no farther from the mesh than the mesh is large, since small
+    coordinates would lose their last digits otherwise. Else it is rounded to a power of two not
+    below 1/1024 of the extent. Coordinate and centre are then multiples of the coordinate's last
+    place, and their difference is no larger than the coordinate.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extent = float((high - low).max())
@@ -105,41 +116,43 @@ def exact_centre(vertices: np.ndarray) -> np.ndarray:
 
 
 DoubleDouble = tuple[np.ndarray, np.ndarray]
-"""Numbers as sums of two float64, high and low; of vectors, components along the first axis."""
+"""Numbers as sums of two float64, high and low; for vectors the components are along the first
+axis."""
 
 _SPLIT_FACTOR = 2.0**27 + 1
-"""Factor that parts a float64 into two of half as many digits."""
+"""Factor that splits a float64 into two of half as many digits."""
 
 _GRAZING_SINE_MAX = 1e-6
-"""Sine of the angle to a facet under which its plane may run through it within rounding."""
+"""Sine of the angle to a facet below which its plane may lie along the ray within rounding."""
 
 
 def to_double_double(values: np.ndarray) -> DoubleDouble:
-    """Pair of numbers that float64 holds."""
+    """Return float64 numbers as double-doubles."""
     return values, np.zeros_like(values)
 
 
 def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Sum and what its rounding left."""
+    """Return a sum and its rounding error."""
     total = a + b
     virtual_b = total - a
     return total, (a - (total - virtual_b)) + (b - virtual_b)
 
 
 def _quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Sum and what its rounding left, for abs(a) >= abs(b)."""
+    """Return a sum and its rounding error, for abs(a) >= abs(b)."""
     total = a + b
     return total, b - (total - a)
 
 
 def _split(a: np.ndarray) -> DoubleDouble:
+    """Split numbers into two of half as many digits."""
     scaled = a * _SPLIT_FACTOR
     high = scaled - (scaled - a)
     return high, a - high
 
 
 def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Product of two pairs."""
+    """Return the product of two double-doubles."""
     high_product = a[0] * b[0]
     (ah, al), (bh, bl) = _split(a[0]), _split(b[0])
     low_product = ((ah * bh - high_product) + ah * bl + al * bh) + al * bl
@@ -147,7 +160,7 @@ def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Sum of two pairs, accurate also where the high parts cancel."""
+    """Return the sum of two double-doubles, accurate even if the high parts cancel."""
     high_sum, high_error = _two_sum(a[0], b[0])
     low_sum, low_error = _two_sum(a[1], b[1])
     high_sum, high_error = _quick_two_sum(high_sum, high_error + low_sum)
@@ -155,18 +168,21 @@ def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def subtract(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Difference of two pairs."""
+    """Return the difference of two double-doubles."""
     return add(a, (-b[0], -b[1]))
 
 
 def dot(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Scalar product of two vectors; of a vector (3, 1, n) and a matrix (3, 3, n), a vector."""
+    """Return the scalar product of two vectors.
+
+    For a vector (3, 1, n) and a matrix (3, 3, n) it is their product, a vector (3, n).
+    """
     x, y, z = zip(*multiply(a, b), strict=True)
     return add(add(x, y), z)
 
 
 def _cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Vector product."""
+    """Return the vector product of two vectors."""
     (ay, az), (by, bz) = (
         [(v[0][axes], v[1][axes]) for axes in ([1, 2, 0], [2, 0, 1])] for v in (a, b)
     )
@@ -174,9 +190,9 @@ def _cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def facet_normals(corners: np.ndarray) -> DoubleDouble:
-    """Compute normals (3, n) of facets by their winding, twice their areas long.
+    """Compute normals (3, n) of facets, oriented by their winding and of twice their areas' length.
 
-    `corners` (3, 3, n) are first, second and third corner; their x, y, z.
+    `corners` (3, 3, n) are x, y, z of the first, second and third corner.
     """
     a, b, c = (to_double_double(corner) for corner in corners)
     return _cross(subtract(b, a), subtract(c, a))
@@ -189,14 +205,31 @@ def plane_distances(
     ray_origin: DoubleDouble,
     ray_direction: DoubleDouble,
 ) -> DoubleDouble:
-    """Distances of facets' planes along rays, in lengths of `ray_direction` (3, n).
+    """Compute the distances of facets' planes along rays.
 
-    `plane_height` (n,) is the product of the normals with a corner less the origin. A plane seen so
-    flatly that it runs through the facet within rounding is met somewhere on the facet: the
-    distance stays between those of its corners.
+    Parameters
+    ----------
+    corners : ndarray (3, 3, n)
+        x, y, z of the facets' first, second and third corner [m].
+    facet_normal : DoubleDouble (3, n)
+        Normals of the facets.
+    plane_height : DoubleDouble (n,)
+        Product of the normals with a corner minus the origin.
+    ray_origin, ray_direction : DoubleDouble (3, n)
+        Origins [m] and directions of the rays.
+
+    Returns
+    -------
+    DoubleDouble (n,)
+        Distance in lengths of `ray_direction`.
+
+    Notes
+    -----
+    If a plane is so oblique that it lies along the ray within rounding, the hit may be anywhere on
+    the facet. The distance is then limited to those of its corners.
     """
     normal_speed = dot(facet_normal, ray_direction)
-    with np.errstate(all="ignore"):  # parallel to a plane
+    with np.errstate(all="ignore"):  # rays parallel to a plane
         distance_high = plane_height[0] / normal_speed[0]
         remainder, distance_low = subtract(
             plane_height, multiply(to_double_double(distance_high), normal_speed)

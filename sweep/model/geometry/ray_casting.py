@@ -1,10 +1,10 @@
-"""Rays cast at rigid bodies: what each hits first, how far off and how steeply.
+"""Ray casting at rigid bodies: the first hit of each ray, its range and incidence.
 
-Coordinates are taken relative to a mesh's own origin exactly. The nearest triangle is found by
-tests that leave no crack between neighbours (:mod:`sweep.model.geometry.bvh`). Its plane is met in
-twice float64's precision (:mod:`sweep.model.geometry.mesh`). So a range is the exact one of the
-numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body that moves is met in
-its own frame, so its mesh is never rebuilt.
+Coordinates are taken relative to a mesh's own origin exactly. Tests without gaps between neighbours
+find the nearest triangle (:mod:`sweep.model.geometry.bvh`). Its plane is intersected in twice
+float64's precision (:mod:`sweep.model.geometry.mesh`). So a range is the exact one for the given
+numbers, rounded once, which at 2 km is 1e-6 rad of optical phase. Rays are transformed to the frame
+of a moving body, so its mesh is never rebuilt.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ from sweep.model.geometry.mesh import (
 )
 
 _RAYS_PER_BATCH = 4096
-"""Rays that are looked at together: so many that what is made of them stays at hand."""
+"""Number of rays processed together, so that intermediate results stay in the cache."""
 
 
 class Pose(NamedTuple):
     """Position and attitude of a body: x_world = attitude x_body + position."""
 
     position: np.ndarray
-    """(3,) or, ray by ray (bundle by bundle), (n, 3) float64 [m]."""
+    """(3,), or (n, 3) for each bundle, float64 [m]."""
     attitude: np.ndarray
     """(4,) or (n, 4) float64: quaternion (w, x, y, z) from the body's frame to the world's."""
 
@@ -41,27 +41,34 @@ class BundleHits(NamedTuple):
     """First hits of the beamlets of each bundle."""
 
     range: np.ndarray
-    """(n,) float64 [m]: range R_0 of the reference beamlet, inf where all miss."""
+    """(n,) float64 [m]: range R_0 of the reference beamlet, inf if all miss."""
     reference_beamlet: np.ndarray
-    """(n,) int64: beamlet that ranges are relative to, the first that hits; -1 where all miss."""
+    """(n,) int64: beamlet that ranges are relative to, the first that hits; -1 if all miss."""
     normal: np.ndarray
-    """(n, 3) float64: unit normal where the reference beamlet hits, towards the origin; or nan."""
+    """(n, 3) float64: unit normal where the reference beamlet hits, towards the origin; nan if all
+    miss."""
     range_offset: np.ndarray
     """(n, b) float64 [m]: R_b - R_0 with all its digits, nan for a miss."""
     is_hit: np.ndarray
-    """(n, b) bool: the beamlet hits something."""
+    """(n, b) bool: True if the beamlet hits a body."""
     cos_incidence: np.ndarray
-    """(n, b) float64, 0..1; nan for a miss."""
+    """(n, b) float64: cosine of the incidence angle, 0..1; nan for a miss."""
     surface_index: np.ndarray
-    """(n, b) int16, -1 for a miss."""
+    """(n, b) int16: index of the surface, -1 for a miss."""
     face_index: np.ndarray
     """(n, b) int64: triangle in the body's mesh, -1 for a miss."""
     body_index: np.ndarray
-    """(n, b) int16: number of the body hit, -1 for a miss."""
+    """(n, b) int16: index of the body, -1 for a miss."""
 
 
 class RayCaster:
-    """One or several rigid bodies, numbered from 0, ready to be cast at."""
+    """Rigid bodies, numbered from 0, prepared for ray casting.
+
+    Parameters
+    ----------
+    bodies : Mesh or sequence of Mesh
+        Meshes of the bodies.
+    """
 
     def __init__(self, bodies: Mesh | Sequence[Mesh]):
         self.meshes = (bodies,) if isinstance(bodies, Mesh) else tuple(bodies)
@@ -69,7 +76,7 @@ class RayCaster:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the bodies' triangles and trees."""
+        """Memory of the bodies' triangles and trees [bytes]."""
         mesh_bytes = sum(
             mesh.vertices.nbytes + mesh.faces.nbytes + mesh.surface_index.nbytes
             for mesh in self.meshes
@@ -84,12 +91,23 @@ class RayCaster:
         poses: Sequence[Pose | None] | None = None,
         range_min: float = 0.0,
     ) -> BundleHits:
-        """First hits of bundles of beamlets, each bundle from one origin (n, 3) [m].
+        """Find the first hits of bundles of beamlets.
 
-        Directions (n, b, 3) are unit vectors in the world's frame, the beam's centre first. A pose
-        of None is that of a body that rests in the world's frame. Rays pass through all that is
-        nearer than `range_min` [m]. If that is 0, a facet on which a ray starts, within
-        rounding, may count as hit or not.
+        Parameters
+        ----------
+        origins : array_like (n, 3)
+            Origin of each bundle in the world's frame [m].
+        directions : array_like (n, b, 3)
+            Unit vectors in the world's frame, the beam's centre first.
+        poses : sequence of Pose or None, optional
+            Pose of each body; None for a body at rest in the world's frame.
+        range_min : float
+            Rays pass through everything nearer than this [m]. At 0, a facet on which a ray starts,
+            within rounding, may count as hit or not.
+
+        Returns
+        -------
+        BundleHits
         """
         origin, direction = (
             np.ascontiguousarray(rays, np.float64) for rays in (origins, directions)
@@ -116,7 +134,7 @@ class RayCaster:
             reference_hits
         )
         normal[hit_bundles[cosines > 0]] *= -1.0  # towards the ray's origin
-        # On one facet  t_b - t_0 = -t_0 n.delta / (n.d_b),  delta = d_b - d_0: nothing is lost.
+        # On one facet t_b - t_0 = -t_0 n.delta / (n.d_b), delta = d_b - d_0, without cancellation.
         all_bundles, (range_offset, cos_incidence) = (
             np.arange(n_bundles),
             np.zeros((2, *face_index.shape)),
@@ -128,7 +146,7 @@ class RayCaster:
                 direction_component - direction_component[all_bundles, reference_beamlet][:, None]
             )
         range_offset *= -range_high[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):  # nothing is hit, or another facet
+        with np.errstate(divide="ignore", invalid="ignore"):  # misses, or another facet
             range_offset /= cos_incidence
         is_other_facet = face_index != face_index[all_bundles, reference_beamlet][:, None]
         is_other_facet |= body_index != body_index[all_bundles, reference_beamlet][:, None]
@@ -158,7 +176,7 @@ class RayCaster:
         )
 
     def _first_hits(self, frames, origins, directions, range_min):
-        """Triangle and body that each beamlet hits first, (n, b)."""
+        """Return the triangle and the body that each beamlet hits first, (n, b) each."""
         shape = directions.shape[:2]
         distance, face_index = np.full(shape, np.inf), np.full(shape, -1)
         body_index = np.full(shape, -1, np.int16)
@@ -171,9 +189,10 @@ class RayCaster:
         return face_index, body_index
 
     def _intersect(self, frames, origins, directions, ray_indices, facets):
-        """Ranges of facets that rays meet, high and low [m], normals (m, 3), cosines to these.
+        """Return ranges, high and low [m], normals (m, 3), and cosines between rays and normals.
 
-        `ray_indices` are bundle and beamlet of each, ((m,), (m,)), `facets` its triangle and body.
+        `ray_indices` are bundle and beamlet of each ray, ((m,), (m,)); `facets` are its triangle
+        and body.
         """
         results = np.empty((6, len(ray_indices[0])))
         for body_number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
@@ -192,7 +211,7 @@ class RayCaster:
         return results[0], results[1], results[2:5].T, results[5]
 
     def _mesh_frames(self, poses, n_bundles):
-        """Frame of each body."""
+        """Return the frame of each body for its pose."""
         poses = [None] * len(self.meshes) if poses is None else poses
         return [
             _MeshFrame(
@@ -208,12 +227,15 @@ class _MeshFrame(NamedTuple):
     mesh_origin: np.ndarray
     """(3,): the mesh's own origin in the body's frame [m]."""
     rotation: np.ndarray | None
-    """(n, 3, 3): x_world = rotation x_body + position; None: the body's frame is the world's."""
+    """(n, 3, 3): x_world = rotation x_body + position; None if the body's frame is the world's."""
     position: np.ndarray | None
-    """(n, 3) [m]."""
+    """(n, 3): position of the body [m]; None if the body's frame is the world's."""
 
     def to_mesh_origins(self, origins, ray_rows):
-        """Origins of rays (m, 3) by their places (m,) as a vector of pairs (3, m)."""
+        """Return origins (m, 3) in the mesh's frame as double-doubles (3, m).
+
+        `ray_rows` (m,) are the rows of the rays in rotation and position.
+        """
         world_origin, mesh_origin = (
             to_double_double(origins.T),
             to_double_double(self.mesh_origin[:, None]),
@@ -224,7 +246,7 @@ class _MeshFrame(NamedTuple):
         return subtract(self._rotate_back(from_body, ray_rows), mesh_origin)
 
     def to_mesh_directions(self, directions, ray_rows):
-        """Directions of rays, likewise."""
+        """Return directions (m, 3) in the mesh's frame as double-doubles (3, m)."""
         world_direction = to_double_double(directions.T)
         return (
             world_direction
@@ -233,11 +255,12 @@ class _MeshFrame(NamedTuple):
         )
 
     def _rotate_back(self, vector, ray_rows):
+        """Rotate vectors from the world's frame to the body's."""
         rotations = self.rotation[ray_rows].transpose(1, 2, 0)
         return dot((vector[0][:, None], vector[1][:, None]), to_double_double(rotations))
 
     def to_mesh_rounded(self, origins, directions):
-        """Origins (n, 3) and directions (n, b, 3) in the mesh's frame, rounded to float64."""
+        """Return origins (n, 3) and directions (n, b, 3) in the mesh's frame, as float64."""
         n_bundles, n_beamlets = directions.shape[:2]
         mesh_origins = self.to_mesh_origins(origins, np.arange(n_bundles))[0].T
         if self.rotation is not None:
@@ -255,11 +278,11 @@ class _MeshFrame(NamedTuple):
             ]
             directions = np.concatenate([*rotated, np.empty((0, 3))]).reshape(directions.shape)
         directions = directions.view()
-        directions.flags.writeable = False  # always, as numba compiles anew for either
+        directions.flags.writeable = False  # always, else numba compiles another version
         return np.ascontiguousarray(mesh_origins), directions
 
     def to_world(self, vector, ray_rows):
-        """Vectors (3, m) in the world's frame."""
+        """Return vectors (3, m) in the world's frame."""
         if self.rotation is None:
             return vector
         x, y, z = self.rotation[ray_rows].transpose(2, 1, 0)
@@ -267,8 +290,8 @@ class _MeshFrame(NamedTuple):
 
 
 def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
-    """Compute what `_met` returns, for rays that meet one body, (6, m)."""
-    starts_facet = np.ones(len(bundle), bool)  # the ray before may have met the same facet
+    """Return the results of `RayCaster._intersect` for rays that hit one body, as rows (6, m)."""
+    starts_facet = np.ones(len(bundle), bool)  # successive rays may hit the same facet
     starts_facet[1:] = (np.diff(bundle) != 0) | (np.diff(face_index) != 0)
     first_ray, facet_of_ray = np.flatnonzero(starts_facet), np.cumsum(starts_facet) - 1
     corners = mesh.vertices[mesh.faces[face_index[first_ray]]].transpose(1, 2, 0)
@@ -292,7 +315,7 @@ def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
 
 
 def _pose_matrices(pose, n_bundles):
-    """Rotation matrices (n, 3, 3) and positions (n, 3) of a pose."""
+    """Return the rotation matrices (n, 3, 3) and positions (n, 3) of a pose."""
     attitude = np.atleast_2d(quaternion.normalise(pose.attitude))
     position = np.atleast_2d(np.asarray(pose.position, dtype=np.float64))
     columns = quaternion.rotate(attitude[:, None], np.eye(3))

@@ -1,9 +1,8 @@
-"""Directions and times of shots by number, rays of their beamlets, and pointing errors.
+"""Scanners: directions and times of shots by number, rays of their beamlets, and pointing errors.
 
-Directions are in the body frame (x forward, y left, z up).
-
-A measurement cycle is the set of shots from which one velocity vector is made. Everything is a
-function of the shot's number, so that any part of a flight can be had without the rest.
+Directions are in the body frame (x forward, y left, z up). A measurement cycle is the set of shots
+from which one velocity vector is computed. Everything is a function of the shot's number, so that
+any part of a flight can be computed without the rest.
 """
 
 from __future__ import annotations
@@ -18,13 +17,20 @@ import numpy as np
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
 
 JITTER_DOMAIN = "sweep.jitter"
-"""Domain of the random key, so that no other use of the same seed meets its numbers."""
+"""Domain of the random key, so that no other use of the same seed shares its numbers."""
 
 
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
-    """Directions evenly round nadir, at an angle from it [rad], (number, 3).
+    """Return directions evenly spaced on a cone around nadir, (n_beams, 3).
 
-    `azimuth` is that of the first beam, from forward towards the left [rad].
+    Parameters
+    ----------
+    n_beams : int
+        Number of beams.
+    half_angle : float
+        Angle from nadir [rad].
+    azimuth : float
+        Azimuth of the first beam, from forward towards the left [rad].
     """
     azimuths = azimuth + 2 * math.pi * np.arange(n_beams) / n_beams
     horizontal = math.sin(half_angle)
@@ -33,12 +39,18 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
 
 
 def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
-    """Directions of a two-axis steerer, (..., 3).
+    """Return the directions of a two-axis beam steerer, (..., 3).
 
-    The angle of an axis is that of the beam's projection on the plane of that axis and nadir, so
-    that a grid of angles draws straight lines on level ground: ``tan = x / -z``. Both axes at
-    22.5 deg make 30.4 deg from nadir. `angle_x` is towards forward and `angle_y` towards the left
-    [rad], under 90 deg.
+    Parameters
+    ----------
+    angle_x, angle_y : ndarray
+        Angles towards forward and towards the left [rad], below 90 deg.
+
+    Notes
+    -----
+    The angle of an axis is that of the beam's projection on the plane of that axis and nadir: ``tan
+    = x / -z``. A grid of angles thus draws straight lines on level ground. Both axes at 22.5 deg
+    make 30.4 deg from nadir.
     """
     x, y = np.broadcast_arrays(np.tan(angle_x), np.tan(angle_y))
     vector = np.stack([x, y, np.full(x.shape, -1.0)], axis=-1)
@@ -46,15 +58,15 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
 
 def corner_directions(angle: float) -> np.ndarray:
-    """Four directions at both axes' angles of +-`angle` [rad], counter-clockwise, (4, 3)."""
+    """Return the four directions with both axes at +-`angle` [rad], counter-clockwise, (4, 3)."""
     return steered_directions(angle * np.array([1, -1, -1, 1]), angle * np.array([1, 1, -1, -1]))
 
 
 def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
-    """Angles of an axis of stacked steering elements [rad], rising, (2^n,).
+    """Return the angles of an axis of n stacked steering elements [rad], ascending, (2^n,).
 
-    Each element throws the beam to one side or the other by its angle, and the angles add: 15 and
-    7.5 deg make -22.5, -7.5, 7.5 and 22.5 deg.
+    Each element deflects the beam to either side by its angle, and the angles add: 15 and 7.5 deg
+    make -22.5, -7.5, 7.5 and 22.5 deg.
     """
     angles = np.array([0.0])
     for element_angle in element_angles:
@@ -63,12 +75,23 @@ def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
 
 
 def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """All angles of a steerer with like axes of `stacked_angles`, sorted into squares.
+    """Return all directions of a steerer with two axes of `stacked_angles`, sorted into squares.
 
-    A square is what a quarter turn about nadir makes of one pair of angles. The widest comes
-    first and the narrowest last, each counter-clockwise: for the two elements of [T Fig. 5.2] the
-    corners at 22.5 deg, the two squares that are askew, and the corners at 7.5 deg. Returns unit
-    vectors (4^n, 3), square by square, and the beams of each square, (4^n / 4, 4) int64.
+    A square consists of one pair of angles and its quarter turns about nadir. The widest square
+    comes first and the narrowest last, each counter-clockwise. For the two elements of [T Fig. 5.2]
+    these are the corners at 22.5 deg, the two oblique squares, and the corners at 7.5 deg.
+
+    Returns
+    -------
+    directions : ndarray (4^n, 3)
+        Unit vectors, square by square.
+    patterns : ndarray (4^n / 4, 4) int64
+        Beams of each square.
+
+    Raises
+    ------
+    ValueError
+        If the elements do not reach distinct angles, or reach nadir.
     """
     angles = stacked_angles(element_angles)
     if angles.min() >= 0 or len(np.unique(np.round(angles, 12))) < len(angles) or 0 in angles:
@@ -93,7 +116,7 @@ class ScanShots(NamedTuple):
     direction: np.ndarray
     """(n, 3): unit vectors in the body frame."""
     direction_rate: np.ndarray
-    """(n, 3): their rates of change there [1/s]."""
+    """(n, 3): rate of change of the direction in the body frame [1/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,16 +124,17 @@ class BeamCycle:
     """Beams at fixed angles, fired in a cycle of patterns."""
 
     directions: Sequence[Sequence[float]] | np.ndarray
-    """(b, 3): directions of the beams in the body frame; scaled to length 1."""
+    """(b, 3): directions of the beams in the body frame; they are normalised."""
     patterns: Sequence[Sequence[int]] | np.ndarray
-    """Beams of each measurement cycle as they fire; cycles take the patterns, all as long, in
+    """(p, k): beams of each measurement cycle in the order of firing; cycles use the patterns in
     turn."""
     rate: float
-    """Measurement cycles a second [Hz], > 0."""
+    """Measurement cycles per second [Hz], > 0."""
     interval: float | None = None
-    """Time from one beam of a cycle to the next [s]: 0 fires them at once (several telescopes),
-    None spreads them evenly over the cycle (one steered beam)."""
+    """Time from one beam of a cycle to the next [s]. 0 fires all at once (several telescopes); None
+    spaces them evenly over the cycle (one steered beam)."""
     _checked: tuple[np.ndarray, np.ndarray, float] = field(init=False, repr=False)
+    """Normalised directions, patterns as an array, and interval [s]."""
 
     def __post_init__(self) -> None:
         directions, patterns = np.asarray(self.directions, float), np.asarray(self.patterns)
@@ -145,15 +169,15 @@ class BeamCycle:
 
     @property
     def beams_per_cycle(self) -> int:
-        """Shots of a measurement cycle."""
+        """Number of shots of a measurement cycle."""
         return int(self._checked[1].shape[1])
 
     def count_shots(self, duration: float) -> int:
-        """Shots that begin within a duration [s], its end included."""
+        """Return the number of shots that begin within a duration [s], including its end."""
         return _count_begun_shots(duration, self.rate, self.beams_per_cycle, self._checked[2])
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Shots by number (n,), from 0."""
+        """Return the shots of given numbers (n,), counted from 0."""
         directions, patterns, interval = self._checked
         cycle_number, shot_in_cycle = np.divmod(
             np.asarray(shot_numbers, np.int64), self.beams_per_cycle
@@ -175,7 +199,7 @@ def _count_begun_shots(
     """Count the shots, `shots_per_cycle` a cycle, that begin within a duration [s] from time 0."""
     if duration < 0:
         return 0
-    # A hair below a whole number is that number: times come from products that were rounded.
+    # A number just below an integer counts as that integer, because times are rounded products.
     whole_cycles = math.floor(duration * cycle_rate * (1 + 1e-12) + 1e-9)
     time_in_cycle = max(duration * cycle_rate - whole_cycles, 0.0) / cycle_rate
     shots_in_last_cycle = (
@@ -189,7 +213,7 @@ def _count_begun_shots(
 def fixed_beams(
     directions: Sequence[Sequence[float]] | np.ndarray, *, rate: float, interval: float | None = 0.0
 ) -> BeamCycle:
-    """Beams that all fire in every measurement cycle, at once by default."""
+    """Return a cycle of beams that all fire in every measurement cycle, at once by default."""
     return BeamCycle(directions, [list(range(len(directions)))], rate, interval)
 
 
@@ -201,11 +225,18 @@ def raster_scan(
     rate: float,
     both_ways: bool = True,
 ) -> BeamCycle:
-    """Grid of directions, visited row by row, from right to left and from aft forward.
+    """Return a grid of directions, scanned row by row, from right to left and from aft forward.
 
-    `columns` lie across (y), `rows` along (x), at least 1 each; `half_angles` [rad] are the reach
-    of both to each side of nadir. `rate` counts frames a second [Hz]. Every other row runs
-    backwards; without `both_ways` each starts at the right.
+    Parameters
+    ----------
+    columns, rows : int
+        Number of directions across (y) and along (x), at least 1 each.
+    half_angles : tuple of float
+        Largest angles from nadir across and along [rad].
+    rate : float
+        Frames per second [Hz].
+    both_ways : bool
+        True if every other row is scanned backwards; False if each row starts at the right.
     """
     angles_across = half_angles[0] * np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)
     angles_along = half_angles[1] * np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)
@@ -218,20 +249,20 @@ def raster_scan(
 
 @dataclass(frozen=True)
 class LineScan:
-    """Beams side by side along the track, swept together from side to side."""
+    """Parallel beams along the track, swept together from side to side."""
 
     half_angle: float
-    """Reach of the sweep to each side of nadir [rad], 0 <= . < pi/2."""
+    """Largest angle of the sweep from nadir to each side [rad], 0 <= . < pi/2."""
     line_rate: float
-    """Lines a second [Hz]; a sweep one way is a line."""
+    """Lines per second [Hz]; a sweep in one direction is a line."""
     rate: float
-    """Measurements a second of each beam [Hz]."""
+    """Measurements per second of each beam [Hz]."""
     along: tuple[float, ...] = (0.0,)
-    """Each beam's fixed angle from nadir towards forward [rad]."""
+    """Fixed angle of each beam from nadir towards forward [rad]."""
     wave: str = "triangle"
     """``triangle`` at a constant rate, or ``sine`` for a resonant mirror."""
     interval: float = 0.0
-    """Time from one beam of a measurement to the next [s]; 0 fires them at once."""
+    """Time from one beam of a measurement to the next [s]; 0 fires all at once."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.half_angle < math.pi / 2 and self.along):
@@ -249,15 +280,18 @@ class LineScan:
         return len(self.along)
 
     def count_shots(self, duration: float) -> int:
-        """Shots that begin within a duration [s], its end included."""
+        """Return the number of shots that begin within a duration [s], including its end."""
         return _count_begun_shots(duration, self.rate, self.n_beams, self.interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Shots by number (n,), from 0; a cycle is one measurement of all beams."""
+        """Return the shots of given numbers (n,), counted from 0.
+
+        A cycle is one measurement of all beams.
+        """
         cycle_number, beam_number = np.divmod(np.asarray(shot_numbers, np.int64), self.n_beams)
         time = cycle_number / self.rate + beam_number * self.interval
         angle_along, angle_across = np.asarray(self.along)[beam_number], self.sweep_angle(time)
-        # The mirror turns the fan of beams about x: each keeps its angle towards forward.
+        # The mirror rotates the fan of beams about x: each beam keeps its angle towards forward.
         cosine_along, sine_across, cosine_across = (
             np.cos(angle_along),
             np.sin(angle_across),
@@ -281,14 +315,14 @@ class LineScan:
         )
 
     def sweep_angle(self, times: np.ndarray) -> np.ndarray:
-        """Angle of the sweep from nadir towards the left [rad]; it starts at the right."""
+        """Return the sweep angle from nadir towards the left [rad]; it starts at the right."""
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":
             return np.asarray(-self.half_angle * np.cos(math.pi * lines_scanned))
         return np.asarray(self.half_angle * (1 - 2 * np.abs(1 - lines_scanned % 2)))
 
     def sweep_rate(self, times: np.ndarray) -> np.ndarray:
-        """Rate of that angle [rad/s]; where it turns back, that of what follows."""
+        """Return the rate of the sweep angle [rad/s]; at a turning point, the rate after it."""
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":
             return np.asarray(
@@ -309,12 +343,19 @@ def beamlet_rays(
     tangent_along: np.ndarray,
     sigma: float | np.ndarray,
 ) -> np.ndarray:
-    """Return unit vectors of every beamlet in the world frame, (n, b, 3).
+    """Return unit vectors of all beamlets in the world frame, (n, b, 3).
 
-    `attitude` (n, 4) turns body to world, `axis` (n, 3) are the beams there. `tangent_across` and
-    `tangent_along`
-    (b,) are tangents of angles off the axis towards the two vectors of :func:`transverse_axes`, in
-    units of the beam's standard deviation `sigma` on each axis [rad], (n, 1) or scalar.
+    Parameters
+    ----------
+    attitude : ndarray (n, 4)
+        Quaternions from body to world.
+    axis : ndarray (n, 3)
+        Directions of the beams in the body frame.
+    tangent_across, tangent_along : ndarray (b,)
+        Tangents of angles off the axis towards the two vectors of :func:`transverse_axes`, in units
+        of `sigma`.
+    sigma : float or ndarray (n, 1)
+        Standard deviation of the beam on each axis [rad].
     """
     axes = rotate(attitude[:, None], np.stack([*transverse_axes(axis), axis], axis=1))
     first, second, axis_vector = np.moveaxis(axes, 0, 2)[..., None]
@@ -333,10 +374,10 @@ def beamlet_rays(
 
 
 def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across directions (n, 3): (first, second, direction) is right-handed.
+    """Return two unit vectors across directions (n, 3): (first, second, direction) is right-handed.
 
-    For a beam near -z the first lies near x. A smooth function of the direction but along -x
-    and x, where no beam of a downward-looking instrument points.
+    For a beam near -z the first vector lies near x. They are smooth functions of the direction
+    except near x and -x, where no beam of a downward-looking instrument points.
     """
     second = np.cross(direction, [1.0, 0.0, 0.0])
     length = _vector_length(second)
@@ -347,15 +388,16 @@ def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vector_length(vectors: np.ndarray) -> np.ndarray:
+    """Return the length of vectors, (..., 1)."""
     x, y, z = vectors[..., :1], vectors[..., 1:2], vectors[..., 2:]
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 class PointingJitter(NamedTuple):
-    """Random turns of the beams, shot by shot: three independent normal angles about body axes.
+    """Random rotations of the beams, shot by shot: three independent normal angles about body axes.
 
-    A beam in any direction is thrown off by two angles across it, each of that standard
-    deviation; the third angle turns its footprint about it.
+    A beam in any direction is deflected by two angles across it, each of that standard deviation.
+    The third angle rotates its footprint.
     """
 
     sigma: float
@@ -364,7 +406,11 @@ class PointingJitter(NamedTuple):
     """Seed of the study, >= 0."""
 
     def perturb_attitude(self, attitude: np.ndarray, shot_numbers: np.ndarray) -> np.ndarray:
-        """Attitudes (n, 4) of shots by number (n,), turned; any part is the same bit for bit."""
+        """Return attitudes (n, 4) of shots, rotated at random.
+
+        The rotation depends only on seed and shot number (n,), so that any part of a flight has the
+        same bits.
+        """
         from sweep.model.sampling.philox import (
             STREAM_POINTING_JITTER,
             point_keys,
@@ -375,7 +421,7 @@ class PointingJitter(NamedTuple):
         study_key = point_keys(np.empty((1, 0)), domain=JITTER_DOMAIN, seed=self.seed)
         keys = np.broadcast_to(
             study_key, (len(shot_numbers), 2)
-        )  # a shot's number stands for that of a draw
+        )  # the shot's number replaces that of a draw
         normal_draws = to_normals_by_row(
             uniforms(keys, np.asarray(shot_numbers), STREAM_POINTING_JITTER, 4)
         )[:, :3]
