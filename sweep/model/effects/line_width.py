@@ -5,8 +5,8 @@ There are two models. Both give the mean of |X|^2 over records, with the window'
 **Gaussian** [T, section 3.2]: the power spectrum is convolved with a Gaussian of the given FWHM, at
 any delay. This is exactly the mean over records that each have one random normal frequency, common
 to all beamlets: jitter slow against the record. The mean over the frequency is a sum over equally
-spaced shifts, to a stated error. |X|^2 of a record of L samples has only lags below L, so the
-trapezium rule errs only by a Gaussian's aliases.
+spaced shifts, to a stated error. The spectrum |X|^2 of a record of L samples has only lags below L,
+so the trapezium rule errs only by a Gaussian's aliases.
 
 **Lorentzian**: a laser whose phase is a random walk (FWHM dnu, Gamma = 2 pi dnu), mixed with itself
 after a delay tau [1]_ [2]_. The beat's factor exp(i (theta(t - tau) - theta(t))) has the

@@ -6,10 +6,10 @@ factor
 
     g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b,     z_b complex normal with E|z_b|^2 = 1,
 
-whose mean power is 1. kappa = exp(-(4 pi sigma_h / lambda)^2) is the fraction of power that stays
-coherent if the round trip has normal phases of standard deviation 4 pi sigma_h / lambda. u_b is 1
-if the footprint's phases follow its geometry, and a random phase otherwise. kappa = 0 is a
-Swerling-1 target, any other a Rician one.
+whose mean power is 1. The fraction of power that stays coherent is kappa = exp(-(4 pi sigma_h /
+lambda)^2), if the round trip has normal phases of standard deviation 4 pi sigma_h / lambda. The
+factor u_b is 1 if the footprint's phases follow its geometry, and a random phase otherwise. A
+target with kappa = 0 is a Swerling-1 target, any other a Rician one.
 
 The three segments of a shot see the same heights, so one g_b serves all three. Amplitudes at
 frequencies df apart have the correlation exp(-(4 pi sigma_h df / c)^2 / 2), which is 1 to 1e-6 for
