@@ -263,7 +263,10 @@ NO_SPREAD = OffsetMoments(0.0, 0.0, 0.0)
 
 
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
-    """Return the largest angle of a beamlet off the axis [standard deviations]."""
+    """Return the largest angle of a beamlet off the axis [standard deviations of the beam].
+
+    `n_beamlets` and `pattern` are as of :func:`place_beamlets`.
+    """
     directions, _ = place_beamlets(n_beamlets, pattern)
     return float(np.sqrt((directions**2).sum(axis=0)).max())
 

@@ -286,7 +286,15 @@ def bounded_mean_interval(
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:
-    """Return the distance from estimates to the farther ends of their intervals."""
+    """Return the distance from estimates to the farther ends of their intervals.
+
+    Parameters
+    ----------
+    estimate : array_like
+        Estimated probabilities, 0..1.
+    interval : ConfidenceInterval
+        Their intervals.
+    """
     estimate = np.asarray(estimate, float)
     return np.maximum(interval.high - estimate, estimate - interval.low)
 

@@ -99,7 +99,7 @@ class FlatGround:
     """
 
     off_axis_surface = None
-    """A plane is a single surface."""
+    """Beamlets off the axis's surface: None, as a plane is a single surface."""
 
     def __init__(
         self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True

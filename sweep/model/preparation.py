@@ -86,7 +86,15 @@ class PhaseError(NamedTuple):
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the arguments of selected points in one segment, (points,) each."""
+        """Return the arguments of selected points in one segment, (points,) each.
+
+        Parameters
+        ----------
+        segment : int
+            Index of the segment.
+        point_indices : ndarray of int
+            Selected points.
+        """
         selected = {}
         for name, value in self.arguments.items():
             value = value[segment] if isinstance(value, tuple) else value
@@ -1264,8 +1272,18 @@ def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
     """Return the relative amplitude of the beat for a relative echo.
 
-    It is the square root of the relative echo [1/sr]; with direct detection, where the beat is
-    proportional to power, the relative echo itself.
+    Parameters
+    ----------
+    architecture : str
+        Receiver architecture.
+    relative_echo : ndarray
+        Relative echo [1/sr].
+
+    Returns
+    -------
+    ndarray
+        Square root of the relative echo; with direct detection, where the beat is proportional to
+        power, the relative echo itself.
     """
     return relative_echo if architecture == "direct" else np.sqrt(relative_echo)
 

@@ -193,7 +193,17 @@ def quantisation_variance(
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
     """Return the noise sigma of a bin, per quadrature: sqrt(E_w sigma_x^2 / 2), [T 3.2].
 
-    `noise_variance` is sigma_x^2 of a sample, `window_energy` is E_w = sum w^2.
+    Parameters
+    ----------
+    noise_variance : ndarray
+        Variance sigma_x^2 of a sample [V^2].
+    window_energy : ndarray
+        Energy of the window E_w = sum w^2.
+
+    Returns
+    -------
+    ndarray
+        Sigma of the sum over the record [V].
     """
     return np.sqrt(window_energy * noise_variance / 2)
 

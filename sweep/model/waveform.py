@@ -163,7 +163,12 @@ def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndar
 def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
     """Return the names of a shot's segments in the order of time.
 
-    `segments` is one of :data:`SEGMENT_ORDERS`. Direct detection has no optical Doppler segment.
+    Parameters
+    ----------
+    architecture : str
+        Receiver architecture; direct detection has no optical Doppler segment.
+    segments : str
+        One of :data:`SEGMENT_ORDERS`.
     """
     all_names = segments.split()
     return tuple(name for name in all_names if name != "doppler" or architecture != "direct")
@@ -172,10 +177,21 @@ def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     segment_order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return the times [s] from the shot's start to the starts of up, Doppler and down segment.
+    """Return the times from the shot's start to the starts of up, Doppler and down segment.
 
-    `duration` and `gap` are those of each segment [s]. A segment that does not exist has the time
-    0.
+    Parameters
+    ----------
+    segment_order : tuple of str
+        Names of the existing segments, in the order of time.
+    duration : ndarray
+        Duration of each segment [s].
+    gap : ndarray or float
+        Time from a segment's end to the next one's start [s].
+
+    Returns
+    -------
+    tuple of ndarray
+        Times [s]; 0 for a segment that does not exist.
     """
     period = np.asarray(duration, float) + gap
     return tuple(
@@ -266,7 +282,10 @@ def count_samples_before_echo(
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Return the frequency 0..fs/2 at which a real record shows a signed frequency."""
+    """Return the frequency 0..fs/2 at which a real record shows a signed frequency.
+
+    `frequency` and `sample_rate` are in the same unit.
+    """
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 
 

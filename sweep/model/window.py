@@ -176,8 +176,18 @@ MISSING_STEPS = 32
 def zero_first_samples(window: Window, n_missing: int) -> Window:
     """Return a window whose first samples are 0, rounded to one of :data:`MISSING_STEPS` steps.
 
-    It serves sums over a window that depend little on the exact number; the envelope stays that of
-    the full window.
+    Parameters
+    ----------
+    window : Window
+        Window of the full record.
+    n_missing : int
+        Number of first samples that are 0, before rounding.
+
+    Returns
+    -------
+    Window
+        For sums over a window that depend little on the exact number. The envelope is that of the
+        full window.
     """
     step = min(round(MISSING_STEPS * n_missing / window.length), MISSING_STEPS - 1)
     return _zero_first_steps(window, step) if step else window

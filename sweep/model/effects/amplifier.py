@@ -115,7 +115,12 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Add the beat noise of spontaneous emission; direct detection has none."""
+    """Add the beat noise of spontaneous emission; direct detection has none.
+
+    Notes
+    -----
+    Current variance 4 (M Re)^2 P N' B_e, as of :func:`beat_noise_current_variance`.
+    """
     if shots.architecture == "direct":
         return shots
     current_variance = beat_noise_current_variance(

@@ -57,8 +57,12 @@ class ExtinctionProfile(NamedTuple):
 def exponential_profile(*, surface_extinction: float, scale_height: float) -> ExtinctionProfile:
     """Return an exponential atmosphere, 40 scale heights high.
 
-    `surface_extinction` is the extinction at the ground [1/m]; it falls by e over each
-    `scale_height` [m].
+    Parameters
+    ----------
+    surface_extinction : float
+        Extinction coefficient at the ground [1/m].
+    scale_height : float
+        Height over which the extinction falls by e [m].
     """
     top_scale_heights = 40.0
     return ExtinctionProfile(
@@ -68,7 +72,15 @@ def exponential_profile(*, surface_extinction: float, scale_height: float) -> Ex
 
 
 def layer_profile(*, optical_depth: float, depth: float) -> ExtinctionProfile:
-    """Return a uniform layer on the ground, `depth` [m] high, of a vertical optical depth."""
+    """Return a uniform layer on the ground.
+
+    Parameters
+    ----------
+    optical_depth : float
+        Vertical optical depth of the layer.
+    depth : float
+        Height of the layer [m].
+    """
     return ExtinctionProfile((0.0, depth), (optical_depth / depth, optical_depth / depth))
 
 
@@ -214,9 +226,13 @@ def _path_geometry(
 
 
 def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
-    """Attenuate echoes by T^2 [T 4.4], and light from the ground, such as sunlight, by T.
+    """Attenuate echoes and light from the ground by the transmission of the air.
 
-    T is the one-way transmission exp(-optical depth).
+    Notes
+    -----
+    With the one-way transmission T = exp(-optical depth), echo power is multiplied by T^2 [T 4.4],
+    and light from the ground, such as sunlight, by T. The beat's amplitude is multiplied by T, or
+    with direct detection by T^2.
     """
     profile = extinction_profile(context.parameters)
     if profile is None:

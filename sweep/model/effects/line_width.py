@@ -371,9 +371,15 @@ def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
 
 
 def n_phase_walk_steps(*, delay: float, length: int) -> int:
-    """Return the even number of steps that :func:`phase_walk` takes for a delay [samples].
+    """Return the even number of steps that :func:`phase_walk` takes.
 
-    A delay beyond the record counts as its length: the delayed record then shares nothing with it.
+    Parameters
+    ----------
+    delay : float
+        Delay tau [samples]. A delay beyond the record counts as its length: the delayed record then
+        shares nothing with it.
+    length : int
+        Length of the record [samples].
     """
     return 2 * (length + min(math.floor(delay), length))
 

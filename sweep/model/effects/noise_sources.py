@@ -135,7 +135,13 @@ def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
-    """Add the shot noise of sunlight, attenuated by the air between target and receiver."""
+    """Add the shot noise of sunlight, attenuated by the air between target and receiver.
+
+    Notes
+    -----
+    Current variance 2 q M^2 F Re P B_e, with the power P of :func:`received_sunlight` times the
+    air's transmission.
+    """
     presence = context.presence_factor("solar_background")
     light = received_sunlight(context.parameters) * shots.ground_transmission * presence
     return add_noise_sources(
@@ -215,7 +221,12 @@ def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shots:
-    """Add the intensity noise of the local oscillator; direct detection has none."""
+    """Add the intensity noise of the local oscillator; direct detection has none.
+
+    Notes
+    -----
+    Current variance (M Re P_lo)^2 RIN B_e / CMRR, as of :func:`intensity_noise_current_variance`.
+    """
     if shots.architecture == "direct":
         return shots
     current_variance = intensity_noise_current_variance(context.parameters)
@@ -273,7 +284,12 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
-    """Add white noise of variance lsb^2/12, if the ADC has a number of bits."""
+    """Add white noise of variance lsb^2/12, if the ADC has a number of bits.
+
+    Notes
+    -----
+    Variance of :func:`sweep.model.receiver_chain.quantisation_variance`, which has the source.
+    """
     parameters, samples_iq = context.parameters, shots.complex_record
     variance = receiver_chain.quantisation_variance(
         full_scale=parameters[PROCESSING_PREFIX + "full_scale"],

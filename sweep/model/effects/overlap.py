@@ -146,7 +146,13 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Set ``n_samples_before_echo``: the number of record samples before the echo, by segment."""
+    """Set ``n_samples_before_echo``: the number of record samples before the echo, by segment.
+
+    Notes
+    -----
+    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s), limited to 0..L, as of
+    :func:`sweep.model.waveform.count_samples_before_echo`.
+    """
     n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]

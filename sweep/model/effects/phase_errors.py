@@ -153,7 +153,20 @@ def phase_over_record(
 
 
 def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray:
-    """Return <|phi|>, the largest change of any bin of a line relative to its peak."""
+    """Return the largest change of any bin of a line relative to its peak.
+
+    Parameters
+    ----------
+    phase_bound : PhaseErrorBound
+        Bound of the phase error phi.
+    window : Window
+        Window of the record.
+
+    Returns
+    -------
+    ndarray
+        <|phi|>, the mean weighted with |w| / sum w.
+    """
     moments = window_moments(window)
     total = phase_bound.non_polynomial * moments.magnitude_sum
     for value, mean in zip(phase_bound.coefficients, moments.mean_absolute, strict=True):
@@ -274,7 +287,20 @@ def _add_phase_error(
 
 
 def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
-    """Return the times since the segment's start [s] at positions x of the record, (n, m)."""
+    """Return the times since the segment's start at positions of the record.
+
+    Parameters
+    ----------
+    position : ndarray (m,)
+        Positions x in the record, -1..1.
+    start, duration : ndarray
+        Start since the segment's start, and duration, of the record [s], (n,) or scalar.
+
+    Returns
+    -------
+    ndarray (n, m)
+        Times [s].
+    """
     start, duration = np.atleast_1d(start), np.atleast_1d(duration)
     return start[:, None] + duration[:, None] * (np.asarray(position) + 1) / 2
 

@@ -150,7 +150,17 @@ def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np
 def window_max_near(
     window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
 ) -> np.ndarray:
-    """Return the largest |w| within ``reach_samples`` of a first sample, over sum w."""
+    """Return the largest |w| near a sample, over sum w.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record.
+    first_sample : ndarray of int
+        Number of the sample.
+    reach_samples : ndarray
+        Distance from the sample [samples], rounded up to a power of two.
+    """
     exponents = np.ceil(np.log2(np.clip(reach_samples, 1, window.length))).astype(int)
     window_max = np.empty(np.broadcast_shapes(first_sample.shape, exponents.shape))
     first_sample, exponents = np.broadcast_arrays(first_sample, exponents)

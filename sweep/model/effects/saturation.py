@@ -137,12 +137,15 @@ FULL_SCALE_EXCESS_MAX = 1e6
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Reduce line and noise by clipping at the ADC's full scale.
 
-    The record is taken as one sine with the power of all lines.
-
     Raises
     ------
     UnsupportedShotError
         If a record exceeds full scale more than :data:`FULL_SCALE_EXCESS_MAX` times.
+
+    Notes
+    -----
+    The record is taken as one sine with the power of all lines, and :func:`clipping_gains` gives
+    the gains of line and noise.
     """
     full_scale = np.asarray(context.parameters[_FULL_SCALE_PATH], float)
     is_limited = full_scale > 0

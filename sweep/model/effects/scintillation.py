@@ -71,7 +71,25 @@ class LogIrradianceVariances(NamedTuple):
 
 
 def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.ndarray:
-    """Return C_n^2 [m^(-2/3)] at heights above the ground [m]; below the ground, that on it."""
+    """Return the structure constant C_n^2 at heights above the ground.
+
+    Parameters
+    ----------
+    turbulence : TurbulenceProfile
+        Turbulence over height.
+    height : array_like
+        Height h above the ground [m]; below the ground, the value on the ground is returned.
+
+    Returns
+    -------
+    ndarray
+        C_n^2 [m^(-2/3)].
+
+    Notes
+    -----
+    Hufnagel and Valley's model, with the wind speed v: 0.00594 (v / 27)^2 (1e-5 h)^10 exp(-h /
+    1000) + mid_altitude exp(-h / 1500) + surface_layer exp(-h / 100); and a uniform part.
+    """
     h = np.maximum(np.asarray(height, float), 0.0)
     aloft = 0.00594 * (turbulence.wind_speed / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1e3)
     mid_altitude = turbulence.mid_altitude * np.exp(-h / 1.5e3)
@@ -288,9 +306,21 @@ def turbulence_profile(parameters: Mapping[str, np.ndarray]) -> TurbulenceProfil
 def two_way_log_variances(
     turbulence: TurbulenceProfile, parameters: Mapping[str, np.ndarray], range: np.ndarray
 ) -> tuple[LogIrradianceVariances, LogIrradianceVariances]:
-    """Return the log variances of the way out, averaged over the footprint, and of the way back.
+    """Return the log variances of the irradiance on the ways out and back.
 
-    Those of the way back are averaged over the aperture.
+    Parameters
+    ----------
+    turbulence : TurbulenceProfile
+        Turbulence over height.
+    parameters : mapping
+        Parameters by dotted path.
+    range : ndarray (n,)
+        Range of the target [m].
+
+    Returns
+    -------
+    out, back : LogIrradianceVariances
+        A plane wave averaged over the footprint, and a spherical wave averaged over the aperture.
     """
     lidar_height, target_height = path_heights(parameters, range)
     aperture = np.asarray(parameters[TELESCOPE_PREFIX + "aperture"], float)
@@ -344,7 +374,13 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
-    """Draw the scintillation of each shot's echo, the same in all its segments."""
+    """Draw the scintillation of each shot's echo, the same in all its segments.
+
+    Notes
+    -----
+    The factor multiplies the echo's power, its shot noise and the pedestal of phase noise. Its
+    square root multiplies the beat's amplitude, or with direct detection the factor itself.
+    """
     parameters = context.parameters
     turbulence = turbulence_profile(parameters)
     if turbulence is None:

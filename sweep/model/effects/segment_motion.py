@@ -70,7 +70,15 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Let the segments start one after the other, while the target moves."""
+    """Let the segments start one after the other, while the target moves.
+
+    Notes
+    -----
+    Sets the start of each segment, that of the middle look with several looks. Adds the mean start
+    t_m of up- and down-chirp to the range walk's time. Sets the fraction S t_d / 2 of the optical
+    frequency at mid-chirp by which the beats underestimate the radial velocity, and the drift of
+    lines per look.
+    """
     starts, n_looks = shots.scheduled_segment_starts, shots.looks.number
     middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
     if n_looks > 1:

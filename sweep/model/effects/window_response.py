@@ -143,7 +143,22 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return |W(y)| / sum w for |y| <= 1.5 bins of fs/L, from its series."""
+    """Return the magnitude of the main lobe from its series.
+
+    Parameters
+    ----------
+    fft_window : Window
+        Window of the record.
+    coefficients : ndarray
+        Coefficients of the series in y^2.
+    y : ndarray
+        Distance from the line [bins of fs/L], |y| <= 1.5.
+
+    Returns
+    -------
+    ndarray
+        |W(y)| / sum w.
+    """
     real_part = np.polynomial.polynomial.polyval(np.asarray(y, float) ** 2, coefficients)
     return np.hypot(
         real_part, fft_window.first_value / fft_window.sum * np.sin(np.pi * np.asarray(y, float))

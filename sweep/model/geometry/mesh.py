@@ -83,6 +83,15 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
 def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.ndarray) -> None:
     """Check that the arrays of a mesh fit together and that faces refer to existing vertices.
 
+    Parameters
+    ----------
+    vertices : ndarray (n, 3)
+        Vertices.
+    faces : ndarray (m, 3) of int
+        Vertices of each triangle.
+    surface_index : ndarray (m,)
+        Surface of each triangle.
+
     Raises
     ------
     ValueError

@@ -213,7 +213,18 @@ def _count_begun_shots(
 def fixed_beams(
     directions: Sequence[Sequence[float]] | np.ndarray, *, rate: float, interval: float | None = 0.0
 ) -> BeamCycle:
-    """Return a cycle of beams that all fire in every measurement cycle, at once by default."""
+    """Return a cycle of beams that all fire in every measurement cycle.
+
+    Parameters
+    ----------
+    directions : array_like (b, 3)
+        Directions of the beams in the body frame.
+    rate : float
+        Measurement cycles per second [Hz].
+    interval : float, optional
+        Time from one beam to the next [s]; 0 fires all at once, None spaces them evenly over the
+        cycle.
+    """
     return BeamCycle(directions, [list(range(len(directions)))], rate, interval)
 
 
@@ -406,10 +417,19 @@ class PointingJitter(NamedTuple):
     """Seed of the study, >= 0."""
 
     def perturb_attitude(self, attitude: np.ndarray, shot_numbers: np.ndarray) -> np.ndarray:
-        """Return attitudes (n, 4) of shots, rotated at random.
+        """Rotate the attitudes of shots at random.
 
-        The rotation depends only on seed and shot number (n,), so that any part of a flight has the
-        same bits.
+        Parameters
+        ----------
+        attitude : ndarray (n, 4)
+            Quaternions from body to world.
+        shot_numbers : ndarray (n,)
+            Numbers of the shots. The rotation depends only on seed and number, so that any part of
+            a flight has the same bits.
+
+        Returns
+        -------
+        ndarray (n, 4)
         """
         from sweep.model.sampling.philox import (
             STREAM_POINTING_JITTER,
