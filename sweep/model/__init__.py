@@ -4,6 +4,10 @@ Compiled code keeps the order of floating-point sums: neither reassociation nor 
 allowed. The number of optimisation passes depends on what was compiled before and on what came from
 a cache. With reassociation, the last bits of results would depend on it too, for a gain in speed of
 5 %.
+
+In docstrings [T] is D. B. Chester, *A Parameterized Simulation of Doppler Lidar*, Utah State
+University, 2017. Points of one category share all settings that are words or sizes
+(:func:`sweep.model.preparation.split_by_category`). Sigma is the noise of a bin per quadrature.
 """
 
 VERSION = "45"

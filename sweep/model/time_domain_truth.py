@@ -1,9 +1,9 @@
 """Reference simulation in the time domain: every beamlet, every sample, the full FFT.
 
-The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 2, sample by sample.
-The records are summed, windowed and transformed. Tests compare every fast path with this one. It
-shares link budget, noise and footprint with the fast path, but neither lines nor kernels nor bins.
-A shot takes seconds. Its own accuracy, limited by rounding of f t, is 1e-11 of the peak.
+The beat of each beamlet follows from the exact delay tau(t) (:mod:`sweep.model.waveform`), sample
+by sample. The records are summed, windowed and transformed. Tests compare every fast path with this
+one. It shares link budget, noise and footprint with the fast path, but neither lines nor kernels
+nor bins. A shot takes seconds. Its own accuracy, limited by rounding of f t, is 1e-11 of the peak.
 
 With the effect of overlap, a beamlet has an echo in samples from its own delay tau(t) until the
 chirp ends.

@@ -1,6 +1,7 @@
 """Waveform and its segments: beat frequencies, phases, and range and velocity from a set of peaks.
 
-Homodyne beat phase of a segment (PHYSICS section 2), tau(t) = tau_0 - beta t, beta = 2 v_r / c:
+Homodyne beat phase of a segment, for the delay tau(t) = tau_0 - beta t with beta = 2 v_r / c
+(docs/physics.md, *Beats*):
 
     psi(t) = 2 pi [ -f_seg tau(t) + s S ( tau(t)^2 / 2 - t tau(t) ) ],   s = +1, 0, -1
 
@@ -403,7 +404,7 @@ def resolve_range_velocity(
     Doppler frequency. The reading with the best prediction is chosen, a fold counting as
     :data:`FOLD_PENALTY_BINS` bins of mismatch. The velocity has the sign of down - up.
 
-    PHYSICS section 2 gives the readings without folds. Half sum and half difference belong to the
+    docs/physics.md, *Folding*, explains the readings. Half sum and half difference belong to the
     carrier and to the range at mid-chirp, which is corrected here.
     """
     if has_signs or doppler is None:

@@ -1,8 +1,8 @@
 """Phase errors over the record: range walk, acceleration, and nonlinearity of the sweep.
 
-Each effect has a phase psi(t) [cycles], added to the beat of every line (PHYSICS section 2). It
-also has a phase-error bound, a polynomial in the position x in the record, from which its error
-bound follows.
+Each effect has a phase psi(t) [cycles], added to the beat of every line
+(:mod:`sweep.model.waveform`). It also has a phase-error bound, a polynomial in the position x in
+the record, from which its error bound follows.
 
 Range walk and acceleration are all terms in t^2 and beyond of a target whose delay is tau(t) =
 tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:

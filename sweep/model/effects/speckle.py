@@ -671,8 +671,8 @@ class BeamletMoments(NamedTuple):
 def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     """Return the beamlets' moments of Doppler ratio and relative range.
 
-    The covariance is about the mean of each surface: surfaces at different ranges, as a roof and
-    the ground below, are echoes of their own, each of which fades as a whole.
+    The covariance is about the mean of each surface. Surfaces at different ranges, such as a roof
+    and the ground below, are separate echoes, which fade independently.
     """
     values = np.array([shots.doppler_ratio_offset, shots.relative_range_offset])
     return _moments_by_surface(
@@ -706,9 +706,9 @@ def _phase_moments(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean [rad] and variance [rad^2] of the phase differences over ray-traced beamlets.
 
-    (len(phases), n) each. Ranges and Doppler ratios change linearly across a Gaussian beam, so that
-    the phase is normal. A sum of phasors over few rays would recur where their phases are whole
-    cycles apart.
+    Both are (len(phases), n). Ranges and Doppler ratios change linearly across a Gaussian beam, so
+    the phase is normal. A sum of phasors over few rays would be periodic where their phases differ
+    by whole cycles.
     """
     weights = (
         2 * np.pi * np.array([[phase.doppler_cycles, -phase.delay_cycles] for phase in phases])
