@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 SINGLE_MODE, APERTURE = COUPLINGS = "single_mode", "aperture"
 
 COUPLING_PATH = "instrument.telescope.coupling"
-"""Parameter that selects the law of coupling, one of `COUPLINGS`."""
+"""Path of the law of coupling, one of `COUPLINGS`."""
 APERTURE_DIAMETER_PATH = "instrument.telescope.aperture"
 WAVELENGTH_PATH = "instrument.laser.wavelength"
 DIVERGENCE_PATH = "instrument.laser.beam_divergence"

@@ -70,9 +70,9 @@ from sweep.model.threshold import tnr_from_parameters
 from sweep.model.window import canonical_window_name, window_samples
 
 BEAMLETS_PATH = "footprint.beamlets"
-"""Number of beamlets; 0 if it follows from the tolerance."""
+"""Path of the number of beamlets; 0 if it follows from the tolerance."""
 PATTERN_PATH = "footprint.pattern"
-"""Pattern of the beamlets."""
+"""Path of the pattern of the beamlets."""
 
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
 """Smallest and largest ratio of the number of rays to that of the cast before."""

@@ -60,8 +60,9 @@ class ErrorBudget:
     quantile: 0.99 takes 1.7 times the draws of 0.95."""
 
     line_error: ArrayLike = AUTOMATIC
-    """Error of a bin, in noise sigmas, due to few lines in place of many beamlets. By default
-    `lines_fraction` of the tolerance. A smaller error slowly increases the lines a segment."""
+    """Error of a bin, in noise sigmas, due to few lines in place of one a beamlet. By default
+    `lines_fraction` of the tolerance. A smaller error slowly increases the number of lines of a
+    segment."""
 
     leakage_error: ArrayLike = AUTOMATIC
     """Probability of leakage, over all bins far from the lines, that is neglected. By default
@@ -110,8 +111,8 @@ class ErrorBudget:
     smooth plane almost cancels."""
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Least number of rays of a flight's shot, for tolerances from each value on. No estimate can
-    know of objects that no ray hits: fewer rays miss small objects."""
+    """Pairs of a tolerance and the least number of rays of a flight's shot from that tolerance up.
+    No estimate can know of objects that no ray hits: fewer rays miss small objects."""
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
     """Numbers of rays that may be cast for a shot: full shells of the lattice, which alone are
@@ -139,7 +140,7 @@ class ErrorBudget:
 
     @property
     def allowed_line_error(self) -> np.ndarray:
-        """Tolerated error of a bin over sigma, due to few lines in place of many."""
+        """Tolerated error of a bin over sigma, due to few lines in place of one a beamlet."""
         return self._stated_or_fraction(self.line_error, self.lines_fraction)
 
     @property

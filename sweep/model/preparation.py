@@ -44,16 +44,18 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
     for section in ("laser", "chirp", "telescope", "receiver", "processing")
 )
 RECORD_PATH = RECEIVER_PREFIX + "record"
-"""Kind of samples of a record: ``real``, or ``complex`` from I and Q."""
+"""Path of the kind of samples of a record: ``real``, or ``complex`` from I and Q."""
 
 BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
-"""Error of pd due to the number of beamlets, present if that number follows from the tolerance."""
+"""Path of the error of pd due to the number of beamlets, present if that number follows from the
+tolerance."""
 
 APPROACH_SPEED_PATH = "target.approach"
-"""Speed [m/s] at which the range along the beam falls, present if it was found by ray tracing."""
+"""Path of the speed [m/s] at which the range along the beam falls, present if it was found by ray
+tracing."""
 
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
-"""Chirp rates of Doppler segment and down-chirp over that of the up-chirp."""
+"""Paths of the chirp rates of Doppler segment and down-chirp over that of the up-chirp."""
 CATEGORY_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
@@ -62,8 +64,8 @@ CATEGORY_PATHS = (
     LOOKS_VOTES_PATH,
     *CHIRP_SLOPE_PATHS,
 )
-"""Numeric parameters that points must share to be prepared together; all text parameters must be
-shared."""
+"""Paths of numeric parameters that points must share to be prepared together. They must share all
+text parameters as well."""
 
 ADC_NOISE_SOURCE = "quantisation"
 """Noise source that does not pass the receiver."""
@@ -111,8 +113,8 @@ class Shots:
     """Points of one category, ready for the spectrum.
 
     Arrays are (n,) or scalars unless stated otherwise, in SI units. Segments are in the order up,
-    Doppler, down. The fields from ``relative_amplitude`` on have their defaults unless an effect
-    sets them.
+    Doppler, down. The fields after ``relative_amplitude`` have their defaults unless an effect sets
+    them.
     """
 
     architecture: str
@@ -178,7 +180,7 @@ class Shots:
     leakage_tolerance: np.ndarray
     """Probability of leakage, over all bins far from the lines, that may be neglected."""
     line_error_tolerance: np.ndarray
-    """Tolerated error of a bin due to few lines in place of many, over sigma."""
+    """Tolerated error of a bin, over sigma, due to few lines in place of one a beamlet."""
     beamlets_error: np.ndarray
     """Error of pd due to the number of beamlets; nan where it was not estimated."""
     echo_power_scale: np.ndarray

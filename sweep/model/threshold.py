@@ -50,7 +50,7 @@ PROCESSING_PREFIX = "instrument.processing."
         "design_pfa_shot",
     )
 )
-"""Parameters that state the threshold; exactly one is given."""
+"""Paths of the parameters that state the threshold; exactly one is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""

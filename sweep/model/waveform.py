@@ -66,7 +66,7 @@ SEARCH_PREFIX = "instrument.processing.search."
 SEARCH_RANGE_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
 SEARCH_VELOCITY_PATHS = SEARCH_PREFIX + "min_radial_velocity", SEARCH_PREFIX + "max_radial_velocity"
 SEARCH_BAND_PATHS = SEARCH_RANGE_PATHS + SEARCH_VELOCITY_PATHS
-"""Parameters of a search band; all four are given together."""
+"""Paths of the parameters of a search band; all four are given together."""
 
 
 class WaveformSegment(NamedTuple):

@@ -189,7 +189,7 @@ def _mean_extinction(
 
 
 BEAM_ELEVATION_PATH = "path.elevation"
-"""Angle of the beam below the horizon [rad], by shot; present only in scenes."""
+"""Path of the angle of the beam below the horizon [rad], by shot; present only in scenes."""
 
 
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:

@@ -72,7 +72,7 @@ EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
 EFFECT_CATEGORY_PATHS = tuple(
     parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
 )
-"""Numeric parameters of effects that points must share to be prepared together."""
+"""Paths of numeric parameters of effects that points must share to be prepared together."""
 
 PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.BEAM_DEFAULTS

@@ -69,7 +69,7 @@ N_PHASES = 16
 """Number of phases of the line over which alarms are averaged."""
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
-"""Optical path of the leaked light beyond that of the local oscillator."""
+"""Path of the leaked light's optical path beyond that of the local oscillator [m]."""
 
 
 def _leaked_power_and_current(

@@ -53,7 +53,8 @@ _TIE_SLACK = 1.0 + 1e-12
 """Factor above the rounding of a hit's distance: a box is skipped only if it cannot hold a tie."""
 
 _BUNDLE_TESTS_MAX, _UNLIMITED_TESTS = np.array([128, 1 << 62])
-"""Number of triangles tested against a full bundle before its rays are traversed one by one."""
+"""Number of triangles tested against a full bundle before its rays are traversed one by one, and a
+number that is never reached."""
 
 
 class BoxTree(NamedTuple):

@@ -199,7 +199,7 @@ def _cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def facet_normals(corners: np.ndarray) -> DoubleDouble:
-    """Compute normals (3, n) of facets, oriented by their winding and of twice their areas' length.
+    """Compute normals (3, n) of facets, oriented by their winding, with lengths of twice the areas.
 
     `corners` (3, 3, n) are x, y, z of the first, second and third corner.
     """
