@@ -3,7 +3,7 @@
 A coherent receiver sees one spatial mode. Light mixes with the local oscillator as far as it lies
 in the oscillator's mode, propagated back through the telescope to the target. A diffuse surface
 returns the radiance rho_pi P I_T. A single mode collects lambda^2 of a radiance at any distance
-(Siegman, Appl. Opt. 5, 1966, 1588). With the transmitted power P_tx the received power is
+[1]_. With the transmitted power P_tx the received power is
 
     P_sig = P_tx tau_o rho_pi lambda^2  integral of I_T I_L d^2x
 
@@ -24,6 +24,10 @@ detection. A ray represents the light at one position on the target and of one d
 telescope and near a focus, positions and directions spread differently. Ranges follow positions,
 which spread as w(R) / R. Doppler shifts follow directions, which have the far-field spread at every
 range.
+
+References
+----------
+.. [1] Siegman, Appl. Opt. 5, 1966, 1588.
 """
 
 import math

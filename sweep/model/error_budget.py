@@ -15,9 +15,9 @@ or from means of conditional probabilities. The tolerance bounds the error of th
 :func:`interval_half_width` is its distance to the farther end of the interval. Near 0 and 1, where
 intervals lie on one side of the estimate, it is up to twice half their length.
 
-For counts there are two intervals. Wilson's score interval [J. Am. Stat. Assoc. 22, 209, 1927] has
-the stated coverage on average over probabilities. The interval of Clopper and Pearson [Biometrika
-26, 404, 1934] has at least the stated coverage at every probability.
+For counts there are two intervals. Wilson's score interval [1]_ has the stated coverage on average
+over probabilities. The interval of Clopper and Pearson [2]_ has at least the stated coverage at
+every probability.
 
 For a mean m of n values within 0..1, of sample variance s^2, rare values that no draw has shown may
 add any amount. s^2 = 0 after n equal values proves nothing. But if the true mean lies d above m,
@@ -31,6 +31,11 @@ likely with such a variance, as the score interval does:
 With s^2 = 0 the half-width is q z^2 / n (3.8 q / n for 95 %), as wide as what n draws can miss.
 With many draws it is z s / sqrt(n). For values of only 0 and 1 it is the score interval, except for
 terms of z^2 / n of its width.
+
+References
+----------
+.. [1] Wilson, J. Am. Stat. Assoc. 22, 209, 1927.
+.. [2] Clopper and Pearson, Biometrika 26, 404, 1934.
 """
 
 from collections.abc import Callable, Mapping

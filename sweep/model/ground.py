@@ -6,7 +6,7 @@ incidence i returns the intensity f P cos(i) [W/sr] along the beam. The illumina
 Lambert's f = rho/pi gives rho cos(i)/pi.
 
 The law of Lommel and Seeliger describes dark, porous ground (regolith), where light that is
-scattered once dominates [Hapke 1981; 2012, ch. 10]:
+scattered once dominates [1]_ [2]_:
 
     f = w / (4 pi) / (cos i + cos e) * p(g) (1 + B(g))
 
@@ -14,6 +14,11 @@ with the single-scattering albedo w, the phase function p and the opposition sur
 hidden behind their grains. A lidar observes at the phase angle g = 0 and i = e, where f cos(i) is w
 p(0) (1 + B(0)) / (8 pi) at any incidence. A sphere of such ground is uniformly bright, like the
 full Moon.
+
+References
+----------
+.. [1] Hapke, 1981.
+.. [2] Hapke, 2012, ch. 10.
 """
 
 import math

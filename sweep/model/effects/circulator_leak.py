@@ -15,9 +15,9 @@ d longer than the local oscillator's, with the delay tau = d / c. It is present 
 - **Intensity noise**. A balanced receiver rejects that of the light, but not that of the beat. The
   variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
 - **Phase noise** of a Lorentzian laser of width v. The beat carries theta(t) - theta(t - tau), of
-  density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [Richter et al.,
-  IEEE J. Quantum Electron. 22, 2070, 1986]. A line turns it into noise of i^2 / 2 times that
-  density. It is assumed to be white within B_e, and at most 2 pi v tau in total.
+  density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [1]_. A line turns
+  it into noise of i^2 / 2 times that density. It is assumed to be white within B_e, and at most 2
+  pi v tau in total.
 
 The line begins at its own delay tau, as an echo does (:mod:`sweep.model.effects.overlap`): a path
 of a metre takes 3 ns of a record that begins with the chirp. With overlap off the line fills the
@@ -33,6 +33,10 @@ fades in developed speckle crosses with Q_1(L / s, Th / s), s^2 = sigma^2 + |X|^
 Neglected are saturation of the ADC by the line, the line's own image of I and Q, and skirts of echo
 and line that together raise one bin. The spectrum of
 :func:`sweep.model.spectrum.segment_spectra.segment_spectrum` is that of the echo alone.
+
+References
+----------
+.. [1] Richter et al., IEEE J. Quantum Electron. 22, 2070, 1986.
 """
 
 from collections.abc import Mapping

@@ -149,7 +149,11 @@ class ErrorBound(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
-    """Physical effect, with its error bound and its change of the shots; compared by identity."""
+    """Physical effect, with its error bound and its change of the shots; compared by identity.
+
+    An effect has `apply`, or for draws one of `perturb_parameters` and `perturb_shots`. An effect
+    of the scene alone has none of them.
+    """
 
     name: str
     """Name in specs and stores."""
@@ -160,20 +164,24 @@ class Effect:
     ``noise``; ``record`` and its phases; ``spectrum``; ``detection``; and ``draws``, random changes
     of any of these."""
     error_bound: "Callable[[PlannerInputs], ErrorBound | None]"
-    """Function that returns the upper bound on the output change if the effect is omitted; None if
-    it is absent."""
+    """Function of :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of n points. It
+    returns the upper bound on the output change if the effect is omitted, or None if the effect is
+    absent."""
     phase_error_bound: "Callable[[PlannerInputs], PhaseErrorBound | None] | None" = None
-    """Function that returns the bound of the phase error over the record. All phase-error bounds
-    are known before any `error_bound` is evaluated."""
+    """Function of :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of n points. It
+    returns the bound of the phase error over the record, or None. All phase-error bounds are known
+    before any `error_bound` is evaluated."""
     apply: Callable[[Shots, EffectContext], Shots] | None = None
-    """Function that changes prepared shots."""
+    """Function of prepared shots and their :class:`EffectContext` that returns the changed shots.
+    """
     perturb_parameters: (
         Callable[[dict[str, np.ndarray], DrawAddresses], dict[str, np.ndarray]] | None
     ) = None
-    """Function that draws a random change of parameters, before shots are prepared."""
+    """Function of parameters by path and :class:`DrawAddresses` that returns randomly changed
+    parameters, before shots are prepared."""
     perturb_shots: Callable[[Shots, EffectContext, DrawAddresses], Shots] | None = None
-    """Function that draws a random change of shots, after all other effects except spectrum and
-    detection."""
+    """Function of shots, :class:`EffectContext` and :class:`DrawAddresses` that returns randomly
+    changed shots, after all other effects except spectrum and detection."""
     parameters: tuple[Parameter, ...] = ()
     """Fields that the effect adds to a spec."""
     parent: str = ""

@@ -1,8 +1,7 @@
 """Saturation: a record beyond the ADC's full scale is clipped.
 
 A beat of amplitude A with Gaussian noise of standard deviation s is clipped at +-V. As a memoryless
-nonlinearity on a sine, clipping leaves [Blachman, IRE Trans. Inf. Theory 10 (1964) 162, in the
-manner of Bussgang]
+nonlinearity on a sine, clipping leaves [1]_, in the manner of Bussgang,
 
 - the line, with the gain  2/A <m(A sin t) sin t>, where m(x) is the mean of x + n after clipping
   and < > the mean over the phase t;
@@ -14,6 +13,10 @@ fraction 2/pi asin(r) of the time.
 
 The record is taken as one sine of constant amplitude. A footprint that spreads over bins has an
 envelope that varies over the record, which clips less than its peak indicates.
+
+References
+----------
+.. [1] Blachman, IRE Trans. Inf. Theory 10 (1964) 162.
 """
 
 import math
