@@ -1,4 +1,4 @@
-"""The declarative experiment: YAML in, checked values out, every mistake at once."""
+"""Declarative specs of studies: YAML in, validated values or all mistakes out."""
 
 from sweep.spec.axes import Axis, AxisParameter
 from sweep.spec.cluster_config import (

@@ -1,6 +1,7 @@
-"""The axes of a study: which parameters vary, over which values, together or apart.
+"""Axes of a study: the parameters that vary and their values.
 
-The ``axes`` section of a spec is read here as a whole.
+`read_axes` reads the ``axes`` section of a spec. A plain axis varies one parameter; a zipped axis
+varies several parameters together. The grid of a study is the product of its axes.
 """
 
 from __future__ import annotations
@@ -38,30 +39,34 @@ from sweep.spec.sections import (
 from sweep.units import QuantityError, Unit
 
 RESERVED_DIMENSIONS = ("batch", "draw", "point", "spec", "study_id")
-"""Names of dimensions that a store may have besides its axes."""
+"""Names of dimensions that a store may have in addition to its axes."""
 
 _MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Names of the coordinate that marks a study's points, in the dataset that its store opens as."""
+"""Pattern of the name of a marker coordinate: it identifies the study of each point in a
+dataset."""
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 _LISTED_VALUES_MAX = 64
-"""Values of an axis that its identity lists at most."""
+"""Maximum number of values that the identity of an axis lists; longer axes are given by a
+digest."""
 _NAME_REMEDY = "take a word such as 'cut'"
 
 
 @dataclass(frozen=True, eq=False)
 class AxisParameter:
-    """One parameter along an axis."""
+    """One parameter that varies along an axis, with its values."""
 
     path: str
+    """Dotted path of the parameter, such as ``target.range``."""
     coordinate: str
-    """Name of its coordinate."""
+    """Name of the parameter's coordinate in the store."""
     values: np.ndarray | tuple[str, ...]
-    """SI values (n,), float64 or int64; words of a parameter that takes words."""
+    """Values (n,) in SI units, float64 or int64; a tuple of n words if the parameter takes
+    words."""
     display_values: np.ndarray
-    """The same in `units`."""
+    """Values (n,) in `units`; the words if the parameter takes words."""
     units: str
-    """The unit that the user wrote; empty where there is none."""
+    """Unit in which the user wrote the values; empty if the parameter has no unit."""
 
 
 @dataclass(frozen=True)
@@ -69,22 +74,37 @@ class Axis:
     """One dimension of a study's grid."""
 
     name: str
+    """Name of the dimension in the store."""
     parameters: tuple[AxisParameter, ...]
-    """The parameters along it: one, or several that vary together."""
+    """Parameters along the axis: one, or several that vary together."""
 
     @property
     def size(self) -> int:
-        """Number of values."""
+        """Number of values along the axis."""
         return len(self.parameters[0].values)
 
     @property
     def is_zipped(self) -> bool:
-        """True if the dimension has a name of its own."""
+        """True if the axis is zipped: the name of its dimension is not that of its parameter."""
         return len(self.parameters) > 1 or self.parameters[0].coordinate != self.name
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Content of an axis: its values where they are few, else their number, ends and digest."""
+    """Return the content of an axis for the study's identity.
+
+    An axis of at most 64 values is listed value by value. A longer axis is given by the number of
+    its values, the first and last value, and a digest of all values.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to identify.
+
+    Returns
+    -------
+    dict
+        Data for JSON with the keys ``name`` and ``members`` (content of each parameter by path).
+    """
     return {
         "name": axis.name,
         "members": {
@@ -94,7 +114,7 @@ def axis_identity(axis: Axis) -> dict[str, Any]:
 
 
 def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
-    """Content of one parameter along an axis."""
+    """Return the content of one parameter along an axis for the study's identity."""
     n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
     if n_values <= _LISTED_VALUES_MAX:
         return {
@@ -110,7 +130,7 @@ def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
 
 
 def parameter_location(path: str, axes: tuple[Axis, ...]) -> Location:
-    """Location of the values of a parameter in a spec: on its axis, if it has one."""
+    """Return the location of a parameter's values in a spec: its axis, if any, else its field."""
     for axis in axes:
         if any(parameter.path == path for parameter in axis.parameters):
             return ("axes", axis.name if axis.is_zipped else path)
@@ -118,7 +138,20 @@ def parameter_location(path: str, axes: tuple[Axis, ...]) -> Location:
 
 
 def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
-    """Axes of a spec's ``axes`` section that can be read, and everything that is wrong with it."""
+    """Read the ``axes`` section of a spec.
+
+    Parameters
+    ----------
+    raw_axes : object
+        The section as parsed from YAML.
+
+    Returns
+    -------
+    axes : tuple of Axis
+        Axes that can be read, in the order of the spec.
+    findings : list of Finding
+        Every mistake in the section.
+    """
     if not isinstance(raw_axes, dict):
         remedy = "write e.g. 'target.range: [1 km, 2 km]' below it, or leave it out"
         return (), [Finding(("axes",), "must be a mapping of paths to values", remedy, raw_axes)]
@@ -132,7 +165,10 @@ def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
 
 
 def first_values_on_axes(raw_axes: object) -> dict[str, object]:
-    """Parameters that a spec's ``axes`` section sets, each with its first value as written."""
+    """Return the first value, as written, of each parameter that a spec's ``axes`` section sets.
+
+    Keys of the result are dotted paths. Paths that name no parameter are left out.
+    """
     first_values: dict[str, object] = {}
     for key, value in raw_axes.items() if isinstance(raw_axes, dict) else ():
         for path, values in _paths_and_values(str(key), value):
@@ -141,11 +177,23 @@ def first_values_on_axes(raw_axes: object) -> dict[str, object]:
 
 
 def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Copy of a written study in whose sections no field is that an axis of it sets.
+    """Return a copy of a written spec without the fields that its axes also set.
 
-    A field and its axis may not contradict each other: this gives a study of plain data an axis
-    in the place of a field.
+    A spec may not set a field and an axis over the same field. With this function a program can add
+    an axis to a spec that already sets the field.
 
+    Parameters
+    ----------
+    raw_spec : Mapping
+        Spec as parsed from YAML.
+
+    Returns
+    -------
+    dict
+        Deep copy of the spec.
+
+    Examples
+    --------
     >>> study = {"target": {"range": "2 km", "reflectance": 0.1}}
     >>> remove_fields_on_axes({**study, "axes": {"target.range": ["1 km", "3 km"]}})
     {'target': {'reflectance': 0.1}, 'axes': {'target.range': ['1 km', '3 km']}}
@@ -162,7 +210,7 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
-    """Paths and values of a written axis; of a zipped one, piece after piece."""
+    """Return pairs of path and written values of an axis, piece by piece if it is zipped."""
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
     pieces = raw_axis["zip"] if isinstance(raw_axis["zip"], list) else [raw_axis["zip"]]
@@ -171,14 +219,14 @@ def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
 
 
 def _first_raw_value(values: object) -> object:
-    """First value of a written list or generator; None where it has none."""
+    """Return the first value of a written list or generator; None if it is empty."""
     while isinstance(values, dict | list) and values:
         values = next(iter(values.values())) if isinstance(values, dict) else values[0]
     return None if isinstance(values, dict | list) else values
 
 
 def _read_axis(key: str, raw_axis: object, location: Location) -> Axis:
-    """One axis, plain or zipped."""
+    """Read one axis, plain or zipped; raise `FindingsError` if it can't be read."""
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
         return _read_zip(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
@@ -193,7 +241,10 @@ def _read_axis(key: str, raw_axis: object, location: Location) -> Axis:
 
 
 def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
-    """Dotted path of the first field within sections as written, and its values in short."""
+    """Return the dotted path of the first field in nested sections, and a form for its values.
+
+    Both are for the remedy when a user writes a section under ``axes`` in place of a field's path.
+    """
     while (
         isinstance(raw_section, dict)
         and raw_section
@@ -205,7 +256,7 @@ def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
 
 
 def _axis_rule(path: str, location: Location) -> Rule:
-    """Rule of the parameter at a path."""
+    """Return the rule of the parameter at a path; raise `FindingsError` if no axis may set it."""
     rule = parameter_rules().get(path)
     if rule is None:
         raise findings_error(location, *_axis_refusal(path))
@@ -220,7 +271,7 @@ _FIXED_PROBLEM = "is the same for a whole study"
 
 
 def _axis_refusal(path: str) -> tuple[str, str]:
-    """Rule and remedy for the path of what no axis may set."""
+    """Return the problem and the remedy for a path that no axis may set."""
     section, _, name = path.partition(".")
     if path == "seed":
         problem = f"{_FIXED_PROBLEM}: each point and draw has random numbers of its own already"
@@ -235,14 +286,14 @@ def _axis_refusal(path: str) -> tuple[str, str]:
 
 
 def _make_axis_parameter(path: str, pieces: list[PieceValues], location: Location) -> AxisParameter:
-    """Parameter along an axis, from pieces laid end to end."""
+    """Concatenate pieces of values into one parameter along an axis."""
     name = short_name(path)
     n_values = _number_of_values(pieces)
     if n_values > AXIS_VALUES_MAX:
         raise findings_error(
             location, f"has {n_values} values, and an axis takes at most {AXIS_VALUES_MAX}"
         )
-    # Not in decibels where some piece is not: those have no zero.
+    # Use a linear unit if any piece has one: a value of zero can't be shown in decibels.
     unit = next((piece.unit for piece in pieces if not piece.unit.is_logarithmic), pieces[0].unit)
     values = np.concatenate([piece.si_values for piece in pieces])
     if values.dtype.kind == "U":
@@ -255,7 +306,7 @@ def _make_axis_parameter(path: str, pieces: list[PieceValues], location: Locatio
 
 
 def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
-    """No value twice along an axis, or a finding that names one."""
+    """Raise `FindingsError` if a value occurs more than once along an axis."""
     values = np.asarray(parameter.values)
     if values.dtype.kind != "U" and (
         np.all(values[1:] > values[:-1]) or np.all(values[1:] < values[:-1])
@@ -270,11 +321,11 @@ def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
         raise findings_error(location, f"holds {value_text} more than once", "list it once")
 
 
-# Zipped axes: several parameters that vary together, in pieces laid end to end
+# Zipped axes: several parameters that vary together, written in pieces that are concatenated
 
 
 def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
-    """Zipped axis, each of whose pieces gives all of its parameters."""
+    """Read a zipped axis; every piece must set the same parameters."""
     findings = Findings(
         Finding((*location, str(other)), "is no part of a zipped axis", "write {zip: [...]}")
         for other in raw_axis
@@ -315,7 +366,10 @@ def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
 
 
 def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceValues]]:
-    """Values of one piece by path, all of one length."""
+    """Return the values of one piece of a zipped axis by path, all of equal length.
+
+    A single value is repeated to the length of the piece's lists.
+    """
     if not isinstance(raw_piece, dict) or not raw_piece:
         raise findings_error(location, "must be a mapping of paths to values", "", raw_piece)
     findings = Findings()
@@ -345,15 +399,15 @@ def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceVa
 
 
 def _number_of_values(pieces: list[PieceValues]) -> int:
-    """Count the values in pieces."""
+    """Return the total number of values in a list of pieces."""
     return sum(len(piece.si_values) for piece in pieces)
 
 
-# Names
+# Names of coordinates
 
 
 def _name_coordinates(axes: list[Axis]) -> list[Axis]:
-    """Axes whose coordinates have the shortest names that tell them apart."""
+    """Return the axes with each coordinate named by the shortest unambiguous tail of its path."""
     paths = [parameter.path for axis in axes for parameter in axis.parameters]
     named_axes = []
     for axis in axes:
@@ -367,9 +421,9 @@ def _name_coordinates(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Return the shortest dotted tail of a path that names it alone, joined by underscores.
+    """Return the shortest tail of a dotted path that identifies a parameter, joined by underscores.
 
-    No other path ends with it, and no variable of a store is called so.
+    No other path ends with this tail, and no variable of a store has this name.
     """
     keys, *other_keys = (
         parameter_path.removesuffix(".kind").split(".")
@@ -384,7 +438,7 @@ def _coordinate_name(path: str, paths: list[str]) -> str:
 
 
 def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
-    """Parameters that two axes set."""
+    """Return a finding for each parameter that two axes set."""
     keys_by_path: dict[str, list[str]] = {}
     for key, value in raw_axes.items():
         for path in sorted({path for path, _ in _paths_and_values(str(key), value)}):
@@ -397,7 +451,7 @@ def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
 
 
 def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
-    """List zipped axes that bear the name of another axis's coordinate, or of a variable."""
+    """Return a finding for each zipped axis that has the name of a coordinate or variable."""
     findings = []
     for axis in axes:
         other_coordinates = {
@@ -421,62 +475,80 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
     return findings
 
 
-# Written values as arrays: single ones, and linear, log or step generators. Regular values stay
-# exact until the one rounding of each: a generator makes the float that the same value, written
-# out, gives.
+# Written values as arrays: single values, and linear, log or step generators. The values of a
+# progression are exact fractions that are rounded once, so that a generator gives the same floats
+# as a list of the same values.
 
 AXIS_VALUES_MAX = 20_000_000
+"""Maximum number of values along an axis."""
 _GENERATOR_FORMS = {
     "linear": "{linear: [first, last], number: 10}",
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
+"""Generators of values by keyword, with the form in which each is written."""
 _NUMPY_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
-"""Names that generators have in NumPy."""
+"""Keyword of the generator that corresponds to a function of NumPy, by the function's name."""
 _NUMBER_OF_VALUES_RULE = NumericRule(
     description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
 )
 
 
-# Regular values, exactly
+# Regular values in exact arithmetic
 
 
 @dataclass(frozen=True)
 class Progression:
-    """The regular values ``start + increment * i`` for ``i = 0 .. number - 1``, exactly."""
+    """Exact arithmetic progression ``start + increment * i`` for ``i = 0 .. number - 1``."""
 
     start: Fraction
+    """First value."""
     increment: Fraction = Fraction(0)
+    """Difference of consecutive values."""
     number: int = 1
+    """Number of values."""
 
     def scale_and_shift(self, factor: Fraction, offset: Fraction) -> Progression:
         """Return the progression of ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
     def values(self) -> np.ndarray:
-        """Floats (number,), each the nearest to its exact value: quotients of whole numbers."""
+        """Return the values (number,) as floats, each rounded once from its exact value."""
         denominator = math.lcm(self.start.denominator, self.increment.denominator)
         first, step = int(self.start * denominator), int(self.increment * denominator)
         return np.array([(first + step * i) / denominator for i in range(self.number)])
 
 
 def _round_to_15_digits(values: np.ndarray) -> np.ndarray:
-    """Values (n,) to 15 significant digits.
+    """Round values (n,) to 15 significant digits.
 
-    Powers and logarithms may differ in the last bit from one machine to the next; 15 digits are
-    the same everywhere.
+    Powers and logarithms may differ in the last bit between machines. Rounded to 15 digits they are
+    equal on all machines.
     """
     magnitude = np.abs(values)
     np.floor(np.log10(magnitude, where=magnitude > 0, out=np.zeros(values.shape)), out=magnitude)
     exponent = 14 - magnitude.astype(np.int64)
-    has_exact_scale = np.abs(exponent) <= 22  # powers of ten that are exact floats
+    has_exact_scale = np.abs(exponent) <= 22  # powers of ten up to 1e22 are exact floats
     scale = 10.0 ** np.where(has_exact_scale, np.abs(exponent), 0)
     scaled_up, scaled_down = np.rint(values * scale) / scale, np.rint(values / scale) * scale
     return np.where(has_exact_scale, np.where(exponent >= 0, scaled_up, scaled_down), values)
 
 
 def convert_from_si(unit: Unit, si_values: np.ndarray) -> np.ndarray:
-    """SI values (n,) in the given unit, to 15 significant digits."""
+    """Convert SI values to a unit, rounded to 15 significant digits.
+
+    Parameters
+    ----------
+    unit : Unit
+        Unit of the result; may have an offset (temperature) or be logarithmic (decibels).
+    si_values : ndarray, shape (n,)
+        Values in SI units.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Values in `unit`.
+    """
     if unit.is_logarithmic:
         return _round_to_15_digits(10.0 * np.log10(si_values / float(unit.factor)))
     if (unit.factor, unit.offset) == (1, 0):
@@ -487,7 +559,22 @@ def convert_from_si(unit: Unit, si_values: np.ndarray) -> np.ndarray:
 
 
 def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
-    """Written value in the unit of choice."""
+    """Read a written value and convert it to a unit.
+
+    Parameters
+    ----------
+    rule : NumericRule
+        Rule of the field that the value belongs to.
+    raw_value : object
+        Value as the user wrote it, with its unit.
+    unit_name : str
+        Unit of the result; empty for a pure number.
+
+    Returns
+    -------
+    float
+        The value in `unit_name`.
+    """
     number, unit = rule.read_exact(raw_value)
     single_value = PieceValues(np.array([unit.to_si(number)]), unit, Progression(number))
     return float(single_value.to_unit(rule.read_exact(f"1 {unit_name}" if unit_name else 1)[1])[0])
@@ -498,17 +585,17 @@ def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
 
 @dataclass(frozen=True)
 class PieceValues:
-    """Numbers or words of one written piece of an axis."""
+    """Values of one piece of an axis: a single value or a generator."""
 
     si_values: np.ndarray
-    """SI values (n,), or words."""
+    """Values (n,) in SI units, or words."""
     unit: Unit
-    """The unit they were written in; of words none."""
+    """Unit in which the values were written; ``Unit("")`` for words."""
     progression: Progression | None = None
-    """The same numbers exactly, in `unit`, where they are regular."""
+    """Exact values in `unit`; None if they are not an arithmetic progression."""
 
     def to_unit(self, unit: Unit) -> np.ndarray:
-        """Values (n,) in the unit of choice."""
+        """Return the values (n,) in a unit."""
         if self.progression is not None and unit == self.unit:
             return self.progression.values()
         if self.progression is None or unit.is_logarithmic or self.unit.is_logarithmic:
@@ -517,13 +604,33 @@ class PieceValues:
         return self.progression.scale_and_shift(self.unit.factor / unit.factor, offset).values()
 
     def repeat(self, number: int) -> PieceValues:
-        """Return a single value as often as asked."""
+        """Return a single value repeated `number` times."""
         progression = self.progression and replace(self.progression, number=number)
         return replace(self, si_values=np.repeat(self.si_values, number), progression=progression)
 
 
 def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[PieceValues]:
-    """Values of an axis over one field: a list of values and generators, or one generator."""
+    """Read the values of an axis over one field.
+
+    Parameters
+    ----------
+    raw_value : object
+        A list of values and generators, or one generator, as parsed from YAML.
+    rule : Rule
+        Rule of the field.
+    location : Location
+        Location of the values in the spec, for findings.
+
+    Returns
+    -------
+    list of PieceValues
+        One entry for each element of the list.
+
+    Raises
+    ------
+    FindingsError
+        With every mistake in the values.
+    """
     if isinstance(raw_value, dict):
         return [_read_generator(raw_value, rule, location)]
     if not isinstance(raw_value, list):
@@ -543,7 +650,13 @@ def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[Piece
 
 
 def read_single_value(raw_value: object, rule: Rule, location: Location) -> PieceValues:
-    """One value: of numeric fields with its unit, of others the word."""
+    """Read one value: a number with its unit for numeric fields, else a word.
+
+    Raises
+    ------
+    FindingsError
+        If the value breaks the field's rule.
+    """
     try:
         value = rule.read(raw_value)
         if not isinstance(rule, NumericRule):
@@ -556,7 +669,7 @@ def read_single_value(raw_value: object, rule: Rule, location: Location) -> Piec
 
 
 def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> PieceValues:
-    """Values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``, within the field's bounds."""
+    """Read ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``; check the field's bounds."""
     given_forms = [key for key in raw_generator if key in _GENERATOR_FORMS]
     if len(given_forms) != 1:
         name, value = next(iter(raw_generator.items()), ("", None))
@@ -582,7 +695,8 @@ def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Locatio
             number = int(_NUMBER_OF_VALUES_RULE.read(raw_generator["number"]))
     values: PieceValues | None = None
     with findings.collect():
-        # Bounds are looked at even if the number of values cannot be read.
+        # Read the bounds even if the number of values can't be read, to report all mistakes at
+        # once.
         values = _generate_values(form, raw_generator[form], number or 2, rule, (*location, form))
         if number or form == "step":
             _check_bounds(values, rule, location)
@@ -594,7 +708,7 @@ def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Locatio
 def _generate_values(
     form: str, raw_bounds: object, number: int, rule: NumericRule, location: Location
 ) -> PieceValues:
-    """Values between written bounds."""
+    """Return the values of a generator from its written bounds."""
     bounds, unit = _read_bounds(form, raw_bounds, rule, location)
     if form == "step":
         return _progression_values(_step_progression(bounds, location), unit, rule, location)
@@ -611,7 +725,10 @@ def _generate_values(
 def _read_bounds(
     form: str, raw_bounds: object, rule: NumericRule, location: Location
 ) -> tuple[list[Fraction], Unit]:
-    """First, last and (for a step) increment as exact numbers in the first one's unit."""
+    """Return the first value, last value and (for a step) increment, and their common unit.
+
+    The numbers are exact and in the unit of the first value.
+    """
     count = 3 if form == "step" else 2
     if not isinstance(raw_bounds, list) or len(raw_bounds) != count:
         raise findings_error(
@@ -637,7 +754,7 @@ def _read_bounds(
         raise findings_error(
             location, "mixes units of decibels", f"take {first_unit.symbol} for all"
         )
-    # An increment feels no offset.
+    # An increment is a difference of values, so that the unit's offset cancels.
     offsets = [
         exact_values[0][1].offset - first_unit.offset,
         exact_values[1][1].offset - first_unit.offset,
@@ -650,7 +767,7 @@ def _read_bounds(
 
 
 def _step_progression(bounds: list[Fraction], location: Location) -> Progression:
-    """Values from first to last, last included where a step lands on it."""
+    """Return the values from first to last, including last if a step ends there."""
     first, last, step = bounds
     if step == 0:
         raise findings_error(location, "has a step of zero", "list the values")
@@ -667,7 +784,7 @@ def _step_progression(bounds: list[Fraction], location: Location) -> Progression
 def _progression_values(
     progression: Progression, unit: Unit, rule: NumericRule, location: Location
 ) -> PieceValues:
-    """Values of a regular progression, whole ones where the field asks for them."""
+    """Return the values of an arithmetic progression, as integers if the field takes integers."""
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
         return PieceValues(si_values, unit, progression)
@@ -685,7 +802,10 @@ def _progression_values(
 def _geometric_values(
     bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: Location
 ) -> PieceValues:
-    """Values with a constant ratio, spaced in SI so that the unit of the ends doesn't matter."""
+    """Return values with a constant ratio.
+
+    They are spaced in SI units, so that the unit of the bounds does not matter.
+    """
     if unit.is_logarithmic:
         remedy = f"write {_GENERATOR_FORMS['linear']}"
         raise findings_error(location, "steps in decibels, which are logarithms already", remedy)
@@ -703,7 +823,7 @@ def _geometric_values(
 
 
 def _check_bounds(values: PieceValues, rule: NumericRule, location: Location) -> None:
-    """Values within the bounds of their field, or a finding that names the first outside."""
+    """Raise `FindingsError` that names the first value outside the bounds of the field."""
     violation = rule.first_out_of_bounds(values.si_values)
     if violation is not None:
         index, problem = violation

@@ -1,7 +1,7 @@
-"""A cluster in one YAML file: where workers run, how many, and who may talk to them.
+"""Configuration of a cluster, from one YAML file: how its workers are started, and their number.
 
-No study names a cluster and no cluster a study: the same spec runs on any of them, to the same
-bytes.
+A spec names no cluster and a cluster's file names no study. The same spec gives the same bytes on
+every cluster.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from sweep.spec.yaml_document import (
 from sweep.units import QuantityError
 
 LOOPBACK_ADDRESS = "127.0.0.1"
+"""Address at which a service accepts connections from its own machine alone."""
 NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
 _WORKERS_RULE = NumericRule(
     description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
@@ -35,14 +36,16 @@ _BOUNDS_REMEDY = "write e.g. {least: 2, most: 40}"
 
 
 class WorkerBounds(NamedTuple):
-    """Workers at least and at most; the same where their number is fixed."""
+    """Minimum and maximum number of workers, equal if the number is fixed."""
 
     least: int
+    """Minimum number of workers."""
     most: int
+    """Maximum number of workers."""
 
 
 def _read_worker_bounds(raw_value: object) -> WorkerBounds:
-    """Read a number of workers, or bounds that it is kept within."""
+    """Read a number of workers, or a mapping with their minimum and maximum."""
     if not isinstance(raw_value, Mapping):
         try:
             return WorkerBounds(_WORKERS_RULE.read(raw_value), _WORKERS_RULE.read(raw_value))
@@ -62,7 +65,7 @@ def _read_worker_bounds(raw_value: object) -> WorkerBounds:
 
 
 def _read_environment(raw_value: object) -> dict[str, str]:
-    """Environment variables by name."""
+    """Read environment variables: a mapping of names to values of one line each, without quotes."""
     remedy = "write e.g. {TMPDIR: /scratch}"
     if not isinstance(raw_value, Mapping):
         raise QuantityError("must be a mapping of names to values", remedy)
@@ -81,12 +84,18 @@ _LINE_TEXT_ARGUMENTS = {
     "pattern": r"[^\n\r\0]{1,2000}",
     "remedy": "write one line",
 }
+"""Arguments of `TextRule` for a text of one line."""
 _TEXTS_MAX = 100_000
+"""Maximum number of texts in a list."""
 _MEMORY_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
+"""Arguments of `declare.quantity` for an amount of memory: unit, example, lower and upper bound."""
 
 
 class Security(SpecSection):
-    """Certificates with which all parts know each other, in PEM: traffic is TLS throughout."""
+    """TLS certificates in PEM, by which scheduler, workers and client authenticate each other.
+
+    With this section all traffic of the cluster is encrypted.
+    """
 
     ca: str = declare.file_path("Certificate of the authority that signed the others")
     certificate: str = declare.file_path("Certificate of scheduler, workers and client")
@@ -94,7 +103,7 @@ class Security(SpecSection):
 
 
 class LocalWorkerConfig(SpecSection):
-    """One worker process of this machine."""
+    """Threads and memory of a worker process on this machine."""
 
     threads: int = declare.count(
         "Threads, each with a block of its own", "1", at_most="1000", default=1
@@ -107,13 +116,16 @@ class LocalWorkerConfig(SpecSection):
 
 
 class WorkerConfig(LocalWorkerConfig):
-    """One worker process."""
+    """Threads and memory of a worker process; the memory is required."""
 
     memory: float = declare.quantity("Memory that it may take", *_MEMORY_ARGUMENTS)
 
 
 class SchedulerConfig(SpecSection):
-    """Address of the scheduler, which listens to this machine alone unless told otherwise."""
+    """Address and ports of the scheduler.
+
+    Without a host or an interface the scheduler accepts connections from this machine alone.
+    """
 
     host: str = declare.word("Address that workers reach it by", "10.0.0.5", "")
     interface: str = declare.word("Or the network interface that it has", "ib0", "")
@@ -129,7 +141,7 @@ class SchedulerConfig(SpecSection):
 
 
 class BatchJobConfig(SpecSection):
-    """One job of a batch system, with one worker or several."""
+    """Resources and options of one job of a batch system, which holds one worker or several."""
 
     workers: int = declare.count("Workers of one job", "8", at_most="1000", default=1)
     walltime: float = declare.duration(
@@ -149,18 +161,19 @@ class BatchJobConfig(SpecSection):
 
 
 class ClusterConfig(SpecSection):
-    """Base of all clusters."""
+    """Base of the configurations of all clusters."""
 
     security: Security | None = None
 
     _base: Path = PrivateAttr(default=Path())
+    """Folder that paths in the configuration are relative to."""
 
     def resolve_path(self, raw_path: str) -> str:
-        """Path of a file that the cluster's file names."""
-        return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user stays as it is
+        """Return the path of a file that the cluster's file names relative to its folder."""
+        return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user is left as it is
 
     def certificate_paths(self) -> tuple[str, str, str] | None:
-        """Paths of authority, certificate and key; None without security."""
+        """Return the paths of authority, certificate and private key; None without `security`."""
         security = self.security
         if security is None:
             return None
@@ -171,7 +184,7 @@ class ClusterConfig(SpecSection):
 
 
 class StartedClusterConfig(ClusterConfig):
-    """Base of clusters whose workers are started here."""
+    """Base of the configurations of clusters whose workers the session starts."""
 
     environment: dict[str, str] = declare.field_of_rule(
         CustomRule(description="Environment variables of workers", reader=_read_environment), {}
@@ -179,7 +192,7 @@ class StartedClusterConfig(ClusterConfig):
 
 
 class LocalClusterConfig(StartedClusterConfig):
-    """Processes of this machine."""
+    """Cluster of worker processes on this machine."""
 
     kind: Literal["local"]
     workers: WorkerBounds | None = declare.field_of_rule(
@@ -191,7 +204,7 @@ class LocalClusterConfig(StartedClusterConfig):
 
 
 class ExistingSchedulerConfig(ClusterConfig):
-    """A Dask scheduler that runs already."""
+    """Cluster of a Dask scheduler that is already running, with the workers that connect to it."""
 
     kind: Literal["scheduler"]
     address: str = declare.text(
@@ -202,7 +215,7 @@ class ExistingSchedulerConfig(ClusterConfig):
 
 
 class SSHClusterConfig(StartedClusterConfig):
-    """Machines that are reached by SSH."""
+    """Cluster of machines on which workers are started over SSH."""
 
     kind: Literal["ssh"]
     hosts: tuple[str, ...] = declare.list_of(
@@ -221,7 +234,7 @@ class SSHClusterConfig(StartedClusterConfig):
 
 
 class BatchClusterConfig(StartedClusterConfig):
-    """Jobs of a batch system."""
+    """Base of the configurations of clusters whose workers are jobs of a batch system."""
 
     workers: WorkerBounds = declare.field_of_rule(
         CustomRule(description="Workers, in whole jobs", reader=_read_worker_bounds)
@@ -235,26 +248,26 @@ class BatchClusterConfig(StartedClusterConfig):
 
 
 class SlurmClusterConfig(BatchClusterConfig):
-    """Jobs of SLURM."""
+    """Cluster of SLURM jobs."""
 
     kind: Literal["slurm"]
 
 
 class PBSClusterConfig(BatchClusterConfig):
-    """Jobs of PBS."""
+    """Cluster of PBS jobs."""
 
     kind: Literal["pbs"]
 
 
 class Volume(SpecSection):
-    """A persistent volume that all pods and this machine see, for stores and scenes."""
+    """Persistent volume for stores and scenes, mounted at one path in all pods and here."""
 
     claim: str = declare.word("Its claim", "studies")
     path: str = declare.word("Where it is mounted, the same as here", "/data")
 
 
 class KubernetesClusterConfig(StartedClusterConfig):
-    """Pods that the Dask operator of a Kubernetes cluster starts."""
+    """Cluster of pods that the Dask operator of a Kubernetes cluster starts."""
 
     kind: Literal["kubernetes"]
     workers: WorkerBounds = declare.field_of_rule(
@@ -288,20 +301,55 @@ _CLUSTER_ADAPTER: TypeAdapter[AnyClusterConfig] = TypeAdapter(AnyClusterConfig)
 
 
 def load_cluster_config(path: str | Path) -> AnyClusterConfig:
-    """Cluster that a YAML file describes, or a `SpecError` with every mistake in it."""
+    """Read the configuration of a cluster from a YAML file.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML file. Paths in it are relative to its folder.
+
+    Returns
+    -------
+    AnyClusterConfig
+        Validated configuration.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in the file.
+    """
     return _read_cluster_config(read_document(Path(path)), Path(path).absolute().parent)
 
 
 def cluster_config_from_mapping(
     mapping: Mapping[str, Any], *, base: Path | str = "."
 ) -> AnyClusterConfig:
-    """Cluster from plain data, written as in a file whose folder is `base`."""
+    """Read the configuration of a cluster from plain data.
+
+    Parameters
+    ----------
+    mapping : Mapping
+        Data, written as in a YAML file.
+    base : str or Path
+        Folder that paths in `mapping` are relative to.
+
+    Returns
+    -------
+    AnyClusterConfig
+        Validated configuration.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in the data.
+    """
     return _read_cluster_config(
         Document(drop_extensions(to_plain_data(mapping))), Path(base).absolute()
     )
 
 
 def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
+    """Validate the configuration in a document; raise `SpecError` with every mistake."""
     findings = document.findings
     try:
         cluster = _CLUSTER_ADAPTER.validate_python(document.content)
@@ -316,7 +364,7 @@ def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
 
 
 def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
-    """Mistakes in a cluster beyond its single fields."""
+    """Yield mistakes in a cluster that involve several fields, or files."""
     for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"
@@ -344,6 +392,7 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
 
 
 def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Iterator[Finding]:
+    """Yield mistakes in the address of the scheduler; workers on other machines need one."""
     if scheduler.host and scheduler.interface:
         yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")
     elif is_remote and not (scheduler.host or scheduler.interface):

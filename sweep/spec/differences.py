@@ -1,4 +1,4 @@
-"""Differences of two studies, told in words."""
+"""Description of the differences between two studies, as lines of text."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sweep.spec.sections import MODEL_BY_SECTION
 from sweep.units import read_unit
 
 LISTED_VALUES_MAX = 8
-"""Values of an axis that are told one by one."""
+"""Maximum number of values that a list shows in full."""
 SHOWN_CHARACTERS_MAX = 200
-"""Characters of a word that are told."""
+"""Maximum number of characters of a text that are shown."""
 SCENE_SECTIONS: spec_fields.ModelClasses = (
     Scene,
     Platform,
@@ -28,12 +28,15 @@ SCENE_SECTIONS: spec_fields.ModelClasses = (
     SceneStorage,
     *spec_fields.models_of_annotation(AnyScanner),
 )
-"""Sections that studies of scenes alone have."""
+"""Models of the sections that only specs of scenes have."""
 
 
 @cache
 def rules_by_field_name() -> MappingProxyType[str, Rule]:
-    """Rule of every field by its name: one name has one unit wherever it stands."""
+    """Return the rule of every field by the field's name.
+
+    Fields of equal name have equal units in all sections.
+    """
     return MappingProxyType({
         name: rule
         for model in spec_fields.reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTIONS)
@@ -43,7 +46,18 @@ def rules_by_field_name() -> MappingProxyType[str, Rule]:
 
 
 def describe_differences(a: Any, b: Any) -> list[str]:
-    """Lines ``path: value -> value`` for each difference between two specs or their identities."""
+    """Return a line ``path: value -> value`` for each difference between two specs.
+
+    Parameters
+    ----------
+    a, b : GridSpec, SceneSpec or Mapping
+        Specs, or their identities as plain data.
+
+    Returns
+    -------
+    list of str
+        Lines in the order of the fields of `a`, then fields that only `b` has.
+    """
     identities = (
         identity if isinstance(identity, Mapping) else identity.identity() for identity in (a, b)
     )
@@ -59,7 +73,7 @@ def describe_differences(a: Any, b: Any) -> list[str]:
 
 
 def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Leaves of an identity by dotted path; the values of an axis count as one leaf."""
+    """Return the leaves of an identity by dotted path; the values of an axis count as one leaf."""
     leaves: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():
         if key == "axes":
@@ -77,7 +91,7 @@ def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _format_leaf(path: str, value: Any) -> str:
-    """Format a leaf of an identity in words."""
+    """Return a leaf of an identity as text."""
     rule = rules_by_field_name().get(path.rsplit(".", 1)[-1])
     if value is None:
         return "(none)"
@@ -103,7 +117,7 @@ def _format_leaf(path: str, value: Any) -> str:
 
 
 def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
-    """Values of a field in a row, the first and last where they are many."""
+    """Return the values of a field as a list with its unit; more than 8 values are shortened."""
     texts = [_format_number(rule, value) for value in values]
     if len(texts) > LISTED_VALUES_MAX:
         texts = [*texts[:2], "...", texts[-1], f"{len(texts)} in all"]
@@ -111,7 +125,10 @@ def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
 
 
 def _unit_suffix(rule: Rule | None) -> str:
-    """Units that a field is told in, behind a space: of angles those of its example, else SI."""
+    """Return a blank and the unit in which a field is shown; empty for a pure number.
+
+    Angles are shown in the unit of the field's example, all other quantities in SI units.
+    """
     unit_name = "" if rule is None else rule.value_unit
     if rule is not None and unit_name.startswith("rad"):
         unit_name = rule.example.split(",")[0].split()[-1].strip("]")
@@ -119,7 +136,10 @@ def _unit_suffix(rule: Rule | None) -> str:
 
 
 def _format_number(rule: Rule | None, value: Any) -> str:
-    """Value in SI as it is told: of an angle what reads back as it."""
+    """Return an SI value as a number in the unit in which its field is shown.
+
+    The text of an angle reads back as exactly the same value.
+    """
     unit_name = _unit_suffix(rule).strip()
     if rule is None or unit_name == rule.value_unit or isinstance(value, str):
         return repr(value) if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Sections of a spec: how their fields are declared, and walks over fields, values and files."""
+"""Declaration of the fields of a spec's sections, and traversal of fields, values and files."""
 
 from __future__ import annotations
 
@@ -34,22 +34,25 @@ from sweep.spec.rules import (
 
 AUTO, ON, OFF = EFFECT_MODES
 ModelClasses = tuple[type[BaseModel], ...]
+"""Models that a value may be validated as."""
 KeyPath = tuple[str, ...]
+"""Names of the sections and the field that lead to a value."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 KIND_RULE = TextRule(description="Which of several a part is")
+"""Rule of the field ``kind``, which selects one of several models of a section."""
 
 
 class SpecSection(BaseModel):
-    """A section of a spec: frozen, and with no field but its own."""
+    """A section of a spec: immutable, without fields that it does not declare."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-# Fields, each declared in a line. Bounds are as a user would write them; a field without a default
-# is required, but for a choice, which is the first of its words by default.
+# Declarations of fields, one line for each field. Bounds are written as users write values. A field
+# without a default is required, except that a choice has its first option as the default.
 
-# Far beyond all that flies, and near enough that squares and products stay within a float.
+# Above any value of a real study, and small enough that squares and products do not overflow.
 _SIGNED_QUANTITY_MAX = {
     "m": "1e9 m",
     "rad": "1e6 deg",
@@ -58,11 +61,21 @@ _SIGNED_QUANTITY_MAX = {
     "rad/s": "1e6 deg/s",
     "": "1e12",
 }
-"""Largest magnitude of a signed quantity, by its SI unit."""
+"""Default bound of the magnitude of a signed quantity, by its SI unit."""
 
 
 def field_of_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
-    """Field that holds what a rule says; required without a default."""
+    """Declare a field with a rule.
+
+    Parameters
+    ----------
+    rule : Rule
+        Rule of the field's values.
+    default : object
+        SI value without one in the spec; the field is required without a default.
+    alias : str, optional
+        Name of the field in a spec, if it differs from the attribute's.
+    """
     field_info = Field(default, alias=alias)
     field_info.metadata.append(rule)
     return field_info
@@ -76,7 +89,22 @@ def quantity_rule(
     at_most: str = "",
     **rule_options: Any,
 ) -> NumericRule:
-    """Rule of a quantity within bounds, wide ones by default."""
+    """Return the rule of a quantity within bounds.
+
+    Parameters
+    ----------
+    description : str
+        Description for users.
+    unit : str
+        SI unit; empty for a pure number.
+    example : str
+        A valid value.
+    at_least, at_most : str
+        Inclusive bounds with units; wide ones by default (`_SIGNED_QUANTITY_MAX`).
+    **rule_options
+        Further fields of `NumericRule`. With `above` or `below`, `at_least` or `at_most` is not
+        used.
+    """
     bounds = (
         {"at_least": at_least or f"-{_SIGNED_QUANTITY_MAX[unit]}"}
         if "above" not in rule_options
@@ -105,7 +133,17 @@ def quantity(
     keyword: str = "",
     **rule_options: Any,
 ) -> Any:
-    """Declare a number with a unit; the word, if there is one, stands for the default."""
+    """Declare a field for a number with a unit.
+
+    Parameters
+    ----------
+    description, unit, example, at_least, at_most, **rule_options
+        As in `quantity_rule`.
+    default : object
+        SI value without one in the spec; the field is required without a default.
+    keyword : str
+        Word that stands for the default, or for the option `keyword_value`.
+    """
     rule_options |= (
         {"keyword": keyword, "keyword_value": rule_options.get("keyword_value", default)}
         if keyword
@@ -117,7 +155,7 @@ def quantity(
 
 
 def number(description: str, example: str = "0.5", *bounds: str, **rule_options: Any) -> Any:
-    """Pure number."""
+    """Declare a field for a pure number."""
     return quantity(description, "", example, *bounds, **rule_options)
 
 
@@ -128,27 +166,27 @@ def count(
     at_most: str = "1e6",
     **rule_options: Any,
 ) -> Any:
-    """Whole number."""
+    """Declare a field for an integer, from 1 to 1e6 by default."""
     return quantity(description, "", example, at_least, at_most, is_integer=True, **rule_options)
 
 
 def length(description: str, example: str = "10 m", *bounds: str, **rule_options: Any) -> Any:
-    """Length of either sign."""
+    """Declare a field for a length of either sign [m]."""
     return quantity(description, "m", example, *bounds, **rule_options)
 
 
 def positive_length(description: str, example: str = "10 m", **rule_options: Any) -> Any:
-    """Length above 0."""
+    """Declare a field for a length of at least 1 um [m]."""
     return length(description, example, "1 um", **rule_options)
 
 
 def angle(description: str, example: str = "10 deg", *bounds: str, **rule_options: Any) -> Any:
-    """Angle of either sign."""
+    """Declare a field for an angle of either sign [rad]."""
     return quantity(description, "rad", example, *bounds, **rule_options)
 
 
 def speed(description: str, **rule_options: Any) -> Any:
-    """Speed, not signed."""
+    """Declare a field for a speed of at least 0 [m/s]."""
     return quantity(description, "m/s", "30 m/s", "0 m/s", **rule_options)
 
 
@@ -159,19 +197,32 @@ def duration(
     at_most: str = "1e8 s",
     **rule_options: Any,
 ) -> Any:
-    """Time, 0 to some years by default."""
+    """Declare a field for a duration, from 0 to 1e8 s by default [s]."""
     return quantity(description, "s", example, at_least, at_most, **rule_options)
 
 
 def frequency(description: str, example: str = "20 Hz") -> Any:
-    """Rate above 0."""
+    """Declare a field for a rate or frequency from 1e-6 to 1e9 Hz [Hz]."""
     return quantity(description, "Hz", example, "1e-6 Hz", "1e9 Hz")
 
 
 def list_of(
     element_rule: Rule, length_min: int, length_max: int, default: Any = ..., **rule_options: Any
 ) -> Any:
-    """List of values, each held to the same rule, described by `description`."""
+    """Declare a field for a list of values that have a common rule.
+
+    Parameters
+    ----------
+    element_rule : Rule
+        Rule of each value.
+    length_min, length_max : int
+        Bounds of the number of values.
+    default : object
+        Tuple of SI values without a list in the spec; the field is required without a default.
+    **rule_options
+        Further fields of `ListRule`, such as `description`, and `alias`, the field's name in a
+        spec.
+    """
     alias = rule_options.pop("alias", None)
     return field_of_rule(
         ListRule(
@@ -185,7 +236,7 @@ def list_of(
 def vector(
     description: str, unit: str, example: str, *, dimensions: int = 3, **rule_options: Any
 ) -> Any:
-    """Components of a vector of so many dimensions."""
+    """Declare a field for the components of a vector of `dimensions` dimensions."""
     return list_of(
         quantity_rule("Component", unit, example),
         dimensions,
@@ -196,17 +247,17 @@ def vector(
 
 
 def position(description: str, *, dimensions: int = 3, **rule_options: Any) -> Any:
-    """Position in so many dimensions."""
+    """Declare a field for a position in `dimensions` dimensions [m]."""
     return vector(description, "m", "10 m", dimensions=dimensions, **rule_options)
 
 
 def seed(description: str = "Seed of its random numbers") -> Any:
-    """Seed, 0 by default."""
+    """Declare a field for the seed of random numbers, 0 by default."""
     return count(description, "1", "0", "2^63", default=0)
 
 
 def name_rule(description: str, example: str = "ground") -> TextRule:
-    """Rule of the name of an object or a scanner."""
+    """Return the rule of the name of an object or scanner."""
     return TextRule(
         description=description,
         example=example,
@@ -216,48 +267,48 @@ def name_rule(description: str, example: str = "ground") -> TextRule:
 
 
 def name(description: str, default: Any = ...) -> Any:
-    """Name of an object or a scanner."""
+    """Declare a field for the name of an object or scanner."""
     return field_of_rule(name_rule(description), default)
 
 
 def word_rule(description: str, example: str) -> TextRule:
-    """Rule of one word on a command line: no blanks, no quotes, nothing that a shell reads."""
+    """Return the rule of a word on a command line, without blanks, quotes or other shell syntax."""
     remedy = f"write one word, such as '{example}'"
     pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
     return TextRule(description=description, example=example, pattern=pattern, remedy=remedy)
 
 
 def word(description: str, example: str, default: Any = ...) -> Any:
-    """One word on a command line."""
+    """Declare a field for a word on a command line."""
     return field_of_rule(word_rule(description, example), default)
 
 
 def text(description: str, default: Any = ..., **rule_options: str) -> Any:
-    """Text for people, or of a pattern with a remedy."""
+    """Declare a field for a text; `rule_options` may restrict it by a pattern with a remedy."""
     return field_of_rule(TextRule(description=description, **rule_options), default)
 
 
 def choice(description: str, options: tuple[str, ...], default: Any = MISSING) -> Any:
-    """One of several words, the first by default."""
+    """Declare a field for one of several words, the first by default."""
     rule = ChoiceRule(description=description, options=options)
     return field_of_rule(rule, options[0] if default is MISSING else default)
 
 
 def flag(description: str, *, default: bool) -> Any:
-    """Declare a field that is true or false."""
+    """Declare a field for a truth value."""
     return field_of_rule(FlagRule(description=description), default)
 
 
 def file_path(description: str, default: Any = ..., **rule_options: Any) -> Any:
-    """Path of a file."""
+    """Declare a field for the path of a file."""
     return field_of_rule(FilePathRule(description=description, **rule_options), default)
 
 
-# Fields that physical effects bring into sections, as the model's catalogue declares them
+# Fields of physical effects, declared by the model's catalogue
 
 
 def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[SectionT]]:
-    """Return a decorator that adds effects' parameters to the section at a dotted path."""
+    """Return a class decorator that adds effects' parameters to the section at a dotted path."""
     field_definitions = {
         parameter.path.removeprefix(f"{section_path}."): (
             Annotated[
@@ -273,7 +324,7 @@ def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[
 
 
 def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
-    """Add a mode for every effect to the section, `auto` by default."""
+    """Class decorator that adds the mode of every effect to a section, `auto` by default."""
     mode_rules = {
         effect.name: ChoiceRule(
             description=effect.description[0].upper() + effect.description[1:], options=EFFECT_MODES
@@ -286,6 +337,7 @@ def add_effect_modes(section: type[SectionT]) -> type[SectionT]:
 
 
 def _parameter_rule(parameter: Parameter) -> Rule:
+    """Return the rule of an effect's parameter."""
     if parameter.is_table:
         return FrequencyErrorTableRule(description=parameter.description)
     if parameter.options:
@@ -300,7 +352,7 @@ def _parameter_rule(parameter: Parameter) -> Rule:
 
 
 def _extend_section(section: type[SectionT], field_definitions: dict[str, Any]) -> type[SectionT]:
-    """Return the section with further fields, by the same name."""
+    """Return a section of equal name with further fields."""
     if duplicate_names := sorted(set(field_definitions) & set(section.model_fields)):
         raise TypeError(f"{section.__name__} has {', '.join(duplicate_names)} already")
     extended: type[SectionT] = create_model(
@@ -313,26 +365,26 @@ def _extend_section(section: type[SectionT], field_definitions: dict[str, Any]) 
     return extended
 
 
-# Fields of models
+# Traversal of the fields of models
 
 
 def rule_of_field(field: Any) -> Rule | None:
-    """Return the rule in a field's metadata, if it has one."""
+    """Return the rule in a field's metadata; None if it has none."""
     return next((item for item in field.metadata if isinstance(item, Rule)), None)
 
 
 def yaml_name(name: str, field: Any) -> str:
-    """Name of a field as users write it: `from` is a word of Python's own."""
+    """Return the name of a field in a spec: its alias, if any, for names such as `from`."""
     return str(field.alias or name)
 
 
 def fields_by_name(model: type[BaseModel]) -> dict[str, Any]:
-    """Fields of a model by the names that users write."""
+    """Return the fields of a model by their names in a spec."""
     return {yaml_name(name, field): field for name, field in model.model_fields.items()}
 
 
 def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
-    """Rules of a model's fields and of its sections' fields, by dotted path."""
+    """Return the rules of a model's fields, including those of nested sections, by dotted path."""
     rules: dict[str, Rule] = {}
     for name, field in model.model_fields.items():
         path = f"{prefix}.{name}" if prefix else name
@@ -345,7 +397,7 @@ def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
 
 
 def models_of_annotation(annotation: Any) -> ModelClasses:
-    """Models that a value of an annotation is read as: several where its kind tells which."""
+    """Return the models of an annotation: several if the field ``kind`` selects one of a union."""
     if get_origin(annotation) is Annotated:
         return models_of_annotation(get_args(annotation)[0])
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -358,13 +410,16 @@ def models_of_annotation(annotation: Any) -> ModelClasses:
 
 
 def kind_of_model(model: type[BaseModel]) -> str:
-    """Return the word that a model goes by among others."""
+    """Return the value of the field ``kind`` that selects a model; empty for models without it."""
     field = model.model_fields.get("kind")
     return str(get_args(field.annotation)[0]) if field is not None else ""
 
 
 def _element_annotation(annotation: Any) -> Any:
-    """Annotation of what a mapping or a list holds."""
+    """Return the annotation of the values of a mapping or the elements of a list.
+
+    None for others.
+    """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _element_annotation(arguments[0])
@@ -374,7 +429,7 @@ def _element_annotation(annotation: Any) -> Any:
 
 
 def reachable_models(*roots: type[BaseModel]) -> list[type[BaseModel]]:
-    """Every model that values of the roots may consist of, the roots too, each once."""
+    """Return the given models and all models nested in them, without duplicates."""
     visited: dict[type[BaseModel], None] = {}
     pending = list(roots)
     while pending:
@@ -392,18 +447,26 @@ def reachable_models(*roots: type[BaseModel]) -> list[type[BaseModel]]:
 
 
 class ResolvedLocation(NamedTuple):
-    """A place in a spec."""
+    """A location in a spec, with the models of the value there and of the section around it."""
 
     location: Location
-    """Keys and indices that lead there, as in the file."""
+    """Keys and indices that lead to the value in the file."""
     value_models: ModelClasses
-    """Models as one of which the value there is read; none for a single value."""
+    """Models that the value may be validated as; empty for a scalar or list."""
     section_models: ModelClasses
-    """Models as one of which the part around it is read."""
+    """Models that the section around the value may be validated as."""
 
 
 def resolve_location(pydantic_location: Location, root: Any) -> ResolvedLocation:
-    """Place of one of pydantic's locations, which name the kind of a part after its key."""
+    """Translate a location of a pydantic error to a location in a spec.
+
+    Parameters
+    ----------
+    pydantic_location : Location
+        Location from pydantic, which contains the kind of a section after the section's key.
+    root : type
+        Model, or union of models, that was validated.
+    """
     annotation = root
     keys: list[str | int] = []
     section_models: ModelClasses = ()
@@ -422,11 +485,19 @@ def resolve_location(pydantic_location: Location, root: Any) -> ResolvedLocation
     return ResolvedLocation(tuple(keys), models_of_annotation(annotation), section_models)
 
 
-# Values of sections
+# Traversal of the values of sections
 
 
 def read_or_none(annotation: Any, raw_value: object) -> Any:
-    """Read a part by itself as a model or one of several; None where it can't be read."""
+    """Validate a part of a spec by itself; return None if it is invalid.
+
+    Parameters
+    ----------
+    annotation : type
+        Model, or union of models, that the part is validated as.
+    raw_value : object
+        The part as parsed from YAML.
+    """
     try:
         return _type_adapter(annotation).validate_python(raw_value)
     except ValidationError:
@@ -435,11 +506,15 @@ def read_or_none(annotation: Any, raw_value: object) -> Any:
 
 @cache
 def _type_adapter(annotation: Any) -> TypeAdapter[Any]:
+    """Return the pydantic adapter of an annotation."""
     return TypeAdapter(annotation)
 
 
 def iter_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Rule, Any]]:
-    """Every value of a part and of the parts in it that is there: its path, rule and SI value."""
+    """Yield path, rule and SI value of every value in a section and its nested sections.
+
+    Values that are None are skipped.
+    """
     for name, field in type(section).model_fields.items():
         value, key_path = getattr(section, name), (*prefix, yaml_name(name, field))
         rule = KIND_RULE if name == "kind" else rule_of_field(field)
@@ -455,7 +530,17 @@ def iter_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyP
 def values_by_path(
     section: BaseModel, prefix: KeyPath = (), digests: Mapping[str, str] = MappingProxyType({})
 ) -> dict[str, Any]:
-    """SI values of a part at a path by dotted path; of files, their digests where known."""
+    """Return the SI values of a section by dotted path.
+
+    Parameters
+    ----------
+    section : SpecSection
+        Section of a spec.
+    prefix : KeyPath
+        Path of the section itself, with which the result's keys begin.
+    digests : Mapping of str to str
+        Digests that replace the paths of files; other files keep their path.
+    """
     return {
         ".".join(key_path): digests.get(value, value) if isinstance(rule, FilePathRule) else value
         for key_path, rule, value in iter_values(section, prefix)
@@ -463,7 +548,7 @@ def values_by_path(
 
 
 def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
-    """Put a value at a path that a mapping lacks; False if it is there."""
+    """Set a value at a path of nested mappings if there is none; return True if it was set."""
     for name in path[:-1]:
         mapping = mapping.setdefault(name, {})
         if not isinstance(mapping, dict):
@@ -477,7 +562,10 @@ def set_if_absent(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
 
 
 def to_canonical(value: Any) -> Any:
-    """Value in the one form that its equals share: whole floats as integers, keys in order."""
+    """Return the canonical form of data, in which equal data has equal JSON text.
+
+    Floats without a fraction below 2**53 become integers, keys are sorted, and tuples become lists.
+    """
     if isinstance(value, Mapping):
         return {str(key): to_canonical(value[key]) for key in sorted(value)}
     if isinstance(value, list | tuple):
@@ -488,29 +576,43 @@ def to_canonical(value: Any) -> Any:
 
 
 def identity_digest(identity: Mapping[str, Any]) -> str:
-    """Hash of an identity: 128 bits of BLAKE2b over its canonical JSON, in hex."""
+    """Return the hash of an identity: BLAKE2b of its canonical JSON, 32 hexadecimal digits."""
     text = json.dumps(
         to_canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
     )
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-# Files that sections name
+# Files in sections
 
 
 @dataclass(frozen=True)
 class SpecFiles:
-    """Files named in a spec."""
+    """Files that a spec names, with the digests that they had when it was loaded."""
 
     base: Path
-    """Folder that their paths are relative to; ~ is the user's own."""
+    """Folder that paths in the spec are relative to."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Digest of each file by its path as written."""
     time_origin: Decimal = Decimal(0)
-    """Time [s] in tables of waypoints that is the flight's 0: the first of the platform's table."""
+    """Time [s] in the tables of waypoints at which the flight begins: the first time of the
+    platform's table."""
 
     def resolve(self, raw_path: str, digest_of: Callable[[Path], str] = file_digest) -> Path:
-        """Path of a file; a `SceneError` if it has changed since the spec was loaded."""
+        """Return the path of a file, with ``~`` as the user's home folder.
+
+        Parameters
+        ----------
+        raw_path : str
+            Path as written in the spec.
+        digest_of : callable
+            Function that computes the digest of the file.
+
+        Raises
+        ------
+        SceneError
+            If the file has changed since the spec was loaded.
+        """
         path = self.base / os.path.expanduser(raw_path)
         expected_digest = self.digests.get(raw_path)
         if expected_digest is not None and digest_of(path) != expected_digest:
@@ -523,7 +625,7 @@ class SpecFiles:
 
 
 def iter_file_paths(section: BaseModel) -> Iterator[tuple[KeyPath, FilePathRule, str]]:
-    """Places in a spec that name a file, with their rule and the path written there."""
+    """Yield path, rule and written file path of every field of a section that names a file."""
     for key_path, rule, value in iter_values(section):
         if isinstance(rule, FilePathRule):
             yield key_path, rule, value

@@ -1,6 +1,7 @@
-"""The figures and tables that a study makes of its results, over a grid or of a scene.
+"""Sections of a spec that declare its figures and tables, of grids and of scenes.
 
-They are held against the study that they draw: its coordinates, stored quantities, scanners, draws.
+The checks in this module compare a figure with its study: coordinates, stored quantities, scanners
+and draws.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ CropLimits = tuple[float, ...]
 
 
 def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:
-    """Coordinates with one value or several each, as written."""
+    """Read a mapping of coordinates to one value or several values each, kept as written."""
     if not isinstance(raw_value, dict):
         problem = "must be a mapping of coordinates to values"
         raise QuantityError(problem, "write e.g. {grazing_angle: 15 deg}")
@@ -39,14 +40,14 @@ def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:
 
 
 def _read_selected_value(raw_value: object) -> str | int | float:
-    """One value, as written."""
+    """Read one value of a coordinate, kept as written."""
     if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
         raise QuantityError("must hold a value, or a list of values, of each coordinate")
     return raw_value
 
 
 def _read_published_numbers(raw_value: object) -> PublishedNumbers:
-    """Numbers, nested as written."""
+    """Read numbers in nested lists; return nested tuples of SI values."""
     if not isinstance(raw_value, list | tuple):
         raise QuantityError("must be a list of numbers or of rows of numbers")
     return tuple(
@@ -58,6 +59,7 @@ def _read_published_numbers(raw_value: object) -> PublishedNumbers:
 
 
 def _read_number(raw_value: object) -> float:
+    """Read one number; return its SI value."""
     value, unit = read_number(raw_value)
     return unit.to_si(value)
 
@@ -85,7 +87,7 @@ _PUBLISHED_NUMBERS_RULE = CustomRule(
 
 
 def _name_field(description: str, example: str, default: Any = ...) -> Any:
-    """Name of something in a store."""
+    """Declare a field that holds the name of a coordinate or variable of a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
     return declare.text(
         f"Name of {description}", default, pattern=pattern, remedy=f"take {example}"
@@ -93,6 +95,7 @@ def _name_field(description: str, example: str, default: Any = ...) -> Any:
 
 
 def _coordinate_field(default: Any = ...) -> Any:
+    """Declare a field that holds the name of a coordinate."""
     example = "the last part of an axis's path, such as 'range'"
     return _name_field("a coordinate: the last part of an axis's path", example, default)
 
@@ -103,10 +106,10 @@ _VARIABLE_FIELD = _name_field(
 
 
 class FigureBase(SpecSection):
-    """Base of all figures."""
+    """Base of all figures and tables."""
 
     FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
-    """Fields whose values make the file's name, and words between them."""
+    """Names of the fields whose values make up the file name; other entries are used literally."""
 
     name: str = declare.text(
         "Stem of the picture's file name",
@@ -118,7 +121,7 @@ class FigureBase(SpecSection):
 
     @property
     def file_stem(self) -> str:
-        """Stem of the picture's file name."""
+        """Stem of the picture's file name: `name`, else the values of `FILE_NAME_PARTS`."""
         words = [
             getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
         ]
@@ -129,7 +132,7 @@ class FigureBase(SpecSection):
 
 
 class GridFigureBase(FigureBase):
-    """Base of figures of grids."""
+    """Base of all figures of grids."""
 
 
 _LEVEL_RULE = declare.quantity_rule("Level, in the quantity's unit", "", "0.9", "-1e30", "1e30")
@@ -219,6 +222,7 @@ FIGURE_QUANTITIES = (
 """Quantities of shots and of points that a figure can show."""
 
 SEVERAL_SURFACES_KEYWORD = "several_surfaces"
+"""Keyword for the first shot whose footprint has several surfaces, in place of a shot's number."""
 _VIEW_WORD_RULE = ChoiceRule(
     description="Where from", options=("oblique", "above", "side", "front")
 )
@@ -229,7 +233,7 @@ _EYE_ANGLE_RULES = {
 
 
 def _read_view(raw_value: object) -> str | dict[str, float]:
-    """Read a word, or azimuth and elevation of the eye [rad]."""
+    """Read a view: a word, or azimuth and elevation of the eye, returned in rad."""
     if not isinstance(raw_value, dict):
         return _VIEW_WORD_RULE.read(raw_value)
     if set(raw_value) != set(_EYE_ANGLE_RULES):
@@ -256,7 +260,7 @@ _VIEW_RULE = CustomRule(
 
 
 def _quantity_field(description: str, default: Any = ...) -> Any:
-    """Declare a quantity of shots or points."""
+    """Declare a field that holds the name of a quantity of shots or points."""
     remedy = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
     problem = "is no quantity of shots or points"
     return declare.field_of_rule(
@@ -268,7 +272,7 @@ def _quantity_field(description: str, default: Any = ...) -> Any:
 
 
 def _crop_field(axis: str) -> Any:
-    """Part of the scene along an axis."""
+    """Declare a field that holds the lower and upper limit of a scene's coordinate [m]."""
     rule = declare.quantity_rule("Coordinate", "m", "100 m")
     return declare.list_of(rule, 2, 2, None, description=f"Part along {axis}", increasing=True)
 
@@ -285,7 +289,7 @@ _TIME_FIELD = declare.list_of(
 
 
 class SceneFigureBase(FigureBase):
-    """Base of figures of scenes."""
+    """Base of all figures of scenes."""
 
     where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
 
@@ -337,7 +341,7 @@ class ShotSpectraFigure(SceneFigureBase):
 
 
 class _NavigationFigureBase(SceneFigureBase):
-    """Base of figures and tables of navigation."""
+    """Base of the figure and the table of navigation."""
 
     FILE_NAME_PARTS = ("quantity", "show")
     scanners: tuple[str, ...] | None = declare.list_of(
@@ -366,19 +370,34 @@ SceneFigure = Annotated[
     Field(discriminator="kind"),
 ]
 
-# What is wrong with figures
+# Checks of figures
 
 _COORDINATE_FIELDS = ("x", "y", "by", "rows", "columns")
-"""Fields of a grid's figure that name a coordinate."""
+"""Fields of a grid's figure that hold the name of a coordinate."""
 
 NAVIGATION_SHOTS_MIN = 3
-"""Shots of a cycle from which on there is navigation."""
+"""Minimum number of shots per cycle for a navigation solution."""
 
 
 def grid_figure_findings(
     raw_spec: Mapping[str, Any], axes: tuple[Axis, ...], extra_variables: Collection[str] = ()
 ) -> Iterator[Finding]:
-    """Mistakes in the figures of a grid's study; ``extra_variables`` names what it stores too."""
+    """Yield mistakes in the figures of a grid's spec.
+
+    Parameters
+    ----------
+    raw_spec : Mapping
+        Spec as parsed from YAML.
+    axes : tuple of Axis
+        Axes of the study.
+    extra_variables : Collection of str
+        Variables that the study stores in addition to `outputs.GRID_OUTPUTS`.
+
+    Yields
+    ------
+    Finding
+        One mistake. Figures that can't be read are skipped; their fields have findings already.
+    """
     draws = raw_spec.get("draws")
     for location, figure in _iter_readable_figures(raw_spec, GridFigure):
         yield from _coordinate_findings(figure, axes, location)
@@ -392,7 +411,20 @@ def grid_figure_findings(
 def scene_figure_findings(
     raw_spec: Mapping[str, Any], axes: tuple[Axis, ...] | None
 ) -> Iterator[Finding]:
-    """Mistakes in the figures of a scene's study, as written; axes None where unreadable."""
+    """Yield mistakes in the figures of a scene's spec.
+
+    Parameters
+    ----------
+    raw_spec : Mapping
+        Spec as parsed from YAML.
+    axes : tuple of Axis or None
+        Axes of the study; None if they can't be read, which skips the checks of coordinates.
+
+    Yields
+    ------
+    Finding
+        One mistake. Figures that can't be read are skipped; their fields have findings already.
+    """
     scanners = raw_spec.get("scanners")
     scanners = scanners if isinstance(scanners, Mapping) else {}
     for location, figure in _iter_readable_figures(raw_spec, SceneFigure):
@@ -405,7 +437,7 @@ def scene_figure_findings(
 def _iter_readable_figures(
     raw_spec: Mapping[str, Any], annotation: Any
 ) -> Iterator[tuple[Location, Any]]:
-    """Figures that can be read, each with its location."""
+    """Yield location and model of each figure that can be read."""
     figures = raw_spec.get("figures")
     for i, raw_figure in enumerate(figures if isinstance(figures, list | tuple) else ()):
         if (figure := read_or_none(annotation, raw_figure)) is not None:
@@ -413,7 +445,7 @@ def _iter_readable_figures(
 
 
 def _name_findings(raw_spec: Mapping[str, Any], annotation: Any, problem: str) -> Iterator[Finding]:
-    """Figures that share a file."""
+    """Yield a finding for each figure that has the same file name as an earlier one."""
     stems: set[str] = set()
     for location, figure in _iter_readable_figures(raw_spec, annotation):
         if figure.file_stem in stems:
@@ -424,7 +456,10 @@ def _name_findings(raw_spec: Mapping[str, Any], annotation: Any, problem: str) -
 def _coordinate_findings(
     figure: Any, axes: tuple[Axis, ...], figure_location: Location
 ) -> Iterator[Finding]:
-    """Coordinates that no axis has, and values that are none, or in a scene not one, of them."""
+    """Yield mistakes in the coordinates that a figure names, and in values that it selects.
+
+    Figures of scenes may select only one value of a coordinate.
+    """
     is_grid_figure = isinstance(figure, GridFigureBase)
     coordinate_names = (
         {field: getattr(figure, field, "") for field in _COORDINATE_FIELDS}
@@ -460,7 +495,7 @@ def _coordinate_findings(
 def _variable_findings(
     figure: Any, draws: object, extra_variables: Collection[str], location: Location
 ) -> Iterator[Finding]:
-    """Report a variable that the study does not store."""
+    """Yield a finding if a figure shows a variable that the study does not store."""
     variable = getattr(figure, "variable", None)
     amount_fields = ("number", "limit") if isinstance(draws, Mapping) else ()
     has_draws = any(draws.get(name, 0) not in (0, "0") for name in amount_fields)  # type: ignore[attr-defined]
@@ -488,7 +523,7 @@ def _variable_findings(
 
 
 def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
-    """Report closed forms that a study of whole spectra does not store."""
+    """Yield a finding if a figure shows a closed form: studies of whole spectra store none."""
     stored_variables = (
         outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
@@ -509,7 +544,7 @@ def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
 def _scanner_findings(
     figure: Any, scanners: Mapping[str, Any], location: Location
 ) -> Iterator[Finding]:
-    """Scanners that the study lacks, or of too few beams for navigation."""
+    """Yield a finding for each scanner that is missing or has too few beams for navigation."""
     single_scanner, listed_scanners = (
         getattr(figure, "scanner", None),
         getattr(figure, "scanners", None) or (),
@@ -537,7 +572,7 @@ def _scanner_findings(
 
 
 def _has_navigation(raw_scanner: object) -> bool:
-    """Return true if a scanner has enough shots a cycle for navigation, or can't be read."""
+    """Return True if a scanner has enough shots per cycle for navigation, or can't be read."""
     scanner = read_or_none(AnyScanner, raw_scanner)
     try:
         return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN
@@ -546,7 +581,10 @@ def _has_navigation(raw_scanner: object) -> bool:
 
 
 def _draw_findings(figure: Any, raw_draws: object, location: Location) -> Iterator[Finding]:
-    """Report a draw that the study does not make; none where its draws can't be read."""
+    """Yield a finding if a figure shows a draw that the study does not make.
+
+    Studies whose draws can't be read are skipped.
+    """
     draw, draws = getattr(figure, "draw", 0), read_or_none(SceneDraws, raw_draws or {})
     if draws is not None and draw >= draws.number:
         problem = f"is beyond the study's draws, 0 to {draws.number - 1}"

@@ -1,4 +1,7 @@
-"""Movement of things and directions of beams: paths, attitudes, the platform, scan patterns."""
+"""Sections of a spec for motion and beam directions: paths, attitudes, platform and scan patterns.
+
+World frame: x, y and z form a right-handed system with z up. Body frame: x forward, y left, z up.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
 TimeSpan = tuple[float, float]
-"""Start and stop of a stretch of time [s]."""
+"""Start and stop of a time interval [s]."""
 
 
 class StraightPath(SpecSection):
@@ -32,7 +35,7 @@ class StraightPath(SpecSection):
     final_speed: float | None = declare.speed("Speed at the end; the initial one", default=None)
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
-        """Return the straight path."""
+        """Return the trajectory along the straight line; `files` and `span` are not used."""
         return motion_laws.straight_trajectory(
             start_point=self.begin,
             end_point=self.to,
@@ -51,7 +54,7 @@ class AccelerationPath(SpecSection):
     duration: float = declare.duration("How long it lasts", at_least="1 ns")
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
-        """Return the path of constant acceleration."""
+        """Return the trajectory of constant acceleration; `files` and `span` are not used."""
         path_class = motion_laws.ConstantAcceleration
         return path_class(self.position, self.velocity, self.acceleration, self.duration)
 
@@ -64,7 +67,7 @@ class WaypointPath(SpecSection):
     smooth: bool = declare.flag("Join them by a cubic spline, not by straight lines", default=True)
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
-        """Return the path through the file's waypoints."""
+        """Return the trajectory through the waypoints of the table; `span` is not used."""
         from sweep.scenes.scene_files import read_waypoints
 
         table = read_waypoints(files.resolve(self.file), files.time_origin)
@@ -81,7 +84,13 @@ class StationaryPath(SpecSection):
     )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
-        """Return the path of a platform that stays in place."""
+        """Return the trajectory of a body at rest, over its `duration` or else over `span`.
+
+        Raises
+        ------
+        ValueError
+            If there is neither a duration nor a span, as for a platform without a duration.
+        """
         if self.duration is not None:
             span = (0.0, self.duration)
         if span is None:
@@ -105,7 +114,13 @@ class Orientation(SpecSection):
     )
 
     def to_quaternion(self) -> np.ndarray:
-        """Return the unit quaternion (4,); length 0, or angles given too, is a ValueError."""
+        """Return the unit quaternion (4,) as w, x, y, z.
+
+        Raises
+        ------
+        ValueError
+            If the quaternion has length 0, or if angles are given in addition to it.
+        """
         if self.quaternion is None:
             return quaternion.from_heading(heading=self.heading, pitch=self.pitch, roll=self.roll)
         if any((self.heading, self.pitch, self.roll)):
@@ -123,7 +138,7 @@ class NadirAttitude(SpecSection):
     )  # fmt: skip
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude."""
+        """Return the attitude law of a level body, with a fixed heading or that of its track."""
         return motion_laws.NadirAttitude(None if self.heading == "track" else float(self.heading))
 
 
@@ -134,7 +149,7 @@ class AlongTrackAttitude(SpecSection):
     roll: float = declare.angle("Left side up", default=0.0)
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude."""
+        """Return the attitude law of a body whose forward axis points along its velocity."""
         return motion_laws.AlongTrackAttitude(self.roll)
 
 
@@ -144,7 +159,7 @@ class FixedAttitude(Orientation):
     kind: Literal["fixed"]
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude."""
+        """Return the attitude law of a constant attitude."""
         return motion_laws.FixedAttitude(self.to_quaternion())
 
 
@@ -157,7 +172,7 @@ class SpinningAttitude(Orientation):
     )
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude."""
+        """Return the attitude law of a constant angular velocity, from the start of `path`."""
         return motion_laws.SpinningAttitude(self.angular_velocity, self.to_quaternion(), path.start)
 
 
@@ -170,7 +185,15 @@ class TabulatedAttitude(SpecSection):
     )
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude."""
+        """Return the attitude law that interpolates the attitudes of a table.
+
+        Raises
+        ------
+        ValueError
+            If no table is named.
+        SceneError
+            If the table can't be read or has no attitude.
+        """
         from sweep.scenes.scene_files import SceneError, read_waypoints
 
         if self.file is None:
@@ -197,14 +220,30 @@ class RigidMotion(SpecSection):
     def build_flight(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
-        """Movement of the body; one that stays does so throughout `span`."""
+        """Return the motion of the body: position and attitude as functions of time.
+
+        Parameters
+        ----------
+        files : SpecFiles
+            Files that the spec names.
+        span : tuple of float, optional
+            Start and stop [s] of the motion of a body at rest that has no duration.
+
+        Returns
+        -------
+        MovingBody
+            Trajectory and attitude law of the body.
+        """
         path = self.path.build_path(files, span)
         return motion_laws.MovingBody(path, self.build_attitude(files, path))
 
     def build_attitude(
         self, files: SpecFiles, path: motion_laws.Trajectory
     ) -> motion_laws.AttitudeLaw:
-        """Return the law of attitude along a path."""
+        """Return the attitude law along a path.
+
+        An attitude from a table that names no file uses the file of the path's waypoints.
+        """
         attitude = self.attitude
         if (
             isinstance(attitude, TabulatedAttitude)
@@ -229,7 +268,10 @@ class Platform(RigidMotion):
     )  # fmt: skip
 
     def read_time_origin(self, files: SpecFiles) -> Decimal:
-        """Time [s] in tables at which the flight begins: the first of the path's table, or 0."""
+        """Return the time [s] in the tables at which the flight begins, with all its digits.
+
+        This is the first time of the path's table, or 0 if the path is not given by a table.
+        """
         from sweep.scenes.scene_files import read_first_time
 
         if not isinstance(self.path, WaypointPath):
@@ -239,11 +281,26 @@ class Platform(RigidMotion):
     def build_flight(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
-        """Movement of the instrument."""
+        """Return the motion of the instrument: the platform's with lever arm and mounting applied.
+
+        Parameters
+        ----------
+        files : SpecFiles
+            Files that the spec names.
+        span : tuple of float, optional
+            Start and stop [s] of the motion of a platform at rest that has no duration.
+
+        Returns
+        -------
+        MovingBody
+            Trajectory of the platform, attitude law of the instrument, and lever arm in the
+            instrument's frame.
+        """
         mounting = self.mounting.to_quaternion()
         path = self.path.build_path(files, span)
         mounted_attitude = motion_laws.MountedAttitude(self.build_attitude(files, path), mounting)
-        # A flight's arm is told in the frame of its attitude, which is the instrument's.
+        # MovingBody takes the lever arm in the frame of its attitude law: here the instrument's
+        # frame.
         instrument_arm = quaternion.rotate(
             quaternion.conjugate(mounting), np.asarray(self.lever_arm, float)
         )
@@ -253,23 +310,26 @@ class Platform(RigidMotion):
 # Scan patterns
 
 BEAMS_MAX = 10_000
+"""Maximum number of beams of a scanner, and of directions along each side of a raster."""
 STEERING_ANGLES_RULE = ListRule(
     description="Angles of a beam towards forward and towards the left",
     element_rule=declare.quantity_rule("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
     length_min=2,
     length_max=2,
 )
+"""Rule of a beam given by two steering angles [rad]."""
 _DIRECTION_VECTOR_RULE = ListRule(
     description="Direction of a beam in the body frame",
     element_rule=declare.quantity_rule("Component", "", "-1", "-1e9", "1e9"),
 )
+"""Rule of a beam given by the three components of its direction in the body frame."""
 
 
 class BeamDirectionsRule(Rule):
-    """Directions of beams: angles towards forward and left, or vectors in the body frame."""
+    """Rule of a list of beam directions: steering angles, or vectors in the body frame."""
 
     def read(self, raw_value: object) -> tuple[tuple[float, ...], ...]:
-        """Angles [rad] (two of them) or components (three) of each beam."""
+        """Return a tuple for each beam: two steering angles [rad] or three vector components."""
         remedy = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
         if not isinstance(raw_value, list | tuple) or not 0 < len(raw_value) <= BEAMS_MAX:
             raise QuantityError(f"must be a list of 1 to {BEAMS_MAX} beams", remedy)
@@ -288,7 +348,7 @@ class BeamDirectionsRule(Rule):
 
 
 def beam_rule(beam: object) -> ListRule:
-    """Rule of a beam, by how many numbers it has."""
+    """Return the rule of one beam: a direction vector for three numbers, else two angles."""
     return (
         _DIRECTION_VECTOR_RULE
         if isinstance(beam, list | tuple) and len(beam) == 3
@@ -297,6 +357,7 @@ def beam_rule(beam: object) -> ListRule:
 
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
+"""Smallest and largest angle between a beam and nadir."""
 _CYCLE_RATE_FIELD = declare.frequency("Measurement cycles a second")
 _SIMULTANEOUS_INTERVAL_FIELD = declare.duration(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
@@ -318,7 +379,7 @@ class ConeScanner(SpecSection):
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of beams on a cone around nadir."""
         directions = scan_patterns.cone_directions(
             self.beams, half_angle=self.half_angle, azimuth=self.azimuth
         )
@@ -339,7 +400,7 @@ class FixedBeamsScanner(SpecSection):
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of beams at the given directions."""
         directions = [
             scan_patterns.steered_directions(*beam) if len(beam) == 2 else np.array(beam)  # type: ignore[arg-type]
             for beam in self.beams
@@ -358,7 +419,7 @@ class CornersScanner(SpecSection):
     interval: float | None = _EVEN_INTERVAL_FIELD
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of a beam steered to the four corners of a square."""
         return scan_patterns.fixed_beams(
             scan_patterns.corner_directions(self.angle), rate=self.rate, interval=self.interval
         )
@@ -376,7 +437,7 @@ class SquaresScanner(SpecSection):
     interval: float | None = _EVEN_INTERVAL_FIELD
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of a beam steered along squares, one square per cycle."""
         directions, visited_directions = scan_patterns.square_patterns(self.elements)
         return scan_patterns.BeamCycle(directions, visited_directions, self.rate, self.interval)
 
@@ -395,7 +456,7 @@ class RasterScanner(SpecSection):
     both_ways: bool = declare.flag("Every other row runs backwards", default=True)
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of a beam steered over a grid, one grid per cycle."""
         return scan_patterns.raster_scan(**self.model_dump(exclude={"kind"}))
 
 
@@ -416,7 +477,7 @@ class LineScanner(SpecSection):
     interval: float = _SIMULTANEOUS_INTERVAL_FIELD
 
     def build_pattern(self) -> ScanPattern:
-        """Return the scan pattern."""
+        """Return the scan pattern of beams swept from side to side."""
         return scan_patterns.LineScan(**self.model_dump(exclude={"kind"}))
 
 
@@ -427,7 +488,7 @@ AnyScanner = Annotated[
 
 
 def shots_per_cycle(pattern: ScanPattern) -> int:
-    """Shots of one measurement cycle."""
+    """Return the number of shots in one measurement cycle of a scan pattern."""
     if isinstance(pattern, scan_patterns.BeamCycle):
         return pattern.beams_per_cycle
     return pattern.n_beams

@@ -1,7 +1,8 @@
-"""Rules that join several fields, held against the whole grid of a study by its extremes.
+"""Checks of combinations of fields over the whole grid of a study.
 
-A chirp longer than its echo's delay, samples to transform, no more electrons than photons; beams
-that an aperture can make; effects with what they need; detectors that fit their spectra.
+Each check evaluates the extremes of the grid, not each point. It may find a chirp shorter than the
+delay of its echo, or a responsivity above one electron per photon. It may find a beam that its
+aperture can't make, or an effect without a parameter that it needs.
 """
 
 from __future__ import annotations
@@ -61,30 +62,34 @@ TRAINING_PATH, GUARD_PATH, RANK_PATH = (
 )
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
-"""Samples with which windows are tried as they are read: with more they can be had."""
+"""Maximum number of samples of the window that is computed as a trial. All windows exist above this
+number.
+"""
 _SPECTRUM_BINS_MIN = 8
-"""Bins of a spectrum that is looked at whole."""
+"""Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
 
 Condition = Callable[[Any], Any]
-"""Condition on each of several values."""
+"""Condition on a parameter, evaluated elementwise: values (n,) to bool (n,)."""
 
 
 @dataclass(frozen=True)
 class GridValues:
-    """Values of a study's parameters, as far as they can be read.
+    """Parameter values of a study's grid, as far as they can be read from the spec.
 
-    Axes vary apart, and the members of one together.
+    Axes vary independently of each other; the parameters of one axis vary together.
     """
 
     values: Mapping[str, Any]
-    """SI values of the parameters by dotted path; of those on axes, the value off the axis."""
+    """SI values of the parameters by dotted path. A parameter on an axis has the value of its field
+    here."""
     axes: tuple[Axis, ...] = ()
+    """Axes of the study."""
     effect_modes: Mapping[str, str] = field(default_factory=dict)
-    """Mode of each effect by its name."""
+    """Mode of each effect (auto, on, off) by the effect's name."""
 
     @classmethod
     def from_raw_spec(cls, raw_spec: Mapping[str, Any], axes: tuple[Axis, ...]) -> GridValues:
-        """Grid of a spec as written."""
+        """Read the values of a spec as parsed from YAML, without those that break their rule."""
         values: dict[str, Any] = {}
         for path, rule in parameter_rules().items():
             raw_value = raw_value_at(raw_spec, path)
@@ -99,11 +104,11 @@ class GridValues:
         return cls(values, axes, effect_modes)
 
     def has_values(self, *paths: str) -> bool:
-        """Return true if all parameters could be read."""
+        """Return True if all given parameters could be read."""
         return all(self.values_of(path).size for path in paths)
 
     def values_of(self, path: str) -> np.ndarray:
-        """Values (n,) that a parameter takes; none where it could not be read."""
+        """Return a parameter's values (n,) over the grid; empty if it could not be read."""
         for axis in self.axes:
             for parameter in axis.parameters:
                 if parameter.path == path:
@@ -111,11 +116,17 @@ class GridValues:
         return np.asarray([self.values[path]] if path in self.values else [])
 
     def make_finding(self, path: str, problem: str, remedy: str) -> Finding:
-        """Mistake in a parameter, told where its values stand."""
+        """Return a finding about a parameter, located at its axis, if any, else at its field."""
         return Finding(parameter_location(path, self.axes), problem, remedy)
 
     def has_point(self, conditions: Mapping[str, Condition]) -> bool:
-        """Return true if some point meets all conditions on parameters by path."""
+        """Return True if at least one point of the grid meets all conditions.
+
+        Parameters
+        ----------
+        conditions : Mapping of str to Condition
+            Conditions on single parameters, by dotted path.
+        """
         paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
         for path in set(conditions) - paths_on_axes:
             if path not in self.values or not conditions[path](np.asarray(self.values[path])):
@@ -127,10 +138,22 @@ class GridValues:
         terms: Mapping[str, Callable[[Any], Any]],
         conditions: Mapping[str, Condition] = MappingProxyType({}),
     ) -> dict[str, float]:
-        """Parameters where the sum of a term of each is least, of points that meet conditions.
+        """Return the point of the grid that minimises a sum of functions of single parameters.
 
-        Each axis adds its own least part. Empty where no point meets the conditions, or not all
-        of the terms' parameters could be read.
+        The axes are independent, so that each is minimised by itself.
+
+        Parameters
+        ----------
+        terms : Mapping of str to callable
+            Terms of the sum: functions of the values (n,) of one parameter, by dotted path.
+        conditions : Mapping of str to Condition
+            Conditions on single parameters that the point must meet.
+
+        Returns
+        -------
+        dict of str to float
+            SI values of the parameters in `terms` at the minimum. Empty if no point meets the
+            conditions, or if a parameter in `terms` could not be read.
         """
         if not self.has_values(*terms) or not self.has_point(conditions):
             return {}
@@ -149,7 +172,7 @@ class GridValues:
 
 
 def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSING) -> Any:
-    """Value written at a dotted path."""
+    """Return the value written at a dotted path of a spec, or `default`."""
     raw_value: Any = raw_spec
     for name in path.split("."):
         raw_value = raw_value.get(name, MISSING) if isinstance(raw_value, Mapping) else MISSING
@@ -157,7 +180,7 @@ def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSI
 
 
 def _meets_conditions(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
-    """Return true for places along an axis (n,) that meet the conditions on its own parameters."""
+    """Return a mask (n,) of the points along an axis that meet the conditions on its parameters."""
     is_met = np.ones(axis.size, bool)
     for parameter in axis.parameters:
         if parameter.path in conditions:
@@ -166,23 +189,27 @@ def _meets_conditions(axis: Axis, conditions: Mapping[str, Condition]) -> np.nda
 
 
 def _equals(expected: str | float) -> Condition:
+    """Return the condition that values equal `expected`."""
     return lambda values: values == expected
 
 
 def _differs_from(unwanted: str | float) -> Condition:
+    """Return the condition that values differ from `unwanted`."""
     return lambda values: values != unwanted
 
 
 def _is_positive(values: np.ndarray) -> np.ndarray:
+    """Return a mask (n,) of values above 0."""
     return values > 0
 
 
 def _is_zero(values: np.ndarray) -> np.ndarray:
+    """Return a mask (n,) of values equal to 0."""
     return values == 0
 
 
 def grid_findings(grid: GridValues) -> list[Finding]:
-    """Mistakes in the combinations of values in a study's grid."""
+    """Return the mistakes in combinations of values of a study's grid."""
     return [
         *(list(_time_findings(grid)) or _window_findings(grid)),
         *_photon_findings(grid),
@@ -200,7 +227,7 @@ def grid_findings(grid: GridValues) -> list[Finding]:
 
 
 def _least_weighted_sum(grid: GridValues, weights: Mapping[str, float]) -> float | None:
-    """Least weighted sum of parameters over a grid; None where not all could be read."""
+    """Return the minimum over a grid of a weighted sum of parameters; None if any is unknown."""
     terms = {path: partial(operator.mul, weight) for path, weight in weights.items()}
     minimum = grid.argmin_of_sum(terms)
     return sum(weights[path] * minimum[path] for path in weights) if minimum else None
@@ -213,14 +240,16 @@ ECHO_TIME_PATHS = (
     SAMPLE_RATE_PATH,
     FFT_SIZE_PATH,
 )
+"""Parameters that determine when a record ends and when its echo arrives."""
 _ECHO_TIME_POINTS_MAX = 10**7
-"""Points of the grid of these parameters up to which all are looked at."""
+"""Maximum number of points of the grid of `ECHO_TIME_PATHS`; a larger grid is not checked."""
 
 
 def _time_findings(grid: GridValues) -> Iterator[Finding]:
-    """Grids in which no echo arrives before its record ends, or records of less than two samples.
+    """Yield a finding if no point of the grid has an echo in its record, or records are too short.
 
-    A grid some points of which have no echo is simulated: nothing is detected there.
+    A record needs two samples. A grid in which only some points lack an echo is valid: these points
+    detect nothing.
     """
     lateness = _least_echo_lateness(grid)
     if lateness is not None and lateness.chirp >= 0:
@@ -250,16 +279,19 @@ def _time_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 class _EchoLateness(NamedTuple):
-    """Least time [s] over a grid from an end to the echo's arrival; negative if that is before."""
+    """Smallest delay of the echo after an end, over a grid; negative if it arrives before."""
 
     chirp: float
-    """From the chirp's end."""
+    """Time from the end of the chirp [s]."""
     record: float
-    """From the record's end, where that matters; else from the chirp's."""
+    """Time from the end of the record, or of the chirp if the effect `overlap` is off [s]."""
 
 
 def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
-    """Find how late the earliest echo arrives; None where it can't be told."""
+    """Return the smallest lateness of the echo over the grid.
+
+    None if a parameter could not be read, or if the grid is too large to evaluate.
+    """
     if not grid.has_values(*ECHO_TIME_PATHS):
         return None
     values: dict[str, np.ndarray] = {
@@ -292,7 +324,11 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
 
 
 def _fewest_samples(grid: GridValues) -> float | None:
-    """Fewest samples of one segment over the grid; None where it can't be told."""
+    """Return the smallest number of samples of a segment over the grid; None if it is not known.
+
+    The number is (chirp duration - acquisition delay) * sample rate. An axis over the sample rate
+    is evaluated in full; all other axes enter by the smallest difference of the two times.
+    """
     if not grid.has_values(CHIRP_DURATION_PATH, ACQUISITION_DELAY_PATH, SAMPLE_RATE_PATH):
         return None
     weights = {CHIRP_DURATION_PATH: 1.0, ACQUISITION_DELAY_PATH: -1.0}
@@ -324,7 +360,7 @@ def _fewest_samples(grid: GridValues) -> float | None:
 
 
 def _window_findings(grid: GridValues) -> Iterator[Finding]:
-    """Report a window that does not exist at the length of the shortest record."""
+    """Yield a finding if a window function does not exist at the length of the shortest record."""
     samples = _fewest_samples(grid)
     if samples is None or not grid.has_values(WINDOW_PATH, FFT_SIZE_PATH):
         return
@@ -343,7 +379,7 @@ def _window_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _photon_findings(grid: GridValues) -> Iterator[Finding]:
-    """More electrons than photons."""
+    """Yield a finding if the responsivity exceeds one electron per photon, q lambda / (h c)."""
     responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
     least_margin = _least_weighted_sum(
         grid, {beam.WAVELENGTH_PATH: responsivity_per_metre, RESPONSIVITY_PATH: -1.0}
@@ -359,7 +395,7 @@ def _photon_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _table_findings(grid: GridValues) -> Iterator[Finding]:
-    """Report a table of the sweep's error that does not cover the chirp."""
+    """Yield a finding if the table of the sweep's error does not cover the longest chirp."""
     table_text = grid.values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
@@ -381,10 +417,11 @@ _SINGLE_MODE_CONDITIONS = {
     beam.COUPLING_PATH: _equals(beam.SINGLE_MODE),
     beam.ARCHITECTURE_PATH: _differs_from("direct"),
 }
+"""Conditions of a coherent receiver that couples a single mode."""
 
 
 def _beam_findings(grid: GridValues) -> Iterator[Finding]:
-    """Beams that are given twice or not at all, too wide for their aperture, or too narrow."""
+    """Yield mistakes in the beam: given twice or not at all, too wide, or too narrow."""
     if not grid.has_values(
         beam.WAVELENGTH_PATH, beam.APERTURE_DIAMETER_PATH, beam.DIVERGENCE_PATH, beam.WAIST_PATH
     ):
@@ -400,7 +437,12 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _width_findings(grid: GridValues) -> Iterator[Finding]:
-    """Beams that are too wide for their aperture, or too narrow for the paraxial approximation."""
+    """Yield mistakes in the width of beams that their aperture or the paraxial limit exclude.
+
+    Notes ----- The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D).
+    A waist may be at most the radius of the aperture, and must be so wide that the beam spreads by
+    at most 90 deg.
+    """
     remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
     if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):
         narrow_beam, limit = narrowest
@@ -438,9 +480,22 @@ def _width_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> str:
-    """Beam of a study that its aperture cannot make, in words; empty where there is none.
+    """Describe a beam of the study that its aperture can't make; return '' if there is none.
 
-    Only where all light in the aperture mixes: elsewhere such a beam is refused.
+    Covers direct detection and receivers with ``coupling: aperture``. For other receivers such a
+    beam is a mistake (`grid_findings`).
+
+    Parameters
+    ----------
+    values : Mapping
+        SI values of the parameters by dotted path.
+    axes : tuple of Axis
+        Axes of the study.
+
+    Returns
+    -------
+    str
+        Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D).
     """
     for conditions in (
         {beam.COUPLING_PATH: _equals(beam.APERTURE)},
@@ -461,8 +516,13 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
 def _narrowest_impossible_beam(
     grid: GridValues, conditions: Mapping[str, Condition]
 ) -> tuple[dict[str, float], float] | None:
-    """Parameters of the narrowest beam that no aperture under a law makes, and its limit [rad]."""
-    # The product of these powers is the waist over the aperture's radius, but for 4 / pi.
+    """Find the beam that is furthest below the divergence limit of its aperture.
+
+    Return its parameters and the limit [rad]; None if all beams that meet the conditions are
+    possible.
+    """
+    # This product of powers is proportional to the ratio of the waist to the radius of the
+    # aperture.
     rising, falling = (
         (beam.QUALITY_PATH, beam.WAVELENGTH_PATH),
         (beam.DIVERGENCE_PATH, beam.APERTURE_DIAMETER_PATH),
@@ -477,7 +537,7 @@ def _narrowest_impossible_beam(
 
 
 def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
-    """Divergence [rad] of a beam with a waist [m], or waist of one with a divergence."""
+    """Convert the waist [m] of a beam to its divergence [rad], or vice versa by the same law."""
     return float(
         beam.divergence_from_waist(
             waist_or_divergence, parameters[beam.WAVELENGTH_PATH], parameters[beam.QUALITY_PATH]
@@ -488,12 +548,13 @@ def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: f
 def _argmax_of_product(
     grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, Condition]
 ) -> dict[str, float]:
-    """Parameters where a product of powers of them is largest; empty where there are none."""
+    """Return the parameters that maximise a product of powers; empty if no point qualifies."""
     terms = {path: partial(_log_of_power, -power) for path, power in powers.items()}
     return grid.argmin_of_sum(terms, conditions)
 
 
 def _log_of_power(power: float, values: np.ndarray) -> np.ndarray:
+    """Return the logarithm of ``values ** power``; infinite at 0."""
     with np.errstate(divide="ignore"):
         return np.asarray(power * np.log(values))
 
@@ -501,14 +562,16 @@ def _log_of_power(power: float, values: np.ndarray) -> np.ndarray:
 # Looks
 
 VOTING_LOOKS_MAX = 64
+"""Maximum number of looks of a shot whose detections are combined by votes."""
 
 
 def _exceeds_one(number: np.ndarray) -> np.ndarray:
+    """Return a mask (n,) of values above 1."""
     return number > 1
 
 
 def _looks_findings(grid: GridValues) -> Iterator[Finding]:
-    """Report looks whose probabilities are not known, or that contradict each other."""
+    """Yield mistakes in multiple looks: contradictions, or an unknown detection probability."""
     several_looks: dict[str, Condition] = {looks.LOOKS_NUMBER_PATH: _exceeds_one}
     combined_by_bin: dict[str, Condition] = {
         looks.LOOKS_COMBINE_PATH: _differs_from(looks.COMBINE_COHERENT),
@@ -582,7 +645,7 @@ def _looks_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
-    """Noise drawn where a line of leaked light stands, or in the bins of several records."""
+    """Yield a finding if noise is drawn with a leak line, or in the bins of several looks."""
     if method != "probabilities" and grid.has_point(
         {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
     ):
@@ -602,7 +665,7 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
 
 
 def _search_findings(grid: GridValues) -> Iterator[Finding]:
-    """Search bands that lack an end, are upside down, or count bins that are not searched."""
+    """Yield mistakes in the search band: missing or swapped ends, or counted bins outside."""
     missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.values_of(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
         problem = "is left out, and a beat tells of range and velocity both"
@@ -624,22 +687,26 @@ def _search_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 class ParameterRequirement(NamedTuple):
-    """A parameter that has no meaning with some values of another."""
+    """Requirement of one parameter on another: values of one exclude values of the other."""
 
     path: str
+    """Dotted path of the parameter that has the requirement."""
     needs_other: Condition
-    """True if values of it need the other."""
+    """Condition on its values for which the requirement applies."""
     other_path: str
-    """Parameter that must then have another value."""
+    """Dotted path of the required parameter."""
     is_unmet: Condition
-    """True if values of that one will not do."""
+    """Condition on the values of the required parameter that break the requirement."""
     problem: str
+    """Text of the finding: the end of a sentence about `path`."""
     remedy: str
+    """Text of the remedy, as an imperative clause."""
     holds_if_forced_on: bool = False
-    """True if the parameter's effect has the same need wherever it is forced on."""
+    """True if the requirement applies, at any value of the parameter, when its effect is ``on``."""
 
 
 def _require_positive(path: str, needs_other: Condition, other_path: str) -> ParameterRequirement:
+    """Return the requirement that another parameter is not 0."""
     return ParameterRequirement(
         path,
         needs_other,
@@ -730,10 +797,11 @@ REQUIREMENTS = (
         "set it to 1 au or so",
     ),
 )
+"""Requirements of the parameters of effects on other parameters."""
 
 
 def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
-    """Effects that are on within others that are off."""
+    """Yield a finding for each effect that is on although its parent effect is off."""
     outer_of_effect = {effect.name: effect.parent for effect in EFFECTS}
     for name, outer in outer_of_effect.items():
         while outer and grid.effect_modes.get(name) == ON:
@@ -744,7 +812,7 @@ def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
-    """Parameters of effects without others that they need."""
+    """Yield a finding for each broken requirement of an effect that is not off."""
     for requirement in REQUIREMENTS:
         owning_effect = next(
             effect
@@ -769,7 +837,11 @@ def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _record_findings(grid: GridValues) -> Iterator[Finding]:
-    """Complex records of direct detection; filters before the ADC that let noise fold, or stay."""
+    """Yield mistakes in complex records of direct detection and in the anti-alias filter.
+
+    A filter wider than the sample rate keeps no alias out, and ``noise_shape: white`` ignores the
+    filter.
+    """
     if grid.has_point({RECORD_PATH: _equals("complex"), beam.ARCHITECTURE_PATH: _equals("direct")}):
         problem = "samples I and Q, of which direct detection has one"
         yield grid.make_finding(RECORD_PATH, problem, "take a coherent receiver, or record: real")
@@ -795,7 +867,7 @@ def _record_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
-    """Random effects that a grid has and, without draws, can't simulate."""
+    """Yield a finding for each active random effect of a grid that has no draws."""
     problem = "is simulated by draws, and the study has none"
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name) == ON:
@@ -811,9 +883,17 @@ def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Finding]:
-    """Random effects and methods that are asked for in a flight, and that only grids draw.
+    """Yield mistakes in random effects and methods that flights can't draw.
 
-    All other random effects are drawn; a target's own parameters are told where they stand.
+    All other random effects are drawn in flights. Mistakes in the parameters of a target are
+    located in the target's own section.
+
+    Parameters
+    ----------
+    grid : GridValues
+        Parameter values of the flight.
+    draws : SceneDraws
+        The spec's ``draws`` section.
     """
     problem = "is not drawn in flights"
     for effect in EFFECTS:
@@ -852,16 +932,17 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
 
 
 def _mode_finding(effect: str, problem: str, remedy: str) -> Finding:
-    """Mistakes in an effect that is on."""
+    """Return a finding about an effect whose mode is ``on``."""
     return Finding(("effects", effect), problem, remedy, ON)
 
 
 def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parameter]]:
-    """Random effects that are not off, each with a parameter by which the scene has it."""
+    """Yield each random effect that is not off, with each of its parameters that enables it."""
     for effect in EFFECTS:
         if effect.is_random and grid.effect_modes.get(effect.name, OFF) != OFF:
             for parameter in effect.parameters:
-                # One that is something by default only says how an effect acts.
+                # A parameter whose default is not neutral (0, 0 dB, none) configures its effect
+                # only.
                 is_not_default = _differs_from(parameter.default)  # type: ignore[arg-type]
                 if parameter.enables_effect and grid.has_point({parameter.path: is_not_default}):
                     yield effect, parameter
@@ -871,12 +952,23 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
 
 
 def is_detector_or_estimator(path: str) -> bool:
-    """Return true if a parameter sets the detector or estimator for whole spectra."""
+    """Return True if a parameter belongs to the detector or the estimator of whole spectra."""
     return path.startswith((DETECTOR_PREFIX, ESTIMATOR_PREFIX))
 
 
 def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
-    """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
+    """Yield mistakes in methods that examine whole spectra.
+
+    Such a method needs ``draws.method: spectra`` and a number of draws, and CFAR windows must fit
+    the spectrum.
+
+    Parameters
+    ----------
+    draws : Draws or SceneDraws
+        The spec's ``draws`` section.
+    grid : GridValues
+        Parameter values of the study.
+    """
     yield from _drawn_noise_findings(grid, draws.method)
     if not draws.draws_whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA_METHOD}, number: 1000}}, or leave it out"
@@ -891,7 +983,7 @@ def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Fi
 
 
 def _changed_method_paths(grid: GridValues) -> list[str]:
-    """Methods' parameters that are not at their defaults."""
+    """Return paths of detector and estimator parameters on axes or away from their defaults."""
     paths_on_axes = [
         parameter.path
         for axis in grid.axes
@@ -908,7 +1000,7 @@ def _changed_method_paths(grid: GridValues) -> list[str]:
 
 
 def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
-    """CFAR windows that are odd or too wide, and ranks beyond them, by the grid's extremes."""
+    """Yield a finding for odd or too wide CFAR windows, and for ranks beyond the window."""
     training, guard, rank = (
         grid.values_of(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)
     )

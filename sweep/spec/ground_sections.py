@@ -1,4 +1,4 @@
-"""Ground of a scene: real terrain, heights from files, planes, and what is drawn at random."""
+"""Sections of a spec for the ground of a scene: surveys, files, planes and random terrain."""
 
 from __future__ import annotations
 
@@ -20,14 +20,25 @@ if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
 
 SQUARE_STEPS_MAX = 7000
-"""Grid steps along one side of a square."""
+"""Maximum number of grid steps along one side of a square."""
 _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
+"""Uses of random numbers; the index of a use selects its random stream."""
 
 Vector = tuple[float, ...]
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
-    """Random numbers of one use: the same seed gives craters and boulders unlike places."""
+    """Return the random number generator of one use, such as ``craters`` or ``trees``.
+
+    Uses with the same seed have independent random numbers.
+
+    Parameters
+    ----------
+    purpose : str
+        One of ``relief``, ``hills``, ``craters``, ``boulders`` and ``trees``.
+    seed : int
+        Seed of the section, >= 0.
+    """
     key = (_RANDOM_STREAMS.index(purpose),)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
@@ -40,7 +51,7 @@ class Material(SpecSection):
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)
-"""Fields that rays know nothing of."""
+"""Fields of a surface that do not change where its rays hit."""
 
 
 class Relief(SpecSection):
@@ -55,7 +66,20 @@ class Relief(SpecSection):
     seed: int = declare.seed()
 
     def draw_heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
-        """Heights on a grid [m], of mean 0."""
+        """Draw fractal heights with mean 0 on a grid.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Number of rows and columns.
+        spacing : (float, float)
+            Grid steps along x and y [m].
+
+        Returns
+        -------
+        ndarray, shape (rows, columns)
+            Heights [m].
+        """
         from sweep.scenes.terrain import draw_fractal_relief
 
         heights = draw_fractal_relief(
@@ -82,7 +106,7 @@ class Craters(SpecSection):
     seed: int = declare.seed()
 
     def carve_into(self, terrain: Terrain) -> Terrain:
-        """Terrain with the craters in it."""
+        """Return the terrain with randomly drawn craters carved into it."""
         from sweep.scenes.scattered_objects import carve_craters, draw_craters, lunar_crater_law
 
         equilibrium_diameter = (
@@ -98,13 +122,13 @@ class Craters(SpecSection):
 
 
 def _check_memory(n_nodes: int) -> None:
-    """Refuse a grid whose triangles would take more memory than there is."""
+    """Raise `SceneError` if the triangles of a grid would need more memory than is free."""
     remedy = "take a coarser grid, or a smaller part of it"
     require_memory(f"a ground of {n_nodes:,} heights", BYTES_PER_CELL * n_nodes, remedy)
 
 
 class Ground(Material, ABC):
-    """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
+    """Base of all grounds: heights on a grid, then smoothing, refining, relief and craters."""
 
     smoothing: float = declare.length(
         "Standard deviation of a Gaussian that the heights are blurred by", "10 m", "0 m",
@@ -117,14 +141,35 @@ class Ground(Material, ABC):
     craters: Craters | None = None
 
     def build_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground in its own coordinates.
+        """Return the processed ground in its own coordinates.
 
-        A `SceneError` for an unfit file, a ValueError for a grid that can not hold what it should.
+        Raises
+        ------
+        SceneError
+            If the file is unsuitable, or memory does not suffice.
+        ValueError
+            If the grid is invalid, or can't hold the craters.
         """
         return self.process(self.unprocessed_terrain(files))
 
     def process(self, terrain: Terrain) -> Terrain:
-        """Return the survey smoothed, refined, with its relief and its craters."""
+        """Smooth and refine a terrain, then add relief and craters.
+
+        Parameters
+        ----------
+        terrain : Terrain
+            Ground before processing.
+
+        Returns
+        -------
+        Terrain
+            Processed ground in the same coordinates.
+
+        Raises
+        ------
+        ValueError
+            If the refined grid has too many nodes.
+        """
         from sweep.scenes.terrain import refine, smooth
 
         if terrain.heights.size * self.factor**2 > GRID_CELLS_MAX:
@@ -148,22 +193,22 @@ class Ground(Material, ABC):
         """Return the ground before smoothing, refining, relief and craters."""
 
     def check_grid(self) -> None:
-        """Raise a ValueError for a grid that, by its fields alone, can not be."""
+        """Raise `ValueError` if the fields of the section define an invalid grid."""
 
     def grid_step(self) -> float | None:
-        """Grid step [m], the larger one; None where only a file knows it."""
+        """Return the larger grid step after refining [m]; None if it is known from a file alone."""
         return None
 
 
 class PlacedGround(Ground):
-    """Ground without coordinates of its own."""
+    """Base of grounds whose grid has no coordinates: `position` places its middle."""
 
     position: Vector = declare.position(
         "Where the middle of its grid lies, its heights above that", default=(0.0, 0.0, 0.0)
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground before smoothing, refining, relief and craters."""
+        """Return the ground at its position, before smoothing, refining, relief and craters."""
         terrain = self.unplaced_terrain(files)
         (rows, columns), (dx, dy) = terrain.heights.shape, terrain.spacing
         corner = np.array([-(columns - 1) / 2 * dx, -(rows - 1) / 2 * dy, 0.0])
@@ -171,7 +216,7 @@ class PlacedGround(Ground):
 
     @abstractmethod
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Heights, wherever they are."""
+        """Return the heights on a grid of arbitrary origin."""
 
 
 # Ground of surveys and files
@@ -193,7 +238,7 @@ class JacksboroGround(PlacedGround):
     )  # fmt: skip
 
     def unplaced_terrain(self, files: SpecFiles | None) -> Terrain:
-        """Heights of the survey."""
+        """Return the heights of the survey, or of the square cut from it [m above sea level]."""
         from sweep.scenes.rasters import read_jacksboro
         from sweep.scenes.terrain import cut_square
 
@@ -203,11 +248,11 @@ class JacksboroGround(PlacedGround):
         )  # type: ignore[arg-type]
 
     def check_grid(self) -> None:
-        """Look for ground where the piece is cut."""
+        """Raise `ValueError` if the square does not lie within the survey."""
         self.unplaced_terrain(None)
 
     def grid_step(self) -> float | None:
-        """Grid step from south to north [m]."""
+        """Return the larger grid step after refining [m]."""
         return max(abs(step) for step in self.unplaced_terrain(None).spacing) / self.factor
 
 
@@ -251,7 +296,7 @@ class RasterGround(Ground):
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Heights of the raster."""
+        """Return the heights of the raster, times `scale`, in the raster's coordinates."""
         field_names = {"band", "window", "metres_per_degree", "metres_per_unit", "height_unit"}
         terrain = read_raster(
             files.resolve(self.file, raster_digest),
@@ -276,7 +321,7 @@ class ArrayGround(PlacedGround):
     scale: float = _HEIGHT_SCALE_FIELD
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Heights of the file."""
+        """Return the heights of the NumPy file, times `scale`."""
         from sweep.scenes.rasters import read_array
 
         spacing, no_data = (self.spacing[0], self.spacing[1]), self.no_data
@@ -295,33 +340,33 @@ class ImageGround(PlacedGround):
     black: float = declare.length("Height of black", "0 m", default=0.0)
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Heights of the image."""
+        """Return the heights of the image, linear in brightness between `black` and `white`."""
         from sweep.scenes.rasters import read_image
 
         path = files.resolve(self.file)
         return read_image(path, pixel=self.pixel, black=self.black, white=self.white)
 
 
-# Ground that no file holds
+# Ground without a file
 
 
 def _nodes_per_side(side: float, step: float) -> int:
-    """Nodes of a grid of at least a side's length."""
+    """Return the number of nodes in steps of `step` [m] along a grid of at least `side` [m]."""
     return math.ceil(side / step * (1 - 1e-12)) + 1
 
 
 class SquareGround(PlacedGround):
-    """A square of ground on a grid that is stated."""
+    """Base of square grounds on a regular grid."""
 
     size: float = declare.positive_length("Side of the square", "3 km")
 
     def unrefined_step(self) -> float:
-        """Grid step before refining [m]; one cell without a spacing."""
+        """Return the grid step before refining [m]; the side of the square without a spacing."""
         spacing = self.spacing  # type: ignore[attr-defined]
         return float(self.size if spacing is None else spacing)
 
     def flat_terrain(self) -> Terrain:
-        """Return the grid, with heights of 0."""
+        """Return the grid with all heights 0."""
         from sweep.scenes.terrain import Terrain
 
         self.check_grid()
@@ -330,7 +375,7 @@ class SquareGround(PlacedGround):
         return Terrain(np.zeros((n_nodes, n_nodes)), (step, step), np.zeros(3))
 
     def check_grid(self) -> None:
-        """Look at the number of grid steps."""
+        """Raise `ValueError` if the number of grid steps is 0 or too large."""
         n_steps = _nodes_per_side(self.size, self.unrefined_step()) - 1
         if not 1 <= n_steps <= SQUARE_STEPS_MAX:
             raise ValueError(
@@ -339,7 +384,7 @@ class SquareGround(PlacedGround):
             )
 
     def grid_step(self) -> float | None:
-        """Grid step [m]."""
+        """Return the grid step after refining [m]."""
         return self.unrefined_step() / self.factor
 
 
@@ -355,7 +400,7 @@ class PlaneGround(SquareGround):
     )
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the sloping plane."""
+        """Return the plane of slope angle `slope` that rises in the direction `uphill`."""
         terrain = self.flat_terrain()
         tangent, node_numbers = math.tan(self.slope), np.arange(len(terrain.heights))
         rise_along_side = (node_numbers - node_numbers.mean()) * terrain.spacing[0] * tangent
@@ -373,7 +418,7 @@ class ReliefGround(Relief, SquareGround):
     spacing: float = declare.positive_length("Grid step", "5 m")
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the fractal ground, drawn by its seed."""
+        """Return the fractal ground, drawn from its seed."""
         terrain = self.flat_terrain()
         shape = len(terrain.heights), len(terrain.heights)
         return replace(terrain, heights=self.draw_heights(shape, terrain.spacing))
@@ -391,13 +436,13 @@ class HillsGround(SquareGround):
     seed: int = declare.seed()
 
     def check_grid(self) -> None:
-        """Look at the number of grid steps, and at their size."""
+        """Raise `ValueError` if the grid has too many steps, or too coarse ones for the hills."""
         super().check_grid()
         if not self.correlation_length > 3 * self.spacing:
             raise ValueError("hills need a correlation length over three grid steps")
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the hills, drawn by their seed."""
+        """Return the hills, drawn from their seed."""
         from sweep.scenes.terrain import draw_hills
 
         terrain = self.flat_terrain()

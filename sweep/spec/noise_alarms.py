@@ -1,4 +1,4 @@
-"""False alarms that noise alone raises in a study, and the fields to change for fewer."""
+"""False-alarm probabilities of a study due to noise alone, and advice on how to reduce them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,31 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 ALARM_PROBABILITY_MAX = 0.01
-"""Probability of a false alarm in a shot beyond which a study is warned of."""
+"""False-alarm probability of a shot above which the user is warned."""
 
 SAMPLED_SETTINGS_MAX = 400
-"""Thresholds, FFT sizes and detectors of a study that are computed, about."""
+"""Approximate maximum number of combinations of threshold, FFT size and detector that are
+computed."""
 
 
 def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]:
-    """Probabilities that noise raises an alarm in any chirp of a shot, and in both, 0..1.
+    """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's settings.
 
-    One pair for each of the thresholds, FFT sizes and detectors of a study, of which some
-    hundreds are sampled; none for detectors of the user's own.
+    Parameters
+    ----------
+    spec : GridSpec or SceneSpec
+        Study. Its axes over ``instrument.processing`` are sampled evenly, about 400 combinations in
+        all.
+
+    Returns
+    -------
+    list of (float, float)
+        Probability of a false alarm in at least one chirp, and in both chirps, for each sampled
+        combination. Combinations with a user-defined detector are left out.
+
+    Notes ----- Noise in the up- and down-chirp is independent, so that the probability of a false
+    alarm in both chirps is the product of the two. A chirp's probability follows from that of a bin
+    and the number of independent bins that have as many alarms (`alarm_equivalent_bins`).
     """
     axes = [
         axis for axis in spec.axes
@@ -64,7 +78,10 @@ def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]
 
 
 def iter_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
-    """Yield a sentence if noise alone raises false alarms in many shots, with the remedy."""
+    """Yield one sentence if noise alone raises a false alarm in more than 1 % of the shots.
+
+    The sentence states the largest probability over the study's settings and the fields to change.
+    """
     pfa_max = max((pfa_any for pfa_any, _ in alarm_probabilities(spec)), default=0.0)
     if pfa_max > ALARM_PROBABILITY_MAX:
         yield (
@@ -74,7 +91,7 @@ def iter_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
 
 
 def fewer_alarms_remedy(spec: GridSpec | SceneSpec) -> str:
-    """Fields of a study to change for fewer false alarms, as an imperative."""
+    """Return the change of fields that reduces false alarms, as an imperative clause."""
     parameters, kind_path = spec.parameters(), f"{DETECTOR_PREFIX}kind"
     values_by_path = {
         member.path: member.values for axis in spec.axes for member in axis.parameters

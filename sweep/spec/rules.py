@@ -1,7 +1,7 @@
-"""Rules of single fields of a spec, and mistakes: what is wrong, where, and what to write instead.
+"""Rules of single fields of a spec, and the findings and mistakes that broken rules raise.
 
-A rule sits in a field's metadata. Pydantic reads the field with it, an axis over the field holds
-every one of its values to it, and the JSON Schema describes it.
+A rule is an entry of a field's metadata. Pydantic validates the field with it, an axis over the
+field applies it to every value, and the JSON Schema describes it.
 """
 
 from __future__ import annotations
@@ -31,35 +31,40 @@ from sweep.model.window import COSINE_SUM_COEFFICIENTS, WINDOW_NAME_ALIASES
 from sweep.scenes.scene_files import file_digest
 from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
 
-# Mistakes of users
+# Mistakes in specs
 
 Location = tuple[str | int, ...]
+"""Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Stands for a value where none is written."""
+"""Stands for a value that is not written."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
+"""Maximum number of characters of a value that are shown."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
-"""Characters of a part of a name that suggests the whole, and whole names that are suggested."""
+"""Minimum length of a part of a name for which longer names are suggested, and their maximum
+number."""
 _OFF_WORDS = {"no", "n", "false", "none", "never", "null", "disable", "disabled", "0", "off"}
+"""Words that users write for ``off``."""
 _ON_WORDS = {"yes", "y", "true", "always", "enable", "enabled", "1", "on"}
-"""Words for off and on."""
+"""Words that users write for ``on``."""
 
 
 @dataclass(frozen=True, order=True)
 class Mistake:
-    """One mistake in a spec; texts are empty where there is nothing to tell."""
+    """One mistake in a spec; texts are empty if there is nothing to report."""
 
     path: str
     """Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``."""
     problem: str
-    """The rule broken, as the end of a sentence about the path."""
+    """The broken rule, as the end of a sentence about the path."""
     value: str = ""
-    """The value as the user wrote it."""
+    """Value as the user wrote it."""
     suggestion: str = ""
-    """A near miss or a remedy."""
+    """Similar name or remedy."""
     line: int | None = None
     """Line in the file, from 1."""
     file: str = ""
+    """Path of the file."""
 
     def __str__(self) -> str:
         prefix = (
@@ -73,7 +78,7 @@ class Mistake:
 
 
 class SpecError(Exception):
-    """Everything that is wrong with a spec, at once, in the order in which to show it."""
+    """Error that holds every mistake in a spec, in the order in which they are shown."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list(mistakes)
@@ -88,18 +93,20 @@ class SpecError(Exception):
 
 @dataclass(frozen=True)
 class Finding:
-    """A mistake whose place in the file is still to be looked up."""
+    """A mistake at a location of a spec, before its file and line are known."""
 
     location: Location
-    """Keys and list indices that lead to it."""
+    """Keys and list indices that lead to the value."""
     problem: str
+    """The broken rule, as the end of a sentence about the location."""
     suggestion: str = ""
+    """Similar name or remedy; may be empty."""
     raw_value: object = MISSING
-    """The value as read from the file, if it is to be shown."""
+    """Value as read from the file, if it is to be shown; else `MISSING`."""
 
 
 class FindingsError(Exception):
-    """A part of a spec that cannot be read, with everything that is wrong with it."""
+    """Error of a part of a spec that can't be read; holds all findings about that part."""
 
     def __init__(self, *findings: Finding) -> None:
         super().__init__(*findings)
@@ -109,16 +116,20 @@ class FindingsError(Exception):
 def findings_error(
     location: Location, problem: str, suggestion: str = "", raw_value: object = MISSING
 ) -> FindingsError:
-    """Refusal for a single reason, to be raised."""
+    """Return a `FindingsError` with a single finding, to be raised."""
     return FindingsError(Finding(location, problem, suggestion, raw_value))
 
 
 class Findings(list[Finding]):
-    """Findings of several parts, which are read one after the other whatever is wrong with one."""
+    """List of findings that collects the errors of several parts, so that all parts are read."""
 
     @contextmanager
     def collect(self, location: Location = (), raw_value: object = MISSING) -> Iterator[None]:
-        """Context that keeps what is wrong with a part, or with the value at a location."""
+        """Context manager that appends errors of reading a part to this list.
+
+        A `QuantityError` becomes a finding at `location` that shows `raw_value`; a `FindingsError`
+        adds its own findings.
+        """
         try:
             yield
         except FindingsError as error:
@@ -127,13 +138,13 @@ class Findings(list[Finding]):
             self.append(Finding(location, error.rule, error.suggestion, raw_value))
 
     def raise_if_any(self) -> None:
-        """Raise all findings, if there are any."""
+        """Raise a `FindingsError` with all findings, if there are any."""
         if self:
             raise FindingsError(*self)
 
 
 def dotted_path(location: Location) -> str:
-    """Path of keys and indices as text: ``axes.target.range[2]``."""
+    """Return a location as text, such as ``axes.target.range[2]``."""
     path = ""
     for key in location:
         path += f"[{key}]" if isinstance(key, int) else f".{key}" if path else str(key)
@@ -141,7 +152,7 @@ def dotted_path(location: Location) -> str:
 
 
 def format_raw_value(raw_value: object) -> str:
-    """Format a written value on one short line; empty for ``MISSING`` and for whole sections."""
+    """Return a written value as one short line; empty for `MISSING`, mappings and lists."""
     if raw_value is MISSING or isinstance(raw_value, dict | list | tuple):
         return ""
     if raw_value is None:
@@ -155,7 +166,22 @@ def format_raw_value(raw_value: object) -> str:
 
 
 def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str = "") -> str:
-    """Suggestion of the known name that `name` resembles, or those that hold it, else a remedy."""
+    """Suggest known names that resemble a wrong name.
+
+    Parameters
+    ----------
+    name : str
+        Wrong name.
+    known_names : Iterable of str
+        Valid names. One that is similar is suggested, else up to three that contain `name`.
+    fallback : str
+        Result if no name is similar.
+
+    Returns
+    -------
+    str
+        Suggestion, as a question, or `fallback`.
+    """
     names = list(known_names)
     similar_names = [k for k in names if k.lower() == name.lower()] or get_close_matches(
         name, names, n=1
@@ -170,12 +196,13 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 # Rules
 
 RULE_ERROR_TYPE = "broken_rule"
+"""Type of pydantic errors that are raised by rules."""
 
 Json = dict[str, Any]
 
 
 def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
-    """Mistake in a value, or in a section as a whole, told in pydantic's way."""
+    """Return the pydantic error for a broken rule of a field or section, to be raised."""
     return PydanticCustomError(
         RULE_ERROR_TYPE, "{rule}", {"rule": problem, "suggestion": suggestion}
     )
@@ -183,40 +210,41 @@ def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of what a field may hold."""
+    """Base of rules: what values a field may hold."""
 
     description: str
-    """Description of the field, for people."""
+    """Description of the field for users."""
 
     @property
     def example(self) -> str:
-        """A good value; empty where none need be shown."""
+        """A valid value as a user would write it; empty if none needs to be shown."""
         return ""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the value read; empty where there is none."""
+        """SI unit of the value after reading; empty if it has no unit."""
         return ""
 
     def read(self, raw_value: object) -> Any:
-        """Value of what the user wrote.
+        """Convert a value as written to the value inside the program, in SI units.
 
         Raises
         ------
         QuantityError
-            With the rule broken and a suggestion.
+            With the broken rule and a suggestion.
         """
         raise QuantityError("holds nothing that can be read")
 
     def format(self, value: Any) -> Any:
-        """Text or number that reads back as exactly `value`."""
+        """Return text or a number that reads back as exactly `value`."""
         return value
 
     def schema(self) -> Json:
-        """JSON Schema of what a user may write."""
+        """Return the JSON Schema of a value as written."""
         return {"description": self.description} | self._value_schema()
 
     def _value_schema(self) -> Json:
+        """Return the JSON Schema without the description."""
         return {}
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -226,7 +254,7 @@ class Rule:
         return self.schema()
 
     def _validate(self, raw_value: object) -> Any:
-        """Value read, with a mistake told in pydantic's way."""
+        """Read a value; raise a pydantic error if it breaks the rule."""
         try:
             return self.read(raw_value)
         except QuantityError as error:
@@ -235,15 +263,15 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class CustomRule(Rule):
-    """Rule of one kind of field alone."""
+    """Rule of a single field, given by a function."""
 
     reader: Callable[[Any], Any]
-    """Reads what the user wrote, or raises a `QuantityError`."""
+    """Function that reads a value as written, or raises a `QuantityError`."""
     value_schema: Json = dataclasses.field(default_factory=dict, compare=False)
-    """JSON Schema of it."""
+    """JSON Schema of a value as written."""
 
     def read(self, raw_value: object) -> Any:
-        """Value of what the user wrote."""
+        """Convert a value as written by `reader`."""
         return self.reader(raw_value)
 
     def _value_schema(self) -> Json:
@@ -256,44 +284,57 @@ _BOUND_KINDS = {
     "below": ("less than", np.greater_equal, "exclusiveMaximum"),
     "at_most": ("at most", np.greater, "maximum"),
 }
-"""Bounds of numbers: in words, what breaks them, and in JSON Schema's words."""
+"""Kinds of bounds of a number: the words for it, the comparison that breaks it, its JSON Schema
+keyword."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumericRule(Rule):
-    """A number within bounds, which are as a user would write them."""
+    """Rule of a number within bounds; bounds are written as users write values."""
 
     si_unit: str = ""
-    """Unit of the value inside; ``"dB"`` for a power ratio that is written in decibels; empty for
-    a pure number."""
+    """SI unit after reading; ``"dB"`` for a power ratio written in decibels; empty for a pure
+    number."""
     example: str = ""
+    """A valid value as a user would write it."""
     above: str | None = None
+    """Exclusive lower bound; None for none."""
     at_least: str | None = None
+    """Inclusive lower bound; None for none."""
     below: str | None = None
+    """Exclusive upper bound; None for none."""
     at_most: str | None = None
+    """Inclusive upper bound; None for none."""
     is_integer: bool = False
+    """True for integers."""
     is_power_ratio: bool = False
-    """True for a pure number that may be written in decibels, as a ratio of powers."""
+    """True for a pure number that may also be written in decibels, as a ratio of powers."""
     keyword: str = ""
-    """A word that may stand in place of a number, not along axes; empty for none."""
+    """Word that may replace the number, except on axes; empty for none."""
     keyword_value: float | str = 0
-    """Value that the word stands for, whatever the bounds."""
+    """Value that the keyword stands for; may be outside the bounds."""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the value read; a power ratio has none."""
+        """SI unit of the value after reading; empty for a power ratio."""
         return "" if self.si_unit == DECIBEL else self.si_unit
 
     @property
     def bounds(self) -> dict[str, str]:
-        """Bounds that there are, as written."""
+        """Bounds as written, by kind; only those that are set."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None
         }
 
     def read_exact(self, raw_value: object) -> tuple[Fraction, Unit]:
-        """Exact number and unit of what the user wrote, bounds apart."""
+        """Return the exact number and the unit of a written value, without a check of the bounds.
+
+        Raises
+        ------
+        QuantityError
+            If the value is no number with a unit of the right dimension, or is the keyword.
+        """
         if self.si_unit:
             return read_quantity(raw_value, si_unit=self.si_unit, example=self.example)
         if self.keyword and raw_value == self.keyword:
@@ -313,7 +354,13 @@ class NumericRule(Rule):
             raise QuantityError(f"must be a number or {self.keyword}", error.suggestion) from None
 
     def read(self, raw_value: object) -> Any:
-        """SI value of what the user wrote, within the bounds; or what its word means."""
+        """Return the SI value of a written value within the bounds, or the value of the keyword.
+
+        Raises
+        ------
+        QuantityError
+            With the broken rule and a suggestion.
+        """
         if self.keyword and raw_value == self.keyword:
             return self.keyword_value
         try:
@@ -328,15 +375,19 @@ class NumericRule(Rule):
             raise QuantityError(error.rule, remedy) from None
 
     def _is_valid(self, number: Fraction) -> bool:
-        """Tell whether a pure number fits the field."""
+        """Return True if a pure number is within the bounds, and an integer if required."""
         if self.is_integer and number.denominator != 1:
             return False
         try:
             return self.first_out_of_bounds(np.array([Unit("").to_si(number)])) is None
-        except QuantityError:  # more than a float holds
+        except QuantityError:  # beyond the range of floats
             return False
 
     def _read_number(self, raw_value: object) -> float | int:
+        """Return the SI value of a written number within the bounds.
+
+        An int if integers are required.
+        """
         number, unit = self.read_exact(raw_value)
         if self.is_integer and number.denominator != 1:
             raise QuantityError("must be a whole number")
@@ -347,7 +398,18 @@ class NumericRule(Rule):
         return int(number) if self.is_integer else value
 
     def first_out_of_bounds(self, values: np.ndarray) -> tuple[int, str] | None:
-        """Index of the first of the SI values (n,) that breaks a bound, and that bound in words."""
+        """Return the index of the first SI value outside the bounds, and the broken bound in words.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n,)
+            SI values.
+
+        Returns
+        -------
+        (int, str) or None
+            None if all values are within the bounds.
+        """
         for name, bound_text in self.bounds.items():
             comparison, violates, _ = _BOUND_KINDS[name]
             is_outside = violates(values, _bound_in_si(self, bound_text))
@@ -356,7 +418,10 @@ class NumericRule(Rule):
         return None
 
     def format(self, value: Any) -> str | int | float:
-        """Text that reads back as exactly `value`: ``0.001 W``; of decibels, to 15 digits."""
+        """Return a number, or text such as ``0.001 W``, that reads back as exactly `value`.
+
+        Decibels read back to 15 digits.
+        """
         if self.keyword and value == self.keyword_value:
             return self.keyword
         if self.si_unit:
@@ -388,32 +453,38 @@ class NumericRule(Rule):
 
 
 def _first_clause(description: str) -> str:
-    """First clause of a description, as the end of a sentence."""
+    """Return the first clause of a description, in a form that can end a sentence."""
     clause = re.split(r"[;:,.(] ?", description)[0].strip()
     return clause[:1].lower() + clause[1:] if clause[1:2].islower() else clause
 
 
 @lru_cache(maxsize=1024)
 def _bound_in_si(rule: NumericRule, bound_text: str) -> float:
-    """SI value of a rule's bound."""
+    """Return a rule's bound in SI units."""
     number, unit = rule.read_exact(bound_text)
     return unit.to_si(number)
 
 
 _FUNCTION_PATTERN = r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*:[A-Za-z_][A-Za-z0-9_]*"
+"""Pattern of a function's name as ``module:function``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChoiceRule(Rule):
-    """One of several words; of on and off, which YAML makes truth values of, these too."""
+    """Rule of one of several words.
+
+    If ``on`` is one of them, YAML's truth values are accepted too.
+    """
 
     options: tuple[str, ...]
+    """Valid words."""
     problem: str = ""
-    """Message for other words; by default that they are none of the options."""
+    """Text of the finding for other words; by default a list of the options."""
     remedy: str = ""
+    """Remedy for words that resemble none of the options."""
 
     def read(self, raw_value: object) -> str:
-        """Return the word written."""
+        """Return the word; ``on`` or ``off`` for a truth value."""
         if isinstance(raw_value, bool) and "on" in self.options:
             return "on" if raw_value else "off"
         if raw_value in self.options and isinstance(raw_value, str):
@@ -440,10 +511,10 @@ class ChoiceRule(Rule):
 
 
 class ChoiceOrFunctionRule(ChoiceRule):
-    """One of several words, or ``module:function``, which reading does not import."""
+    """Rule of one of several words, or of a function ``module:function``; does not import it."""
 
     def read(self, raw_value: object) -> str:
-        """Return the word or the function's name."""
+        """Return the word or the name of the function."""
         if isinstance(raw_value, str) and re.fullmatch(_FUNCTION_PATTERN, raw_value):
             return raw_value
         try:
@@ -462,10 +533,10 @@ class ChoiceOrFunctionRule(ChoiceRule):
 
 
 class FlagRule(Rule):
-    """True or false."""
+    """Rule of a truth value."""
 
     def read(self, raw_value: object) -> bool:
-        """Return true or false."""
+        """Return the truth value."""
         if not isinstance(raw_value, bool):
             raise QuantityError("must be true or false", "write 'true' or 'false'")
         return raw_value
@@ -476,15 +547,17 @@ class FlagRule(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class TextRule(Rule):
-    """Words for people, or the name of something."""
+    """Rule of a text that matches a pattern."""
 
     example: str = ""
+    """A valid text."""
     pattern: str = r"[^\x00-\x08\x0b-\x1f\x7f-\x9f]{0,5000}"
-    """Regular expression that the whole text matches."""
+    """Regular expression that the full text must match."""
     remedy: str = "write at most 5000 characters that can be printed"
+    """Remedy for texts that do not match."""
 
     def read(self, raw_value: object) -> str:
-        """Return the text."""
+        """Return the text; numbers are converted to text."""
         if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
             remedy = (
                 self.remedy
@@ -502,13 +575,13 @@ class TextRule(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class FilePathRule(Rule):
-    """Path of a file, relative to the one that names it."""
+    """Rule of a file's path, relative to the file that names it."""
 
     digest: Callable[[Path], str] = file_digest
-    """Digest of what is read from the file."""
+    """Function that returns the digest of all that is read from the file."""
 
     def read(self, raw_value: object) -> str:
-        """Return the path, as written."""
+        """Return the path as written."""
         if not isinstance(raw_value, str) or not 0 < len(raw_value.strip()) <= 4096:
             raise QuantityError("must be the path of a file", "write it relative to this file")
         if "\0" in raw_value:
@@ -521,30 +594,33 @@ class FilePathRule(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class ListRule(Rule):
-    """A list of values, each held to the same rule."""
+    """Rule of a list of values that have a common rule."""
 
     element_rule: Rule
+    """Rule of each value."""
     length_min: int = 3
+    """Minimum number of values."""
     length_max: int = 3
+    """Maximum number of values."""
     noun: str = "values"
-    """Name of all values together."""
+    """Noun for the values in messages."""
     increasing: bool = False
-    """Each must exceed the one before."""
+    """True if each value must exceed the previous one."""
     distinct: bool = False
-    """None may be there twice."""
+    """True if no value may occur twice."""
 
     @property
     def value_unit(self) -> str:
-        """SI unit of the values read; empty where there is none."""
+        """SI unit of the values after reading; empty if they have no unit."""
         return self.element_rule.value_unit
 
     @property
     def example(self) -> str:
-        """A good list."""
+        """A valid list."""
         return f"[{', '.join([self.element_rule.example] * max(self.length_min, 1))}]"
 
     def read(self, raw_value: object) -> tuple[Any, ...]:
-        """SI values of what the user wrote."""
+        """Return the SI values of a written list."""
         remedy = f"write e.g. {self.example}"
         if (
             not isinstance(raw_value, list | tuple)
@@ -565,7 +641,7 @@ class ListRule(Rule):
         return values
 
     def format(self, value: Any) -> Any:
-        """List that reads back as exactly `value`."""
+        """Return a list that reads back as exactly `value`."""
         return [self.element_rule.format(element) for element in value]
 
     def _value_schema(self) -> Json:
@@ -579,7 +655,7 @@ class ListRule(Rule):
 
 
 def read_element(rule: Rule, index: int, raw_value: object) -> Any:
-    """One value of a list, or what is wrong with it."""
+    """Read one value of a list; the error of an invalid value names its index."""
     try:
         return rule.read(raw_value)
     except QuantityError as error:
@@ -597,6 +673,7 @@ _TIME_RULE = NumericRule(
     at_least="-1e6 s",
     at_most="1e6 s",
 )
+"""Rule of a time in a table of the sweep's frequency error."""
 _FREQUENCY_ERROR_RULE = NumericRule(
     description="Frequency error",
     si_unit="Hz",
@@ -604,14 +681,16 @@ _FREQUENCY_ERROR_RULE = NumericRule(
     at_least="-1e15 Hz",
     at_most="1e15 Hz",
 )
+"""Rule of a frequency error in a table of the sweep's frequency error."""
 ERROR_TABLE_ROWS_MAX = 4096
+"""Maximum number of rows of a table of the sweep's frequency error."""
 
 
 class FrequencyErrorTableRule(Rule):
-    """A table of the sweep's frequency error over time; text inside, a row after the other."""
+    """Rule of a table of the sweep's frequency error over time, which is held as text."""
 
     def read(self, raw_value: object) -> str:
-        """Rows ``time error`` in SI, separated by commas; or none."""
+        """Return the rows ``time error`` [s, Hz] as text, separated by commas; or `NO_TABLE`."""
         if raw_value == NO_TABLE:
             return NO_TABLE
         remedy = "write e.g. [[0 us, 0 Hz], [10 us, 2 kHz], [20 us, 1 kHz]], or a CSV file's path"
@@ -638,7 +717,7 @@ class FrequencyErrorTableRule(Rule):
         return table_text
 
     def format(self, value: Any) -> Any:
-        """Rows that read back as exactly `value`."""
+        """Return rows that read back as exactly `value`."""
         if value == NO_TABLE:
             return value
         rules = (_TIME_RULE, _FREQUENCY_ERROR_RULE)
@@ -654,21 +733,23 @@ class FrequencyErrorTableRule(Rule):
 
 
 COSINE_SUM_WINDOWS = tuple(COSINE_SUM_COEFFICIENTS)
-"""Windows that need no look at scipy, which is slow to import; all others are put to it."""
+"""Windows that are computed without scipy, which is slow to import. All others are made by
+scipy."""
 SCIPY_WINDOWS = (
     "barthann", "bartlett", "bohman", "chebwin", "cosine", "dpss", "exponential", "gaussian",
     "general_gaussian", "general_hamming", "kaiser", "lanczos", "parzen", "taylor", "triang",
     "tukey",
 )  # fmt: skip
+"""Names of scipy's windows that are suggested to users."""
 _WINDOW_PATTERN = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?")
 _KAISER_REMEDY = "write e.g. 'kaiser(8.6)'"
 
 
 class WindowFunctionRule(Rule):
-    """Name of a window function, with its parameters: ``hamming``, ``kaiser(8.6)``."""
+    """Rule of a window function with its parameters, such as ``hamming`` or ``kaiser(8.6)``."""
 
     def read(self, raw_value: object) -> str:
-        """Window in one spelling."""
+        """Return the window's name and parameters in normal form."""
         match = (
             _WINDOW_PATTERN.fullmatch(raw_value.strip().lower())
             if isinstance(raw_value, str)
@@ -700,8 +781,11 @@ class WindowFunctionRule(Rule):
 
 @lru_cache(maxsize=256)
 def _check_scipy_window(name: str, parameters: tuple[float, ...]) -> None:
-    """Make the window with scipy; a QuantityError where it knows none or refuses parameters."""
-    from scipy.signal import get_window  # slow to import, and seldom needed
+    """Compute a window with scipy.
+
+    Raise `QuantityError` if it is unknown or its parameters are invalid.
+    """
+    from scipy.signal import get_window  # slow to import and rarely needed
 
     try:
         with warnings.catch_warnings():
@@ -710,7 +794,7 @@ def _check_scipy_window(name: str, parameters: tuple[float, ...]) -> None:
     except UserWarning:
         problem = "has parameters that make it unsuitable for spectral analysis"
         raise QuantityError(problem, "take others, for chebwin 45 or more") from None
-    except RuntimeWarning:  # samples beyond what a number can be
+    except RuntimeWarning:  # samples beyond the range of floats
         raise QuantityError("has parameters that make no usable window") from None
     except (ValueError, TypeError, ArithmeticError, MemoryError):
         if name in COSINE_SUM_WINDOWS + SCIPY_WINDOWS:

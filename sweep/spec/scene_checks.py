@@ -1,6 +1,7 @@
-"""Mistakes in a study of a scene beyond its single fields.
+"""Checks of a scene's spec beyond its single fields.
 
-Names and references, objects, files, the flight, and axes that would move the rays.
+They cover names and references, objects, files, the flight, and axes. A scene's rays are cast once,
+so that no axis may change where beamlets hit.
 """
 
 from __future__ import annotations
@@ -37,32 +38,39 @@ from sweep.spec.sections import default_value
 from sweep.units import QuantityError, read_unit
 
 SHOTS_PER_SCANNER_MAX = 10**9
-"""Shots of a scanner at most, as arrays of them are made."""
+"""Maximum number of shots of a scanner: arrays of this length are allocated."""
 
 RESERVED_SCANNER_NAMES = ("scene_map",)
-"""Names that a store has for other groups than its scanners."""
+"""Names of groups in a store that are not scanners."""
 _POSITIONED_SOLIDS = (scene_sections.Sphere, scene_sections.Box)
+"""Models of solids that need a position or a motion."""
 OBJECTS_LOCATION: Location = ("scene", "objects")
+"""Location of the section of objects in a spec."""
 _ATTITUDE_TRIAL_TIMES = 257
-"""Times at which an attitude is tried."""
+"""Number of times along a path at which its attitude is evaluated as a trial."""
 
 
 def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
-    """Return a mapping in a spec; empty where there is none."""
+    """Return the mapping at a path of a spec as written; empty if there is none."""
     raw_section = raw_value_at(raw_spec, ".".join(map(str, path)))
     return dict(raw_section) if isinstance(raw_section, Mapping) else {}
 
 
 def _read_sections(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
-    """Parts of a kind in a section that can be read, by name."""
+    """Return the sections that can be read as a model, by name."""
     sections = {name: read_or_none(annotation, value) for name, value in raw_sections.items()}
     return {name: section for name, section in sections.items() if section is not None}
 
 
 def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Finding]:
-    """Mistakes in scene, platform and scanners beyond their single fields.
+    """Return the mistakes in scene, platform and scanners beyond their single fields.
 
-    Sections that cannot be read are passed over; files are left alone without a base.
+    Parameters
+    ----------
+    raw_spec : Mapping
+        Spec as parsed from YAML. Sections that can't be read are skipped.
+    base : Path or None
+        Folder that paths in the spec are relative to; None skips all checks that read files.
     """
     objects = _read_sections(
         _raw_section(raw_spec, *OBJECTS_LOCATION), scene_sections.AnySceneObject
@@ -99,7 +107,7 @@ def _name_findings(
     is_taken: Callable[[str], bool],
     owner: str,
 ) -> Iterator[Finding]:
-    """Names of objects or scanners that can't be, and a section without any."""
+    """Yield a finding for each invalid or reserved name in a section, and for an empty section."""
     raw_sections = _raw_section(raw_spec, *section_location)
     for name in raw_sections:
         try:
@@ -117,7 +125,7 @@ def _name_findings(
 def _reference_findings(
     raw_spec: Mapping[str, Any], objects: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """Report references to objects that are missing or no ground, and a position of the origin."""
+    """Yield findings for references to missing grounds, and for a position of the origin."""
     raw_objects = _raw_section(raw_spec, *OBJECTS_LOCATION)
     if not raw_objects:
         return
@@ -146,7 +154,7 @@ def _ground_reference_findings(
     objects: Mapping[str, Any],
     extra_remedy: str,
 ) -> Iterator[Finding]:
-    """One reference to a ground."""
+    """Yield a finding if a name is that of no ground of the scene."""
     grounds = [key for key, scene_object in objects.items() if isinstance(scene_object, Ground)]
     remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
     remedy += extra_remedy
@@ -162,7 +170,7 @@ def _ground_reference_findings(
 def _file_findings(
     objects: Mapping[str, Any], platform: flight_sections.Platform | None, base: Path
 ) -> Iterator[Finding]:
-    """Files that are missing or can not be read."""
+    """Yield a finding for each file of objects and platform that is missing or can't be read."""
     located_sections: list[tuple[Location, Any]] = [
         ((*OBJECTS_LOCATION, name), section) for name, section in objects.items()
     ]
@@ -183,7 +191,7 @@ def _file_findings(
 
 
 def _construction_findings(construct: Callable[[], object], location: Location) -> list[Finding]:
-    """Refusal of the model to make a part."""
+    """Return a finding if calling `construct` raises an error, else nothing."""
     try:
         construct()
     except (ValueError, ArithmeticError) as error:
@@ -192,7 +200,7 @@ def _construction_findings(construct: Callable[[], object], location: Location) 
 
 
 def _object_findings(scene_object: Any, location: Location) -> Iterator[Finding]:
-    """Mistakes in an object at a location, its references and files apart."""
+    """Yield mistakes in an object, except those in its references and files."""
     if isinstance(scene_object, Ground):
         yield from _ground_findings(scene_object, location)
     if isinstance(scene_object, RasterGround) and scene_object.height_unit is not None:
@@ -228,14 +236,14 @@ def _object_findings(scene_object: Any, location: Location) -> Iterator[Finding]
 def _diameter_findings(
     section: scene_sections.Boulders | Craters, location: Location
 ) -> Iterator[Finding]:
-    """Diameters without a range."""
+    """Yield a finding if the largest diameter is not above the smallest."""
     if not section.smallest < section.largest:
         problem = f"must exceed the smallest diameter, {section.smallest:g} m"
         yield Finding((*location, "largest"), problem, "", f"{section.largest:g} m")
 
 
 def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
-    """Report a grid that can not be made, or that can not hold its craters."""
+    """Yield a finding for an invalid grid, or for craters smaller than three grid steps."""
     field_name = "middle" if isinstance(ground, JacksboroGround) else "spacing"
     construction_findings = _construction_findings(ground.check_grid, (*location, field_name))
     yield from construction_findings
@@ -255,7 +263,7 @@ def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
 def _solid_findings(
     scene_object: scene_sections.SolidObject, location: Location
 ) -> Iterator[Finding]:
-    """Report a solid that is placed twice or nowhere, or whose lengths have no unit."""
+    """Yield mistakes in a solid: two positions or none, an invalid rotation, an unknown unit."""
     position_location = (*location, "position")
     if scene_object.motion is not None and scene_object.position is not None:
         problem = "stands beside a motion, whose path places the object"
@@ -274,7 +282,7 @@ def _solid_findings(
             yield Finding((*location, "unit"), error.rule, error.suggestion, scene_object.unit)
 
 
-# The flight: paths, attitudes, scan patterns, and targets that move
+# The flight: paths, attitudes, scan patterns and moving targets
 
 
 def _flight_findings(
@@ -283,12 +291,12 @@ def _flight_findings(
     objects: Mapping[str, Any],
     base: Path | None,
 ) -> list[Finding]:
-    """Mistakes in platform, scanners and moving objects, of those that can be read."""
+    """Return the mistakes in platform, scanners and moving objects that can be read."""
     span: flight_sections.TimeSpan | None = None
     findings: list[Finding] = []
     files = SpecFiles(base or Path())
     if platform is not None and (base is not None or not _reads_tables(platform)):
-        with contextlib.suppress(SceneError):  # which is found where the path is made
+        with contextlib.suppress(SceneError):  # _motion_findings reports this error
             files = replace(files, time_origin=platform.read_time_origin(files))
         findings += _motion_findings(platform, ("platform",), files, None)
         if not findings:
@@ -304,7 +312,7 @@ def _flight_findings(
 
 
 def _reads_tables(motion: flight_sections.RigidMotion) -> bool:
-    """Return true if a path or an attitude is read from a table."""
+    """Return True if the path or the attitude is read from a table."""
     return motion.path.kind == "waypoints" or motion.attitude.kind == "track"
 
 
@@ -314,7 +322,10 @@ def _motion_findings(
     files: SpecFiles,
     span: flight_sections.TimeSpan | None,
 ) -> Iterator[Finding]:
-    """Report a path or attitude that can not be flown, or a path shorter than the flight."""
+    """Yield a finding for an invalid path or attitude, or for a path shorter than the flight.
+
+    `span` is the start and stop of the flight [s]; None if `motion` is that of the platform.
+    """
     field_name = "path"
     try:
         path = motion.path.build_path(files, span)
@@ -343,7 +354,7 @@ def _motion_findings(
 def _scanner_findings(
     scanner: Any, location: Location, span: flight_sections.TimeSpan | None
 ) -> Iterator[Finding]:
-    """Report a scan pattern that can not be made, or makes no whole cycle or too many shots."""
+    """Yield a finding for an invalid scan pattern, less than a full cycle, or too many shots."""
     construction_findings = _construction_findings(scanner.build_pattern, location)
     yield from construction_findings
     if construction_findings or span is None:
@@ -366,11 +377,11 @@ def _scanner_findings(
         yield Finding((*location, "rate"), problem, remedy)
 
 
-# Axes: what may vary while the light falls where it fell
+# Axes: parameters that may vary without moving a beamlet
 
 
 def stored_names() -> frozenset[str]:
-    """Names of a store's arrays and dimensions."""
+    """Return the names of a store's arrays and dimensions."""
     output_tables = (
         SHOT_VARIABLES,
         CYCLE_VARIABLES,
@@ -391,6 +402,7 @@ _BEAM_PATHS = (
     beam.OSCILLATOR_WAIST_PATH,
     beam.COUPLING_PATH,
 )
+"""Parameters that determine the width of the beam."""
 _ARRANGEMENT_PATHS = (
     PATTERN_PATH,
     "footprint.phases",
@@ -399,21 +411,34 @@ _ARRANGEMENT_PATHS = (
     beam.WAIST_PATH,
     beam.FOCUS_PATH,
 )
-"""Parameters that say where beamlets go."""
+"""Parameters that determine the positions of beamlets."""
 _MOVES_BEAMLETS_REFUSAL = (
     "moves the beamlets, and a study casts its rays once",
     _OTHER_STUDY_REMEDY,
 )
+"""Problem and remedy of an axis over a parameter that moves beamlets."""
 _AXIS_REFUSALS = {
-    "footprint.speckle": ("", ""),  # which moves no beamlet
+    "footprint.speckle": ("", ""),  # moves no beamlet, unlike other fields of footprint
     "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
     **dict.fromkeys((*_BEAM_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
     "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY),
 }
+"""Problem and remedy of axes by prefix of the parameter's path; the first match applies."""
 
 
 def axis_refusal(path: str) -> tuple[str, str]:
-    """Why an axis can't set a parameter, and a remedy; empty where it can."""
+    """Return why no axis may set a parameter, and a remedy; empty texts if an axis may.
+
+    Parameters
+    ----------
+    path : str
+        Dotted path of the parameter.
+
+    Returns
+    -------
+    (str, str)
+        Problem, as the end of a sentence about the path, and remedy.
+    """
     return next(
         (
             refusal
@@ -427,7 +452,19 @@ def axis_refusal(path: str) -> tuple[str, str]:
 def variation_findings(
     parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: Location
 ) -> list[Finding]:
-    """Mistakes in one of the parameters taking several values, which stand at a location."""
+    """Return the mistakes in letting one parameter of a scene take several values.
+
+    Parameters
+    ----------
+    parameters : Mapping
+        SI values of all parameters by dotted path.
+    path : str
+        Dotted path of the parameter that varies.
+    values : Iterable
+        SI values that it takes.
+    location : Location
+        Location of the values in the spec, for findings.
+    """
     problem, remedy = axis_refusal(path)
     if problem:
         return [Finding(location, problem, remedy)]
@@ -448,7 +485,7 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Axes of what can not vary on one geometry."""
+    """Yield a finding for each axis that is impossible with a single set of rays."""
     parameters = {path: default_value(path) for path in _ARRANGEMENT_PATHS} | dict(grid.values)
     if parameters[PATTERN_PATH] in ("line", "square"):
         problem = "stands for a plane alone, and the ground of a scene is none"

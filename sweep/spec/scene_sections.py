@@ -1,4 +1,7 @@
-"""A scene: meshes and solids, objects on its ground, and the other parts of a study."""
+"""Sections of a spec for scenes: objects, draws, navigation, error floor, interface and storage.
+
+`build_scene` turns the section ``scene`` into bodies at which rays can be cast.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +45,14 @@ if TYPE_CHECKING:
 Vector = tuple[float, ...]
 
 WORLD_ORIGIN = "world"
-"""The origin of a scene whose coordinates are as they are."""
+"""Name of the origin of a scene that keeps the coordinates of its objects."""
 
 
 class SolidObject(Material, ABC):
-    """An object of its own, at rest or moving.
+    """Base of solid objects, at rest or in motion.
 
-    One that moves is placed by its path; its rotation is that in the moving body's frame.
+    The path of a moving object determines its position; its rotation is relative to the moving
+    body's frame.
     """
 
     position: Vector | None = declare.position(
@@ -58,12 +62,18 @@ class SolidObject(Material, ABC):
     motion: RigidMotion | None = None
 
     def build_facets(self, files: SpecFiles) -> Facets:
-        """Its facets, turned, about its own zero; a `SceneError` for an unfit file."""
+        """Return the rotated facets relative to the object's origin [m].
+
+        Raises
+        ------
+        SceneError
+            If the object's file is unsuitable.
+        """
         return self.unrotated_facets(files).transform(rotation=self.rotation.to_quaternion())
 
     @abstractmethod
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Its facets before they are turned."""
+        """Return the facets before rotation, relative to the object's origin [m]."""
 
 
 class MeshObject(SolidObject):
@@ -78,7 +88,7 @@ class MeshObject(SolidObject):
     scale: float = declare.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Its facets before they are turned."""
+        """Return the facets of the file before rotation [m]."""
         from sweep.scenes.meshes import read_mesh
 
         return read_mesh(files.resolve(self.file), unit=self.unit, up=self.up, scale=self.scale)
@@ -94,7 +104,7 @@ class Sphere(SolidObject):
     )
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Its facets about its centre."""
+        """Return the facets of the sphere, relative to its centre [m]."""
         from sweep.scenes.meshes import sphere_facets
 
         return sphere_facets(radius=self.radius, subdivisions=self.subdivisions)
@@ -107,7 +117,7 @@ class Box(SolidObject):
     size: Vector = declare.vector("Length along x, y and z", "m", "2 m")
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
-        """Its facets about its middle."""
+        """Return the facets of the box, relative to its centre [m]."""
         from sweep.scenes.meshes import box_facets
 
         return box_facets(size=self.size)
@@ -120,7 +130,7 @@ class MartianRocks(SpecSection):
     abundance: float = declare.number("Fraction of the ground under rocks", "5 %", "1e-9", "0.9")
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Size-frequency law."""
+        """Return the size-frequency law of Golombek and Rapp (1997)."""
         from sweep.scenes.scattered_objects import MartianRockLaw
 
         return MartianRockLaw(self.abundance)
@@ -136,7 +146,7 @@ class PowerLaw(SpecSection):
     exponent: float = declare.number("Exponent", "2.5", "1e-3", "20")
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
-        """Size-frequency law."""
+        """Return the power law of the number of boulders per area over their diameter."""
         from sweep.scenes.scattered_objects import LeastPowerLaw
 
         return LeastPowerLaw(((self.density, self.exponent),))
@@ -164,9 +174,17 @@ class Boulders(Material):
     seed: int = declare.seed()
 
     def build_facets(self, ground: Terrain) -> Facets:
-        """Their facets on a ground in the scene's frame.
+        """Draw boulders on a ground and return their facets in the scene's frame.
 
-        A ValueError for too many of them, or none of the ground within the square.
+        Parameters
+        ----------
+        ground : Terrain
+            Ground in the scene's frame.
+
+        Raises
+        ------
+        ValueError
+            If there are too many boulders, or the square contains no ground.
         """
         from sweep.scenes.scattered_objects import draw_boulders
         from sweep.scenes.terrain import square_bounds
@@ -212,9 +230,22 @@ class Trees(SpecSection):
     seed: int = declare.seed()
 
     def build_facets(self, ground: Terrain) -> Facets:
-        """Leaves (surface 0) and trunks (1) on a ground in the scene's frame.
+        """Draw trees on a ground and return their facets in the scene's frame.
 
-        A ValueError if there is no room for them, or one would stand off the ground.
+        Parameters
+        ----------
+        ground : Terrain
+            Ground in the scene's frame.
+
+        Returns
+        -------
+        Facets
+            Facets of the leaves (surface 0) and of the trunks (surface 1).
+
+        Raises
+        ------
+        ValueError
+            If the trees do not fit into the clump, or a tree would stand off the ground.
         """
         from sweep.scenes.scattered_objects import MeanTree, plant_clump
 
@@ -246,14 +277,14 @@ AnySceneObject = Annotated[
 
 
 def has_relief(scene_object: SpecSection) -> bool:
-    """Return true for ground that is no plane, and for what stands on it in numbers."""
+    """Return True for ground that is not a plane, and for boulders and trees."""
     if isinstance(scene_object, PlaneGround):
         return scene_object.relief is not None or scene_object.craters is not None
     return isinstance(scene_object, Ground | Boulders | Trees)
 
 
 def named_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Material]]:
-    """Materials of an object with the names of their surfaces, in the order that faces count."""
+    """Return name and material of each surface of an object, in the order of surface numbers."""
     if isinstance(scene_object, Trees):
         return [(f"{name}.leaf", scene_object.leaf), (f"{name}.trunk", scene_object.trunk)]
     assert isinstance(scene_object, Material)
@@ -283,12 +314,12 @@ class SceneDraws(SpecSection):
 
     @property
     def has_draws(self) -> bool:
-        """True, as a point cloud has one draw at the least."""
+        """True: a point cloud always has at least one draw."""
         return True
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if a detector and an estimator look at whole spectra."""
+        """True if draws are whole spectra that a detector and an estimator examine."""
         return self.method == SPECTRA_METHOD
 
 
@@ -399,7 +430,7 @@ class Interface(SpecSection):
 
     @model_validator(mode="after")
     def _check_limits_and_period(self) -> Self:
-        """Refuse limits that leave nothing between them, and numbers of shots without a period."""
+        """Check that lower limits are below upper limits, and that averaging has a rate."""
         for name in ("range", "radial_velocity"):
             low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
             if low is not None and high is not None and low >= high:
@@ -420,28 +451,32 @@ class SceneStorage(SpecSection):
     block_draws: int = declare.count("Draws that one block holds at most", "64", default=64)
 
 
-# The scene, built: its objects as bodies that rays can be cast at
+# The built scene: objects as bodies at which rays can be cast
 
 
 class BuiltScene(NamedTuple):
-    """Bodies that rays are cast at, in the scene's frame."""
+    """Scene as bodies at which rays can be cast, in the scene's frame."""
 
     caster: RayCaster
-    """The bodies: all that rests is the first, if there is any, and each that moves another."""
+    """Ray caster of the bodies: all objects at rest form the first body, if there are any.
+
+    Each moving
+    object is a body of its own.
+    """
     surfaces: tuple[SurfaceMaterial, ...]
-    """Surfaces by their numbers."""
+    """Materials of the surfaces by surface number."""
     body_flights: tuple[MovingBody | None, ...]
-    """Motion of each of the caster's bodies; None for one at rest."""
+    """Motion of each body of the caster; None for the body at rest."""
     mesh_reports: tuple[str, ...]
-    """Report of what loading found and mended, a line an object."""
+    """One line per object: repairs and remaining defects of its mesh."""
     origin: np.ndarray
-    """(3,): what was subtracted from the objects' own coordinates [m]."""
+    """Origin (3,) that was subtracted from the objects' own coordinates [m]."""
     warnings: tuple[str, ...] = ()
-    """What is doubtful about the scene's files."""
+    """Doubts about the scene's files, as sentences."""
 
 
 def scene_surfaces(scene: Scene) -> tuple[SurfaceMaterial, ...]:
-    """Surfaces of a scene in the order of their numbers."""
+    """Return the materials of a scene's surfaces, in the order of their numbers."""
     from sweep.model.geometry.mesh import SurfaceMaterial
 
     return tuple(
@@ -452,10 +487,22 @@ def scene_surfaces(scene: Scene) -> tuple[SurfaceMaterial, ...]:
 
 
 def scene_projection(scene: Scene, files: SpecFiles) -> str:
-    """WKT of the map projection of a scene's coordinates [m], or ''.
+    """Return the map projection of a scene's coordinates as WKT.
 
-    It is empty where rasters state none, or several. The scene's origin has to be added to
-    coordinates in a store.
+    Coordinates in a store are relative to the scene's origin: add the origin to obtain coordinates
+    of the map [m].
+
+    Parameters
+    ----------
+    scene : Scene
+        Section ``scene`` of the spec.
+    files : SpecFiles
+        Files that the spec names.
+
+    Returns
+    -------
+    str
+        WKT; empty if the scene's rasters state no projection, or different ones.
     """
     from sweep.scenes.map_projection import metric_projection_wkt
     from sweep.scenes.rasters import raster_digest
@@ -475,9 +522,26 @@ def scene_projection(scene: Scene, files: SpecFiles) -> str:
 
 
 def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
-    """Build a scene; a `SceneError` for an unfit file or object.
+    """Build the bodies of a scene.
 
-    An object that stays in place does so for the `span` of the flight [s].
+    Parameters
+    ----------
+    scene : Scene
+        Section ``scene`` of the spec.
+    files : SpecFiles
+        Files that the spec names.
+    span : (float, float)
+        Start and stop of the flight [s], for moving objects without a duration.
+
+    Returns
+    -------
+    BuiltScene
+        Bodies, surfaces, motions and reports.
+
+    Raises
+    ------
+    SceneError
+        If a file or an object is unsuitable.
     """
     from sweep.model.geometry.mesh import merge_meshes
     from sweep.model.geometry.ray_casting import RayCaster
@@ -502,7 +566,7 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
         del mesh
         reports.append(f"{name}: {report.summary()}")
         first_surface += len(named_materials(name, scene_object))
-    del grounds  # before the trees are built, which take the most memory
+    del grounds  # free the grids before the ray caster builds its trees, which need the most memory
     merged_meshes = [merge_meshes(resting_meshes)] if resting_meshes else []
     resting_meshes.clear()
     return BuiltScene(
@@ -516,20 +580,20 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
 
 
 def _build_mesh(facets: Facets, first_surface: int) -> tuple[Mesh, MeshReport]:
-    """Mesh of facets whose surfaces are numbered from `first`, and its report."""
+    """Return the mesh of facets and its report; surface numbers start at `first_surface`."""
     surface = (facets.surface + first_surface).astype(np.int16)
     return replace(facets, surface=surface).to_mesh()
 
 
 def _object_error(name: str, error: Exception) -> SceneError:
-    """Mistakes in an object, as users are told it."""
+    """Return the error that names an object and why it can't be built."""
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 
 def _build_grounds(
     scene: Scene, files: SpecFiles
 ) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
-    """Return the scene's origin, its grounds in the scene's frame, and what is doubtful of them."""
+    """Return the scene's origin (3,) [m], grounds in the scene's frame by name, and warnings."""
     from sweep.scenes.map_frames import require_one_map
     from sweep.scenes.tiles import join_tiles
 
@@ -575,7 +639,7 @@ def _build_grounds(
             )
     grounds = {}
     for name, terrain in terrains.items():
-        # One without coordinates of its own stands where its position says, beside the origin.
+        # A ground without coordinates has its position in the scene's frame already.
         is_placed_in_scene = isinstance(scene.objects[name], PlacedGround) and name != scene.origin
         shift = 0.0 if is_placed_in_scene else origin
         grounds[name] = replace(terrain, origin=terrain.origin - shift)
@@ -589,7 +653,7 @@ def _build_object_facets(
     origin: np.ndarray,
     files: SpecFiles,
 ) -> Facets:
-    """Facets of an object in the scene's frame; of one that moves, in its own."""
+    """Return an object's facets in the scene's frame, or in its own frame if the object moves."""
     if isinstance(scene_object, Ground):
         return grounds[name].to_facets()
     if isinstance(scene_object, Boulders | Trees):

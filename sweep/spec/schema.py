@@ -1,4 +1,4 @@
-"""JSON Schema of what a user writes in a spec, for editors and for `sweep schema`."""
+"""JSON Schema of spec files as users write them, for editors and for `sweep schema`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.spec.yaml_document import library_instruments
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""Dialect of the schema."""
 
 _INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
+"""Names of the models of an instrument's sections."""
 
 
 def json_schema() -> Json:
-    """JSON Schema (2020-12) of a spec file, of a flat target or of a scene.
+    """Return the JSON Schema (2020-12) of spec files, for a flat target or a scene.
 
-    Values of parameters are described by field. Fields that an axis or an instrument file may
-    supply are not required by it; `sweep.load` does require them.
+    Values of parameters are described field by field. Fields that an axis or an instrument's file
+    may supply are not required by the schema, although `sweep.load` requires them.
     """
     _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
     definitions: Json = schema["$defs"]
@@ -65,7 +67,7 @@ def json_schema() -> Json:
 def _complete_study_schema(
     study_schema: Json, rules: Mapping[str, Rule], required: tuple[str, ...]
 ) -> None:
-    """Describe a study's instrument and axes, and name what it can't do without."""
+    """Add instrument, axes and required sections to the schema of a study."""
     study_schema["properties"]["instrument"] = {
         "description": "The instrument: its name in the library (sweep instruments), the path of "
         "its file, one of these with fields set anew, or all of it",
@@ -82,7 +84,7 @@ def _complete_study_schema(
 
 
 def _format_defaults(properties: Json, model: type[BaseModel]) -> None:
-    """Defaults as a user would write them, in place of SI values; of single fields only."""
+    """Replace the defaults of scalar fields in SI units by values as users write them."""
     for name, field in fields_by_name(model).items():
         field_schema, rule = properties[name], rule_of_field(field)
         if rule is not None and field_schema.get("default") not in (None, "", [], {}):
@@ -92,12 +94,12 @@ def _format_defaults(properties: Json, model: type[BaseModel]) -> None:
 
 
 def _definition_reference(path: str, suffix: str) -> Json:
-    """Return a reference to what a field may hold."""
+    """Return a reference to the definition of a field's value or values."""
     return {"$ref": f"#/$defs/{path}.{suffix}"}
 
 
 def _object_schema(properties: Json, *required: str, **keywords: Any) -> Json:
-    """Return the schema of a mapping with properties of its own and no other ones."""
+    """Return the schema of a mapping with the given properties only."""
     required_keyword = {"required": list(required)} if required else {}
     return (
         {"type": "object", "properties": properties, "additionalProperties": False}
@@ -107,6 +109,7 @@ def _object_schema(properties: Json, *required: str, **keywords: Any) -> Json:
 
 
 def _list_schema(items: Json, length_min: int = 1, **keywords: Any) -> Json:
+    """Return the schema of a list."""
     return {"type": "array", "items": items, "minItems": length_min} | keywords
 
 
@@ -121,7 +124,7 @@ def _values_schema(path: str, rule: Rule) -> Json:
 
 
 def _generator_schemas(value_schema: Json) -> Iterator[Json]:
-    """Yield the schemas of the three generators."""
+    """Yield the schemas of the generators linear, log and step."""
     number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for form in ("linear", "log"):
         bounds_schema = _list_schema(value_schema, 2, maxItems=2)
@@ -131,7 +134,7 @@ def _generator_schemas(value_schema: Json) -> Iterator[Json]:
 
 
 def _axes_schema(rules: Mapping[str, Rule]) -> Json:
-    """Axes by path, each with its own field's values, and zipped axes by any other name."""
+    """Return the schema of ``axes``: plain axes by path, zipped axes by other names."""
     value_schemas = {
         path: {
             "anyOf": [_definition_reference(path, "value"), _definition_reference(path, "values")]

@@ -1,6 +1,6 @@
-"""Sections of a spec: the instrument, target, air and effects; accuracy, draws and execution.
+"""Sections of a spec that grids and scenes share, such as the instrument, and those of grids.
 
-Values are SI inside; what users write carries units.
+Values are in SI units after reading; users write values with units.
 """
 
 from __future__ import annotations
@@ -31,10 +31,15 @@ from sweep.spec.rules import (
 )
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
+"""Detection architectures of the receiver."""
 _POWER_BOUNDS = ("1e-18 W", "1e9 W")
+"""Lower and upper bound of an optical power."""
 _FREQUENCY_BOUNDS = ("1 mHz", "1e15 Hz")
+"""Lower and upper bound of a frequency or bandwidth."""
 _RESISTANCE_BOUNDS = ("1 uohm", "1e12 ohm")
+"""Lower and upper bound of a resistance."""
 _WAIST_EXAMPLE_AND_BOUNDS = ("5 mm", "100 nm", "1 km")
+"""Example, lower and upper bound of the radius of a beam."""
 
 
 @add_effect_parameters("instrument.laser")
@@ -232,7 +237,7 @@ class Estimator(SpecSection):
 
 
 def _search_limit_field(description: str, *rule_arguments: str) -> Any:
-    """Field of an end of the search band."""
+    """Declare a field for one limit of the search band."""
     full_description = (
         f"{description}, as a segment starts; a search band has all four ends, and without them "
         "the "
@@ -257,7 +262,7 @@ class SearchBand(SpecSection):
 
 
 def _design_pfa_field(noise_scope: str) -> Any:
-    """Field of a probability of a false alarm that the threshold is set by."""
+    """Declare a field for a false-alarm probability from which the threshold follows."""
     description = (
         f"Instead of tnr: probability that noise alone raises a false alarm in {noise_scope}"
     )
@@ -326,7 +331,7 @@ class Processing(SpecSection):
 
     @model_validator(mode="after")
     def _check_single_threshold(self) -> Self:
-        """Refuse a threshold that is not set, or that is set in several ways."""
+        """Check that exactly one field sets the threshold."""
         threshold_fields = [
             field_name.removeprefix(PROCESSING_PREFIX) for field_name in THRESHOLD_PATHS
         ]
@@ -384,11 +389,11 @@ class Instrument(SpecSection):
     looks: LooksOfShot = LooksOfShot()
 
 
-# Target, footprint, air and effects; accuracy, draws, storage and execution of a study
+# Target, footprint, atmosphere and effects; accuracy, draws, storage and execution of a study
 
 
 def sunlight_field(illuminated: str) -> Any:
-    """Field of the sunlight on something."""
+    """Declare a field for the spectral irradiance of sunlight on a target or scene [W/m^3]."""
     description = f"Spectral irradiance of sunlight on the {illuminated}"
     return declare.quantity(
         description, "W/m^3", "0.5 W/m^2/nm", "0 W/m^3", "1e18 W/m^3", default=0.0
@@ -396,7 +401,7 @@ def sunlight_field(illuminated: str) -> Any:
 
 
 REFLECTANCE_FIELD = declare.number("Fraction of light scattered back", "0.1", "0", "1")
-"""Field of a reflectance."""
+"""Declaration of a field for a reflectance, 0..1."""
 
 
 @add_effect_parameters("target")
@@ -446,7 +451,7 @@ class Effects(SpecSection):
 
 
 def _tolerance_share_field(description: str) -> Any:
-    """Part of the tolerance that can be set by hand."""
+    """Declare a field for a part of the tolerance that is automatic or set by the user."""
     description += "; auto: as accuracy.tolerance needs"
     return declare.number(description, "1e-6", "0", "1", default=AUTOMATIC, keyword="auto")
 
@@ -507,12 +512,12 @@ class Draws(SpecSection):
 
     @property
     def has_draws(self) -> bool:
-        """True if anything is drawn."""
+        """True if the study draws random realisations."""
         return self.number > 0 or self.is_adaptive
 
     @property
     def draws_whole_spectra(self) -> bool:
-        """True if a detector and an estimator look at whole spectra."""
+        """True if draws are whole spectra that a detector and an estimator examine."""
         return self.method == SPECTRA_METHOD
 
     @property
@@ -547,7 +552,7 @@ class Execution(SpecSection):
     )
 
 
-# Fields by dotted path: what an axis may vary
+# Fields by dotted path: the parameters that an axis may vary
 
 MODEL_BY_SECTION: dict[str, type[BaseModel]] = {
     "instrument": Instrument,
@@ -556,6 +561,7 @@ MODEL_BY_SECTION: dict[str, type[BaseModel]] = {
     "footprint": Footprint,
     "accuracy": Accuracy,
 }
+"""Models of the sections whose fields an axis may vary, by the section's name."""
 
 
 AXES_REMEDY = (
@@ -570,7 +576,7 @@ SECTIONS_NOT_ON_AXES = (
 
 @cache
 def parameter_rules() -> MappingProxyType[str, Rule]:
-    """Rule of every parameter that an axis may vary, by dotted path."""
+    """Return the rule of every parameter that an axis may vary, by dotted path."""
     rules: dict[str, Rule] = {}
     for section, model in MODEL_BY_SECTION.items():
         rules |= rules_by_path(model, section)
@@ -578,7 +584,7 @@ def parameter_rules() -> MappingProxyType[str, Rule]:
 
 
 def default_value(path: str) -> Any:
-    """Default of a parameter, SI; None where it has none."""
+    """Return the default of a parameter in SI units; None if the parameter is required."""
     section, *names = path.split(".")
     model: Any = MODEL_BY_SECTION[section]
     for name in names[:-1]:
@@ -588,13 +594,29 @@ def default_value(path: str) -> Any:
 
 
 def short_name(path: str) -> str:
-    """Last part of a parameter's path; of what a part is, the part's own name."""
+    """Return the last part of a parameter's path.
+
+    The part before it if the last part is ``kind``.
+    """
     *parent_names, last_name = path.split(".")
     return parent_names[-1] if last_name == "kind" and parent_names else last_name
 
 
 def suggest_parameter(path: str, known: Iterable[str] | None = None) -> str:
-    """Suggestion for a path that names no parameter; of those known, all by default."""
+    """Suggest the parameter that a wrong path probably means.
+
+    Parameters
+    ----------
+    path : str
+        Path that names no parameter.
+    known : Iterable of str, optional
+        Paths to choose from; all parameters by default.
+
+    Returns
+    -------
+    str
+        Suggestion, or advice on the sections that axes take.
+    """
     paths = list(parameter_rules() if known is None else known)
     tail = short_name(path)
     same_tail = [known for known in paths if short_name(known) == tail]

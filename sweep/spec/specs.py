@@ -1,4 +1,7 @@
-"""A study of a flat target over a grid, or of a flight over a scene; and what both have."""
+"""Specs of studies: `GridSpec` for a grid over a flat target, `SceneSpec` for a flight.
+
+`load` reads a spec from a YAML file and reports every mistake in it at once.
+"""
 
 from __future__ import annotations
 
@@ -102,24 +105,26 @@ if TYPE_CHECKING:
 
 
 GRID_POINTS_MAX = 10**15
+"""Maximum number of points of a grid."""
 DRIFT_BINS_MIN = 2.0
-"""Drift of a speckled line within a record from which its stated errors are too small [bins]."""
+"""Smallest drift of a speckled line within a record that raises a warning [bins]. From this drift
+on the stated standard errors are too small."""
 
 _DRIFT_SAMPLES = 1000
-"""Times of a flight at which its acceleration is looked at."""
+"""Number of times of a flight at which its acceleration is evaluated."""
 
 FILES_KEY = "files"
-"""Section of a stored study: the digest of each file by its path."""
+"""Key of a stored spec that holds the digest of each file by the file's path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections of a study of which no default is written out."""
+"""Sections of a spec whose defaults are not written out."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
-"""Rule of axes, which `read_axes` has read before pydantic sees them."""
+"""Rule of the field `axes`: `read_axes` has read the axes before pydantic validates the spec."""
 
 
 class BaseSpec(SpecSection):
-    """A study as its user declared it, every value read and checked.
+    """Base of specs: a study as the user declared it, with every value read and checked.
 
-    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    `load` makes a spec from a file, `from_mapping` from plain data. Values are in SI units.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
@@ -136,25 +141,35 @@ class BaseSpec(SpecSection):
     axes: tuple[Axis, ...] = declare.field_of_rule(_AXES_RULE, ())
 
     _yaml_mapping: dict[str, Any] = PrivateAttr(default_factory=dict)
+    """The spec with all defaults, as a user would write it."""
     _base: Path = PrivateAttr(default=Path())
+    """Folder that paths in the spec are relative to."""
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
+    """Digest of each file by its path as written."""
     _instrument_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
+    """Fields of the error floor that come from the instrument; None if the spec states all of
+    them."""
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
-        """Spec from plain data, written as in a file.
+        """Make a spec from plain data, written as in a YAML file.
 
         Parameters
         ----------
-        mapping : mapping
-            Content of a spec file; it is not changed.
-        base : path
-            Folder that the files which it names are relative to.
+        mapping : Mapping
+            Content of a spec file; not changed.
+        base : Path or str
+            Folder that paths in `mapping` are relative to.
+
+        Returns
+        -------
+        GridSpec or SceneSpec
+            Spec of the class on which this method is called.
 
         Raises
         ------
         SpecError
-            With every mistake in it.
+            With every mistake in the data.
         """
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", format_raw_value(mapping))])
@@ -163,9 +178,22 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def from_stored(cls, json_text: str, base: Path | str | None = None) -> Self:
-        """Spec from the JSON that `to_json` gave, the same again but for its execution.
+        """Make a spec from the JSON text of `to_json`.
 
-        Files, relative to `base`, are not looked at before they are needed.
+        The spec equals the original, except for ``execution``, which is not stored. Files are not
+        read before they are needed.
+
+        Parameters
+        ----------
+        json_text : str
+            Text from `to_json`.
+        base : Path or str, optional
+            Folder that paths in the spec are relative to; the current folder by default.
+
+        Raises
+        ------
+        SpecError
+            If the text is no valid spec.
         """
         raw_spec = to_plain_data(parse_json(json_text))
         if not isinstance(raw_spec, dict):
@@ -177,10 +205,20 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Spec from a document, which is changed.
+        """Make a spec from a document.
 
-        Without a base it is a store's own document, whose files are left alone, and in which a
-        field and its axis may differ.
+        Parameters
+        ----------
+        document : Document
+            Spec as read from YAML or plain data; changed by this method.
+        base : Path or None
+            Folder that paths in the spec are relative to. None for the document of a store: its
+            files are not read, and the value of a field may differ from those of its axis.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in the document.
         """
         user_values = {} if base is None else _user_values_on_axes(document.content)
         takes_floor = "error_floor" in cls.model_fields
@@ -206,14 +244,15 @@ class BaseSpec(SpecSection):
         findings += [*_size_findings(axes), *_segment_findings(grid), *_strongest_findings(grid)]
         findings += cls.extra_findings(raw_spec, grid, base, all_axes_read)
         findings += _contradiction_findings(user_values, axes)
-        # What is wrong with an axis or an instrument's file is told there, and there alone.
+        # Mistakes in an axis or in an instrument's file have findings of their own: drop findings
+        # for the fields that were filled in from these.
         findings = [
             finding
             for finding in findings
             if dotted_path(finding.location) not in filled_paths
             and (is_instrument_resolved or finding.location[0] != "instrument")
         ]
-        if lacks_instrument and filled_paths:  # an axis has filled in some of it
+        if lacks_instrument and filled_paths:  # an axis has filled in part of the instrument
             findings = [finding for finding in findings if finding.location[0] != "instrument"]
             findings.insert(0, Finding(("instrument",), "is missing", missing_instrument_remedy()))
         findings = document.findings + findings
@@ -225,21 +264,34 @@ class BaseSpec(SpecSection):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return true: an axis may set every parameter of this kind of study."""
+        """Return True if an axis may set the parameter at a dotted path; always for grids."""
         return True
 
     @classmethod
     def extra_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Mistakes in a spec as written beyond its single fields and its grid.
+        """Return mistakes beyond single fields and the grid that depend on the class of spec.
 
-        Files are left alone without a base. Not all axes may have been read.
+        Parameters
+        ----------
+        raw_spec : Mapping
+            Spec as parsed from YAML.
+        grid : GridValues
+            Parameter values over the grid.
+        base : Path or None
+            Folder that paths in the spec are relative to; None skips checks that read files.
+        all_axes_read : bool
+            False if some axes can't be read, and are missing in `grid`.
         """
         return []
 
     def parameters(self) -> dict[str, float | int | str]:
-        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        """Return the SI values of all parameters by dotted path.
+
+        A parameter on an axis has the value of its field, or its first value on the axis without a
+        field.
+        """
         return {
             path: value
             for section in sections.MODEL_BY_SECTION
@@ -248,21 +300,26 @@ class BaseSpec(SpecSection):
         }
 
     def effect_modes(self) -> dict[str, str]:
-        """Mode of each effect by its name: `auto`, `on` or `off`."""
+        """Return the mode of each effect, `auto`, `on` or `off`, by the effect's name."""
         return values_by_path(self.effects)
 
     def parameters_with(self, overrides: Mapping[str, object]) -> dict[str, float | int | str]:
-        """Parameters with some set anew, written as in a spec.
+        """Return the parameters with new values for some of them.
 
         Parameters
         ----------
-        overrides : mapping
-            Values by dotted path or its last part: ``{"range": "2 km"}``.
+        overrides : Mapping
+            Values as written in a spec, by dotted path or its last part: ``{"range": "2 km"}``.
+
+        Returns
+        -------
+        dict
+            SI values of all parameters by dotted path.
 
         Raises
         ------
         SpecError
-            With every mistake in it, the combination's included.
+            With every mistake in the values and in their combination.
         """
         parameters = self.parameters()
         findings = []
@@ -275,7 +332,7 @@ class BaseSpec(SpecSection):
                 findings.append(Finding((name,), "is no parameter", suggestion))
                 continue
             try:
-                if path in THRESHOLD_PATHS:  # one takes another's place
+                if path in THRESHOLD_PATHS:  # a spec has one field for the threshold
                     parameters = {
                         other_path: other_value
                         for other_path, other_value in parameters.items()
@@ -293,11 +350,17 @@ class BaseSpec(SpecSection):
         return parameters
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
-        """Mistakes in giving a parameter a value in this kind of study: none."""
+        """Return mistakes in giving a parameter a value, for this class of spec; none for grids."""
         return []
 
     def axis_parameter(self, name: str) -> AxisParameter:
-        """Parameter on an axis, by its coordinate's name or dotted path; or a KeyError."""
+        """Return the parameter on an axis with a given coordinate name or dotted path.
+
+        Raises
+        ------
+        KeyError
+            If no axis has the parameter.
+        """
         for axis in self.axes:
             for parameter in axis.parameters:
                 if name in (parameter.coordinate, parameter.path):
@@ -305,9 +368,26 @@ class BaseSpec(SpecSection):
         raise KeyError(name)
 
     def read_coordinate(self, name: str, raw_value: object) -> float | int | str:
-        """Written value of a coordinate, in the unit that the coordinate is displayed in.
+        """Read a value of a coordinate and convert it to the unit of the coordinate's display.
 
-        A KeyError where no axis has it, a `QuantityError` where the value cannot be read.
+        Parameters
+        ----------
+        name : str
+            Coordinate's name or dotted path.
+        raw_value : object
+            Value as a user writes it.
+
+        Returns
+        -------
+        float, int or str
+            Value in the unit of `AxisParameter.units`, or a word.
+
+        Raises
+        ------
+        KeyError
+            If no axis has the coordinate.
+        QuantityError
+            If the value can't be read.
         """
         parameter = self.axis_parameter(name)
         rule = sections.parameter_rules()[parameter.path]
@@ -316,14 +396,14 @@ class BaseSpec(SpecSection):
         return read_in_unit(rule, raw_value, parameter.units)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences on errors whose size the spec does not state itself: none of a grid."""
+        """Return sentences about errors whose size the spec does not state; none for grids."""
         return []
 
     def identity(self) -> dict[str, Any]:
-        """Content that makes the study this one, in SI values.
+        """Return the content that identifies the study, in SI values.
 
-        Title, question, figures and execution are no part of it, nor are values that an axis
-        overrides. The order of the axes is: it lays out the arrays.
+        Title, question, figures, execution and fields overridden by an axis do not count. The order
+        of the axes counts, because it determines the layout of the arrays.
         """
         section_names = ("draws", "error_floor", "navigation", "storage")
         return {
@@ -339,7 +419,7 @@ class BaseSpec(SpecSection):
         }
 
     def parameters_off_axes(self) -> dict[str, float | int | str]:
-        """SI values of the parameters that no axis overrides, by dotted path."""
+        """Return the SI values of the parameters that no axis sets, by dotted path."""
         paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
         return {
             path: value for path, value in self.parameters().items() if path not in paths_on_axes
@@ -362,10 +442,11 @@ class BaseSpec(SpecSection):
         return hash(self.id)
 
     def to_yaml_mapping(self) -> dict[str, Any]:
-        """Return the spec as a user would write it whole: no instrument file, no default left out.
+        """Return the complete spec as a user would write it, with the instrument and all defaults.
 
-        What an axis sets is in no section: what the study holds is the same whether or not its
-        user wrote a value there too. Execution is left out, as it is no part of what a study is.
+        Fields that an axis sets are left out, so that the result does not depend on values that a
+        user wrote there in addition. ``execution`` is left out because it is no part of a study's
+        identity.
         """
         return copy.deepcopy(self._yaml_mapping)
 
@@ -380,7 +461,7 @@ class BaseSpec(SpecSection):
         return remove_fields_on_axes(mapping)
 
     def to_json(self) -> str:
-        """Return the spec as JSON text, for a store to hold, with the digests of its files."""
+        """Return the spec as JSON text for a store, with the digests of its files."""
         mapping = self.to_yaml_mapping() | (
             {FILES_KEY: self._file_digests} if self._file_digests else {}
         )
@@ -388,14 +469,17 @@ class BaseSpec(SpecSection):
 
 
 def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, Rule | None]:
-    """Dotted path and rule of a parameter, by its path or its last part."""
+    """Return dotted path and rule of a parameter, found by its path or the last part of its path.
+
+    If none or several match, return the name itself and None.
+    """
     rules = sections.parameter_rules()
     paths = [path for path in known_paths if name in (path, sections.short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
 def _segment_findings(grid: GridValues) -> Iterator[Finding]:
-    """Report segments whose beats do not tell range and velocity apart, and rules without laws."""
+    """Yield a finding if the slopes of segments do not separate range and velocity."""
     if grid.has_point({waveform.DOWN_SLOPE_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
         yield grid.make_finding(
@@ -418,11 +502,11 @@ def _segment_findings(grid: GridValues) -> Iterator[Finding]:
 STRONGEST_PEAK_CONDITION: dict[str, Condition] = {
     waveform.PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
-"""Condition on points whose segments report their strongest peak alone."""
+"""Condition on points at which each segment reports its strongest peak alone."""
 
 
 def _strongest_findings(grid: GridValues) -> Iterator[Finding]:
-    """Report the strongest peak alone where no law of it is known."""
+    """Yield a finding if the strongest peak is reported in a case without a known probability."""
     several_looks: dict[str, Condition] = {
         looks.LOOKS_NUMBER_PATH: lambda number: number > 1,
         looks.LOOKS_COMBINE_PATH: lambda combination: combination != looks.COMBINE_COHERENT,
@@ -443,7 +527,7 @@ def _strongest_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
-    """Report a grid too large to count."""
+    """Yield a finding if the grid has more than `GRID_POINTS_MAX` points."""
     n_points = math.prod(axis.size for axis in axes)
     if n_points > GRID_POINTS_MAX:
         problem = f"make {n_points:.3g} points, and a study has at most {GRID_POINTS_MAX:.0e}"
@@ -467,7 +551,7 @@ class GridSpec(BaseSpec):
     def extra_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Figures of what the study lacks, random effects without draws, draws without an end."""
+        """Return mistakes in figures, random effects without draws, and draws set in two ways."""
         extra_variables = STRONGEST_PEAK_OUTPUTS if grid.has_point(STRONGEST_PEAK_CONDITION) else ()
         findings = (
             list(grid_figure_findings(raw_spec, grid.axes, extra_variables))
@@ -492,7 +576,7 @@ class GridSpec(BaseSpec):
 
     @cached_property
     def has_random_effects(self) -> bool:
-        """True if anything but noise may be random at any point."""
+        """True if any effect beyond noise may be random at any point."""
         return any(
             undrawn_effect_findings(GridValues(self.parameters(), self.axes, self.effect_modes()))
         )
@@ -503,9 +587,9 @@ class GridSpec(BaseSpec):
         return GridValues(self.parameters(), self.axes).has_point(STRONGEST_PEAK_CONDITION)
 
     def identity(self) -> dict[str, Any]:
-        """Content that makes the study this one, in SI values.
+        """Return the content that identifies the study, in SI values.
 
-        Settings of detectors and estimators for whole spectra count only if these are drawn.
+        Parameters of detectors and estimators count only if whole spectra are drawn.
         """
         identity = super().identity()
         if not self.draws.draws_whole_spectra:
@@ -536,7 +620,21 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Spec from a document, which is changed, or all of its mistakes at once."""
+        """Make a spec from a document, and compute the digests of the files that it names.
+
+        Parameters
+        ----------
+        document : Document
+            Spec as read from YAML or plain data; changed by this method.
+        base : Path or None
+            Folder that paths in the spec are relative to. None for the document of a store, whose
+            files are not read.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in the document.
+        """
         spec = super().from_document(document, base)
         if base is not None:
             files = SpecFiles(base)
@@ -551,7 +649,7 @@ class SceneSpec(BaseSpec):
     def extra_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Mistakes in scene, flight, files, random effects and figures."""
+        """Return mistakes in scene, flight, files, random effects and figures."""
         draws = (
             read_or_none(scene_sections.SceneDraws, raw_spec.get("draws", {}))
             or scene_sections.SceneDraws()
@@ -565,26 +663,30 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return true if an axis of this kind of study may set the parameter at a path."""
+        """Return True if an axis may set the parameter at a dotted path without moving beamlets."""
         return not axis_refusal(path)[0]
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
-        """Mistakes in a parameter taking a value without the geometry changing."""
+        """Return mistakes in giving a parameter a value while the geometry stays fixed."""
         return variation_findings(self.parameters(), path, [value], location)
 
     @property
     def base(self) -> Path:
-        """Folder that the scene's files are relative to."""
+        """Folder that paths in the spec are relative to."""
         return self._base
 
     @property
     def files(self) -> SpecFiles:
-        """The scene's files, with the time in them at which the flight begins."""
+        """Files that the spec names, with the time in their tables at which the flight begins."""
         files = SpecFiles(self._base, self._file_digests)
         return replace(files, time_origin=self.platform.read_time_origin(files))
 
     def parameters(self) -> dict[str, float | int | str]:
-        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        """Return the SI values of all parameters by dotted path.
+
+        A parameter on an axis has the value of its field. The number of beamlets is that of the
+        rays cast per shot; detector and estimator are left out unless whole spectra are drawn.
+        """
         parameters = super().parameters()
         if not self.draws.draws_whole_spectra:
             parameters = {p: v for p, v in parameters.items() if not is_detector_or_estimator(p)}
@@ -596,39 +698,55 @@ class SceneSpec(BaseSpec):
 
     @property
     def is_ray_number_set_by_tolerance(self) -> bool:
-        """True if the tolerance says how many rays there are of each shot."""
+        """True if the number of rays of each shot follows from the tolerance."""
         return self.footprint.beamlets == 0 and beamlets_converge(self.parameters())
 
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
-        """Surfaces by their numbers; no file is looked at."""
+        """Return the materials of the scene's surfaces, in the order of their numbers.
+
+        Reads no file.
+        """
         return scene_sections.scene_surfaces(self.scene)
 
     def build_scene(self) -> scene_sections.BuiltScene:
-        """Build the scene; a `SceneError` for an unfit file or object."""
+        """Return the scene as bodies at which rays can be cast.
+
+        Raises
+        ------
+        SceneError
+            If a file or an object is unsuitable.
+        """
         flight = self.build_flight()
         return scene_sections.build_scene(self.scene, self.files, (flight.start, flight.stop))
 
     def build_flight(self) -> MovingBody:
-        """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
+        """Return the motion of the instrument in the scene's frame.
+
+        Raises
+        ------
+        SceneError
+            If the table of waypoints is unsuitable.
+        """
         return self.platform.build_flight(self.files)
 
     def scan_pattern(self, name: str) -> ScanPattern:
-        """Return the scan pattern of a scanner."""
+        """Return the scan pattern of the scanner `name`."""
         return self.scanners[name].build_pattern()
 
     def shots_per_cycle(self, name: str) -> int:
-        """Shots of a measurement cycle of a scanner."""
+        """Return the number of shots in a measurement cycle of the scanner `name`."""
         return shots_per_cycle(self.scan_pattern(name))
 
     @property
     def has_navigation(self) -> bool:
-        """True if a scanner has the shots in a cycle that navigation takes."""
+        """True if at least one scanner has enough shots per cycle for a navigation solution."""
         return any(self.shots_per_cycle(name) >= NAVIGATION_SHOTS_MIN for name in self.scanners)
 
     def unstated_error_sentences(self) -> list[str]:
-        """Return sentences on errors whose size the spec does not state itself.
+        """Return sentences about errors whose size the spec does not state.
 
-        Those are the floor that its instrument brings, and errors that a navigation lacks.
+        They concern the error floor that comes with the instrument, the drift of lines within a
+        record, and errors that navigation does not know of.
         """
         sentences = []
         floor_values, rules = (
@@ -678,9 +796,11 @@ class SceneSpec(BaseSpec):
         return sentences
 
     def _line_drift_bins(self) -> float:
-        """Largest drift of a speckled line within a record by acceleration [bins].
+        """Return the largest drift of a speckled line within a record, due to acceleration [bins].
 
-        0 below `DRIFT_BINS_MIN`, and for ground whose echoes have no developed speckle.
+        Notes ----- Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda
+        within a record of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda
+        bins. The result is 0 below `DRIFT_BINS_MIN`, and for ground without developed speckle.
         """
         p = self.parameters()
         if p["footprint.speckle"] != "developed":
@@ -697,17 +817,20 @@ class SceneSpec(BaseSpec):
         return drift if drift > DRIFT_BINS_MIN else 0.0
 
     def number_of_cycles(self, name: str) -> int:
-        """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""
+        """Return the number of complete measurement cycles of the scanner `name` in the flight."""
         flight, pattern = self.build_flight(), self.scan_pattern(name)
         return pattern.count_shots(flight.stop - flight.start) // shots_per_cycle(pattern)
 
     @property
     def beamlet_pattern(self) -> str:
-        """Arrangement of the beamlets, `sweep.model.beamlets.place_beamlets`'s word."""
+        """Arrangement of the beamlets: a pattern of `sweep.model.beamlets.place_beamlets`."""
         return beamlet_pattern(self.parameters())
 
     def footprint_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
-        """Angles of the beam's footprint by range; None where its divergence says all."""
+        """Return the function from range to footprint angles.
+
+        None if the divergence is constant.
+        """
         parameters = self.parameters()
         return (
             None
@@ -716,7 +839,13 @@ class SceneSpec(BaseSpec):
         )
 
     def interface_with(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
-        """Return the unit's interface with some fields set anew, written as in a spec."""
+        """Return the section ``interface`` with new values for some fields, written as in a spec.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in the new values.
+        """
         raw_fields = {
             path[-1]: rule.format(value) for path, rule, value in iter_values(self.interface)
         }
@@ -730,7 +859,7 @@ class SceneSpec(BaseSpec):
         raise SpecError(map(Document({}).to_mistake, located_findings))
 
     def pointing_jitter(self) -> PointingJitter | None:
-        """Random turns of the beams; None where there are none."""
+        """Return the random pointing errors of the beams; None without jitter."""
         from sweep.model.geometry.scanner import PointingJitter
 
         sigma = self.platform.jitter
@@ -738,17 +867,17 @@ class SceneSpec(BaseSpec):
 
     @property
     def has_rotating_bodies(self) -> bool:
-        """True if any body of the scene turns."""
+        """True if any body of the scene rotates."""
         motions = (
             getattr(scene_object, "motion", None) for scene_object in self.scene.objects.values()
         )
         return any(motion is not None and motion.attitude.kind != "fixed" for motion in motions)
 
     def geometry_identity(self, name: str) -> dict[str, Any]:
-        """Content of what is seen through one scanner: all that rays depend on, and no more.
+        """Return the content that identifies one scanner's geometry: all that its rays depend on.
 
-        Names are no part of it, nor are reflectances, nor where files are: they count by content.
-        Objects count by their place in the scene, which their surfaces' numbers come from.
+        Names, reflectances and the paths of files do not count. Files count by their content.
+        Objects count by their order in the scene, which numbers their surfaces.
         """
         parameters, digests = self.parameters(), self._file_digests
         index_by_name = {key: index for index, key in enumerate(self.scene.objects)}
@@ -777,13 +906,13 @@ class SceneSpec(BaseSpec):
         }
 
     def geometry_id(self, name: str) -> str:
-        """Hash of the geometry, 32 hexadecimal digits."""
+        """Return the hash of the geometry seen by the scanner `name`, 32 hexadecimal digits."""
         return identity_digest(self.geometry_identity(name))
 
     def identity(self) -> dict[str, Any]:
-        """Content that makes the study this one, in SI values.
+        """Return the content that identifies the study, in SI values.
 
-        Files count by content, and not by where they are. The order of objects is part of it: it
+        Files count by their content and not by their paths. The order of objects counts, because it
         numbers the surfaces. A number of rays that follows from the tolerance counts as 0.
         """
         digests, automatic_beamlets = (
@@ -803,16 +932,28 @@ class SceneSpec(BaseSpec):
         }
 
 
-# Studies from files and from what a store holds, whichever their kind
+# Reading of specs of either class, from files and stores
 
 
 def load(path: str | Path) -> GridSpec | SceneSpec:
-    """Study in a YAML file: one of a flat target, or of a scene where it has a ``scene``.
+    """Load a spec from a YAML file.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML file. Paths in it are relative to its folder.
+
+    Returns
+    -------
+    GridSpec or SceneSpec
+        `SceneSpec` if the file has a section ``scene``, else `GridSpec`.
 
     Raises
     ------
     SpecError
-        With every mistake in it, each with its path, its line and a remedy.
+        With every mistake in the file, each with its path, its line and a remedy.
+    TypeError
+        If `path` is no path.
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(
@@ -824,9 +965,9 @@ def load(path: str | Path) -> GridSpec | SceneSpec:
 
 
 def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
-    """Return the fields that a user has in a section although an axis sets them, as written.
+    """Return the values, as written, of fields that a user sets although an axis sets them too.
 
-    An instrument's own file or the library may have them: an axis is there to change these.
+    Fields of the library or of an instrument's file do not count: an axis may override them.
     """
     if not isinstance(raw_spec, Mapping):
         return {}
@@ -840,7 +981,7 @@ def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
 def _contradiction_findings(
     user_values: Mapping[str, object], axes: Sequence[Axis]
 ) -> Iterator[Finding]:
-    """Report fields whose value, as written, is none of their axis."""
+    """Yield a finding for each field whose value is not among the values of its axis."""
     parameters_by_path = {
         parameter.path: parameter for axis in axes for parameter in axis.parameters
     }
@@ -849,7 +990,7 @@ def _contradiction_findings(
             continue
         try:
             si_value = sections.parameter_rules()[path].read(value)
-        except QuantityError:  # told as a mistake of the field's own
+        except QuantityError:  # the field has a finding already
             continue
         values = np.asarray(parameter.values)
         is_number = values.dtype.kind in "fi" and not isinstance(si_value, str)
@@ -865,16 +1006,46 @@ def _contradiction_findings(
 
 
 def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | SceneSpec:
-    """Study from the JSON that its `to_json` gave, as `BaseSpec.from_stored`."""
+    """Make a spec from the JSON text of its `to_json`.
+
+    Parameters
+    ----------
+    json_text : str
+        Text that a store holds.
+    base : Path or str, optional
+        Folder that paths in the spec are relative to; the current folder by default.
+
+    Returns
+    -------
+    GridSpec or SceneSpec
+        `SceneSpec` if the text has a section ``scene``, else `GridSpec`.
+    """
     return _spec_class(parse_json(json_text)).from_stored(json_text, base)
 
 
 def _spec_class(raw_spec: Any) -> type[GridSpec] | type[SceneSpec]:
+    """Return the class of a spec: `SceneSpec` if it has a section ``scene``, else `GridSpec`."""
     return SceneSpec if isinstance(raw_spec, dict) and "scene" in raw_spec else GridSpec
 
 
 def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
-    """Values as a file has them, from text by path: ``{"axes.target.range": "[1 km, 2 km]"}``."""
+    """Parse YAML values given as text by dotted path.
+
+    Parameters
+    ----------
+    text_by_path : Mapping of str to str
+        For example ``{"axes.target.range": "[1 km, 2 km]"}``.
+
+    Returns
+    -------
+    dict
+        Values as parsed from YAML, by dotted path.
+
+    Raises
+    ------
+    SpecError
+        If a text is no valid YAML.
+    """
     yaml_text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in text_by_path.items())
     document = parse_document(yaml_text, Path("--set"))
     if document.findings:

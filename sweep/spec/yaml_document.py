@@ -1,7 +1,7 @@
-"""A spec as written: YAML with the line of every value, and every mistake in plain words.
+"""Reading of a spec as written: YAML text to a `Document`, and errors to findings with lines.
 
-YAML becomes a `Document`, a plain mapping with the line of every value; what pydantic then finds
-wrong with it becomes findings, which the document gives their lines.
+A `Document` is a mapping of plain data with the file and line of every value. It turns findings
+about values into mistakes that name their file and line.
 """
 
 from __future__ import annotations
@@ -40,23 +40,30 @@ from sweep.spec.rules import (
 from sweep.spec.sections import parameter_rules
 
 FILE_BYTES_MAX = 1_000_000
+"""Maximum size of a YAML file [bytes]."""
 NESTING_MAX = 30
+"""Maximum depth of nested mappings and lists."""
 YAML_NODES_MAX = 200_000
+"""Maximum number of YAML nodes in a document, counted once for each repetition by an alias."""
 
 _INSTRUMENT_LOCATION: Location = ("instrument",)
 _EXAMPLE_INSTRUMENT = "settembrini_2026"
-"""Instrument of the library that remedies name."""
+"""Instrument of the library that remedies use as an example."""
 _FLOOR_SECTION = "error_floor"
+"""Name of the section with an instrument's error floor."""
 _INSTRUMENT_FILE_SECTIONS = frozenset(
     {"title", "source", "doi", "published", "assumed", "numbers", _FLOOR_SECTION, "instrument"}
 )
-"""Sections of an instrument's file; a study takes the last two."""
+"""Sections of an instrument's file. A study uses `error_floor` and `instrument`."""
 _LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
+"""Folder of the instruments that come with this package."""
 _THRESHOLD_FIELDS = {way.removeprefix(PROCESSING_PREFIX) for way in THRESHOLD_PATHS}
+"""Fields of ``instrument.processing`` that set the threshold, of which a spec may use one."""
 
 _NUMBER_DIGITS_MAX = 4000
-"""Of a number: Python reads no more, unless it is asked to."""
+"""Maximum number of digits of a number; Python refuses longer integers by default."""
 _DECIMAL_PATTERN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
+"""Pattern of a number in decimal notation."""
 _PATH_REMEDY = "check the path, which is relative to the file that names it"
 _SYNTAX_REMEDY = "look at the brackets, quotes, colons and indentation there and above"
 _YAML_REMEDIES = {
@@ -68,51 +75,67 @@ _YAML_REMEDIES = {
     "another document": "keep one of them: a file holds one document, without lines '---' in it",
     "unexpected end of stream": "close the quotes of the text that begins there",
 }
-"""Remedies by what YAML's parser says."""
+"""Remedies by phrases in the messages of the YAML parser."""
 _STANDARD_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
 )
+"""YAML tags that are read; all others are mistakes."""
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _MERGE_KEY = "<<"
 _EXTENSION_PREFIX = "x-"
-"""Beginning of the names of sections that hold anchors for others, and are no part of a spec."""
+"""Prefix of the names of sections that only hold anchors for other sections."""
 
 
 class InstrumentErrorFloor(NamedTuple):
-    """Fields of a floor of errors that a study has from its instrument."""
+    """Fields of a study's error floor that come from its instrument."""
 
     instrument: str
-    """Name in the library, or path as written, of the instrument."""
+    """Name of the instrument in the library, or path as written."""
     fields: dict[str, Any]
-    """Fields that the study does not state, as the instrument's file has them."""
+    """Values, as in the instrument's file, of the fields that the study does not state."""
 
 
 @dataclass
 class Document:
-    """A spec as written: values, their places and what is already known to be wrong."""
+    """A spec as written: values, their files and lines, and mistakes in the YAML text."""
 
     content: dict[str, Any]
+    """Plain data of the spec: dicts with text keys, lists and scalars."""
     positions: dict[Location, tuple[str, int | None]] = field(default_factory=dict)
-    """File and line of each location; no file and no line if it was not read from one."""
+    """File and line of each location; an empty file and None if the value is not from a file."""
     findings: list[Finding] = field(default_factory=list)
-    """Mistakes found on reading."""
+    """Mistakes in the YAML text, and in the instrument's file."""
     file: str = ""
-    """The file read; empty where there is none."""
+    """Path of the file; empty for plain data."""
     n_nodes: int = 0
-    """YAML's nodes read, each as often as an alias repeats it."""
+    """Number of YAML nodes read, counted once for each repetition by an alias."""
     open_nodes: list[yaml.Node] = field(default_factory=list)
-    """Mappings being read, each within the one before."""
+    """Mappings that are being read, from the outermost to the innermost."""
     instrument_floor: InstrumentErrorFloor | None = None
-    """Floor of errors that comes with the instrument; None where the study states all of it."""
+    """Fields of the error floor that come from the instrument; None if the study states all of
+    them."""
 
     @classmethod
     def from_plain_data(cls, content: dict[str, Any]) -> Document:
-        """Make a document of plain data, which is in no file."""
+        """Make a document of plain data that is not from a file."""
         return cls(content, dict.fromkeys(_iter_locations(content, ()), ("", None)))
 
     def read_node(self, node: yaml.Node, location: Location) -> Any:
-        """Value of one of YAML's nodes, whose places and mistakes are noted."""
+        """Return the value of a YAML node, and record its positions and mistakes.
+
+        Parameters
+        ----------
+        node : yaml.Node
+            Scalar, sequence or mapping.
+        location : Location
+            Keys and indices that lead to the node.
+
+        Raises
+        ------
+        SpecError
+            If the document has too many nodes or is nested too deeply.
+        """
         self.n_nodes += 1
         line = node.start_mark.line + 1
         if self.n_nodes > YAML_NODES_MAX or max(len(location), len(self.open_nodes)) > NESTING_MAX:
@@ -131,9 +154,10 @@ class Document:
         return _read_scalar(node)
 
     def _read_mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
-        """Read a mapping with text keys; of a key given twice the first counts.
+        """Read a mapping with text keys; the first value of a repeated key counts.
 
-        A merge key, ``<<: *base``, brings the fields of other mappings that are not written here.
+        A merge key, ``<<: *base``, adds the fields of other mappings that this mapping does not
+        have.
         """
         values: dict[str, Any] = {}
         merged_nodes: list[yaml.Node] = []
@@ -157,7 +181,7 @@ class Document:
             else:
                 values[key] = self.read_node(value_node, key_location)
         fields: dict[str, Any] = {}
-        for merged_node in reversed(merged_nodes):  # of several the first counts
+        for merged_node in reversed(merged_nodes):  # earlier mappings override later ones
             fields |= self._merged_fields(merged_node, location, values)
         self.open_nodes.pop()
         return fields | values
@@ -165,9 +189,11 @@ class Document:
     def _merged_fields(
         self, node: yaml.Node, location: Location, written_fields: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Fields of a mapping that a merge key names, and the places of those not written here.
+        """Return the fields of a mapping under a merge key.
 
-        What is wrong in the mapping is told where it stands, and not once more here.
+        Record the positions of those not overridden.
+
+        Mistakes in the merged mapping are reported where it is defined, and not here.
         """
         merge_location = (*location, _MERGE_KEY)
         if not isinstance(node, yaml.MappingNode):
@@ -190,10 +216,10 @@ class Document:
         return fields
 
     def to_mistake(self, finding: Finding) -> Mistake:
-        """Give a finding its file and line; those of the nearest place around it that has any.
+        """Return a finding with the file and line of its location, or of the section around it.
 
-        An instrument of the library is right by itself: what is wrong with its fields comes from
-        what the user has written, and is told there.
+        Instruments of the library are valid by themselves. A mistake in a field of the library is
+        therefore located at the user's field that causes it.
         """
         location = finding.location
         while location and location not in self.positions:
@@ -216,10 +242,10 @@ class Document:
         return Mistake(path, rule, value, finding.suggestion, line, file)
 
     def _locate_cause(self, finding: Finding) -> tuple[str, int | None]:
-        """File and line at which the user has set off a mistake in a field of the library's.
+        """Return file and line of the user's field that causes a mistake in a field of the library.
 
-        That is a field that the finding names, by its path or in words, else one of the same
-        section, else the instrument.
+        The first of these that exists in the user's file: a field that the finding names by path or
+        in words, a field of the same section, the name of the instrument.
         """
         location, message = finding.location, f"{finding.problem} {finding.suggestion}"
         section = location if isinstance(_value_at(self.content, location), dict) else location[:-1]
@@ -261,7 +287,10 @@ class Document:
         )
 
     def to_mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
-        """Return findings as they stand in the file, each once; those in other files come last."""
+        """Return findings as mistakes without duplicates, sorted by line.
+
+        Those in other files come last.
+        """
         mistakes = dict.fromkeys(self.to_mistake(finding) for finding in findings)
         return sorted(
             mistakes,
@@ -270,7 +299,7 @@ class Document:
 
 
 def _iter_locations(value: Any, location: Location) -> Iterator[Location]:
-    """Yield the locations of a value in plain data and of all that is in it."""
+    """Yield the location of a value in plain data and of every value in it."""
     yield location
     if isinstance(value, dict):
         for key, inner_value in value.items():
@@ -281,7 +310,7 @@ def _iter_locations(value: Any, location: Location) -> Iterator[Location]:
 
 
 def _read_scalar(node: yaml.Node) -> Any:
-    """Read a number, truth value, nothing or text; numbers in decimal notation only."""
+    """Read a number in decimal notation, a truth value, null or text."""
     tag = node.tag.rsplit(":", 1)[-1]
     if tag == "null":
         return None
@@ -294,18 +323,46 @@ def _read_scalar(node: yaml.Node) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read the mapping in a YAML file; lesser mistakes in it are left in the document.
+    """Read the mapping in a YAML file.
+
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+
+    Returns
+    -------
+    Document
+        Content with lines; its `findings` hold mistakes that do not prevent reading.
 
     Raises
     ------
     SpecError
-        Where the file is no readable YAML mapping.
+        If the file is missing, too large or no YAML mapping.
     """
     return parse_document(_read_text(path), path)
 
 
 def parse_document(text: str, path: Path) -> Document:
-    """Parse a mapping in YAML text; mistakes in it are reported as those of a file."""
+    """Parse the mapping in a YAML text.
+
+    Parameters
+    ----------
+    text : str
+        YAML text.
+    path : Path
+        Path that mistakes are reported with.
+
+    Returns
+    -------
+    Document
+        Content with lines; its `findings` hold mistakes that do not prevent reading.
+
+    Raises
+    ------
+    SpecError
+        If the text is no YAML mapping.
+    """
     try:
         root = yaml.compose(text, Loader=_DepthLimitedLoader)
     except yaml.MarkedYAMLError as error:
@@ -335,14 +392,17 @@ def parse_document(text: str, path: Path) -> Document:
 
 
 def drop_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of a file without the sections that hold anchors for others, ``x-...``."""
+    """Return the content of a file without its sections ``x-...``, which hold anchors only."""
     return {
         name: value for name, value in content.items() if not name.startswith(_EXTENSION_PREFIX)
     }
 
 
 def _read_text(path: Path) -> str:
-    """Text of a file of reasonable size."""
+    """Return the text of a file of at most `FILE_BYTES_MAX` bytes.
+
+    Raise `SpecError` if unreadable.
+    """
     try:
         with open(open_regular(path), "rb") as file:
             content = file.read(FILE_BYTES_MAX + 1)
@@ -367,11 +427,20 @@ def _read_text(path: Path) -> str:
 def _file_error(
     path: Path, problem: str, suggestion: str = "", line: int | None = None
 ) -> SpecError:
+    """Return a `SpecError` about a file as a whole, or one of its lines."""
     return SpecError([Mistake("", problem, "", suggestion, line, str(path))])
 
 
 def suggest_similar_file(path: Path, *, fallback: str = _PATH_REMEDY) -> str:
-    """Suggestion of a YAML file near a missing one, by its name without the suffix."""
+    """Suggest a YAML file in the same folder whose name resembles that of a missing file.
+
+    Parameters
+    ----------
+    path : Path
+        Missing file.
+    fallback : str
+        Result if no file resembles it.
+    """
     try:
         names = {
             sibling.stem: sibling.name
@@ -387,12 +456,13 @@ def suggest_similar_file(path: Path, *, fallback: str = _PATH_REMEDY) -> str:
 
 
 class _DepthLimitedLoader(yaml.SafeLoader):
-    """YAML's safe loader, which refuses deep nesting before Python's stack does."""
+    """Safe loader of YAML that refuses deep nesting before Python's recursion limit is reached."""
 
     depth = 0
+    """Current depth of nesting."""
 
     def compose_scalar_node(self, anchor: Any) -> Any:
-        """Scalar of the document, whose escapes make whole characters."""
+        """Return a scalar node; refuse escapes that are half of a surrogate pair."""
         node = super().compose_scalar_node(anchor)  # type: ignore[no-untyped-call]
         if not is_utf8_encodable(node.value):
             problem = "an escape there is half of a surrogate pair, and no character"
@@ -400,7 +470,7 @@ class _DepthLimitedLoader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """One node of the document."""
+        """Return a node; refuse one that is nested too deeply."""
         self.depth += 1
         if self.depth > NESTING_MAX:
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
@@ -411,10 +481,24 @@ class _DepthLimitedLoader(yaml.SafeLoader):
 
 
 def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = False) -> bool:
-    """Put an instrument of the library or of a file in the place of its name; False without one.
+    """Replace a reference to an instrument in a document by the instrument's fields.
 
-    With ``takes_floor`` an instrument whose file has an ``error_floor`` brings that too, to a study
-    that may have one; fields that the study states itself take its place.
+    Fields that the user states override those of the instrument.
+
+    Parameters
+    ----------
+    document : Document
+        Spec as read; changed by this function, which also adds findings to it.
+    base : Path
+        Folder that paths in the spec are relative to.
+    takes_floor : bool
+        True for a study with an error floor. The instrument's ``error_floor`` then supplies the
+        fields that the study does not state.
+
+    Returns
+    -------
+    bool
+        False if the reference can't be resolved.
     """
     raw_instrument = document.content.get("instrument")
     reference, location = raw_instrument, _INSTRUMENT_LOCATION
@@ -461,14 +545,14 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
 
 
 def _merge_error_floor(document: Document, instrument_floor: object, instrument_name: str) -> None:
-    """Put an instrument's floor of errors where a study does not state its own."""
+    """Fill in the fields of an instrument's error floor that the study does not state."""
     study_floor = document.content.get(_FLOOR_SECTION, {})
-    if not isinstance(study_floor, Mapping):  # which is told
+    if not isinstance(study_floor, Mapping):  # validation reports this mistake
         return
     if not isinstance(instrument_floor, Mapping):
         document.content.setdefault(
             _FLOOR_SECTION, instrument_floor
-        )  # what is wrong with it is told as of the study's
+        )  # mistakes in it are reported as the study's
         return
     document.content[_FLOOR_SECTION] = merge_mappings(instrument_floor, study_floor)
     if added_fields := {
@@ -478,7 +562,7 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
 
 
 def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
-    """Put the rows of a CSV file of the sweep's error in the place of its path."""
+    """Replace the path of a CSV file with the sweep's frequency error by the file's rows."""
     chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE_PATH.split(".")
     if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
         return
@@ -498,7 +582,7 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
 
 
 def _read_instrument(reference: object, location: Location, base: Path) -> Document:
-    """Document of an instrument, where it stands as in a spec."""
+    """Return the document of an instrument, given by name or path, in the sections of a spec."""
     if not isinstance(reference, str):
         if "file" in location:
             remedy = "write it relative to this file"
@@ -526,9 +610,9 @@ def _read_instrument(reference: object, location: Location, base: Path) -> Docum
 
 
 def _normalise_instrument_file(document: Document) -> Document:
-    """Document of a user's instrument, in the sections that a file of the library has.
+    """Return the document of a user's instrument in the sections of a library file.
 
-    Its file has them as well, or the instrument's fields at its root.
+    The user's file may have these sections, or the fields of the instrument at its root.
     """
     if "instrument" not in document.content:
         floor_section = (
@@ -576,10 +660,12 @@ def _normalise_instrument_file(document: Document) -> Document:
 
 
 def library_instruments() -> dict[str, Path]:
-    """Files of the instruments that a spec may name, by name.
+    """Return the files of the library's instruments by name.
 
     Each file also names its publication, and the numbers that it must reproduce.
 
+    Examples
+    --------
     >>> "settembrini_2026" in library_instruments()
     True
     """
@@ -587,7 +673,7 @@ def library_instruments() -> dict[str, Path]:
 
 
 def _drop_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an instrument without its threshold, where the overrides set one in any way."""
+    """Return an instrument without its threshold if the overrides set a threshold in any way."""
     base_processing, new_processing = instrument.get("processing"), overrides.get("processing")
     if not (
         isinstance(base_processing, Mapping)
@@ -601,7 +687,20 @@ def _drop_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, 
 
 
 def to_plain_data(data: Any, location: Location = ()) -> Any:
-    """Copy plain data as YAML would give it: dicts with text keys, and lists."""
+    """Copy data as YAML would give it: dicts with text keys, and lists.
+
+    Parameters
+    ----------
+    data : object
+        Mappings, sequences and scalars.
+    location : Location
+        Location of `data` in the spec, for mistakes.
+
+    Raises
+    ------
+    SpecError
+        If the data is nested too deeply, or holds an integer with too many digits or invalid text.
+    """
     if len(location) > NESTING_MAX:
         raise SpecError([Mistake(dotted_path(location), "is nested too deeply")])
     if isinstance(data, int) and data.bit_length() > _NUMBER_DIGITS_MAX:
@@ -622,7 +721,7 @@ def to_plain_data(data: Any, location: Location = ()) -> Any:
 
 
 def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay overrides over a mapping, field by field."""
+    """Return a mapping with overrides applied, recursively for nested mappings."""
     result = dict(base)
     for key, value in overrides.items():
         base_value = result.get(key)
@@ -632,7 +731,7 @@ def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
 
 
 def _value_at(value: Any, location: Location) -> Any:
-    """Value at a location; empty text where there is none."""
+    """Return the value at a location of nested data; empty text if there is none."""
     try:
         for key in location:
             value = value[key]
@@ -642,7 +741,7 @@ def _value_at(value: Any, location: Location) -> Any:
 
 
 def _is_leaf(value: Any, location: Location) -> bool:
-    """Return true if the location holds something other than a mapping."""
+    """Return True if the value at a location is not a mapping, or does not exist."""
     for key in location:
         try:
             value = value[key]
@@ -651,7 +750,7 @@ def _is_leaf(value: Any, location: Location) -> bool:
     return not isinstance(value, dict)
 
 
-# Pydantic's errors in plain words
+# Findings from pydantic's errors
 
 _PROBLEM_BY_ERROR_TYPE = {
     "model_type": "must be a mapping of fields to values",
@@ -661,32 +760,42 @@ _PROBLEM_BY_ERROR_TYPE = {
     "tuple_type": "must be a list",
     "invalid_key": "must be a word",
 }
+"""Text of a finding by pydantic's type of error."""
 _SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
+"""Remedy for a section of scenes in the spec of a grid."""
 _OTHER_SPEC_REMEDIES = {
     **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
     **dict.fromkeys(
         ("platform", "scanners", "error_floor", "navigation", "interface"), _SCENE_ONLY_REMEDY
     ),
 }
-"""Remedy for a section that only the other kind of study has."""
+"""Remedies for sections that only the other class of spec has, by the section's name."""
 
 _SPEC_OF_FIGURE_KIND = {
     spec_fields.kind_of_model(model): target
     for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
     for model in spec_fields.models_of_annotation(kind)
 }
-"""Whose studies make a kind of figure."""
+"""Class of spec, in words, that may have a kind of figure, by the kind."""
 
 
 def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
-    """Everything pydantic found wrong with a mapping read as `root`, one model or several."""
+    """Return the findings of a pydantic error.
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+        Errors of one validation.
+    annotation : type
+        Model, or union of models, that the data was validated as.
+    """
     return [
         _validation_finding(dict(detail), annotation) for detail in error.errors(include_url=False)
     ]
 
 
 def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
-    """One error of pydantic's."""
+    """Return the finding of one entry of `ValidationError.errors`."""
     error_type, raw_value = detail["type"], detail["input"]
     resolved = spec_fields.resolve_location(detail["loc"], annotation)
     location = resolved.location
@@ -732,7 +841,7 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
 
 
 def _list_remedy(resolved: spec_fields.ResolvedLocation, error_type: str) -> str:
-    """Remedy for what must be a list or a mapping of parts, and is none."""
+    """Return the remedy for a value that must be a list, or a mapping of sections."""
     if error_type in ("list_type", "tuple_type"):
         return "put it in brackets, [...], or on lines that begin with '- '"
     return (
@@ -743,19 +852,19 @@ def _list_remedy(resolved: spec_fields.ResolvedLocation, error_type: str) -> str
 
 
 def _kind_hint(models: spec_fields.ModelClasses) -> str:
-    """Text that a part of several kinds is written with."""
+    """Return how to write the field ``kind`` of a section that has several models."""
     return f"kind: and one of {', '.join(map(spec_fields.kind_of_model, models))}"
 
 
 def _suggest_kind(tag: str, kind_names: list[str]) -> str:
-    """Suggestion for a kind that is none of those here."""
+    """Return a suggestion for an unknown kind."""
     if tag in _SPEC_OF_FIGURE_KIND and kind_names[0] in _SPEC_OF_FIGURE_KIND:
         return f"{tag} is for studies of {_SPEC_OF_FIGURE_KIND[tag]}"
     return suggest_similar_name(tag, kind_names)
 
 
 def _missing_field_remedy(resolved: spec_fields.ResolvedLocation) -> str:
-    """Remedy for a missing field or section."""
+    """Return the remedy for a missing field or section."""
     name, section = resolved.location[-1], resolved.location[:-1]
     if resolved.location == _INSTRUMENT_LOCATION:
         return missing_instrument_remedy()
@@ -792,7 +901,7 @@ def _missing_field_remedy(resolved: spec_fields.ResolvedLocation) -> str:
 
 
 def missing_instrument_remedy() -> str:
-    """Remedy for a study without an instrument."""
+    """Return the remedy for a spec without an instrument."""
     return (
         f"write e.g. 'instrument: {{like: {_EXAMPLE_INSTRUMENT}}}' (the library has "
         f"{', '.join(library_instruments())}), "
@@ -801,7 +910,7 @@ def missing_instrument_remedy() -> str:
 
 
 def _suggest_field(resolved: spec_fields.ResolvedLocation, root_model: type[BaseModel]) -> str:
-    """Field that an unknown one resembles: beside it, else anywhere."""
+    """Return a suggestion for an unknown field, from the same section or else from all fields."""
     name = str(resolved.location[-1])
     sibling_names = [
         field for model in resolved.section_models for field in spec_fields.fields_by_name(model)
