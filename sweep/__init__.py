@@ -1,8 +1,9 @@
-"""Monte Carlo sweeps of FMCW Doppler lidar performance.
+"""Monte Carlo simulation of the performance of FMCW Doppler lidars.
 
-`load` a spec, `run` it into a store, `open` the store as an xarray Dataset; the store of a scene
-as a DataTree with `open_scene`; `export` its point clouds, or see what the unit `reports`. `status`
-says how far a store is, `verify` checks every byte of it.
+`load` a spec and `run` it into a store. `open` the store of a grid as an xarray Dataset, or the
+store of a scene as a DataTree with `open_scene`. `export` writes point clouds, and `reports`
+returns the unit's reports. `status` returns the progress of a store, and `verify` checks all of its
+bytes.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from importlib import import_module
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # as checkers of programs that use it see the names below
+if TYPE_CHECKING:  # type checkers see the public names by these imports
     from sweep.analysis.datasets import open, open_scene
     from sweep.analysis.scene_results.interface_reports import reports
     from sweep.analysis.scene_results.point_export import export
@@ -23,7 +24,7 @@ if TYPE_CHECKING:  # as checkers of programs that use it see the names below
 
 __version__ = _version("sweep")
 
-#: Where each public name comes from; imported on first use, so that `import sweep` stays cheap.
+# Imported on first use, so that `import sweep` stays fast.
 _MODULE_BY_NAME = {
     "load": "sweep.spec",
     "run": "sweep.tasks.driver",
@@ -37,6 +38,7 @@ _MODULE_BY_NAME = {
     "verify": "sweep.tasks.studies.store_verification",
     "StudyWarning": "sweep.tasks.studies.study_warnings",
 }
+"""Module of each public name."""
 
 __all__ = [
     "StudyWarning", "__version__", "export", "extend", "load", "open", "open_scene", "reports",
@@ -45,12 +47,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Public names, from where they live."""
+    """Import a public name on first use."""
     if name in _MODULE_BY_NAME:
         return getattr(import_module(_MODULE_BY_NAME[name]), name)
     raise AttributeError(f"module 'sweep' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    """Public names."""
+    """Return the names of the module, including public names that are not yet imported."""
     return sorted([*globals(), *_MODULE_BY_NAME])

@@ -1,4 +1,4 @@
-"""Packages that only some studies need: `pip install 'sweep[scenes]'` and the like bring them."""
+"""Optional packages that only some studies need, with the extras that install them."""
 
 EXTRA_BY_MODULE = {
     "laspy": "scenes", "mapbox_earcut": "scenes", "plyfile": "scenes", "pyproj": "scenes",
@@ -8,11 +8,11 @@ EXTRA_BY_MODULE = {
     "asyncssh": "clusters", "dask_jobqueue": "clusters",
     "dask_kubernetes": "kubernetes", "httpx": "kubernetes", "kr8s": "kubernetes",
 }  # fmt: skip
-"""Extra of `pyproject.toml` that installs a module."""
+"""Extra in `pyproject.toml` that installs a module, by the module's name."""
 
 
 def install_hint(error: BaseException) -> str:
-    """Command that installs the module that an import lacked; empty for any other error.
+    """Return the command that installs the module that an import lacked; '' for any other error.
 
     Examples
     --------

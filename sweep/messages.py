@@ -1,8 +1,8 @@
-r"""Messages to people: text that is safe to show, and commands or Python calls to suggest.
+r"""Messages to users: escaping of unprintable text, and suggestions of commands or Python calls.
 
-Text from stores, specs and file names may hold characters that a terminal obeys. They are shown as
-`\x1b` and the like. A suggestion is a shell command where the `sweep` command runs, and a Python
-call where a program has called the package.
+Text from stores, specs and file names may contain characters that control a terminal. These are
+shown as escape sequences such as `\x1b`. A suggestion is a shell command if the `sweep` command is
+running, and a Python call if a program has called the package.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
-# Escape and other control characters (C0 but tab and line feed, DEL, C1), marks that turn the
-# direction of text, invisible characters, separators of lines, surrogates and tags.
+# Control characters (C0 except tab and line feed, DEL, C1), marks of text direction, invisible
+# characters, line separators, surrogates and tags.
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f"
     "\ufeff\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e0fff]"
@@ -22,10 +22,10 @@ _UNPRINTABLE = re.compile(
 
 
 def escape_unprintable(text: str) -> str:
-    r"""Text with every character that a terminal would obey, or not show, as an escape sequence.
+    r"""Replace characters that control a terminal or are invisible by escape sequences.
 
-    Tabs and line feeds stay. Marks that turn the direction of text count too: with them a file
-    name can look like another.
+    Tabs and line feeds are kept. Marks of text direction are replaced, because they can make a file
+    name look like another.
 
     Examples
     --------
@@ -36,6 +36,7 @@ def escape_unprintable(text: str) -> str:
 
 
 def _escape_character(match: re.Match[str]) -> str:
+    """Return the escape sequence of a matched character."""
     code = ord(match[0])
     if code < 0x100:
         return f"\\x{code:02x}"
@@ -43,7 +44,7 @@ def _escape_character(match: re.Match[str]) -> str:
 
 
 def escape_to_one_line(text: object) -> str:
-    r"""Printable text of one line, in which line feeds and tabs are escape sequences too.
+    r"""Return printable text of one line, with line feeds and tabs as escape sequences.
 
     Examples
     --------
@@ -54,7 +55,7 @@ def escape_to_one_line(text: object) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """Return a number of things.
+    """Return a number with a noun, in the plural unless the number is 1.
 
     Examples
     --------
@@ -65,25 +66,28 @@ def counted(number: int, thing: str) -> str:
 
 
 class PrintableError(Exception):
-    """Base of errors whose text quotes stores, specs and file names."""
+    """Base of errors whose text quotes stores, specs and file names.
+
+    Unprintable characters are escaped.
+    """
 
     def __str__(self) -> str:
         return escape_unprintable(super().__str__())
 
 
 class PrintableStream:
-    """Text stream that makes what is written to it printable.
+    """Text stream that escapes unprintable characters.
 
-    It has no `buffer`, so that nothing is written past it. Rich, which makes escape sequences of
-    its own, finds the stream itself as `rich_proxied_file`; what it is given to print goes through
-    :func:`escape_unprintable` before.
+    It has no attribute `buffer`, so that no output bypasses it. Rich, which writes escape sequences
+    of its own, uses the wrapped stream `rich_proxied_file`; the text that rich prints is escaped
+    before.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream
 
     def write(self, text: str) -> int:
-        """Write text."""
+        """Write text with unprintable characters escaped; return the length of `text`."""
         if not isinstance(text, str):
             raise TypeError(f"a text stream takes str, not {type(text).__name__}")
         self.rich_proxied_file.write(escape_unprintable(text))
@@ -100,16 +104,18 @@ class PrintableStream:
         return getattr(self.rich_proxied_file, name)
 
 
-# Suggestions
+# Suggestions to users
 
 _runs_as_command = False
+"""True while the `sweep` command runs."""
 
 EXIT_MISTAKE, EXIT_INCOMPLETE = 2, 3
-"""Exit codes of the command for a mistake of the user's, and a run that ended before its blocks."""
+"""Exit codes of the command for a user's mistake, and for a run that ended before all its
+blocks."""
 
 
 class Placeholder(str):
-    """Word that stands for what the user has to fill in."""
+    """Word in a suggestion that the user has to replace."""
 
 
 SPEC_PLACEHOLDER, STORE_PLACEHOLDER = Placeholder("SPEC"), Placeholder("STORE")
@@ -118,7 +124,7 @@ NEW_PLACEHOLDER = Placeholder("NEW")
 
 @contextmanager
 def suggest_shell_commands() -> Iterator[None]:
-    """Context in which suggestions are shell commands: the `sweep` command runs."""
+    """Context manager in which suggestions are shell commands, because the `sweep` command runs."""
     global _runs_as_command
     previous, _runs_as_command = _runs_as_command, True
     try:
@@ -128,12 +134,21 @@ def suggest_shell_commands() -> Iterator[None]:
 
 
 def is_run_as_command() -> bool:
-    """Tell whether the `sweep` command runs, whose process ends with it."""
+    """Return True while the `sweep` command runs; its process ends with the command."""
     return _runs_as_command
 
 
 def shell_command(name: str, *arguments: object, **options: object) -> str:
-    r"""Command of `sweep` as one types it into a shell, each word quoted where need be.
+    """Return a command of `sweep` as typed into a shell, with words quoted if necessary.
+
+    Parameters
+    ----------
+    name : str
+        Name of the command.
+    *arguments
+        Arguments of the command.
+    **options
+        Options by their Python names; True for a flag without a value.
 
     Examples
     --------
@@ -149,20 +164,20 @@ def shell_command(name: str, *arguments: object, **options: object) -> str:
 
 
 def _shell_word(value: object) -> str:
-    """Word that a shell reads as the value, and a command as no option."""
+    """Quote a value for the shell; a leading '-' gets './' so that it is no option."""
     word = str(value)
     return shlex.quote(f"./{word}" if word.startswith("-") else word)
 
 
 def suggestion(name: str, *arguments: object, **options: object) -> str:
-    """Command to type, or Python call to make, in backquotes.
+    """Return a command to type or a Python call to make, in backquotes.
 
     Parameters
     ----------
     name : str
-        Command, which is also a function of the package: ``resume``.
+        Name of the command, and of the package's function: ``resume``.
     *arguments, **options
-        Its arguments and options, by the names that Python has for them.
+        Arguments and options, by their Python names.
 
     Examples
     --------
@@ -180,7 +195,7 @@ def suggestion(name: str, *arguments: object, **options: object) -> str:
 
 
 def option_text(name: str, value: object = True) -> str:
-    """Option of the command, or argument of the call, that the user has just made.
+    """Return an option to add to the user's command, or an argument to add to the user's call.
 
     Examples
     --------
@@ -199,7 +214,7 @@ def option_text(name: str, value: object = True) -> str:
 
 
 def option_name(name: str) -> str:
-    """Name of an option of the command, or of an argument of the call.
+    """Return the name of an option of the command, or of an argument of the call.
 
     Examples
     --------
@@ -210,11 +225,12 @@ def option_name(name: str) -> str:
 
 
 def _option_flag(option: str) -> str:
+    """Return the flag of an option: ``--retry-failed`` for ``retry_failed``."""
     return f"--{option.replace('_', '-')}"
 
 
 def _python_literal(value: object) -> str:
-    """Value as Python has it; of what the user has to fill in, its name."""
+    """Return a value as Python source text; a placeholder as a variable's name."""
     if isinstance(value, Placeholder):
         return value.lower()
     return repr(value if isinstance(value, bool | int | float | list) else str(value))

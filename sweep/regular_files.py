@@ -1,8 +1,8 @@
-"""Open regular files of untrusted directories without blocking, and within a size limit.
+"""Opening of regular files in untrusted directories, without blocking and within a size limit.
 
-A path that a study or a store names may be a named pipe, whose opening waits for a writer, a device
-that never ends, or a link out of the store. These functions open without waiting, and refuse
-anything that is not a regular file.
+A path in a spec or store may be a named pipe, which blocks until a writer opens it, an endless
+device, or a link out of the store. The functions of this module open files without blocking, and
+refuse everything that is not a regular file.
 """
 
 from __future__ import annotations
@@ -18,21 +18,24 @@ _FILE_TYPE_NAMES = {
     stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket", stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a directory",
 }  # fmt: skip
+"""Name of each type of file other than regular files."""
 
-#: Bytes that are read at a time where content is not kept in memory.
 READ_BUFFER_BYTES = 1 << 20
+"""Number of bytes read at a time if the content is not kept in memory."""
 
 
 class RefusedFileError(OSError):
-    """A path is not a regular file of a permitted size, or leads out of its directory."""
+    """Error of a path that is no regular file, is too large, or leaves its directory."""
 
     def __str__(self) -> str:
         return f"{self.filename} {self.strerror}"
 
 
 def file_type(mode: int) -> str:
-    """Return the name of a file type, from the mode of its stat result.
+    """Return the name of a file's type, given the mode of its stat result.
 
+    Examples
+    --------
     >>> file_type(stat.S_IFIFO)
     'a named pipe'
     """
@@ -42,12 +45,19 @@ def file_type(mode: int) -> str:
 def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
     """Open a regular file for reading without blocking, and return its descriptor.
 
+    Parameters
+    ----------
+    path : str or Path
+        Path of the file.
+    follow_links : bool
+        False refuses a symbolic link.
+
     Raises
     ------
     RefusedFileError
-        The path is a pipe, a device, a socket, or (unless ``follow_links``) a symbolic link.
+        If the path is a pipe, a device, a socket, or a symbolic link that is not followed.
     OSError
-        As of `os.open`.
+        If the file can't be opened, as from `os.open`.
     """
     return _open_refusing_irregular(
         str(path), str(path), 0 if follow_links else os.O_NOFOLLOW, None
@@ -55,10 +65,22 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
 
 
 def open_below(root: str | Path, name: str) -> int:
-    """Open the regular file ``name`` below the directory ``root``; return its descriptor.
+    """Open the regular file ``name`` below the directory ``root``, and return its descriptor.
 
-    ``name`` has components separated by '/'. No component below ``root`` may be a symbolic link,
-    '.' or '..'. ``root`` itself may be reached through links, because the user has named it.
+    Parameters
+    ----------
+    root : str or Path
+        Directory that the user has named; may be reached through symbolic links.
+    name : str
+        Path below ``root`` with components separated by '/'. No component may be a symbolic link,
+        '.' or '..'.
+
+    Raises
+    ------
+    RefusedFileError
+        If the path is no regular file or leaves ``root``.
+    OSError
+        If the file can't be opened, as from `os.open`.
     """
     *parent_names, base_name = name.split("/")
     path_in_messages = f"{root}/{name}"
@@ -86,7 +108,10 @@ def open_below(root: str | Path, name: str) -> int:
 def _open_refusing_irregular(
     name: str, path_in_messages: str, flags: int, folder_descriptor: int | None
 ) -> int:
-    """Open a regular file, or a directory for O_DIRECTORY; errors name it ``path_in_messages``."""
+    """Open a regular file, or a directory if `flags` include O_DIRECTORY.
+
+    Errors use `path_in_messages`.
+    """
     descriptor = -1
     try:
         descriptor = os.open(
@@ -118,20 +143,30 @@ def _open_refusing_irregular(
 
 
 def read_regular(path: str | Path, bytes_max: int) -> bytes:
-    """Read a regular file of at most ``bytes_max`` bytes; symbolic links are followed."""
+    """Return the content of a regular file of at most ``bytes_max`` bytes.
+
+    Symbolic links are followed.
+    """
     return _read(open_regular(path), bytes_max, str(path))
 
 
 def read_below(
     root: str | Path, name: str, bytes_max: int, byte_slice: slice = slice(None)
 ) -> bytes:
-    """Read a regular file, or the bytes ``byte_slice`` of it, as :func:`open_below` opens it."""
+    """Return the bytes ``byte_slice`` of a regular file opened as by :func:`open_below`.
+
+    Raises
+    ------
+    RefusedFileError
+        If the file has more than ``bytes_max`` bytes, or is refused by :func:`open_below`.
+    """
     return _read(open_below(root, name), bytes_max, f"{root}/{name}", byte_slice)
 
 
 def _read(
     descriptor: int, bytes_max: int, path_in_messages: str, byte_slice: slice = slice(None)
 ) -> bytes:
+    """Return a slice of an open file, and close it."""
     with open(descriptor, "rb", buffering=0) as file:
         start, stop, _ = byte_slice.indices(checked_size(descriptor, bytes_max, path_in_messages))
         file.seek(start)
@@ -147,7 +182,10 @@ def _read(
 def stream_below(
     root: str | Path, name: str, bytes_max: int
 ) -> Iterator[tuple[int, Iterator[bytes]]]:
-    """Context manager: size of a regular file below a directory, and an iterator over its bytes."""
+    """Context manager: yield the size of a file below a directory and its content in pieces.
+
+    The file is opened as by :func:`open_below` and has at most ``bytes_max`` bytes.
+    """
     descriptor = open_below(root, name)
     with open(descriptor, "rb", buffering=0) as file:
         size = checked_size(descriptor, bytes_max, f"{root}/{name}")
@@ -155,14 +193,17 @@ def stream_below(
 
 
 def checked_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
-    """Return the size of an open file; raise RefusedFileError if it exceeds ``bytes_max``."""
+    """Return the size of an open file [bytes].
+
+    Raise `RefusedFileError` if it exceeds ``bytes_max``.
+    """
     size = os.fstat(descriptor).st_size
     check_size(size, bytes_max, path_in_messages)
     return size
 
 
 def check_size(size: int, bytes_max: int, path_in_messages: str) -> None:
-    """Raise RefusedFileError if the size of a file or object exceeds ``bytes_max``."""
+    """Raise `RefusedFileError` if the size of a file or object exceeds ``bytes_max``."""
     if size > bytes_max:
         problem = f"has {size:,} bytes, and can have no more than {bytes_max:,}"
         raise RefusedFileError(errno.EFBIG, problem, path_in_messages)

@@ -1,7 +1,7 @@
-"""JSON of others, read so that nothing in it can break what comes later.
+"""Parsing of JSON from untrusted sources, with limits that protect later processing.
 
-Nesting of any depth is valid JSON, and so is half of a surrogate pair. Python's functions fail at
-either, each at another place: what is copied or printed, and what is written as UTF-8.
+JSON may be nested to any depth and may contain half of a surrogate pair. Python's functions fail
+on either, but only later: when data is copied, printed or written as UTF-8.
 """
 
 from __future__ import annotations
@@ -9,14 +9,24 @@ from __future__ import annotations
 import json
 from typing import Any
 
-#: Levels of lists and objects within each other. A store's document has ten.
 JSON_DEPTH_MAX = 60
+"""Maximum depth of nested lists and objects; the document of a store has ten levels."""
 
 
 def parse_json(content: bytes | str, *, allow_non_utf8: bool = False) -> Any:
-    """Parse JSON; ValueError where it is none, nested too deeply, or has text that is no text.
+    """Parse JSON and check its nesting and text.
 
-    With ``allow_non_utf8`` text may be anything: names of files need not be UTF-8.
+    Parameters
+    ----------
+    content : bytes or str
+        JSON document.
+    allow_non_utf8 : bool
+        True if text may be no valid UTF-8, such as names of files.
+
+    Raises
+    ------
+    ValueError
+        If the content is no JSON, is nested too deeply, or contains half of a surrogate pair.
     """
     try:
         parsed = json.loads(content)
@@ -27,7 +37,7 @@ def parse_json(content: bytes | str, *, allow_non_utf8: bool = False) -> Any:
 
 
 def _refuse_unsafe_values(parsed: Any, allow_non_utf8: bool) -> None:
-    """Refuse deep nesting and lone surrogates, level by level."""
+    """Raise `ValueError` for deep nesting and lone surrogates, level by level."""
     level, depth = [parsed], 0
     while level:
         depth += 1
@@ -46,8 +56,10 @@ def _refuse_unsafe_values(parsed: Any, allow_non_utf8: bool) -> None:
 
 
 def is_utf8_encodable(text: str) -> bool:
-    """Tell whether a string can be written as UTF-8: it has no half of a surrogate pair.
+    """Return True if a text can be encoded as UTF-8: it contains no half of a surrogate pair.
 
+    Examples
+    --------
     >>> is_utf8_encodable("Gale"), is_utf8_encodable("Gale" + chr(0xD800))
     (True, False)
     """

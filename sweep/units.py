@@ -1,8 +1,8 @@
-"""Quantities with units at the edges: text such as ``25 mm`` in, SI floats out.
+"""Conversion of quantities with units, such as ``25 mm``, to floats in SI units.
 
-Numbers stay exact fractions until the last step, so that every spelling of a quantity gives the
-same float: ``25 mm``, ``2.5 cm`` and ``0.025 m`` are one. Pint knows the units; the usual ones are
-in a table, so that most specs are read without pint, which takes a second to import.
+Numbers are exact fractions until the last step, so that every spelling of a quantity gives the same
+float: ``25 mm``, ``2.5 cm`` and ``0.025 m``. A table holds the usual units; all others are left to
+pint, which takes a second to import.
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ from functools import cache, lru_cache
 from typing import Any
 
 QUANTITY_TEXT_LENGTH_MAX = 100
+"""Maximum number of characters of a written quantity."""
 DECIBEL = "dB"
+"""Unit of a power ratio in decibels."""
 PER_HERTZ = "1/Hz"
+"""SI unit of a power ratio per bandwidth."""
 LOGARITHMIC_UNITS = {
     "dB": ("dB", Fraction(1)),
     "dB/Hz": (PER_HERTZ, Fraction(1)),
@@ -28,15 +31,19 @@ LOGARITHMIC_UNITS = {
     "dBm": ("W", Fraction(1, 1000)),
     "dBW": ("W", Fraction(1)),
 }
-"""Units of power that are logarithms: the SI unit, and its value at 0 dB. 30 dBm is 1 W, and
--155 dB/Hz is 10^-15.5 /Hz; of a laser's noise it is also written as dBc/Hz."""
+"""Logarithmic units of power: the SI unit, and its value at 0 dB.
+
+30 dBm is 1 W, and -155 dB/Hz is 10^-15.5 /Hz. For the noise of a laser dB/Hz is also written as
+dBc/Hz.
+"""
 
 NO_VALUE_TEXT = "none"
-"""Text of a share or number of nothing, which has no value."""
+"""Text for nan, such as a fraction of nothing."""
 
 _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 _POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
 _EXPONENT_MAX = 999
+"""Largest magnitude of the exponent in a power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
 _QUANTITY_PATTERN = re.compile(
     rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
@@ -50,8 +57,9 @@ _UNIT_OPERATOR_PATTERN = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +
 _NOT_FINITE_PATTERN = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 _SQUARE_ROOT_PATTERN = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
 _ASCII_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
+"""ASCII spelling of special characters in units."""
 
-# Units that a near miss is looked for in, by the SI unit they measure.
+# Units that are suggested for a misspelt unit, by the SI unit of the field.
 _USUAL_UNITS_BY_SI_UNIT = {
     "m": "nm um mm cm m km au",
     "s": "ns us ms s",
@@ -76,8 +84,10 @@ _USUAL_UNITS_BY_SI_UNIT = {
 _PI = Fraction("3.1415926535897932384626433832795028841971693993751")
 _LN_10 = Fraction("2.3025850929940456840179914546843642076011014886288")
 _ATTENUATION_UNITS = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10 * _LN_10}
-"""Attenuation of power with distance: [1/m] of a decibel in each metre, kilometre or centimetre."""
+"""Attenuation of power with distance: value in 1/m of one decibel per metre, kilometre or
+centimetre."""
 _WATT_DIMENSION = {"gram": 1, "meter": 2, "second": -3}
+"""Exponents of pint's root units in a watt."""
 _BASE_UNITS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "m": (Fraction(1), {"meter": 1}),
     "s": (Fraction(1), {"second": 1}),
@@ -91,22 +101,24 @@ _BASE_UNITS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "sr": (Fraction(1), {"radian": 2}),
     "deg": (_PI / 180, {"radian": 1}),
 }
+"""Factor to pint's root units, and exponents of the root units, of each unit known without pint."""
 _PREFIX_EXPONENTS = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
+"""Power of ten of each metric prefix."""
 UNITS_KNOWN_WITHOUT_PINT = frozenset(_BASE_UNITS) | {
     prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNITS
 }
-"""Units that are known without pint; its factors and root units."""
+"""Units that are known without pint; factors and root units equal those of pint."""
 
 
 class QuantityError(ValueError):
-    """A written quantity that cannot be read: the rule it breaks and what to do about it.
+    """Error of a written quantity that can't be read.
 
     Parameters
     ----------
     rule : str
-        The rule broken, as the end of the sentence "this field ...".
+        The broken rule, as the end of the sentence "this field ...".
     suggestion : str
-        A near miss or a remedy, empty where there is none.
+        Similar text or remedy; may be empty.
     """
 
     def __init__(self, rule: str, suggestion: str = "") -> None:
@@ -117,22 +129,32 @@ class QuantityError(ValueError):
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit as the user wrote it and its way to SI: ``si = factor * value + offset``.
+    """A unit as the user wrote it, and its conversion to SI units.
 
-    Decibels are ratios of powers: ``si = factor * 10 ** (value / 10)``.
+    The conversion is ``si = factor * value + offset``. For logarithmic units it is
+    ``si = factor * 10 ** (value / 10)``.
     """
 
     symbol: str
+    """The unit as text; empty for a pure number."""
     factor: Fraction = Fraction(1)
+    """SI value of one unit; of 0 dB for logarithmic units."""
     offset: Fraction = Fraction(0)
+    """SI value of 0 in this unit, such as 273.15 K for degC."""
 
     @property
     def is_logarithmic(self) -> bool:
-        """True if values of this unit are logarithms of power ratios."""
+        """True if values in this unit are logarithms of power ratios."""
         return self.symbol in LOGARITHMIC_UNITS
 
     def to_si(self, value: Fraction) -> float:
-        """SI value of `value` in this unit, correctly rounded."""
+        """Return the SI value of `value` in this unit, correctly rounded.
+
+        Raises
+        ------
+        QuantityError
+            If the result exceeds the range of floats.
+        """
         try:
             scaled = self.factor * (_power_ratio(value) if self.is_logarithmic else value)
             return float(scaled + self.offset)
@@ -147,10 +169,30 @@ def read_number(
     is_power_ratio: bool = False,
     is_valid: Callable[[Fraction], bool] = lambda number: True,
 ) -> tuple[Fraction, Unit]:
-    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
+    """Read a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
-    A ratio of powers may be in decibels, ``"-3 dB"``. A `QuantityError` for any other unit says
-    what the number is, its `description`, and suggests numbers that are `is_valid` only.
+    Parameters
+    ----------
+    raw_value : object
+        Value as written.
+    description : str
+        Description of the number for errors about units.
+    is_power_ratio : bool
+        True if the number may be written in decibels, such as ``"-3 dB"``.
+    is_valid : callable
+        Test of a number that errors may suggest.
+
+    Returns
+    -------
+    value : Fraction
+        Exact number in `unit`.
+    unit : Unit
+        Percent, decibels or no unit.
+
+    Raises
+    ------
+    QuantityError
+        If the value is no number or has another unit.
     """
     value, unit = _split_quantity(raw_value, "must be a number")
     if unit in ("%", "percent"):
@@ -169,10 +211,7 @@ def read_number(
 def _pure_number_suggestion(
     value: Fraction, unit: str, is_valid: Callable[[Fraction], bool]
 ) -> str:
-    """Suggestion of the pure number that a number with a unit may mean, if that is clear.
-
-    Empty where no such number `is_valid`.
-    """
+    """Suggest the pure number that a number with a unit probably means; '' if none is valid."""
     if unit == DECIBEL:
         ratios = {"powers": _power_ratio(value), "amplitudes": _power_ratio(value / 2)}
         ratio_texts = {
@@ -201,15 +240,33 @@ def _pure_number_suggestion(
 
 
 def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
-    """Exact value and unit of a written quantity, such as ``"25 mm"``.
+    """Read a quantity such as ``"25 mm"``.
 
-    The SI unit fixes its dimension: ``"dB"`` for a power ratio written in decibels. The example
-    is shown where the unit is missing, unknown or unfit: a `QuantityError`.
+    Parameters
+    ----------
+    raw_value : object
+        Value as written.
+    si_unit : str
+        SI unit that fixes the dimension; ``"dB"`` for a power ratio written in decibels.
+    example : str
+        A valid quantity, for errors.
+
+    Returns
+    -------
+    value : Fraction
+        Exact number in `unit`.
+    unit : Unit
+        Unit as written.
+
+    Raises
+    ------
+    QuantityError
+        If the value is no number, or its unit is missing, unknown or of another dimension.
     """
     value, unit_text = _split_quantity(raw_value, "must be a number with a unit")
     if not unit_text:
         remedy = f"write e.g. '{example}'"
-        if si_unit == DECIBEL and 1e-300 < value < 1e300:  # others are no floats, or no ratios
+        if si_unit == DECIBEL and 1e-300 < value < 1e300:  # else no float, or not positive
             remedy += f"; a ratio of {_format_number(value)} is {10 * math.log10(value):.4g} dB"
         raise QuantityError("needs a unit", remedy)
     return value, read_unit(unit_text, si_unit=si_unit, example=example)
@@ -217,7 +274,22 @@ def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fra
 
 @lru_cache(maxsize=4096)
 def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
-    """Parse a unit that must measure what `si_unit` measures."""
+    """Parse a unit of the dimension of an SI unit.
+
+    Parameters
+    ----------
+    unit_text : str
+        Unit as written.
+    si_unit : str
+        SI unit of the same dimension.
+    example : str
+        A valid quantity, for errors.
+
+    Raises
+    ------
+    QuantityError
+        If the unit is unknown or of another dimension.
+    """
     compact_text = "".join(unit_text.split())
     if compact_text in LOGARITHMIC_UNITS:
         measured_si_unit, factor = LOGARITHMIC_UNITS[compact_text]
@@ -246,7 +318,7 @@ def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
 
 
 def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[str, str]:
-    """Rule and suggestion for a unit of the wrong dimension."""
+    """Return rule and suggestion for a unit of the wrong dimension."""
     dbm_example = " or '30 dBm'" if (si_unit, unit_text) == ("W", DECIBEL) else ""
     return (
         f"needs a unit like {si_unit}, and '{unit_text}' is none",
@@ -255,7 +327,12 @@ def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[
 
 
 def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
-    """Exact number and unit text (empty where none) of what was written; the rule if unreadable."""
+    """Return the exact number and the text of the unit of a written quantity.
+
+    The text may be empty.
+
+    An unreadable value raises a `QuantityError` with `rule`.
+    """
     if isinstance(raw_value, bool) or not isinstance(raw_value, int | float | str):
         raise QuantityError(rule)
     text = _to_ascii_spelling(str(raw_value))
@@ -275,7 +352,7 @@ def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
 
 
 def _parse_power(base: int, exponent: str) -> Fraction:
-    """Exact power, such as ``2^17`` or ``10^-3``; its exponent is a whole number of few digits."""
+    """Return an exact power, such as ``2^17`` or ``10^-3``, with an integer exponent."""
     if "." in exponent:
         raise QuantityError("has an exponent that is no whole number")
     if abs(int(exponent)) > _EXPONENT_MAX:
@@ -286,7 +363,7 @@ def _parse_power(base: int, exponent: str) -> Fraction:
 
 
 def _grouping_error(text: str, number: str) -> tuple[str, str]:
-    """Rule and suggestion for a number whose digits are grouped, or with a decimal comma."""
+    """Return rule and suggestion for a number with grouped digits or a decimal comma."""
     *groups, last_group = re.split(r"[,_'\s]", number)
     remedies = []
     if "," not in number or (len(last_group) == 3 and "." not in number):
@@ -303,7 +380,7 @@ def _grouping_error(text: str, number: str) -> tuple[str, str]:
 
 
 def _to_ascii_spelling(text: str) -> str:
-    """Text in plain letters: ``25 µm`` as ``25 um``, ``pW/√Hz`` as ``pW/Hz^0.5``."""
+    """Return a text in ASCII spelling: ``25 µm`` as ``25 um``, ``pW/√Hz`` as ``pW/Hz^0.5``."""
     text = unicodedata.normalize("NFKC", text[: 2 * QUANTITY_TEXT_LENGTH_MAX])
     for character, letters in _ASCII_SPELLINGS.items():
         text = text.replace(character, letters)
@@ -311,7 +388,7 @@ def _to_ascii_spelling(text: str) -> str:
 
 
 def _format_number(value: Fraction) -> str:
-    """Format a number as a user would write it."""
+    """Return a number as a user would write it."""
     try:
         return f"{float(value):.4g}"
     except OverflowError:
@@ -319,7 +396,7 @@ def _format_number(value: Fraction) -> str:
 
 
 def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
-    """Names and exponents of a unit's factors; None where the text is no unit."""
+    """Return names and exponents of a unit's factors; None if the text is no unit."""
     factors = []
     sign = 1
     unit_text = re.sub(r"^1\s*/", "/", unit_text.replace("**", "^"))
@@ -329,7 +406,7 @@ def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
             sign = -1 if factor == "/" else 1
             continue
         if index == 0 and unit_text.lstrip().startswith("/"):
-            continue  # 1/m
+            continue  # the 1 of 1/m
         match = _UNIT_FACTOR_PATTERN.fullmatch(factor)
         if match is None:
             return None
@@ -338,7 +415,7 @@ def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
 
 
 def _format_unit(factors: list[tuple[str, Fraction]]) -> str:
-    """One spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``, ``1/km``, ``m^(-2/3)``."""
+    """Return the normal spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``, ``1/km``, ``m^(-2/3)``."""
     if [exponent for _, exponent in factors] == [-1]:
         return f"1/{factors[0][0]}"
     unit_text = ""
@@ -354,7 +431,7 @@ def _format_unit(factors: list[tuple[str, Fraction]]) -> str:
 
 @cache
 def _pint_registry() -> Any:
-    """Pint's registry, in exact fractions."""
+    """Return pint's registry of units with exact fractions."""
     import pint
 
     return pint.UnitRegistry(non_int_type=Fraction)
@@ -362,7 +439,7 @@ def _pint_registry() -> Any:
 
 @cache
 def _in_root_units(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
-    """Factor, offset and dimension of one unit in pint's root units; None where unknown."""
+    """Return factor, offset and dimension of a unit in pint's root units; None if it is unknown."""
     if name in UNITS_KNOWN_WITHOUT_PINT:
         base = name if name in _BASE_UNITS else name[1:]
         factor, powers = _BASE_UNITS[base]
@@ -374,7 +451,18 @@ def _in_root_units(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Frac
 def in_root_units_by_pint(
     name: str,
 ) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
-    """Return the unit as pint has it."""
+    """Return factor, offset and dimension of a unit in root units according to pint.
+
+    Parameters
+    ----------
+    name : str
+        Name of the unit.
+
+    Returns
+    -------
+    (Fraction, Fraction, tuple of (str, Fraction)) or None
+        None if pint does not know the unit.
+    """
     registry = _pint_registry()
     try:
         unit = registry.parse_units("percent" if name == "%" else name)
@@ -389,7 +477,7 @@ def in_root_units_by_pint(
 def _combine_factors(
     factors: list[tuple[str, Fraction]],
 ) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
-    """Factor, offset and dimension of a product of units, all of them known."""
+    """Return factor, offset and dimension of a product of known units."""
     scale, offset = Fraction(1), Fraction(0)
     dimension: dict[str, Fraction] = {}
     for name, exponent in factors:
@@ -399,7 +487,7 @@ def _combine_factors(
         scale *= _exact_power(factor, exponent)
         for key, power in powers:
             dimension[key] = dimension.get(key, Fraction(0)) + power * exponent
-    # A temperature's zero matters to a temperature, not to a unit that it is a factor of.
+    # The offset of a temperature unit applies to temperatures, but not to products with it (W/K).
     return (
         scale,
         offset if len(factors) == 1 else Fraction(0),
@@ -408,7 +496,7 @@ def _combine_factors(
 
 
 def _exact_power(factor: Fraction, exponent: Fraction) -> Fraction:
-    """Power of a positive fraction, to 50 digits where the exponent is no whole number."""
+    """Return a power of a positive fraction, exact for integer exponents, else to 50 digits."""
     if exponent.denominator == 1:
         return factor ** int(exponent)
     with localcontext() as context:
@@ -422,7 +510,7 @@ def _exact_power(factor: Fraction, exponent: Fraction) -> Fraction:
 
 
 def _power_ratio(decibels: Fraction) -> Fraction:
-    """Power ratio of so many decibels, to 50 digits; of more than a float can hold, 1e400."""
+    """Return the power ratio of decibels to 50 digits, clipped to 1e-400 and 1e400."""
     with localcontext() as context:
         context.prec = 50
         exponent = Decimal(decibels.numerator) / decibels.denominator / 10
@@ -430,7 +518,7 @@ def _power_ratio(decibels: Fraction) -> Fraction:
 
 
 def _unit_suggestion(name: str, si_unit: str, example: str) -> str:
-    """Suggestion for an unknown unit: the usual one that it resembles, or an example."""
+    """Suggest a usual unit that resembles an unknown unit, else an example."""
     usual_units = _to_ascii_spelling(_USUAL_UNITS_BY_SI_UNIT.get(si_unit, si_unit))
     names = sorted(set(re.findall(r"[A-Za-z%]+", usual_units)))
     case_variants = [usual_name for usual_name in names if usual_name.lower() == name.lower()]
@@ -442,6 +530,8 @@ def _unit_suggestion(name: str, si_unit: str, example: str) -> str:
 def number_text(value: float, format_spec: str = ".4g") -> str:
     """Return a number as text; ``none`` for nan.
 
+    Examples
+    --------
     >>> number_text(0.25), number_text(float("nan"))
     ('0.25', 'none')
     """
@@ -449,8 +539,10 @@ def number_text(value: float, format_spec: str = ".4g") -> str:
 
 
 def percent(share: float, format_spec: str = ".3g") -> str:
-    """Return a share in percent; ``none`` for nan, the share of nothing.
+    """Return a fraction in percent; ``none`` for nan, such as a fraction of nothing.
 
+    Examples
+    --------
     >>> percent(0.25), percent(float("nan"))
     ('25 %', 'none')
     """

@@ -1,1 +1,1 @@
-"""Scenes as the model's arrays: files read, ground drawn at random, and the objects on it."""
+"""Scenes as arrays for the model: files, random terrain and the objects on it."""

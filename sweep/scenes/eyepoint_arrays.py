@@ -1,4 +1,7 @@
-"""Eyepoints as the arrays of a store, named as in :mod:`sweep.model.outputs`, and back."""
+"""Conversion of eyepoints to the arrays of a store and back.
+
+Names as in :mod:`sweep.model.outputs`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,18 @@ _FIELD_OF_ARRAY = {
 
 
 def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
-    """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store."""
+    """Return the arrays of a store for n shots of b beamlets.
+
+    Parameters
+    ----------
+    eyepoints : Eyepoints
+        Eyepoints of n shots.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Arrays (n, ...) of `SHOT_VARIABLES` and `BEAMLET_VARIABLES`, in the types of the store.
+    """
     outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
     arrays = {
         name: np.asarray(getattr(eyepoints, field), outputs[name].dtype)
@@ -41,7 +55,20 @@ def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Eyepoints of stored arrays and power fractions (b,); ValueError for unlike shapes."""
+    """Return the eyepoints that a store's arrays hold.
+
+    Parameters
+    ----------
+    arrays : Mapping of str to ndarray
+        Arrays of n shots from `eyepoints_to_arrays`.
+    weight : ndarray, shape (b,)
+        Power fractions of the beamlets.
+
+    Raises
+    ------
+    ValueError
+        If an array is missing or has an unexpected shape.
+    """
     if missing := sorted(_FIELD_OF_ARRAY.keys() - arrays.keys()):
         raise ValueError(f"eyepoints lack {', '.join(missing)}")
     fields = {field: np.asarray(arrays[name]) for name, field in _FIELD_OF_ARRAY.items()}

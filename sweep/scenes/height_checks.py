@@ -1,4 +1,4 @@
-"""Heights of grids: values that stand for none, and heights that can hardly be those of ground."""
+"""Checks of grids of heights: values that stand for missing heights, and implausible cliffs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sweep.messages import counted
 from sweep.scenes.scene_files import SceneError
 
 HEIGHT_MAX = 1e6
-"""Largest magnitude of a height [unit of the file]: no ground of a planet lies as far off."""
+"""Largest magnitude of a plausible height [unit of the file]."""
 
 _CUSTOMARY_NO_DATA_VALUES = (
     -32768.0,
@@ -23,40 +23,58 @@ _CUSTOMARY_NO_DATA_VALUES = (
     9999.0,
     99999.0,
 )
-"""Values that files customarily hold where there is no height."""
+"""Values that files customarily use for missing heights."""
 
 _CUSTOMARY_VALUE_GAP_MIN = 0.1
-"""Gap between such a value and the next height, over the span of all others, that is doubtful."""
+"""Smallest suspicious gap between a customary value and the next height, relative to the span of
+all other heights."""
 
 _SHARED_VALUE_GAP_MIN = 1.0
-"""The same for any other value that several cells share."""
+"""Smallest suspicious gap for any other value that several cells share, relative to the same
+span."""
 
 _SHARED_CELLS_MIN = 4
-"""Cells that share a value exactly, from which it may stand for a missing height."""
+"""Smallest number of cells with exactly equal extreme values that is suspicious."""
 
 _DOUBTFUL_VALUES_MAX = 3
-"""Doubtful values that are looked for, one behind the other."""
+"""Maximum number of suspicious values that are searched for, from the extremes inwards."""
 
 _ROWS_PER_STRIP = 256
-"""Rows that are looked at for cliffs at a time."""
+"""Number of rows that are examined for cliffs at a time."""
 
 CLIFF_SLOPE_MIN = 20.0
-"""Tangent of the steepest slope between neighbouring cells that is not told."""
+"""Slope between neighbouring cells, as a tangent, above which a cliff is reported."""
 
 CLIFF_HEIGHT_MIN = 100.0
-"""Least height of such a cliff [m]."""
+"""Height difference above which a cliff is reported [m]."""
 
 
 def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) -> tuple[str, ...]:
-    """Set values without data to NaN, in place; return warnings of values that could be such.
+    """Set missing heights to NaN in place, and return warnings about values that may be missing.
 
-    Values that are not finite, or equal to `no_data` in the type of the file, are without data.
-    SceneError for heights that no planet has and that nothing declares to be without data.
+    Parameters
+    ----------
+    path : Path
+        File of the heights, for messages.
+    values : ndarray, shape (rows, columns)
+        Heights [unit of the file]; changed in place. Values that are not finite are missing.
+    no_data : float or None
+        Value that stands for a missing height, compared in double and in single precision.
+
+    Returns
+    -------
+    tuple of str
+        Warnings.
+
+    Raises
+    ------
+    SceneError
+        If a height exceeds `HEIGHT_MAX` and is not declared as missing.
     """
     is_missing = ~np.isfinite(values)
     if no_data is not None:
         is_missing |= values == no_data
-        # A value of single precision is written in fewer digits than it has.
+        # A single-precision value written in decimals differs from its double-precision value.
         with np.errstate(over="ignore"):
             is_missing |= values == np.float64(np.float32(no_data))
     values[is_missing] = np.nan
@@ -74,14 +92,14 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
 
 
 def _shortest_text(value: float) -> str:
-    """Return a number in the fewest digits that name it, in single precision if it has no more."""
+    """Return the shortest decimal text of a number; single precision is used if it is exact."""
     with np.errstate(over="ignore"):
         single_precision = np.float32(value)
     return str(single_precision) if float(single_precision) == value else repr(value)
 
 
 def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
-    """Warnings of the extreme values of a grid that several cells share, far from all others."""
+    """Return warnings about extreme values that are far from all others and may be missing."""
     warnings: list[str] = []
     low, high = -np.inf, np.inf
     for _ in range(_DOUBTFUL_VALUES_MAX):
@@ -96,7 +114,7 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
         second_highest = float(
             np.max(values, where=is_inside & (values < highest), initial=-np.inf)
         )
-        # Each end is held against the span of everything but itself.
+        # Compare the gap at each end with the span of all values except that end.
         candidates = (
             (lowest, second_lowest - lowest, highest - second_lowest),
             (highest, highest - second_highest, second_highest - lowest),
@@ -105,7 +123,7 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
             count = int(np.count_nonzero(values == value))
             if value in _CUSTOMARY_NO_DATA_VALUES:
                 is_doubtful = gap > _CUSTOMARY_VALUE_GAP_MIN * span
-            else:  # of two heights alone neither is more doubtful than the other
+            else:  # with only two distinct heights neither is more suspicious
                 is_doubtful = count >= _SHARED_CELLS_MIN and gap > _SHARED_VALUE_GAP_MIN * span > 0
             if is_doubtful:
                 warnings.append(
@@ -121,10 +139,19 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
 
 
 def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]) -> list[str]:
-    """Warning of cliffs between neighbouring cells; none for heights (rows, columns) [m] of ground.
+    """Return a warning if neighbouring cells differ by an implausible height, else nothing.
 
-    Missing heights that nothing declares stand as cliffs in a grid, also where they were blended
-    with heights as the grid was resampled.
+    Missing heights that are not declared appear as cliffs in a grid, even if they were blended with
+    heights by resampling.
+
+    Parameters
+    ----------
+    path : Path
+        File of the heights, for the message.
+    heights : ndarray, shape (rows, columns)
+        Heights [m]; NaN for missing heights.
+    spacing : (float, float)
+        Grid steps along x and y [m].
     """
     n_cliffs, largest_rise, step_at_largest = 0, 0.0, 0.0
     for first_row in range(0, len(heights), _ROWS_PER_STRIP):

@@ -1,8 +1,8 @@
-"""Coordinates of maps: metres to their units on the ground, their heights' unit, their agreement.
+"""Coordinates of maps: their scale on the ground, the unit of their heights, and their consistency.
 
-A map's unit is a metre only by name: in Web Mercator at 60 degrees north it is half a metre on the
-ground. The size of a unit is measured by geodesics on the map's own ellipsoid, in the middle, on
-the edges and at the corners of what is read.
+The unit of a map is a metre on the map and not on the ground: in Web Mercator at 60 degrees north
+it is half a metre on the ground. The scale is measured by geodesics on the map's own ellipsoid, at
+the centre, on the edges and at the corners of the part that is read.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from sweep.scenes.scene_files import SceneError
 from sweep.units import QuantityError, read_unit
 
 SCALE_ERROR_MAX = 1e-3
-"""Relative error of a map's scale up to which its coordinates are taken as they are."""
+"""Relative error of a map's scale up to which its coordinates are used without a warning."""
 
 STATED_SCALE_ERROR_MAX = 5e-2
-"""The same, of a scale that the user states, beyond which it is taken for a mistake."""
+"""Relative error of a scale stated by the user above which it counts as a mistake."""
 
 CELL_TAKEN_FOR_DEGREES_MAX = 0.1
-"""Cell size below which coordinates that could be longitudes and latitudes are taken for these."""
+"""Cell size below which coordinates in the range of longitudes and latitudes count as degrees."""
 
 MapBounds = tuple[float, float, float, float]
 """West, south, east and north, in a map's own coordinates."""
@@ -39,22 +39,27 @@ _METRES_PER_HEIGHT_UNIT = (
     )
     | dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048)
 )
-"""Metres to a unit of height, by the names that rasters give to it."""
+"""Metres per unit of height, by the names of the unit in rasters."""
 
 
 class MetresPerUnit(NamedTuple):
-    """Metres on the ground to a unit of a map's coordinates."""
+    """Metres on the ground per unit of a map's coordinates."""
 
     east: float
+    """Metres per unit eastwards."""
     north: float
+    """Metres per unit northwards."""
 
 
 class StatedUnits(NamedTuple):
-    """A user's statements on a raster's coordinates and heights; None if left out."""
+    """Units of a raster's coordinates and heights as stated by the user; None if not stated."""
 
     metres_per_degree: tuple[float, float] | None = None
+    """Metres per degree eastwards and northwards."""
     metres_per_unit: tuple[float, float] | None = None
+    """Metres per unit of the coordinates eastwards and northwards."""
     height_unit: str | None = None
+    """Unit of the heights."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +67,14 @@ class MapFrame:
     """Map that a raster's coordinates belong to."""
 
     metres_per_unit: MetresPerUnit
-    """Metres that its coordinates were multiplied by."""
+    """Metres per unit by which the raster's coordinates are multiplied."""
     wkt: str = ""
-    """Coordinate reference system; '' for none."""
+    """Coordinate reference system as WKT; empty if the raster states none."""
     warnings: tuple[str, ...] = ()
+    """Doubts about the map's scale, as sentences."""
 
     def is_same_map(self, other: MapFrame) -> bool:
-        """Return true if two maps have one coordinate reference system, or one has none."""
+        """Return True if the horizontal reference systems of two maps are equal or not stated."""
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
         horizontal_crs, other_horizontal_crs = (
@@ -77,14 +83,14 @@ class MapFrame:
         return bool(horizontal_crs.equals(other_horizontal_crs, ignore_axis_order=True))
 
     def has_same_height_reference(self, other: MapFrame) -> bool:
-        """Return true if heights on two maps are above one surface, or one map tells none."""
+        """Return True if heights on two maps refer to one surface, or a map states none."""
         return not (self.wkt and other.wkt) or _is_same_height_reference(
             _crs_from_wkt(self.wkt), _crs_from_wkt(other.wkt)
         )
 
     @property
     def height_reference_name(self) -> str:
-        """Name of the surface that its heights are above; '' for none."""
+        """Name of the reference surface of the heights; empty if it is not stated."""
         return _height_reference_name(_crs_from_wkt(self.wkt)) if self.wkt else ""
 
     @property
@@ -94,7 +100,10 @@ class MapFrame:
 
 
 def metric_projection_of_crs(wkt: str) -> str:
-    """WKT of a map projection in metres, without its vertical part if that is not; else ''."""
+    """Return the WKT of a reference system if it is a map projection in metres, else ''.
+
+    A vertical part in another unit than metres is removed.
+    """
     crs = _crs_from_wkt(wkt)
     horizontal = _horizontal_crs(crs)
     if not horizontal.is_projected or _linear_unit(horizontal)[1] != 1.0:
@@ -106,7 +115,7 @@ def metric_projection_of_crs(wkt: str) -> str:
 
 
 def metres_per_height_unit(unit: str) -> float:
-    """Metres to a unit of height; QuantityError for a word that is none."""
+    """Return the metres per unit of height; raise `QuantityError` for an unknown unit."""
     word = unit.strip().lower()
     if word in _METRES_PER_HEIGHT_UNIT:
         return _METRES_PER_HEIGHT_UNIT[word]
@@ -116,11 +125,29 @@ def metres_per_height_unit(unit: str) -> float:
 def height_factor(
     path: Path, wkt: str, band_unit: str, stated_unit: str | None, has_height_scale: bool
 ) -> float:
-    """Metres to a unit of a raster's heights.
+    """Return the metres per unit of a raster's heights.
 
-    The unit is that of the band, or of the vertical axis of the reference system, or what is
-    stated. If nothing tells it, it is the metre, unless the map is in another unit: then it is
-    asked for. `scaled`: the spec has a factor for the heights, which tells their unit too.
+    The unit is stated by the user, by the band, or by the vertical axis of the reference system. If
+    none of them states it, the unit is the metre. A map in another unit than metres must have a
+    stated unit of height.
+
+    Parameters
+    ----------
+    path : Path
+        File of the raster, for errors.
+    wkt : str
+        Coordinate reference system as WKT; may be empty.
+    band_unit : str
+        Unit that the band states; may be empty.
+    stated_unit : str or None
+        Unit that the user states.
+    has_height_scale : bool
+        True if the spec has a factor for the heights, so that their unit is known.
+
+    Raises
+    ------
+    SceneError
+        If the unit is unknown, or statements contradict each other.
     """
     declared_unit = _declared_unit(path, wkt, band_unit)
     if stated_unit is not None:
@@ -147,7 +174,10 @@ def height_factor(
 
 
 def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
-    """Return the unit of heights that a raster declares itself, and metres to it."""
+    """Return the unit of heights that a raster states, and metres per unit.
+
+    None if it states none.
+    """
     crs = _crs_from_wkt(wkt) if wkt else None
     axis = _vertical_axis(crs) if crs is not None else None
     if axis is not None and axis.direction.lower() == "down":
@@ -161,7 +191,7 @@ def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | 
     except QuantityError:
         remedy = "convert them to metres with gdal_calc"
         raise SceneError(path, f"has heights in '{band_unit}'", remedy) from None
-    # 'ft' is written for either foot: they differ by 2e-6, 2 cm in 10 km.
+    # 'ft' may be the international or the US survey foot, which differ by 2e-6: 2 cm in 10 km.
     if map_unit is not None and not math.isclose(map_unit[1], band_unit_scale[1], rel_tol=1e-5):
         problem = (
             f"contradicts itself: its band has heights in '{band_unit}', and its vertical "
@@ -173,17 +203,33 @@ def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | 
 
 
 def _short_unit_name(unit: str) -> str:
-    """Short name of a unit of length that a reference system names."""
+    """Return the short name of a unit of length in a reference system."""
     return {"us survey foot": "sft", "foot": "ft"}.get(unit.lower(), unit)
 
 
 def make_map_frame(
     path: Path, wkt: str, bounds: MapBounds, cell_size: float, stated: StatedUnits
 ) -> MapFrame:
-    """MapFrame of a raster of a reference system (WKT, '' for none), over the bounds that are read.
+    """Return the map of a raster, with a check of its scale on the ground.
 
-    `cell` is the smaller side of a cell, in the raster's coordinates. SceneError where the size of
-    a unit on the ground is not known, or differs over the bounds by more than `SCALE_ERROR_MAX`.
+    Parameters
+    ----------
+    path : Path
+        File of the raster, for errors.
+    wkt : str
+        Coordinate reference system as WKT; empty for none.
+    bounds : MapBounds
+        Bounds of the part that is read.
+    cell_size : float
+        Smaller side of a cell, in the raster's coordinates.
+    stated : StatedUnits
+        Units that the user states.
+
+    Raises
+    ------
+    SceneError
+        If the size of a unit on the ground is unknown, or varies over the bounds by more than
+        `SCALE_ERROR_MAX`.
     """
     per_degree, per_unit = stated.metres_per_degree, stated.metres_per_unit
     for name, sizes in (("degree", per_degree), ("unit", per_unit)):
@@ -210,7 +256,10 @@ def make_map_frame(
 def _map_frame_without_crs(
     path: Path, bounds: MapBounds, cell_size: float, stated: tuple[float, float] | None
 ) -> MapFrame:
-    """MapFrame of a raster without a reference system: metres, unless that can not be."""
+    """Return the map of a raster without a reference system, in metres unless a unit is stated.
+
+    Coordinates that could be degrees raise a `SceneError`.
+    """
     if stated is not None:
         return MapFrame(MetresPerUnit(*stated))
     west, south, east, north = bounds
@@ -238,7 +287,7 @@ def _checked_map_frame(
     stated: tuple[float, float] | None,
     field_name: str,
 ) -> MapFrame:
-    """MapFrame whose scale is held against that on the ground."""
+    """Return the map of a raster, after comparison of its scale with that on the ground."""
     unit = "degree" if crs.is_geographic else "unit of its coordinates"
     if stated is None and not crs.is_geographic:
         factor = _linear_unit(crs)[1]
@@ -248,7 +297,7 @@ def _checked_map_frame(
     else:
         factors = None
     scales, skew = _ground_scales(path, crs, bounds)
-    if scales is None:  # a map of a site, of which no place on a planet is known
+    if scales is None:  # a local map of a site without a position on a planet
         assert factors is not None
         return MapFrame(factors, wkt)
     middle_scale = MetresPerUnit(*scales[len(scales) // 2])
@@ -278,13 +327,29 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
+    """Return the largest relative difference between a map's scale and the scales on the ground."""
     return float(np.abs(np.array(factors) / scales - 1).max())
 
 
 def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray | None, float]:
-    """Metres to a unit eastwards and northwards at nine places (9, 2), and the axes' skew [rad].
+    """Return the scales of a map on the ground, and the deviation of its axes from a right angle.
 
-    None of a map that has no place on a planet.
+    Parameters
+    ----------
+    path : Path
+        File of the raster, for errors.
+    crs : pyproj.CRS
+        Horizontal reference system.
+    bounds : MapBounds
+        Bounds of the part that is read.
+
+    Returns
+    -------
+    scales : ndarray, shape (9, 2), or None
+        Metres per unit eastwards and northwards at nine points; None for a map without a position
+        on a planet.
+    skew : float
+        Largest deviation of the axes from a right angle [rad].
     """
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
@@ -298,7 +363,7 @@ def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray 
         coordinates.ravel()
         for coordinates in np.meshgrid(np.linspace(west, east, 3), np.linspace(south, north, 3))
     )
-    if crs.is_geographic:  # none of a geodesic passes a pole
+    if crs.is_geographic:  # keep geodesics off the poles
         y = np.clip(y, -89.999, 89.999)
     geodesic_step = 1e-4 * max(east - west, north - south)
     try:
@@ -320,14 +385,14 @@ def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray 
 
 
 def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
-    """Remedy for a map whose scale is not that of the ground."""
+    """Return the remedy for a map whose scale is not that of the ground: a reprojection."""
     from pyproj import Transformer
 
     geographic = crs if crs.is_geographic else crs.geodetic_crs
     middle = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     longitude, latitude = Transformer.from_crs(crs, geographic, always_xy=True).transform(*middle)
     remedy = "reproject it with gdalwarp"
-    if abs(crs.ellipsoid.semi_major_metre - WGS84_RADIUS) > 1e4:  # of another planet
+    if abs(crs.ellipsoid.semi_major_metre - WGS84_RADIUS) > 1e4:  # another planet
         centre_text = f"+lon_0={longitude:.4f} +lat_0={latitude:.4f}"
         return (
             f"{remedy}, e.g. -t_srs '+proj=stere {centre_text} "
@@ -346,12 +411,14 @@ def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
 
 
 def _crs_from_wkt(wkt: str) -> Any:
+    """Return the pyproj reference system of a WKT."""
     from pyproj import CRS
 
     return CRS.from_wkt(wkt)
 
 
 def _crs_of_raster(path: Path, wkt: str) -> Any:
+    """Return the pyproj reference system of a raster; raise `SceneError` if it can't be read."""
     from pyproj.exceptions import CRSError
 
     try:
@@ -362,16 +429,16 @@ def _crs_of_raster(path: Path, wkt: str) -> Any:
 
 
 def _horizontal_crs(crs: Any) -> Any:
-    """Part of a reference system that is a map, without a shift to another datum."""
+    """Return the horizontal part of a reference system, without a change of datum."""
     while crs.is_bound or crs.is_compound:
         crs = crs.source_crs if crs.is_bound else crs.sub_crs_list[0]
     return crs
 
 
 def _vertical_crs(crs: Any) -> Any:
-    """Part of a reference system that heights refer to: a vertical one, or one of three axes.
+    """Return the part of a reference system that heights refer to; None if there is none.
 
-    None if there is none.
+    This is a vertical system, or a system of three axes.
     """
     while crs.is_bound:
         crs = crs.source_crs
@@ -385,14 +452,14 @@ def _vertical_crs(crs: Any) -> Any:
 
 
 def _vertical_axis(crs: Any) -> Any:
-    """Axis of the heights of a reference system; None if there is none."""
+    """Return the height axis of a reference system; None if there is none."""
     vertical = _vertical_crs(crs)
     axes = vertical.axis_info if vertical is not None else []
     return axes[-1] if axes else None
 
 
 def _height_reference_name(crs: Any) -> str:
-    """Name of the surface that heights of a reference system are above; '' for none."""
+    """Return the name of the reference surface of a system's heights; empty if there is none."""
     vertical = _vertical_crs(crs)
     if vertical is None:
         return ""
@@ -400,9 +467,9 @@ def _height_reference_name(crs: Any) -> str:
 
 
 def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
-    """Return true if heights of two reference systems are above one surface, or one tells none.
+    """Return True if heights of two systems refer to the same surface, or one states no surface.
 
-    Their units may differ, as all heights are turned into metres.
+    Units may differ, because all heights are converted to metres.
     """
     first, second = _vertical_crs(crs), _vertical_crs(other_crs)
     if first is None or second is None:
@@ -413,7 +480,7 @@ def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
 
 
 def _linear_unit(crs: Any) -> tuple[str, float]:
-    """Name of the unit of a map's axes, and metres to it; degrees count as metres."""
+    """Return the name of the unit of a map's axes, and metres per unit; 1 for degrees."""
     axes = crs.axis_info
     if crs.is_geographic or not axes:
         return "metre", 1.0
@@ -421,18 +488,35 @@ def _linear_unit(crs: Any) -> tuple[str, float]:
 
 
 UTM_LATITUDE_MAX = 80.0
-"""Latitude up to which zones of UTM are defined on both hemispheres [deg]."""
+"""Largest latitude at which UTM zones are defined on both hemispheres [deg]."""
 
 WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
+"""Semi-major axis [m] and flattening of the WGS84 ellipsoid."""
 
 
 def degree_lengths(
     latitude: float, *, radius: float = WGS84_RADIUS, flattening: float = WGS84_FLATTENING
 ) -> tuple[float, float]:
-    """Metres of a degree of longitude and of latitude at a geodetic latitude [deg].
+    """Return the lengths of a degree of longitude and of latitude on an ellipsoid.
 
-    Over a grid of h degrees the east-west scale is off by up to ``tan(latitude) h/2`` at its
-    edges.
+    Parameters
+    ----------
+    latitude : float
+        Geodetic latitude [deg].
+    radius : float
+        Semi-major axis of the ellipsoid [m].
+    flattening : float
+        Flattening of the ellipsoid.
+
+    Returns
+    -------
+    (float, float)
+        Metres per degree of longitude and per degree of latitude.
+
+    Notes
+    -----
+    Over a grid that spans h radians of latitude, the relative error of the east-west scale is up to
+    ``tan(latitude) h/2`` at the edges.
     """
     eccentricity_squared = flattening * (2 - flattening)
     latitude_rad = math.radians(latitude)
@@ -445,7 +529,13 @@ def degree_lengths(
 
 
 def require_one_map(map_frames: Sequence[tuple[str, MapFrame]]) -> None:
-    """Refuse rasters, by name, whose coordinates do not belong to one map; SceneError names two."""
+    """Raise `SceneError` if rasters do not belong to one map; the error names two of them.
+
+    Parameters
+    ----------
+    map_frames : sequence of (str, MapFrame)
+        Names of the objects and their maps.
+    """
     for k, (name, map_frame) in enumerate(map_frames):
         for other_name, other in map_frames[:k]:
             object_path = f"scene.objects.{name}"

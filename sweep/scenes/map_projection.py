@@ -1,4 +1,4 @@
-"""Map projection of a scene's coordinates, as files of points state it."""
+"""Map projection of a scene's coordinates, for export to files of points."""
 
 from __future__ import annotations
 
@@ -11,11 +11,23 @@ from sweep.scenes.scene_files import require_file
 
 
 def metric_projection_wkt(path: str | Path, metres_per_unit: Sequence[float] | None = None) -> str:
-    """WKT of a raster's map projection if a scene's coordinates are those of the map, else ''.
+    """Return the map projection of a raster as WKT if the scene's coordinates are those of the map.
 
-    A scene is in metres. Coordinates in feet or degrees, or in units of another size that is
-    stated, are multiplied by that size and belong to no projection. Heights in feet are turned into
-    metres too: then the projection is that of the map alone.
+    A scene is in metres. Coordinates in feet, degrees or units of a stated size are multiplied by
+    that size, so that they belong to no projection. If only the heights are in feet, the result is
+    the projection of the map without its vertical part.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of the raster.
+    metres_per_unit : sequence of float, optional
+        Stated metres on the ground per unit of the raster's coordinates, east and north.
+
+    Returns
+    -------
+    str
+        WKT; empty if the coordinates belong to no projection.
     """
     with open_raster(require_file(path)) as raster:
         crs = raster.crs

@@ -1,4 +1,4 @@
-"""Triangles that scenes are made of: from files, of simple solids, and cleaned into meshes."""
+"""Triangle meshes of scenes: read from files, made of solids, and cleaned for ray casting."""
 
 from __future__ import annotations
 
@@ -23,49 +23,55 @@ from sweep.scenes.scene_files import SceneError, read_companion, require_file, r
 from sweep.units import QuantityError, read_unit
 
 IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
+"""Quaternion (w, x, y, z) of no rotation."""
 
 _AREA_ROUNDING = 1e-12
-"""Normal over the product of two edges above which no rounding can have made it."""
+"""Ratio of a face's normal to the product of two edges above which the area is no rounding
+error."""
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
-"""Formats whose specification makes y the vertical; for the others z is taken to be it."""
+"""Formats whose specification makes y the vertical axis; z is assumed for all others."""
 
 _TRIANGLE_FORMATS = {".stl", *_Y_UP_FORMATS}
-"""Formats that hold triangles alone."""
+"""Formats that hold triangles only."""
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
-"""Formats that are read. No archive is among them: what it holds can be of any size."""
+"""Formats that can be read. Archives are excluded, because their content can be of any size."""
 
 COORDINATE_MAX = 1e9
-"""Largest distance of a vertex from zero along any axis [m]; beyond, squares overflow."""
+"""Largest magnitude of a vertex coordinate [m]; squares of larger ones overflow."""
 
 _MESH_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
-"""Packages of the extra `scenes` that reading a mesh takes."""
+"""Packages of the extra `scenes` that reading a mesh requires."""
 
 FACES_MAX = 100_000_000
-"""Most triangles of one mesh file."""
+"""Maximum number of triangles of a mesh file."""
 
 _MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
-"""Memory that reading and preparing a mesh takes at most, over the size of its file."""
+"""Memory for reading and preparing a mesh over the size of its file, upper bound by format."""
 
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """A soup of triangles.
-
-    Vertices (n, 3) relative to an origin (3,) [m]: terrain lies millions of metres from the
-    zero of its map, and a vertex kept apart from that loses no digits to it. Faces (m, 3) are
-    counter-clockwise as seen from outside; surface (m,) int16 is the index of each face's in
-    the scene's list. Notes say what was done as they were read. Those of a grid need no mending:
-    their vertices are distinct and used, their faces too, and each has an area.
-    """
+    """Triangles without topology."""
 
     vertices: np.ndarray
+    """Vertices (n, 3) relative to the origin [m].
+
+    Terrain may lie millions of metres from the zero of its map: relative vertices keep their
+    precision.
+    """
     faces: np.ndarray
+    """Vertex indices (m, 3) of the triangles, counter-clockwise seen from outside."""
     surface: np.ndarray
+    """Surface number (m,) int16 of each triangle: an index into the scene's list of surfaces."""
     origin: np.ndarray
+    """Origin (3,) of the vertices in world coordinates [m]."""
     notes: tuple[str, ...] = ()
+    """Changes that were made on reading, as sentences."""
     is_grid: bool = False
+    """True if the triangles need no cleaning: vertices and faces are distinct, all vertices are
+    used and all faces have an area."""
 
     @classmethod
     def on_one_surface(
@@ -76,7 +82,19 @@ class Facets:
         surface: int = 0,
         origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     ) -> Facets:
-        """Facets that share one surface."""
+        """Make facets that all belong to one surface.
+
+        Parameters
+        ----------
+        vertices : ndarray, shape (..., 3)
+            Vertices relative to the origin [m].
+        faces : ndarray, shape (..., 3)
+            Vertex indices of the triangles.
+        surface : int
+            Surface number.
+        origin : sequence of float
+            Origin (3,) of the vertices [m].
+        """
         faces = np.asarray(faces, np.int64).reshape(-1, 3)
         return cls(
             np.asarray(vertices, float).reshape(-1, 3),
@@ -88,11 +106,17 @@ class Facets:
     def transform(
         self, *, rotation: Sequence[float] | np.ndarray = IDENTITY_QUATERNION, scale: float = 1.0
     ) -> Facets:
-        """Facets scaled, then turned about their origin by a unit quaternion (w, x, y, z)."""
+        """Return the facets scaled, then rotated about their origin by a quaternion w, x, y, z."""
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
     def to_mesh(self) -> tuple[Mesh, MeshReport]:
-        """Mesh fit to be cast at, in the world frame, and what was done to make it so."""
+        """Return a mesh for ray casting in the world frame, and the report of its cleaning.
+
+        Raises
+        ------
+        ValueError
+            If a vertex lies beyond `COORDINATE_MAX`, or no face is left.
+        """
         with np.errstate(invalid="ignore"):
             is_too_far = np.abs(self.vertices) > COORDINATE_MAX
         if is_too_far.any():
@@ -112,7 +136,7 @@ class Facets:
 
 
 def join_facets(facets_list: Sequence[Facets]) -> Facets:
-    """All parts, one at least, as one, relative to the first one's origin."""
+    """Join at least one set of facets into one, relative to the origin of the first."""
     origin = facets_list[0].origin
     index_shifts = np.cumsum([0, *(len(facets.vertices) for facets in facets_list)])[:-1]
     return Facets(
@@ -136,24 +160,32 @@ _REPAIR_TEXTS = {
     "merged": "{} coincident vertices merged",
     "unreferenced": "{} unused vertices dropped",
 }
-"""Counts of `Report` in words for people."""
+"""Text for each count of `MeshReport`."""
 
 
 @dataclass(frozen=True)
 class MeshReport:
-    """Counts of facets that `clean` was given, found and mended."""
+    """Counts of the vertices and faces of a mesh, and of the repairs by `clean_mesh`."""
 
     n_vertices: int
+    """Number of vertices before cleaning."""
     n_faces: int
+    """Number of faces before cleaning."""
     non_finite: int = 0
-    degenerate: int = 0  # corners that are one, or in line
-    duplicate: int = 0  # in whatever winding
+    """Number of faces dropped because a vertex is not finite."""
+    degenerate: int = 0
+    """Number of faces dropped because corners coincide or are collinear."""
+    duplicate: int = 0
+    """Number of faces dropped because another face has the same corners, in any order."""
     merged: int = 0
+    """Number of vertices merged with a coincident vertex."""
     unreferenced: int = 0
-    notes: tuple[str, ...] = ()  # what was done as they were read
+    """Number of vertices dropped because no face uses them."""
+    notes: tuple[str, ...] = ()
+    """Changes that were made on reading, as sentences."""
 
     def summary(self) -> str:
-        """One line for people: what was given, and of the rest what is not zero."""
+        """Return one line with the counts before cleaning and all repairs that were needed."""
         counts = [(template, getattr(self, name)) for name, template in _REPAIR_TEXTS.items()]
         repairs = [template.format(count) for template, count in counts if count]
         input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"
@@ -163,15 +195,33 @@ class MeshReport:
 def clean_mesh(
     vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike
 ) -> tuple[Mesh, MeshReport]:
-    """Mesh fit to be cast at, and what was done to make it so.
+    """Clean triangles for ray casting.
 
-    Faces without data, without area or given twice are dropped, coincident vertices merged,
-    unused ones dropped, and the rest centred. Holes and inverted normals stay: rays see both sides
-    of a face. Faces (m, 3) keep their order; vertices (n, 3) [m] are not finite where there is no
-    data.
+    Faces that are not finite, have no area or occur twice are dropped. Coincident vertices are
+    merged, unused vertices dropped and the rest centred. Holes and inverted normals remain: rays
+    hit both sides of a face.
 
-    ValueError where the arrays' shapes do not fit, a face names a vertex that does not exist,
-    or no face is left.
+    Parameters
+    ----------
+    vertices : array_like, shape (n, 3)
+        Vertices [m]; not finite where there is no data.
+    faces : array_like, shape (m, 3)
+        Vertex indices of the triangles.
+    surface : array_like, shape (m,) or ()
+        Surface numbers of the triangles.
+
+    Returns
+    -------
+    mesh : Mesh
+        Mesh with faces in the given order.
+    report : MeshReport
+        Counts of repairs.
+
+    Raises
+    ------
+    ValueError
+        If the arrays' shapes are inconsistent, a face has an invalid vertex index, or no face is
+        left.
     """
     positions, face_corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     surfaces = np.full(len(face_corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
@@ -181,7 +231,7 @@ def clean_mesh(
     face_corners, surfaces = face_corners[has_data], surfaces[has_data]
     _require_faces(len(face_corners), len(has_data))
     used = np.unique(face_corners)
-    positions = positions[used] + 0.0  # -0 and 0 are one place
+    positions = positions[used] + 0.0  # -0.0 and 0.0 are equal positions
     kept_vertices, index_in_kept = _distinct_rows(positions)
     face_corners, merged = (
         index_in_kept[np.searchsorted(used, face_corners)],
@@ -212,13 +262,14 @@ def clean_mesh(
 
 
 def _require_faces(n_left: int, n_given: int) -> None:
+    """Raise `ValueError` if no face is left."""
     if n_left == 0:
         raise ValueError(f"of {n_given} faces none is left that a ray could hit")
 
 
 def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that repeat no earlier one, by index, rising; and the place of every row among them."""
-    order = np.lexsort(rows.T)  # stable: the first of those alike is the first given
+    """Return the indices of distinct rows, first occurrences, and each row's index among these."""
+    order = np.lexsort(rows.T)  # stable: the first of equal rows is kept
     is_new = np.ones(len(rows), dtype=bool)
     is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
     kept = np.sort(order[is_new])
@@ -228,7 +279,7 @@ def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Mask of the faces (m, 3) whose corners are apart and not in one line, exactly."""
+    """Return a mask (m,) of the faces with an area above 0, by exact arithmetic."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
@@ -242,12 +293,31 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def read_mesh(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Facets of a mesh file (`MESH_FORMATS`), all its parts; nothing is mended here.
+    """Read all parts of a mesh file; the mesh is not cleaned.
 
-    Polygons are cut into triangles (:mod:`sweep.scenes.polygons`). The unit of lengths is by
-    default the one that the file states, or else metres; up is by default y for glTF, z for
-    others. SceneError for a file that is missing, can not be loaded or holds no triangles, a
-    polygon without a surface of its own, or an unknown unit.
+    Polygons are cut into triangles (:mod:`sweep.scenes.polygons`).
+
+    Parameters
+    ----------
+    path : str or Path
+        File of one of `MESH_FORMATS`.
+    unit : str, optional
+        Unit of lengths; by default that of the file, or else metres.
+    up : str, optional
+        Vertical axis, ``y`` or ``z``; by default y for glTF and z for other formats.
+    scale : float
+        Factor on all lengths.
+
+    Returns
+    -------
+    Facets
+        Triangles of one surface, in metres, with z up.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing, can't be read or has no triangles, if a polygon does not define a
+        surface, or if the unit is unknown.
     """
     path = require_file(path)
     suffix = path.suffix.lower()
@@ -266,7 +336,7 @@ def read_mesh(
             raise
         remedy = "install what it asks for, or export to OBJ, PLY, STL or plain glTF"
         raise SceneError(path, f"needs another package ({error})", remedy) from None
-    except Exception as error:  # parsers of several formats fail in as many ways
+    except Exception as error:  # parsers of several formats raise many types of errors
         problem, remedy = f"is no mesh that can be read ({error})", "check it, or export it again"
         raise SceneError(path, problem, remedy) from None
     if not parts:
@@ -279,7 +349,7 @@ def read_mesh(
 
 
 def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
-    """Facets of a file of polygons, in the file's frame and unit, which it does not state."""
+    """Return the facets of a file of polygons in its frame, and None because it states no unit."""
     polygons = read_polygons(path)
     triangulation = triangulate(polygons)
     if not len(triangulation.faces):
@@ -293,7 +363,7 @@ def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
 
 
 def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
-    """Facets of a file of triangles, part by part, in the file's frame; its unit of length."""
+    """Return the facets of each part of a file of triangles in its frame, and its length unit."""
     import trimesh
 
     if path.suffix.lower() in _Y_UP_FORMATS:
@@ -306,7 +376,7 @@ def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
             file_type=path.suffix.lower()[1:],
             resolver=_companion_resolver(path),
             process=False,
-            skip_materials=True,  # nothing is seen of textures, which can be of any size
+            skip_materials=True,  # textures have no effect and can be of any size
         )
     nodes = sorted(scene.graph.nodes_geometry)
     faces = [len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) for node in nodes]
@@ -317,42 +387,47 @@ def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
 
 
 def _companion_resolver(path: Path) -> Any:
-    """Trimesh's resolver of the names in a file, which serves plain files beside it alone."""
+    """Return trimesh's resolver of file names, restricted to plain files in the mesh's folder."""
     from trimesh.resolvers import Resolver
 
     class CompanionResolver(Resolver):  # type: ignore[misc]
-        """Files that a mesh names."""
+        """Resolver of the plain files that a mesh file names."""
 
         def __init__(self) -> None:
             pass
 
         def get(self, key: str) -> bytes:
-            """Content of a file."""
+            """Return the content of a file."""
             return read_companion(path, key)
 
         def write(self, name: str, data: bytes) -> None:
-            """Refuse to write: the files that a mesh names are read alone."""
+            """Refuse to write: files that a mesh names are only read."""
             raise PermissionError(f"{name}: a mesh's files are not written")
 
         def namespaced(self, namespace: str) -> CompanionResolver:
-            """Return the same resolver, for names below a folder are none of a glTF's."""
+            """Return this resolver: a glTF has no names below a folder."""
             return self
 
         def keys(self) -> list[str]:
-            """Names that are listed: none."""
+            """Return an empty list: names are not enumerated."""
             return []
 
     return CompanionResolver()
 
 
 _STL_HEADER = struct.Struct("<80sI")
+"""Header of a binary STL: 80 bytes of text and the number of triangles."""
 _STL_TRIANGLE_BYTES = 50
+"""Bytes per triangle of a binary STL."""
 _STL_PROBE_BYTES = 1000
-"""Bytes at the beginning of an STL that tell text from numbers."""
+"""Number of bytes at the beginning of an STL by which text and binary files are distinguished."""
 
 
 def _check_stl(path: Path) -> None:
-    """Refuse a binary STL whose size is not that of its triangles; text has no zero bytes."""
+    """Raise `ValueError` if the size of a binary STL does not match its number of triangles.
+
+    A text STL has no zero bytes.
+    """
     with path.open("rb") as file:
         first_bytes = file.read(_STL_PROBE_BYTES)
     if b"\0" not in first_bytes and re.search(rb"^\W*solid|\bfacet\b", first_bytes, re.I):
@@ -370,12 +445,13 @@ def _check_stl(path: Path) -> None:
 
 
 _GLB_HEADER = struct.Struct("<4sIIII")
+"""Header of a binary glTF and of its first chunk."""
 _ACCESSOR_ELEMENT_BYTES_MAX = 64
-"""Most bytes of an element of an accessor: a matrix of 16 floats."""
+"""Largest size of an accessor's element: a matrix of 16 floats [bytes]."""
 
 
 def _check_gltf(path: Path) -> None:
-    """Refuse a glTF whose arrays are larger than its buffers, or whose document is none."""
+    """Raise an error if a glTF is invalid, or its arrays exceed its buffers or the free memory."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         if len(content) < _GLB_HEADER.size:
@@ -400,7 +476,7 @@ def _check_gltf(path: Path) -> None:
 
 
 def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
-    """Facets of one mesh of a file, in the file's frame; none of points and curves."""
+    """Yield the facets of one mesh of a file in the file's frame; nothing for points and curves."""
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
     if not len(getattr(mesh, "faces", ())):
@@ -408,12 +484,12 @@ def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
     vertices = np.asarray(mesh.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
-        faces = faces[:, ::-1]  # a mirrored part is inside out
+        faces = faces[:, ::-1]  # a mirrored part has inverted normals
     yield Facets.on_one_surface(vertices, faces)
 
 
 def _metres_per_unit(path: Path, unit: str | None) -> float:
-    """Metres of a unit of length; 1 where none is stated."""
+    """Return the metres per unit of length; 1 if no unit is given."""
     if unit is None:
         return 1.0
     try:
@@ -423,7 +499,15 @@ def _metres_per_unit(path: Path, unit: str | None) -> float:
 
 
 def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
-    """Return a refined icosahedron of 20 * 4^subdivisions faces, with its corners on the sphere."""
+    """Return a sphere: a refined icosahedron whose vertices lie on the sphere.
+
+    Parameters
+    ----------
+    radius : float
+        Radius [m].
+    subdivisions : int
+        Number of times that each face is cut into four; there are 20 * 4^subdivisions faces.
+    """
     import trimesh
 
     icosphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
@@ -431,7 +515,13 @@ def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
 
 
 def box_facets(*, size: Sequence[float]) -> Facets:
-    """Return a box of 12 facets, facing outwards, of these lengths along x, y and z [m]."""
+    """Return a box of 12 outward-facing triangles, centred at its origin.
+
+    Parameters
+    ----------
+    size : sequence of float
+        Lengths along x, y and z [m].
+    """
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):

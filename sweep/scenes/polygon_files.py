@@ -1,4 +1,4 @@
-"""Mesh files whose faces may have any number of corners: OBJ, PLY and OFF."""
+"""Readers of mesh files whose faces may have any number of corners: OBJ, PLY and OFF."""
 
 from __future__ import annotations
 
@@ -12,22 +12,29 @@ import numpy as np
 from sweep.scenes.polygons import Polygons
 
 _INDEX_PROPERTIES = ("vertex_indices", "vertex_index")
-"""Names that writers of PLY give to the corners of a face."""
+"""Names that PLY files use for the vertex indices of a face."""
 
 
 def read_polygons(path: Path) -> Polygons:
-    """Vertices and faces of an OBJ, PLY or OFF file, as they are written; a ValueError for none."""
+    """Return the vertices and faces of an OBJ, PLY or OFF file as they are written.
+
+    Raises
+    ------
+    ValueError
+        If the file is invalid.
+    """
     return _READERS[path.suffix.lower()](path)
 
 
 def _make_polygons(vertices: Any, faces: list[list[int]]) -> Polygons:
+    """Return the `Polygons` of vertices and lists of vertex indices."""
     counts = np.array([len(face) for face in faces], np.int64)
     corners = np.array([corner for face in faces for corner in face], np.int64)
     return Polygons(np.asarray(vertices, float).reshape(-1, 3), corners, counts)
 
 
 def _read_obj(path: Path) -> Polygons:
-    """Polygons of a Wavefront OBJ. Materials and textures are not looked for."""
+    """Return the polygons of a Wavefront OBJ file; materials and textures are ignored."""
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
     for number, words in _iter_lines(path, continuation_mark="\\"):
@@ -39,7 +46,7 @@ def _read_obj(path: Path) -> Polygons:
                 indices = [int(word.partition("/")[0]) for word in words[1:]]
                 if not indices or 0 in indices:
                     raise ValueError("a face names vertices from 1")
-                # Below 0 an index counts back from the last vertex so far.
+                # A negative index counts back from the last vertex read.
                 faces.append([k - 1 if k > 0 else len(vertices) + k for k in indices])
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from None
@@ -47,7 +54,7 @@ def _read_obj(path: Path) -> Polygons:
 
 
 def _read_off(path: Path) -> Polygons:
-    """Polygons of an OFF file; colours, normals and texture coordinates are passed over."""
+    """Return the polygons of an OFF file; colours, normals and texture coordinates are ignored."""
     lines = _iter_lines(path)
     number, words = next(lines, (1, [""]))
     heading = words[0].upper()
@@ -80,7 +87,7 @@ def _read_off(path: Path) -> Polygons:
 def _take_lines(
     lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
-    """So many further lines."""
+    """Yield `number` lines; raise `ValueError` if the file ends before."""
     for k in range(number):
         line = next(lines, None)
         if line is None:
@@ -89,7 +96,7 @@ def _take_lines(
 
 
 def _iter_lines(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Words of the lines that say something, with their numbers; '#' begins a comment."""
+    """Yield line number and words of the lines that are not empty; '#' begins a comment."""
     continued_text = ""
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
@@ -103,12 +110,12 @@ def _iter_lines(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, 
 
 
 def _read_ply(path: Path) -> Polygons:
-    """Polygons of a PLY file, ASCII or binary of either byte order."""
+    """Return the polygons of a PLY file, ASCII or binary of either byte order."""
     from plyfile import PlyData, PlyElementParseError
 
     _check_ply_row_counts(path)
     data: Any
-    try:  # faces that are all of three corners are read many times faster
+    try:  # files with triangles only are read many times faster this way
         triangles = {"face": dict.fromkeys(_INDEX_PROPERTIES, 3)}
         data = PlyData.read(str(path), mmap="c", known_list_len=triangles)
     except PlyElementParseError:
@@ -132,11 +139,16 @@ def _read_ply(path: Path) -> Polygons:
 
 
 _HEADER_BYTES_MAX = 1 << 20
+"""Maximum size of a PLY header [bytes]."""
 _INTEGER_PATTERN = re.compile(rb"[-+]?\d{1,4000}")
+"""Pattern of an integer in a PLY header."""
 
 
 def _check_ply_row_counts(path: Path) -> None:
-    """Refuse a header that declares fewer rows than none, or more than the file has bytes."""
+    """Raise `ValueError` if a header declares a negative or impossible number of rows.
+
+    A file has at least one byte per row, so that more rows than bytes are impossible.
+    """
     size = path.stat().st_size
     with path.open("rb") as file:
         header, end_mark, _ = file.read(_HEADER_BYTES_MAX).partition(b"end_header")
@@ -159,5 +171,6 @@ def _check_ply_row_counts(path: Path) -> None:
 
 
 _READERS = {".obj": _read_obj, ".ply": _read_ply, ".off": _read_off}
+"""Reader of each format, by suffix."""
 POLYGON_FORMATS = frozenset(_READERS)
-"""Suffixes of the formats that are read here."""
+"""Suffixes of the formats that this module reads."""

@@ -1,9 +1,10 @@
-"""Polygons of mesh files cut into triangles that cover just them.
+"""Triangulation of the polygons of mesh files.
 
-A polygon is looked at in its mean plane (Newell's normal). A convex one becomes a fan about its
-first corner. Any other is cut by Mapbox's earcut, and the result is checked: the triangles' areas
-sum to the polygon's, and the polygon winds about each of them once. One that crosses itself, or
-goes round a hole in the sense of its outline, does not pass and is refused with its number.
+A polygon is projected to its mean plane (Newell's normal). A convex polygon becomes a fan about its
+first corner. Any other polygon is cut by Mapbox's earcut, and the result is checked: the areas of
+the triangles must sum to the polygon's area, and the polygon must wind about each triangle once. A
+polygon that crosses itself, or has a hole with the winding of its outline, fails the check and is
+refused with its number.
 """
 
 from __future__ import annotations
@@ -14,52 +15,54 @@ from typing import NamedTuple
 import numpy as np
 
 BEND_REPORTED_MIN = 1e-3
-"""Departure from the mean plane, over the square root of the area, from which it is reported."""
+"""Departure from the mean plane, relative to the square root of the area, that is reported."""
 
 BEND_MAX = 0.25
-"""The same, above which the surface between the corners is anybody's guess."""
+"""Departure from the mean plane, relative to the square root of the area, above which a polygon is
+refused: its surface is undetermined.
+"""
 
 _AREA_ROUNDING = 1e-12
-"""Area over the square of a polygon's extent below which rounding may have made it."""
+"""Ratio of area to squared extent below which an area may be due to rounding."""
 
 _AREA_TOLERANCE = 1e-9
-"""Relative difference of the triangles' areas from the polygon's that rounding may make."""
+"""Relative difference between the areas of triangles and polygon that may be due to rounding."""
 
 
 class PolygonError(ValueError):
-    """A polygon that has no surface to be cut: its number in the file, from 1, and the rule."""
+    """Error of a polygon that can't be triangulated, with its number in the file, from 1."""
 
     def __init__(self, number: int, problem: str) -> None:
         super().__init__(f"face {number} {problem}")
 
 
 class Polygons(NamedTuple):
-    """Polygons on common vertices."""
+    """Polygons with common vertices."""
 
     vertices: np.ndarray
-    """(n, 3) float64."""
+    """Vertices (n, 3), float64."""
     corners: np.ndarray
-    """(sum of counts,) int64: vertices of all polygons, one polygon after the other."""
+    """Vertex indices (sum of counts,) int64 of all polygons, one polygon after the other."""
     counts: np.ndarray
-    """(m,) int64: number of corners of each polygon."""
+    """Number of corners (m,) int64 of each polygon."""
 
 
 class Triangulation(NamedTuple):
     """Triangles of polygons, in the polygons' order and winding."""
 
     faces: np.ndarray
-    """(k, 3) int64."""
+    """Vertex indices (k, 3) int64 of the triangles."""
     n_cut: int
-    """Polygons of more than three corners."""
+    """Number of polygons with more than three corners."""
     n_concave: int
-    """Of these, polygons that are not convex."""
+    """Number of polygons with more than three corners that are not convex."""
     n_bent: int
-    """Of these, polygons that depart from their mean plane by more than `BEND_REPORTED_MIN`."""
+    """Number of polygons that depart from their mean plane by more than `BEND_REPORTED_MIN`."""
     largest_bend: float
-    """Largest departure of these, in the unit of the vertices."""
+    """Largest departure of a bent polygon from its mean plane [unit of the vertices]."""
 
     def notes(self) -> tuple[str, ...]:
-        """Sentences for people about what was cut; lengths in the file's unit."""
+        """Return sentences about the polygons that were cut, with lengths in the file's unit."""
         if not self.n_cut:
             return ()
         concave_text = f", {self.n_concave:,} of them not convex" if self.n_concave else ""
@@ -74,15 +77,31 @@ class Triangulation(NamedTuple):
 
 
 def _polygon_count_text(polygons: int) -> str:
+    """Return a number of polygons as text."""
     return f"{polygons:,} polygon{'s' * (polygons != 1)}"
 
 
 def triangulate(polygons: Polygons) -> Triangulation:
     """Cut polygons into triangles.
 
-    A polygon without area, or with a corner that is not finite, becomes triangles of the same
-    kind, which :func:`sweep.scenes.meshes.clean_mesh` drops and counts. PolygonError for one that
-    crosses itself, is bent by more than `BEND_MAX`, or names a vertex that does not exist.
+    A polygon without area, or with a vertex that is not finite, becomes triangles of the same kind,
+    which :func:`sweep.scenes.meshes.clean_mesh` drops and counts.
+
+    Parameters
+    ----------
+    polygons : Polygons
+        Polygons as read from a file.
+
+    Returns
+    -------
+    Triangulation
+        Triangles and counts.
+
+    Raises
+    ------
+    PolygonError
+        If a polygon crosses itself, is bent by more than `BEND_MAX`, or has an invalid vertex
+        index.
     """
     vertices, corners, counts = polygons
     first_corner = np.cumsum(counts) - counts
@@ -113,7 +132,7 @@ def triangulate(polygons: Polygons) -> Triangulation:
             largest_bend,
             float((flat_polygons.bend * np.sqrt(flat_polygons.area))[is_bent].max(initial=0.0)),
         )
-        # Empty polygons are fanned too: triangles without area, which are dropped and counted.
+        # Empty polygons become fans too: clean_mesh drops and counts their triangles without area.
         fanned = np.flatnonzero(flat_polygons.is_convex | flat_polygons.is_empty)
         fan = np.stack(
             [np.zeros(n_corners - 2, int), np.arange(1, n_corners - 1), np.arange(2, n_corners)],
@@ -134,17 +153,25 @@ def triangulate(polygons: Polygons) -> Triangulation:
 
 
 class _FlatPolygons(NamedTuple):
-    """Polygons of n corners each, in their mean planes."""
+    """Polygons of n corners each, projected to their mean planes."""
 
-    corners: np.ndarray  # (m, n, 2), counter-clockwise
-    area: np.ndarray  # (m,)
-    bend: np.ndarray  # (m,): largest departure from the plane over the square root of the area
-    is_convex: np.ndarray  # (m,) bool: strictly
-    is_empty: np.ndarray  # (m,) bool: without area or without data
+    corners: np.ndarray
+    """Corners (m, n, 2) in the plane, counter-clockwise."""
+    area: np.ndarray
+    """Areas (m,)."""
+    bend: np.ndarray
+    """Largest departures (m,) from the plane, relative to the square root of the area."""
+    is_convex: np.ndarray
+    """Mask (m,) of the strictly convex polygons."""
+    is_empty: np.ndarray
+    """Mask (m,) of the polygons without area or with vertices that are not finite."""
 
 
 def _flatten(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
-    """Project polygons (m, n, 3), whose indices in the file are `members`, to their mean planes."""
+    """Project polygons (m, n, 3) to their mean planes.
+
+    `polygon_numbers` (m,) are their indices in the file, for errors.
+    """
     has_data = np.isfinite(points).all(axis=(1, 2))
     points = np.where(has_data[:, None, None], points, 0.0)
     points = points - points[:, :1]
@@ -183,7 +210,7 @@ def _flatten(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
 
 
 def _are_collinear(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Mask of the polygons (m, n, 3), from their first corners, whose corners are all in line."""
+    """Return a mask (m,) of the polygons (m, n, 3), relative to a corner, that are collinear."""
     squared_distance = (points * points).sum(axis=2)
     farthest = points[np.arange(len(points)), squared_distance.argmax(axis=1)]
     cross_product = np.cross(points, farthest[:, None])
@@ -192,10 +219,13 @@ def _are_collinear(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
 
 
 def _triangulate_polygon(plane_corners: np.ndarray, points: np.ndarray, number: int) -> np.ndarray:
-    """Triangles (k, 3) of one polygon, by its corners in the plane (n, 2) and in space (n, 3)."""
+    """Return the triangles (k, 3) of a polygon, given by corners (n, 2) and points (n, 3).
+
+    `plane_corners` are the corners in the polygon's plane, `points` the corners in space.
+    """
     import mapbox_earcut
 
-    # A corner that repeats the one before it adds nothing.
+    # Drop corners that repeat the previous corner.
     kept = np.flatnonzero((points != np.roll(points, 1, axis=0)).any(axis=1))
     corners = np.ascontiguousarray(plane_corners[kept])
     ring_ends = np.array([len(corners)], np.uint32)
@@ -219,17 +249,17 @@ def _triangulate_polygon(plane_corners: np.ndarray, points: np.ndarray, number: 
 
 
 _EDGE_POINT_PAIRS_MAX = 1 << 22
-"""Edges times points that windings are counted of at a time."""
+"""Number of pairs of edge and point whose winding numbers are computed at a time."""
 
 
 def _winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
-    """Return true if a polygon (n, 2) winds once, counter-clockwise, about each triangle in it."""
+    """Return True if a polygon (n, 2) winds once and counter-clockwise about its triangles."""
     edge_ends = np.roll(corners, -1, axis=0)
     centres = corners[triangles].mean(axis=1)
     rows = max(_EDGE_POINT_PAIRS_MAX // len(corners), 1)
     for begin in range(0, len(centres), rows):
         x, y = centres[begin : begin + rows, None].transpose(2, 0, 1)
-        # An edge that passes to the right of a point, upwards, is a turn about it.
+        # An upward edge to the right of a point adds one to the winding number.
         is_up = (corners[:, 1] <= y) & (edge_ends[:, 1] > y)
         is_down = (corners[:, 1] > y) & (edge_ends[:, 1] <= y)
         side = (edge_ends[:, 0] - corners[:, 0]) * (y - corners[:, 1]) - (x - corners[:, 0]) * (
@@ -242,16 +272,16 @@ def _winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
 
 
 def _triangle_areas(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Areas of triangles (k,), positive if they are counter-clockwise."""
+    """Return the areas (k,) of triangles, positive if they are counter-clockwise."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     b, c = b - a, c - a
     return np.asarray(0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]))
 
 
 def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Triangles with the corners that lie on a straight edge, which earcut leaves out.
+    """Return triangles that include the corners on straight edges, which earcut leaves out.
 
-    Without them a neighbour that has such a corner would not share the edge.
+    Otherwise neighbouring polygons with such a corner would not share the edge.
     """
     used = np.zeros(len(corners), bool)
     used[triangles] = True
@@ -273,17 +303,17 @@ def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.
         fractions_with_ends = [0.0, *fractions, 1.0]
         k = triangle_of_edge.get((start, stop), -1)
         if not between or k < 0 or not all(np.diff(fractions_with_ends) > 0):
-            continue  # none, or a spike without area
+            continue  # no corner between, or a spike without area
         (opposite,) = set(result[k]) - {start, stop}
         for first, second in pairwise([start, *between, stop]):
             result.append((first, second, opposite))
             triangle_of_edge |= _directed_edges(result[-1], len(result) - 1)
-        result[k] = result.pop()  # the last part stands in the place of the whole
+        result[k] = result.pop()  # the last part replaces the original triangle
         triangle_of_edge |= _directed_edges(result[k], k)
     return np.array(result)
 
 
 def _directed_edges(triangle: tuple[int, ...], number: int) -> dict[tuple[int, int], int]:
-    """Directed edges of a triangle, each with the triangle's number."""
+    """Return the directed edges of a triangle, each with the triangle's number."""
     a, b, c = triangle
     return {(a, b): number, (b, c): number, (c, a): number}

@@ -1,4 +1,4 @@
-"""Heights from files: georeferenced rasters, NumPy arrays, grey images, and a sample survey."""
+"""Terrain from files: georeferenced rasters, NumPy arrays, grey images, and a sample survey."""
 
 from __future__ import annotations
 
@@ -23,39 +23,43 @@ from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
 
 GRID_CELLS_MAX = 50_000_000
-"""Heights read at once at most: 100 million triangles."""
+"""Maximum number of heights read at once, which make 100 million triangles."""
 
 FILE_CELLS_MAX = 1_000_000_000
-"""Heights of a raster's file at most: all of them are read for its digest."""
+"""Maximum number of heights in a raster file: all of them are read for its digest."""
 
 BYTES_PER_CELL = 220
-"""Memory that a height takes at most while its triangles and their tree are built, measured."""
+"""Memory per height while triangles and their tree are built, upper bound by measurement
+[bytes]."""
 
 _STRIP_CELLS = 1 << 22
-"""Heights that are read from a file at a time."""
+"""Number of heights that are read from a file at a time."""
 
 _GDAL_OFFLINE_OPTIONS = {
     "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none",
-    "GDAL_HTTP_PROXY": "127.0.0.1:1",  # a port where nobody answers
+    "GDAL_HTTP_PROXY": "127.0.0.1:1",  # a port without a server
     "GDAL_HTTPS_PROXY": "127.0.0.1:1",
     "GDAL_HTTP_MAX_RETRY": "0",
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_VRT_ENABLE_RAWRASTERBAND": "NO",
 }
-"""Settings of GDAL by which nothing that a raster names is fetched or run."""
+"""Options of GDAL that prevent it from fetching or running anything that a raster names."""
 
 _GDAL_DRIVERS = (
     "GTiff", "AAIGrid", "GRASSASCIIGrid", "EHdr", "ENVI", "HFA", "PNG", "JPEG", "BMP", "SRTMHGT",
     "USGSDEM", "DTED", "GSAG", "GSBG", "GS7BG", "XYZ", "SAGA", "RST", "PDS", "ISIS2", "ISIS3",
     "VICAR", "JP2OpenJPEG", "netCDF",
 )  # fmt: skip
-"""Formats of rasters that are files of this machine and name no others."""
+"""Raster formats that are local files and refer to no other files."""
 
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
-"""Formats of grey images. Others may run programs, or hold what is no picture."""
+"""Formats of grey images; other formats may run programs or contain something else than an
+image."""
 
 _VRT_BYTES_MAX = 1 << 26
+"""Maximum size of a virtual raster's file [bytes]."""
 _VRT_DEPTH_MAX = 8
+"""Maximum depth of virtual rasters within each other."""
 
 
 def read_raster(
@@ -70,17 +74,45 @@ def read_raster(
     pixel: float | None = None,
     has_height_scale: bool = False,
 ) -> Terrain:
-    """Terrain of a georeferenced raster, such as a GeoTIFF, or of a window (W, S, E, N) of it.
+    """Read a georeferenced raster, such as a GeoTIFF, or a window of it.
 
-    Nodes lie at the centres of the pixels; those without data are holes, and so are those that
-    hold the value `no_data`. The raster's own scale and offset are applied, and feet are turned
-    into metres. One in degrees needs metres per degree, east and north. One on a map whose
-    unit is another length on the ground needs metres per unit (:mod:`sweep.scenes.map_frames`). One
-    without a scale needs the size of a pixel [m]; its lower left corner is the world's origin.
-    `scaled`: a factor is to be applied to the heights, so that their unit is known.
+    Nodes of the terrain lie at the centres of the pixels. Pixels without data, or with the value
+    `no_data`, are holes. The raster's own scale and offset are applied, and feet are converted to
+    metres.
 
-    SceneError for a file that is missing, no raster, without scale, rotated, too large, or without
-    any height. Likewise for a unit whose size is not known, and a missing band or window.
+    Parameters
+    ----------
+    path : str or Path
+        File of the raster.
+    band : int
+        Band with the heights, from 1.
+    window : tuple of float, optional
+        West, south, east and north of the part to read, in the raster's coordinates.
+    metres_per_degree : (float, float), optional
+        Metres per degree east and north; required for a raster in degrees.
+    metres_per_unit : (float, float), optional
+        Metres on the ground per unit of the map's coordinates, east and north; required if the
+        map's scale differs from that of the ground (:mod:`sweep.scenes.map_frames`).
+    height_unit : str, optional
+        Unit of the heights, if the file does not state it.
+    no_data : float, optional
+        Value that stands for a missing height.
+    pixel : float, optional
+        Size of a pixel [m], for a raster without a scale. Its lower left corner is then the world's
+        origin.
+    has_height_scale : bool
+        True if the spec has a factor for the heights, so that their unit is known.
+
+    Returns
+    -------
+    Terrain
+        Heights in metres, in the raster's coordinates converted to metres.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing, no raster, without scale, rotated, too large or without heights; if
+        the band or window does not exist; or if the size of a unit is unknown.
     """
     path = require_file(path)
     with open_raster(path) as raster:
@@ -124,7 +156,7 @@ def read_raster(
 
 
 def _crs_wkt(path: Path, raster: Any) -> str:
-    """Coordinate reference system of a raster as WKT."""
+    """Return the coordinate reference system of a raster as WKT."""
     from rasterio.errors import CRSError
 
     try:
@@ -135,7 +167,7 @@ def _crs_wkt(path: Path, raster: Any) -> str:
 
 
 def _add_warnings(path: Path, terrain: Terrain, no_data_warnings: tuple[str, ...]) -> Terrain:
-    """Terrain with warnings: of its map, the doubts given, and its cliffs."""
+    """Return the terrain with warnings about its map, its missing heights and its cliffs."""
     _require_heights(path, terrain.heights)
     map_warnings = () if terrain.map_frame is None else terrain.map_frame.warnings
     cliff_texts = cliff_warnings(path, terrain.heights, terrain.spacing)
@@ -143,7 +175,15 @@ def _add_warnings(path: Path, terrain: Terrain, no_data_warnings: tuple[str, ...
 
 
 def raster_digest(path: str | Path) -> str:
-    """Digest of a raster's heights, spacing and frame, wherever they come from; or SceneError."""
+    """Return the digest of all heights, spacing and coordinate frame of a raster.
+
+    A virtual raster has the digest of the data of its sources.
+
+    Raises
+    ------
+    SceneError
+        If the raster can't be read or has too many heights.
+    """
     path = require_file(path)
     with open_raster(path) as raster:
         if raster.width * raster.height * raster.count > FILE_CELLS_MAX:
@@ -162,7 +202,13 @@ def raster_digest(path: str | Path) -> str:
 
 @contextmanager
 def open_raster(path: Path) -> Iterator[Any]:
-    """Dataset of a raster. No source on another machine that it names is asked for anything."""
+    """Context manager: open a raster with rasterio, without access to the network.
+
+    Raises
+    ------
+    SceneError
+        If the file is no raster of a supported format, or refers to data on other machines.
+    """
     import rasterio
 
     try:
@@ -178,28 +224,29 @@ def open_raster(path: Path) -> Iterator[Any]:
 
 
 def _require_block_memory(path: Path, raster: Any) -> None:
-    """Refuse a raster whose blocks, each of which is unpacked whole, do not fit into memory."""
+    """Raise `SceneError` if a block of a raster, decompressed as one, exceeds the memory."""
     for (rows, columns), dtype in zip(raster.block_shapes, raster.dtypes, strict=True):
         bytes_needed = 2 * rows * columns * np.dtype(dtype).itemsize
         require_memory(path, bytes_needed, "write it anew with gdal_translate -co TILED=YES")
 
 
 def _open_dataset(path: Path) -> Any:
-    """Open a raster of a format that is read, and of no other."""
+    """Open a raster of a supported format."""
     from rasterio.io import DatasetReader
 
     for sidecar in path.parent.glob(f"{glob.escape(path.stem)}.*"):
         if not (sidecar.is_file() or sidecar.is_dir()) and sidecar.exists():
             problem = f"stands beside {sidecar.name}, which is a pipe or a device"
             raise SceneError(path, problem, "remove that: it would be read as a part of the raster")
-    # An absolute path is no address; rasterio.open would take one driver alone.
+    # DatasetReader takes several drivers, unlike rasterio.open; an absolute path is never taken for
+    # a URL.
     drivers = ["VRT"] if _is_vrt(path) else list(_GDAL_DRIVERS)
     return DatasetReader(str(path.absolute()), driver=drivers)
 
 
 @contextmanager
 def _gdal_offline() -> Iterator[None]:
-    """Environment in which GDAL fetches nothing, whatever hosts the user exempts from proxies."""
+    """Context manager: GDAL fetches nothing, whatever proxy exemptions the environment has."""
     import rasterio
 
     proxy_exemptions = {
@@ -213,16 +260,16 @@ def _gdal_offline() -> Iterator[None]:
 
 
 def _is_vrt(path: Path) -> bool:
-    """Return true if GDAL would take a file for a virtual raster, by its beginning."""
+    """Return True if the beginning of a file is that of a virtual raster for GDAL."""
     with path.open("rb") as file:
         return b"<vrtdataset" in file.read(1 << 16).lower()
 
 
 def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
-    """Refuse a virtual raster over what is no raster of this machine.
+    """Raise `SceneError` if a virtual raster has a source that is no raster on this machine.
 
-    GDAL may take zeros for a source that is lost, and opens sources of any format, hosts among
-    them.
+    GDAL may read zeros for a missing source. It opens sources of any format, including remote
+    hosts. `enclosing_files` are the virtual rasters that lead to this one.
     """
     if not _is_vrt(path):
         return
@@ -234,7 +281,7 @@ def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
 
 
 def _vrt_sources(path: Path) -> list[Path]:
-    """Files that a virtual raster names, each once and existing."""
+    """Return the existing files that a virtual raster names, without duplicates."""
     if path.stat().st_size > _VRT_BYTES_MAX:
         raise SceneError(path, "is no raster that can be read (too large)", "make it a GeoTIFF")
     content = path.read_bytes()
@@ -247,7 +294,7 @@ def _vrt_sources(path: Path) -> list[Path]:
         problem = f"is no raster that can be read ({error})"
         raise SceneError(path, problem, "make it anew with gdalbuildvrt") from None
     for element in root.iter():
-        tag = str(element.tag).rpartition("}")[2].lower()  # GDAL passes over their case
+        tag = str(element.tag).rpartition("}")[2].lower()  # GDAL ignores case
         if tag not in ("sourcefilename", "sourcedataset"):
             continue
         name = (element.text or "").strip()
@@ -261,7 +308,7 @@ def _vrt_sources(path: Path) -> list[Path]:
 
 
 def _require_raster(path: Path) -> None:
-    """Refuse a source of a virtual raster that is of no format that is read."""
+    """Raise `SceneError` if a source of a virtual raster has no supported format."""
     import rasterio
 
     try:
@@ -273,7 +320,7 @@ def _require_raster(path: Path) -> None:
 
 
 def _unrotated_transform(path: Path, raster: Any, pixel: float | None) -> Any:
-    """Geotransform of a raster whose rows run along x."""
+    """Return the geotransform of a raster; raise `SceneError` if it is rotated or has no scale."""
     from rasterio import Affine
 
     transform = raster.transform
@@ -291,7 +338,7 @@ def _unrotated_transform(path: Path, raster: Any, pixel: float | None) -> Any:
 
 
 def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | None) -> Any:
-    """Rows and columns to read."""
+    """Return the window of pixels to read; raise `SceneError` if it has no cell or is too large."""
     from rasterio.windows import Window as PixelWindow
 
     pixel_window = PixelWindow(0, 0, raster.width, raster.height)
@@ -311,7 +358,7 @@ def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | 
 
 
 def _iter_strips(width: int, height: int) -> Iterator[Any]:
-    """Windows of some rows each, or of parts of a row, that make up a raster."""
+    """Yield windows of several rows, or parts of one row, that cover a raster."""
     from rasterio.windows import Window as PixelWindow
 
     rows, columns = max(_STRIP_CELLS // width, 1), min(width, _STRIP_CELLS)
@@ -321,13 +368,13 @@ def _iter_strips(width: int, height: int) -> Iterator[Any]:
 
 
 def _read_window(raster: Any, band: int, window: Any) -> np.ndarray:
-    """Values of a band in a window as they are stored, NaN where there are none."""
+    """Return the stored values of a band in a window (rows, columns); NaN for missing data."""
     values = raster.read(band, window=window, masked=True)
     return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
 def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
-    """Values of a view, strip by strip, as the masks of all at once would take much memory."""
+    """Return the stored values of a band in a window, read in strips to save memory."""
     from rasterio.windows import Window as PixelWindow
 
     values = np.empty((int(pixel_window.height), int(pixel_window.width)))
@@ -345,12 +392,13 @@ def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
 
 
 def _require_heights(path: Path, heights: np.ndarray) -> None:
+    """Raise `SceneError` if a grid has too few heights for a triangle."""
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
 
 
 def require_grid_size(path: Path, rows: int, columns: int, remedy: str) -> None:
-    """Refuse a grid of more heights than a scene takes, or than the memory holds."""
+    """Raise `SceneError` if a grid has too many heights for a scene or for the free memory."""
     if rows * columns > GRID_CELLS_MAX:
         problem = f"has {columns:,} x {rows:,} heights, more than {GRID_CELLS_MAX:.0e}"
         raise SceneError(path, problem, remedy)
@@ -364,11 +412,24 @@ def read_array(
     name: str | None = None,
     no_data: float | None = None,
 ) -> Terrain:
-    """Terrain of a NumPy file, ``.npy`` or ``.npz``, whose first height is at the world's origin.
+    """Read a NumPy file; the first height is at the world's origin.
 
-    Steps from column to column and from row to row [m]; dy < 0 where row 0 is the northern one.
-    An ``.npz`` of several grids needs the name of one; a value may stand for missing heights,
-    as NaN does. SceneError for a file that is missing or holds no grid of numbers.
+    Parameters
+    ----------
+    path : str or Path
+        ``.npy`` or ``.npz`` file.
+    spacing : (float, float)
+        Steps from column to column and from row to row [m]; the second is negative if row 0 is the
+        northern one.
+    name : str, optional
+        Array of an ``.npz`` file that holds several grids.
+    no_data : float, optional
+        Value that stands for a missing height, in addition to NaN.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing or holds no two-dimensional array of numbers.
     """
     path = require_file(path)
     try:
@@ -376,13 +437,13 @@ def read_array(
             values = _read_npy_or_npz(path, file, path.stat().st_size, name)
     except SceneError:
         raise
-    except Exception as error:  # archives and headers fail in as many ways
+    except Exception as error:  # archives and headers raise many types of errors
         raise SceneError(path, f"is no NumPy file ({error})", "write it with numpy.save") from None
     return _terrain_of_heights(path, values, spacing, no_data)
 
 
 def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.ndarray:
-    """Heights of a file of one array, or of an archive of several."""
+    """Return the heights of an ``.npy`` file of `size` bytes, or of one array of an ``.npz``."""
     if not zipfile.is_zipfile(file):
         file.seek(0)
         return _read_array_data(path, file, size)
@@ -410,7 +471,7 @@ def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.n
 
 
 def _read_array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an array in NumPy's format, by its header alone."""
+    """Return shape and type of an array in NumPy's format from its header."""
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0
     if version != (1, 0):
@@ -420,7 +481,10 @@ def _read_array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _read_array_data(path: Path, file: Any, size: int) -> np.ndarray:
-    """Array in NumPy's format of a file of so many bytes, whose header is looked at first."""
+    """Return the array of a NumPy file of `size` bytes.
+
+    Check shape and size in its header first.
+    """
     shape, dtype = _read_array_header(file)
     if len(shape) != 2 or dtype.kind not in "iuf":
         problem = f"holds {dtype} of shape {shape}"
@@ -435,7 +499,7 @@ def _read_array_data(path: Path, file: Any, size: int) -> np.ndarray:
 def _terrain_of_heights(
     path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
 ) -> Terrain:
-    """Terrain of an array of heights."""
+    """Return the terrain of an array of heights, at the world's origin."""
     if min(values.shape) < 2:
         problem = f"holds {values.dtype} of shape {values.shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
@@ -450,11 +514,25 @@ def _terrain_of_heights(
 
 
 def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: float) -> Terrain:
-    """Terrain of a grey image: row 0 is the northern one, its first pixel at the world's origin.
+    """Read a grey image of 8 or 16 bits.
 
-    Heights [m] are from that of black to that of full white, in steps of one grey level: smooth
-    them before trusting slopes. SceneError for a file that is missing, no image, in colour, or
-    of another depth than 8 or 16 bits.
+    Row 0 is the northern one, the first pixel at the world's origin.
+
+    Heights are linear in the grey level, and therefore quantised: smooth them before using slopes.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of the image.
+    pixel : float
+        Size of a pixel [m].
+    black, white : float
+        Heights of black and of full white [m].
+
+    Raises
+    ------
+    SceneError
+        If the file is missing, no image, in colour, or of another depth than 8 or 16 bits.
     """
     levels = _read_grey_levels(require_file(path))
     heights = black + (white - black) * levels / np.iinfo(levels.dtype).max
@@ -462,18 +540,18 @@ def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: flo
 
 
 def _read_grey_levels(path: Path) -> np.ndarray:
-    """Grey levels of an image, as stored."""
+    """Return the grey levels of an image as stored, uint8 or uint16."""
     from PIL import Image
 
     try:
-        with warnings.catch_warnings():  # what is too large is told below
+        with warnings.catch_warnings():  # require_grid_size refuses images that are too large
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path, formats=_IMAGE_FORMATS) as image:
                 require_grid_size(path, image.height, image.width, "cut a part out of it")
                 mode, levels = image.mode, np.asarray(image)
     except SceneError:
         raise
-    except Exception as error:  # readers of pictures fail in as many ways
+    except Exception as error:  # image readers raise many types of errors
         raise SceneError(path, f"is no image that can be read ({error})", "use PNG") from None
     if mode == "RGB" and (levels[..., :1] == levels).all():
         return np.asarray(levels[..., 0])
@@ -484,10 +562,10 @@ def _read_grey_levels(path: Path) -> np.ndarray:
 
 
 def read_jacksboro() -> Terrain:
-    """Heights of the Jacksboro fault, Tennessee, that come with matplotlib: 30 km by 32 km.
+    """Return the terrain of the Jacksboro fault, Tennessee, 30 km x 32 km, from matplotlib.
 
-    From a survey at 3 arc seconds (USGS). World coordinates are metres from its middle; heights
-    are above sea level.
+    The survey has posts every 3 arc seconds (USGS). World coordinates are metres from its centre;
+    heights are above sea level.
     """
     from matplotlib.cbook import get_sample_data
 
@@ -495,7 +573,7 @@ def read_jacksboro() -> Terrain:
     with sample as survey:
         heights = survey["elevation"].astype(float)
         dx, dy = float(survey["dx"]), float(survey["dy"])
-        # The sample names its northern edge ymin; the grid's middle is the same either way.
+        # The sample calls its northern edge ymin, which does not change the middle latitude.
         middle_latitude = (float(survey["ymin"]) + float(survey["ymax"])) / 2
     east, north = degree_lengths(middle_latitude)
     spacing = dx * east, -dy * north

@@ -1,4 +1,4 @@
-"""Craters, boulders and trees: how many lie on an area, and what they look like."""
+"""Craters, boulders and trees: their size-frequency laws, random positions and shapes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,40 @@ from sweep.scenes.terrain import AreaBounds, Terrain
 
 @dataclass(frozen=True)
 class LeastPowerLaw:
-    """The least of several power laws ``N(>D) = coefficient * D**-exponent`` [1/m^2, D in m]."""
+    """Size-frequency law: the minimum of power laws ``N(>D) = coefficient * D**-exponent``."""
 
     laws: tuple[tuple[float, float], ...]
+    """Pairs of coefficient and exponent, for N in 1/m^2 and D in m."""
 
     def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of this diameter or larger [1/m^2]."""
+        """Return the number per area of objects of at least a diameter.
+
+        Parameters
+        ----------
+        diameter : ndarray, shape (n,)
+            Diameters [m].
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Numbers per area [1/m^2].
+        """
         d = np.asarray(diameter, float)
         return np.min([c * d**-b for c, b in self.laws], axis=0)
 
     def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
-        """Diameter [m] which `number` per area [1/m^2] reach or exceed."""
+        """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
+
+        This is the inverse of `cumulative_density`.
+        """
         n = np.asarray(density, float)
         return np.min([(c / n) ** (1 / b) for c, b in self.laws], axis=0)
 
 
 TRASK_POWER_LAW = (10**-1.1, 2.0)
-"""Lunar craters in equilibrium: ``N = 10**10.9 D**-2`` per 10^6 km^2, D in metres.
+"""Coefficient and exponent of lunar craters in equilibrium.
 
+The law is ``N = 10**10.9 D**-2`` per 10^6 km^2, with D in metres:
 Trask, in Ranger VIII and IX, part II, JPL Technical Report 32-800 (1966), restated per m^2.
 """
 
@@ -44,9 +60,18 @@ Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
 
 
 def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw:
-    """Craters in equilibrium up to a diameter [m], and as they were produced beyond it.
+    """Return the size-frequency law of lunar craters.
 
-    The diameter at which the two laws cross grows with the age of the ground.
+    Parameters
+    ----------
+    equilibrium_diameter : float
+        Diameter up to which craters are in equilibrium [m]; larger craters follow the production
+        law. It grows with the age of the ground.
+
+    Returns
+    -------
+    LeastPowerLaw
+        The equilibrium law, and beyond the diameter the production law that meets it there.
     """
     if math.isinf(equilibrium_diameter):
         return LeastPowerLaw((TRASK_POWER_LAW,))
@@ -58,23 +83,39 @@ def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw
 
 @dataclass(frozen=True)
 class MartianRockLaw:
-    """Rocks of the Martian plains, by their cumulative fractional area.
+    """Size-frequency law of rocks on the Martian plains, from their cumulative fractional area.
 
-    ``F(D) = k exp(-q D)``, ``q = 1.79 + 0.152/k`` with D in metres (Golombek and Rapp, J.
-    Geophys. Res. 102, 4117, 1997); each rock covers ``pi D^2 / 4``, so that the number per area
-    is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The cover k is that of rocks of any
-    size, 0.02 to 0.2 at the landing sites.
+    Notes ----- The fraction of the ground under rocks of at least diameter D (in metres) is ``F(D)
+    = k exp(-q D)`` with ``q = 1.79 + 0.152/k`` [1]_. A rock covers ``pi D^2 / 4``, so that the
+    number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The fraction k under
+    rocks of any size is 0.02 to 0.2 at the landing sites.
+
+    References
+    ----------
+    .. [1] Golombek and Rapp, J. Geophys. Res. 102, 4117 (1997).
     """
 
     area_fraction: float
+    """Fraction k of the ground under rocks of any size."""
 
     @property
     def decay_rate(self) -> float:
-        """Decay of the area with the diameter, q [1/m]."""
+        """Decay rate q of the covered area with the diameter [1/m]."""
         return 1.79 + 0.152 / self.area_fraction
 
     def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of this diameter or larger [1/m^2]."""
+        """Return the number per area of rocks of at least a diameter.
+
+        Parameters
+        ----------
+        diameter : ndarray, shape (n,)
+            Diameters [m].
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Numbers per area [1/m^2].
+        """
         d = np.asarray(diameter, float)
         q = self.decay_rate
         return np.asarray(
@@ -82,12 +123,15 @@ class MartianRockLaw:
         )
 
     def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
-        """Diameter [m] which `number` per area [1/m^2] reach or exceed."""
+        """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
+
+        This is the inverse of `cumulative_density`, by Newton's method on its logarithm.
+        """
         n = np.asarray(density, float)
         scale = 4 * self.area_fraction * self.decay_rate / math.pi
         log_density = np.log(n)
-        # N(>D) > scale exp(-q D) / (D (q D + 2)), which puts this start below the root; and log N
-        # is convex in D, so that Newton's steps approach the root from there without passing it.
+        # N(>D) > scale exp(-q D) / (D (q D + 2)) puts this start below the root. log N is convex in
+        # D, so that Newton's method approaches the root from below without overshoot.
         d = np.minimum(scale / (3 * math.e * n), 1 / self.decay_rate)
         for _ in range(100):
             value = self.cumulative_density(d)
@@ -104,7 +148,7 @@ class MartianRockLaw:
 
 
 SizeFrequencyLaw = LeastPowerLaw | MartianRockLaw
-"""Numbers per area by diameter, and diameters by number per area."""
+"""Size-frequency law: number per area from diameter, and its inverse."""
 
 
 def draw_scatter(
@@ -115,10 +159,32 @@ def draw_scatter(
     smallest: float,
     largest: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Independent places (x, y) and diameters [m] on a rectangle, in falling order of diameter.
+    """Draw independent positions and diameters of objects on a rectangle.
 
-    The number is Poisson with the law's mean between the two diameters; places are uniform.
-    ValueError for an empty rectangle or range of diameters, or more than 5 million of them.
+    The number of objects is Poisson with the mean of the law between the two diameters. Positions
+    are uniform.
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    law : SizeFrequencyLaw
+        Number per area by diameter.
+    bounds : AreaBounds
+        Bounds of the rectangle [m].
+    smallest, largest : float
+        Smallest and largest diameter [m].
+
+    Returns
+    -------
+    x, y, diameter : ndarray, shape (n,)
+        Positions and diameters [m], in descending order of diameter.
+
+    Raises
+    ------
+    ValueError
+        If the rectangle or the range of diameters is empty, or more than 5 million objects are
+        expected.
     """
     west, south, east, north = bounds
     if not (0 < smallest < largest and west < east and south < north):
@@ -138,35 +204,56 @@ def draw_scatter(
 
 
 EJECTA_REACH_RADII = 4.0
-"""Radius, in crater radii, at which the ejecta are cut off: 1/64 of their height at the rim."""
+"""Radius at which ejecta are cut off, in crater radii: they have 1/64 of their height at the rim
+there."""
 
 
 class CraterArrays(NamedTuple):
-    """Craters of a piece of ground, (n,) each.
-
-    World position of the centres, diameter from rim crest to rim crest [m], and freshness: depth
-    and rim height as a share of a fresh crater's, 0..1.
-    """
+    """Craters of a piece of ground, as arrays (n,)."""
 
     x: np.ndarray
+    """World x of the centres [m]."""
     y: np.ndarray
+    """World y of the centres [m]."""
     diameter: np.ndarray
+    """Diameter from rim crest to rim crest [m]."""
     freshness: np.ndarray
+    """Depth and rim height as a fraction of those of a fresh crater, 0..1."""
 
 
 def fresh_depth(diameter: np.ndarray) -> np.ndarray:
-    """Depth of a fresh simple crater below its rim crest [m].
+    """Return the depth of a fresh simple crater below its rim crest [m].
 
-    ``0.196 D^1.010`` in km (Pike, in Impact and Explosion Cratering, 489, 1977): lunar craters
-    up to 15 km; about a fifth of the diameter.
+    Parameters
+    ----------
+    diameter : ndarray
+        Diameters from rim crest to rim crest [m].
+
+    Notes ----- The depth is ``0.196 D^1.010`` in km, about a fifth of the diameter, for lunar
+    craters up to 15 km [1]_.
+
+    References
+    ----------
+    .. [1] Pike, in Impact and Explosion Cratering, 489 (1977).
     """
     return np.asarray(1e3 * 0.196 * (np.asarray(diameter, float) / 1e3) ** 1.010)
 
 
 def fresh_rim_height(diameter: np.ndarray) -> np.ndarray:
-    """Height of a fresh simple crater's rim crest above the ground before it [m].
+    """Return the height of a fresh simple crater's rim crest above the original ground [m].
 
-    ``0.036 D^1.014`` in km (Pike, 1977, as for `fresh_depth`).
+    Parameters
+    ----------
+    diameter : ndarray
+        Diameters from rim crest to rim crest [m].
+
+    Notes
+    -----
+    The height is ``0.036 D^1.014`` in km [1]_.
+
+    References
+    ----------
+    .. [1] Pike, in Impact and Explosion Cratering, 489 (1977).
     """
     return np.asarray(1e3 * 0.036 * (np.asarray(diameter, float) / 1e3) ** 1.014)
 
@@ -174,11 +261,29 @@ def fresh_rim_height(diameter: np.ndarray) -> np.ndarray:
 def crater_profile(
     radius: np.ndarray, *, diameter: np.ndarray, freshness: np.ndarray
 ) -> np.ndarray:
-    """Height above the ground before the crater, at a distance from its centre [m].
+    """Return the height of a crater above the original ground.
 
-    A paraboloid from floor to rim crest; outside, ejecta that thin with the third power of the
-    distance (McGetchin, Settle and Head, Earth Planet. Sci. Lett. 20, 226, 1973), lowered so that
-    they end, without a step, at `REACH` radii. Diameter and freshness are as in `Craters`.
+    Parameters
+    ----------
+    radius : ndarray
+        Distances from the centre [m].
+    diameter : ndarray
+        Diameters from rim crest to rim crest [m].
+    freshness : ndarray
+        Depth and rim height as a fraction of those of a fresh crater, 0..1.
+
+    Returns
+    -------
+    ndarray
+        Heights [m], of the shape that the parameters broadcast to.
+
+    Notes ----- The bowl is a paraboloid from floor to rim crest. Outside, the thickness of ejecta
+    falls with the third power of the distance [1]_; it is lowered so that it ends without a step at
+    `EJECTA_REACH_RADII`.
+
+    References
+    ----------
+    .. [1] McGetchin, Settle and Head, Earth Planet. Sci. Lett. 20, 226 (1973).
     """
     depth, rim_height = fresh_depth(diameter), fresh_rim_height(diameter)
     relative_radius = 2 * np.asarray(radius, float) / diameter
@@ -200,11 +305,25 @@ def draw_craters(
     largest: float,
     least_fresh: float = 0.1,
 ) -> CraterArrays:
-    """Craters that reach into a rectangle, largest first; `scatter` has the parameters.
+    """Draw the craters that reach into a rectangle, in descending order of diameter.
 
-    Ground in equilibrium holds craters of every state from fresh to all but gone. Their
-    freshness is drawn evenly: a simplification, as wear by diffusion leaves more of the shallow
-    ones.
+    Parameters
+    ----------
+    generator, law, smallest, largest
+        As in `draw_scatter`.
+    bounds : AreaBounds
+        Bounds of the rectangle [m]; craters with their centre outside may reach into it.
+    least_fresh : float
+        Smallest freshness, 0..1.
+
+    Returns
+    -------
+    CraterArrays
+        Craters whose ejecta or bowl reach into the rectangle.
+
+    Notes ----- Ground in equilibrium has craters of every state from fresh to almost gone.
+    Freshness is uniform from `least_fresh` to 1: a simplification, because wear by diffusion leaves
+    more shallow craters.
     """
     margin = EJECTA_REACH_RADII * largest / 2
     wider_bounds = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
@@ -219,7 +338,13 @@ def draw_craters(
 
 
 def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
-    """Terrain with craters added to it; ValueError where one is under three grid steps across."""
+    """Add craters to the heights of a terrain.
+
+    Raises
+    ------
+    ValueError
+        If the diameter of a crater is below three grid steps.
+    """
     step = max(abs(d) for d in terrain.spacing)
     if len(craters.x) and craters.diameter.min() < 3 * step:
         raise ValueError(
@@ -243,7 +368,7 @@ def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
 def _nodes_within_reach(
     centre: float, reach: float, step: float, number: int
 ) -> tuple[slice, np.ndarray]:
-    """Nodes of one axis within reach of a centre, and their distances from it [m]."""
+    """Return the range of an axis's nodes within `reach` of a centre, and their distances [m]."""
     first, last = sorted(((centre - reach) / step, (centre + reach) / step))
     start = min(max(int(np.ceil(first)), 0), number)
     stop = max(min(int(np.floor(last)) + 1, number), start)
@@ -262,11 +387,30 @@ def draw_boulders(
     elongation: float = 1.5,
     subdivisions: int = 2,
 ) -> Facets:
-    """Boulders on a terrain, from a size-frequency law; `scatter` has the other parameters.
+    """Draw boulders on a terrain: half-ellipsoids with random diameter, elongation and heading.
 
-    The outline of each covers the area of a circle of its diameter exactly. Its long axis over
-    the short one is drawn evenly from 1 to the elongation. Those that would stand in a hole of
+    The outline of a boulder has exactly the area of a circle of its diameter. Boulders at a hole of
     the terrain are left out.
+
+    Parameters
+    ----------
+    generator, law, smallest, largest
+        As in `draw_scatter`.
+    terrain : Terrain
+        Ground on which the boulders lie.
+    bounds : AreaBounds, optional
+        Bounds of the area with boulders [m]; the whole terrain by default.
+    height_ratio : float
+        Height of a boulder over its diameter.
+    elongation : float
+        Largest ratio of the long to the short axis; the ratio is uniform from 1 to this value.
+    subdivisions : int
+        Refinement of the shape, as in `unit_dome`.
+
+    Returns
+    -------
+    Facets
+        Triangles of all boulders.
     """
     x, y, diameter = draw_scatter(
         generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
@@ -283,7 +427,7 @@ def draw_boulders(
         dome[:, 1] * (diameter / 2 / axis_ratio),
     )
     c, s = np.cos(heading[is_on_ground, None]), np.sin(heading[is_on_ground, None])
-    # The skirt goes as deep as half a diameter: no gap under a boulder on a slope up to 45 deg.
+    # The skirt reaches half a diameter below ground: no gap under a boulder on slopes up to 45 deg.
     height_above_ground = np.where(dome[:, 2] > 0, height_ratio, 0.5) * dome[:, 2] * diameter
     vertices = np.stack(
         [
@@ -300,23 +444,33 @@ def draw_boulders(
 
 
 def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a unit dome above z = 0 with a skirt down to z = -1: vertices, faces.
+    """Return a triangulated unit dome above z = 0, with a skirt down to z = -1.
 
-    The outline's area is pi exactly. Each subdivision cuts every facet of the half-octahedron
-    into four.
+    Parameters
+    ----------
+    subdivisions : int
+        Each subdivision cuts every facet of the half-octahedron into four.
+
+    Returns
+    -------
+    vertices : ndarray, shape (n, 3)
+        Vertices. The area of the outline is exactly pi.
+    faces : ndarray, shape (m, 3)
+        Indices of the corners of each triangle.
     """
     n_rows = 2**subdivisions
     points: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     first_of_row = {}
-    # Rows of the octahedron's four upper faces: row k has 4 k nodes, evenly round at k / side.
+    # Rows of nodes on the four upper faces of the octahedron: row k has 4 k nodes at equal azimuth
+    # steps.
     for k in range(n_rows + 1):
         first_of_row[k] = len(points)
         angle = 2 * math.pi * np.arange(max(4 * k, 1)) / max(4 * k, 1)
         tilt = math.pi / 2 * k / n_rows
         ring = math.sin(tilt) * np.cos(angle), math.sin(tilt) * np.sin(angle)
         points += list(np.column_stack([*ring, np.full(len(angle), math.cos(tilt))]))
-    for k in range(n_rows):  # between row k and the next
+    for k in range(n_rows):  # triangles between rows k and k + 1
         quarter, i = np.divmod(np.arange(4 * k + 4), k + 1)
         inner_number, outer_number = k * quarter + i, np.arange(4 * k + 4)
         a, b = (first_of_row[k] + n % max(4 * k, 1) for n in (inner_number, inner_number + 1))
@@ -339,22 +493,36 @@ def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class MeanTree:
-    """Mean measures of the trees of a clump.
+    """Mean dimensions of the trees of a clump.
 
-    Leaves lie at random, with the spherical distribution of leaf angles: every direction of a
-    leaf's normal is as likely as any other. So the probability of a gap along a ray is Beer's law,
-    ``exp(-G * density * path)`` with ``G = 1/2``. Sources: de Wit, Photosynthesis of Leaf Canopies
-    (1965); Ross, The Radiation Regime and Architecture of Plant Stands (1981).
+    Notes
+    -----
+    Leaves have random positions and the spherical distribution of leaf angles: every direction of a
+    leaf's normal is equally likely. The probability of a gap along a ray is therefore Beer's law
+    ``exp(-G * density * path)`` with ``G = 1/2`` [1]_ [2]_.
+
+    References
+    ----------
+    .. [1] de Wit, Photosynthesis of Leaf Canopies (1965).
+    .. [2] Ross, The Radiation Regime and Architecture of Plant Stands (1981).
     """
 
-    height: float = 12.0  # from the ground to the top of the crown [m]
-    crown_diameter: float = 7.0  # [m]
-    crown_base: float = 3.0  # height of the crown's lower end [m]
-    trunk_diameter: float = 0.4  # at the ground [m]; a third of it at the top
-    leaf_length: float = 0.30  # diagonals of a leaf, which is a rhombus [m]
+    height: float = 12.0
+    """Height from the ground to the top of the crown [m]."""
+    crown_diameter: float = 7.0
+    """Diameter of the crown [m]."""
+    crown_base: float = 3.0
+    """Height of the crown's lower end [m]."""
+    trunk_diameter: float = 0.4
+    """Diameter of the trunk at the ground [m]; a third of it at the top."""
+    leaf_length: float = 0.30
+    """Long diagonal of a leaf, which is a rhombus [m]."""
     leaf_width: float = 0.20
-    leaf_area_index: float = 2.0  # one-sided leaf area over that of the crown's outline
-    variation: float = 0.25  # sizes of trees are drawn evenly within this share of the mean
+    """Short diagonal of a leaf [m]."""
+    leaf_area_index: float = 2.0
+    """One-sided leaf area over the area of the crown's outline."""
+    variation: float = 0.25
+    """Largest relative deviation of a tree's size from the mean; sizes are uniform within it."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.crown_base < self.height:
@@ -373,7 +541,7 @@ class MeanTree:
 
 
 LEAF_SURFACE, TRUNK_SURFACE = 0, 1
-"""Surface indices."""
+"""Surface numbers of leaves and trunks."""
 
 
 def plant_clump(
@@ -385,9 +553,32 @@ def plant_clump(
     number: int,
     tree: MeanTree,
 ) -> Facets:
-    """Plant a clump of trees on a terrain, their trunks at least half a crown apart.
+    """Draw a clump of trees on a terrain, with trunks at least half a crown diameter apart.
 
-    ValueError where they find no room within the radius [m], or no ground.
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    terrain : Terrain
+        Ground on which the trees stand.
+    centre : (float, float)
+        World x and y of the clump's centre [m].
+    radius : float
+        Largest distance of a trunk from the centre [m].
+    number : int
+        Number of trees, >= 1.
+    tree : MeanTree
+        Mean dimensions of the trees.
+
+    Returns
+    -------
+    Facets
+        Triangles with the surfaces `LEAF_SURFACE` and `TRUNK_SURFACE`.
+
+    Raises
+    ------
+    ValueError
+        If the trees do not fit within the radius, or a tree would stand off the ground.
     """
     parts = []
     for x, y in _draw_trunk_positions(generator, centre, radius, number, tree.crown_diameter / 2):
@@ -412,7 +603,7 @@ def _draw_trunk_positions(
     number: int,
     distance_min: float,
 ) -> list[tuple[float, float]]:
-    """Places in a disc, no two nearer than `apart` [m], by throwing darts."""
+    """Draw positions in a disc, at least `distance_min` [m] apart, by rejection sampling."""
     positions: list[tuple[float, float]] = []
     for _ in range(1000 * number):
         if len(positions) == number:
@@ -429,7 +620,7 @@ def _draw_trunk_positions(
 
 
 def trunk_facets(tree: MeanTree, size_factor: float = 1.0) -> Facets:
-    """Tapered prism from half a metre below the foot to the middle of the crown."""
+    """Return a tapered prism from half a metre below the foot to the middle of the crown."""
     sides = 8
     top_height = (tree.crown_base + tree.height) / 2
     angle = 2 * math.pi * np.arange(sides) / sides
@@ -448,9 +639,19 @@ def trunk_facets(tree: MeanTree, size_factor: float = 1.0) -> Facets:
 def crown_facets(
     generator: np.random.Generator, tree: MeanTree, size_factor: float = 1.0
 ) -> Facets:
-    """Leaves with their centres spread evenly over an ellipsoid, the tree's foot at the origin.
+    """Draw the leaves of a tree whose foot is at the origin.
 
-    A larger tree has more leaves, not larger ones: the leaf area index stays.
+    The centres of the leaves are uniform in an ellipsoid. A larger tree has more leaves of equal
+    size, so that the leaf area index does not change.
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    tree : MeanTree
+        Mean dimensions.
+    size_factor : float
+        Size of this tree over the mean size.
     """
     n_leaves = round(tree.number_of_leaves * size_factor**2)
     directions = _draw_directions(generator, n_leaves)
@@ -471,6 +672,6 @@ def crown_facets(
 
 
 def _draw_directions(generator: np.random.Generator, number: int) -> np.ndarray:
-    """Return unit vectors, evenly over the sphere, (number, 3)."""
+    """Draw unit vectors (number, 3), uniform over the sphere."""
     vectors = generator.standard_normal((number, 3))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

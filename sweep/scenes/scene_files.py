@@ -1,4 +1,4 @@
-"""Files of a scene: what is wrong with one, what tells it from others, CSV tables."""
+"""Files of a scene: checks, digests and CSV tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sweep.units import QuantityError, read_unit
 
 
 class SceneError(PrintableError):
-    """A file that a scene can not be made of: the rule broken, and what to do about it."""
+    """Error of a file or object that is unsuitable for a scene, with problem and remedy."""
 
     def __init__(self, file: str | Path, problem: str, remedy: str) -> None:
         super().__init__(f"{file}: {problem}; {remedy}")
@@ -29,7 +29,7 @@ class SceneError(PrintableError):
 
 
 def require_file(path: str | Path) -> Path:
-    """Path of a file that is there; SceneError where it is not, or is no plain file."""
+    """Return the path of an existing plain file; raise `SceneError` if there is none."""
     path = Path(path)
     if str(path).startswith("/vsi"):
         raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
@@ -51,7 +51,7 @@ def require_file(path: str | Path) -> Path:
 
 
 def _is_link_loop(path: Path) -> bool:
-    """Return true if symbolic links on the way to a file lead in a circle."""
+    """Return True if symbolic links on the path form a loop."""
     try:
         path.stat()
     except OSError as error:
@@ -60,7 +60,18 @@ def _is_link_loop(path: Path) -> bool:
 
 
 def file_digest(path: str | Path) -> str:
-    """Digest of a file's bytes, and of those of files that a glTF reads; SceneError if lost."""
+    """Return the digest of a file, including the files that a glTF refers to.
+
+    Returns
+    -------
+    str
+        BLAKE2b of the content, 32 hexadecimal digits.
+
+    Raises
+    ------
+    SceneError
+        If a file is missing or can't be read.
+    """
     path = require_file(path)
     digest = hashlib.blake2b(digest_size=16)
     for file_part in (path, *_companion_paths(path)):
@@ -73,7 +84,17 @@ def file_digest(path: str | Path) -> str:
 
 
 def require_memory(subject: str | Path, bytes_needed: float, remedy: str) -> None:
-    """Refuse a file or an object that would take more memory [bytes] than the machine has free."""
+    """Raise `SceneError` if a file or object needs more memory than is free.
+
+    Parameters
+    ----------
+    subject : str or Path
+        File or object, for the message.
+    bytes_needed : float
+        Required memory [bytes].
+    remedy : str
+        Remedy, as an imperative clause.
+    """
     import psutil
 
     bytes_free = psutil.virtual_memory().available
@@ -86,7 +107,13 @@ def require_memory(subject: str | Path, bytes_needed: float, remedy: str) -> Non
 
 
 def read_companion(path: Path, name: str) -> bytes:
-    """Content of a plain file that another one names; SceneError for what is none."""
+    """Return the content of a plain file that another file names.
+
+    Raises
+    ------
+    SceneError
+        If it is no plain file on this machine, or too large for the memory.
+    """
     companion = require_file(_companion_path(path, name))
     size = companion.stat().st_size
     require_memory(companion, 4 * size, "reduce it")
@@ -95,7 +122,10 @@ def read_companion(path: Path, name: str) -> bytes:
 
 
 def _companion_path(path: Path, name: str) -> Path:
-    """Path of a file that another one names; SceneError for an address of the network."""
+    """Return the path of a file that another file names.
+
+    Raise `SceneError` for a network address.
+    """
     if "://" in name:
         problem = f"needs {name}, and nothing is fetched over the network"
         raise SceneError(path, problem, "fetch that, or export it in one file (GLB)")
@@ -103,13 +133,13 @@ def _companion_path(path: Path, name: str) -> Path:
 
 
 def _companion_paths(path: Path) -> list[Path]:
-    """Files whose content belongs to this one's."""
+    """Return the files that a glTF refers to; none for other formats."""
     if path.suffix.lower() != ".gltf":
         return []
     try:
         document = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
-        return []  # what is wrong with it is told where it is read
+        return []  # the reader of the file reports its mistakes
     buffers: Any = document.get("buffers") if isinstance(document, dict) else None
     buffers = buffers if isinstance(buffers, list) else []
     uris = [buffer.get("uri", "") for buffer in buffers if isinstance(buffer, dict)]
@@ -125,36 +155,59 @@ WAYPOINT_COLUMN_UNITS = {
     "qw": "", "qx": "", "qy": "", "qz": "",
     "heading": "rad", "pitch": "rad", "roll": "rad",
 }  # fmt: skip
-"""Columns and the SI unit of each; quaternions have none."""
+"""Columns of a table of waypoints with their SI units; quaternions have no unit."""
 
 _POSITION_COLUMNS = ("time", "x", "y", "z")
+"""Columns that every table of waypoints must have."""
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+"""Columns of an attitude as a quaternion, body to world."""
 _ANGLE_COLUMNS = ("heading", "pitch", "roll")
+"""Columns of an attitude as angles."""
 _HEADER_CELL_PATTERN = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
+"""Pattern of a header cell: a name with a unit in brackets."""
 _EXAMPLE_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
+"""Header of a table of waypoints that errors show."""
 
 
 NumberedRow = tuple[int, list[str]]
-"""Number of a line, and its cells."""
+"""Line number and cells of a row."""
 
 
 class WaypointTable(NamedTuple):
-    """Waypoints of a table."""
+    """Waypoints of a CSV table."""
 
-    time: np.ndarray  # (n,): rising times [s]
-    position: np.ndarray  # (n, 3) [m]
+    time: np.ndarray
+    """Rising times (n,) [s]."""
+    position: np.ndarray
+    """World positions (n, 3) [m]."""
     attitude: np.ndarray | None
-    """(n, 4): quaternions (w, x, y, z), body to world; None where the table has no attitude."""
+    """Quaternions (n, 4) w, x, y, z from body to world; None if the table has no attitude."""
 
 
 def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> WaypointTable:
-    """Waypoints of a CSV table.
+    """Read the waypoints of a CSV table.
 
     The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
-    [m]``. The attitude is either ``qw, qx, qy, qz`` (body to world) or angles. The angles are
-    ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
-    ``roll [deg]`` (left side up); a missing one is 0. Lines that begin with # are skipped. A file
-    that is missing or no such table raises SceneError. Times [s] count from `time_origin`.
+    [m]``. The attitude is either a quaternion ``qw, qx, qy, qz`` (body to world) or angles. The
+    angles are ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
+    ``roll [deg]`` (left side up); a missing angle is 0. Lines that begin with # are skipped.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+    time_origin : Decimal
+        Time [s] in the table that becomes 0.
+
+    Returns
+    -------
+    WaypointTable
+        Waypoints in SI units.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing or no such table.
     """
     table = read_csv_columns(
         path, WAYPOINT_COLUMN_UNITS, _POSITION_COLUMNS, _EXAMPLE_HEADER, time_origin
@@ -164,7 +217,13 @@ def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> Waypo
 
 
 def read_first_time(path: str | Path) -> Decimal:
-    """First time [s] of a CSV table of waypoints, with all its digits; SceneError for no table."""
+    """Return the first time [s] of a CSV table of waypoints, with all its digits.
+
+    Raises
+    ------
+    SceneError
+        If the file is missing or no such table.
+    """
     path = require_file(path)
     rows = _read_rows(path)
     if len(rows) < 2:
@@ -181,27 +240,35 @@ def read_csv_columns(
     example: str,
     time_origin: Decimal = Decimal(0),
 ) -> dict[str, np.ndarray]:
-    """Columns of a CSV table in SI, by name, (n,) each; the times rise.
+    """Read the columns of a CSV table in SI units; its times must rise.
 
-    The first row names the columns and their units: ``time [us]``. Lines that begin with # are
-    passed over.
+    The first row names the columns and their units, such as ``time [us]``. Lines that begin with #
+    are skipped.
 
     Parameters
     ----------
-    column_units : mapping
-        SI unit of each column that there may be, ``time`` among them; empty for a pure number.
-    required_columns : collection of str
-        Columns that must be there.
+    path : str or Path
+        CSV file.
+    column_units : Mapping
+        SI unit of each permitted column, which include ``time``; empty for a pure number.
+    required_columns : Collection of str
+        Columns that must exist.
     example : str
-        A good header.
+        A valid header, for errors.
     time_origin : Decimal
-        Subtracted from the times [s] in decimal arithmetic, before they become float64: seconds of
-        GPS (1.35e9) would lose 1e-7 s there, and the accelerations of a path with them.
+        Time [s] that is subtracted from the times in decimal arithmetic, before conversion to
+        float64. In float64 GPS seconds (1.35e9) would lose 1e-7 s, and with that the accelerations
+        of a path.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Columns (n,) by name.
 
     Raises
     ------
     SceneError
-        For a file that is missing or no such table; names every line at fault, and what to write.
+        If the file is missing or no such table; names every line with a mistake and a remedy.
     """
     path = require_file(path)
     numbered_rows = _read_rows(path)
@@ -231,7 +298,7 @@ def read_csv_columns(
         with localcontext(prec=_TIME_DIGITS):
             table["time"] = np.array([float(time - time_origin) for time in times])
     equal_times = np.flatnonzero(np.diff(table["time"]) <= 0)
-    if equal_times.size:  # apart by less than float64 can tell
+    if equal_times.size:  # equal in float64 although the decimals differ
         line = numbered_rows[equal_times[0] + 2][0]
         problem = f"has a time on line {line} too close to the one before for numbers of 64 bits"
         raise SceneError(path, problem, "leave one of the two lines out")
@@ -239,11 +306,11 @@ def read_csv_columns(
 
 
 _MISTAKES_SHOWN_MAX = 10
-"""Mistakes of one file that are told; of more, their number."""
+"""Maximum number of mistakes of one file that are listed; further ones are counted."""
 
 
 def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
-    """All mistakes of a file as one; their rules are predicates of the file."""
+    """Return one error with all mistakes of a file; each problem is a predicate about the file."""
     shown_mistakes = mistakes[:_MISTAKES_SHOWN_MAX]
     rule = ", and ".join(mistake.problem for mistake in shown_mistakes)
     if len(mistakes) > len(shown_mistakes):
@@ -254,26 +321,29 @@ def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
 
 
 def _too_short_error(path: Path, example: str) -> SceneError:
-    """Refusal of a table without two lines of numbers."""
+    """Return the error for a table with fewer than two lines of numbers."""
     remedy = f"write a header ({example}) and a line for each"
     return SceneError(path, "holds fewer than two lines of numbers", remedy)
 
 
 def _read_exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> list[Decimal]:
-    """Return the times [s] of lines of finite numbers, with all digits that are written."""
+    """Return the times [s] of rows of finite numbers, with all digits that are written."""
     column, factor = list(factors).index("time"), Decimal(repr(factors["time"]))
     with localcontext(prec=_TIME_DIGITS):
         return [Decimal(cells[column].strip()) * factor for _, cells in rows]
 
 
 _TIME_DIGITS = 60
-"""Significant digits of times while they are decimals."""
+"""Significant digits of times in decimal arithmetic."""
 
 
 def _falling_time_error(
     path: Path, earlier: tuple[int, Decimal], later: tuple[int, Decimal]
 ) -> SceneError:
-    """Refusal of a time, given with its line, that does not exceed the time before."""
+    """Return the error for a time that does not exceed the previous one.
+
+    Both are given with their line.
+    """
     (line, time), (next_line, next_time) = earlier, later
     if next_time == time:
         problem = (
@@ -294,7 +364,10 @@ def _column_factors(
     required_columns: Collection[str],
     example: str,
 ) -> dict[str, float]:
-    """Factor that makes each column SI, by name in the order of the header; all its mistakes."""
+    """Return the factor from each column to SI units, in the order of the header.
+
+    All mistakes of the header raise one `SceneError`.
+    """
     for separator, separator_name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
             problem = f"separates its columns by {separator_name}"
@@ -328,7 +401,7 @@ def _column_factors(
 
 
 def _read_rows(path: Path) -> list[NumberedRow]:
-    """Line numbers and cells of all lines that say something."""
+    """Return line number and cells of all rows that are neither empty nor comments."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -342,7 +415,7 @@ def _read_rows(path: Path) -> list[NumberedRow]:
 
 
 def _column_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
-    """Factor that makes a column SI."""
+    """Return the factor from a column to its SI unit."""
     if not si_unit:
         if unit not in ("", "1"):
             raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
@@ -358,7 +431,7 @@ def _column_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
 
 
 def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str]) -> list[float]:
-    """Numbers of a line, in the order of the columns' names."""
+    """Return the numbers of a row, in the order of the columns."""
     line_number, cells = numbered_row
     if len(cells) != len(column_names):
         problem = (
@@ -377,7 +450,7 @@ def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str
 
 
 def _parse_finite_number(cell: str) -> float | None:
-    """Value of a cell; None if it is no finite number."""
+    """Return the number in a cell; None if it is not a finite number."""
     try:
         value = float(cell)
     except ValueError:
@@ -386,7 +459,7 @@ def _parse_finite_number(cell: str) -> float | None:
 
 
 def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Quaternions of the table, (n, 4)."""
+    """Return the quaternions (n, 4) of a table; None if it has no attitude."""
     quaternion_columns = [name for name in _QUATERNION_COLUMNS if name in table]
     angle_columns = {name: table[name] for name in _ANGLE_COLUMNS if name in table}
     if quaternion_columns and angle_columns:
@@ -410,7 +483,7 @@ def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray |
 
 
 def _unfit_quaternion(path: Path, line_number: int, norm: float) -> SceneError:
-    """Refusal of a quaternion whose length is not 1."""
+    """Return the error for a quaternion whose length is not 1."""
     problem = f"has a quaternion of the length {norm:.6g} on line {line_number}, which has to be 1"
     remedy = "divide it by its length" if norm > 0 else "write 1, 0, 0, 0 for no turn"
     return SceneError(path, problem, remedy)

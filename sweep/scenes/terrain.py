@@ -1,12 +1,12 @@
-"""Ground as a grid of heights: its triangles, pieces, refining, and random relief.
+"""Terrain as a grid of heights: triangles, sections, refinement, smoothing and random relief.
 
-Heights sit at the grid's nodes, row i at y = i dy and column j at x = j dx from the first. A cell
-of four nodes becomes two triangles. Missing heights (NaN) leave holes; a cell that lacks one node
-keeps the triangle of the other three.
+Heights are given at the nodes of the grid: row i at y = i dy, column j at x = j dx from the first
+node. A cell of four nodes becomes two triangles. Missing heights (NaN) leave holes; a cell that
+lacks one node keeps the triangle of the other three.
 
-Random ground is a Gaussian field, exact in its statistics, drawn by circulant embedding. The
-covariance is laid on a torus at least twice as large, where the FFT diagonalises it; a corner is
-kept.
+Random terrain is a Gaussian field with exact statistics, drawn by circulant embedding. Its
+covariance is continued periodically on a torus of at least twice the size, where the FFT
+diagonalises it. A corner of the torus is used.
 """
 
 from __future__ import annotations
@@ -22,28 +22,29 @@ from sweep.scenes.map_frames import MapFrame
 from sweep.scenes.meshes import Facets
 
 _NEGATIVE_VARIANCE_MAX = 1e-6
-"""Share of the variance that may be missing where rounding makes a spectrum negative."""
+"""Largest fraction of the variance that rounding may make negative in a power spectrum."""
 
 _NODES_PER_BATCH = 1 << 20
-"""Nodes whose covariance is worked out at a time."""
+"""Number of nodes whose covariance is computed at a time."""
 
 AreaBounds = tuple[float, float, float, float]
-"""World (x least, y least, x largest, y largest) [m]."""
+"""Smallest x, smallest y, largest x and largest y of an area in world coordinates [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights (rows, columns) of nodes on a grid above its origin [m]; NaN where there is none.
-
-    Steps (dx, dy) [m] may be negative; the origin (3,) is that of node (0, 0) at height 0 [m].
-    One that was read from a map has the frame of that map; warnings say what is doubtful about it.
-    """
+    """Heights on a regular grid."""
 
     heights: np.ndarray
+    """Heights (rows, columns) of the nodes above the origin [m]; NaN for missing heights."""
     spacing: tuple[float, float]
+    """Grid steps (dx, dy) from column to column and from row to row [m]; may be negative."""
     origin: np.ndarray
+    """World position (3,) of node (0, 0) at height 0 [m]."""
     map_frame: MapFrame | None = None
+    """Map to which the coordinates belong; None if the terrain is not from a map."""
     warnings: tuple[str, ...] = ()
+    """Doubts about the heights, as sentences."""
 
     def __post_init__(self) -> None:
         z, spacing = self.heights, self.spacing
@@ -54,7 +55,7 @@ class Terrain:
 
     @property
     def bounds(self) -> AreaBounds:
-        """Edges of the grid."""
+        """Bounds of the grid in world coordinates [m]."""
         rows, columns = self.heights.shape
         x = sorted((0.0, (columns - 1) * self.spacing[0]))
         y = sorted((0.0, (rows - 1) * self.spacing[1]))
@@ -63,19 +64,30 @@ class Terrain:
 
     @property
     def centre(self) -> np.ndarray:
-        """World position of the middle of the grid, on the ground [m], (3,)."""
+        """World position (3,) of the centre of the grid, on the ground [m]."""
         west, south, east, north = self.bounds
         x, y = (west + east) / 2, (south + north) / 2
         return np.array([x, y, self.height_at(np.array(x), np.array(y))])
 
     def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """World height of the ground at world (x, y) [m], on its triangles; NaN where none is."""
+        """Return the height of the triangulated ground at world positions.
+
+        Parameters
+        ----------
+        x, y : ndarray
+            World coordinates [m], of equal shape.
+
+        Returns
+        -------
+        ndarray
+            World heights [m], of the same shape; NaN outside the grid and in holes.
+        """
         column = (np.asarray(x, float) - self.origin[0]) / self.spacing[0]
         row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
         return np.asarray(_interpolate_on_triangles(self.heights, row, column) + self.origin[2])
 
     def to_facets(self) -> Facets:
-        """Triangles of the ground, facing upwards, and the nodes that they use."""
+        """Return the upward-facing triangles of the ground with the nodes that they use."""
         z, (dx, dy) = self.heights, self.spacing
         has_height = np.isfinite(z)
         faces = _grid_triangles(has_height)
@@ -86,7 +98,7 @@ class Terrain:
         vertices[..., 0] = np.arange(columns) * dx
         vertices[..., 1] = (np.arange(rows) * dy)[:, None]
         vertices[..., 2] = z
-        vertices += 0.0  # never -0.0
+        vertices += 0.0  # turns -0.0 into 0.0
         nodes = vertices.reshape(-1, 3)
         if not has_height.all():
             used = np.zeros(z.size, bool)
@@ -98,10 +110,10 @@ class Terrain:
 
 
 def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
-    """Triangles of all cells, counter-clockwise where rows and columns both increase, (m, 3) int32.
+    """Return the triangles (m, 3) int32 of all cells, counter-clockwise for positive steps.
 
-    Whole cells are cut along the diagonal from node (i, j) to (i+1, j+1). First come the lower
-    triangles of all cells, then the upper ones.
+    A complete cell is cut along the diagonal from node (i, j) to (i+1, j+1). The lower triangles of
+    all cells come first, then the upper triangles.
     """
     node = np.arange(has_height.size, dtype=np.int32).reshape(has_height.shape)
     # Corners of each cell, counter-clockwise from (i, j).
@@ -118,8 +130,8 @@ def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
     n_missing = sum(is_gap.astype(np.int8) for is_gap in is_missing)
     lower = np.where(is_missing[0], d, a), b, c
     upper = a, np.where(is_missing[2], b, c), d
-    # One gap at b spoils the lower triangle, one at d the upper; gaps at a and c are bridged above
-    # by the other diagonal, which makes one triangle and leaves the other to be dropped.
+    # Without node b a cell has no lower triangle, without d no upper one. Without a or c the cell
+    # is cut along the other diagonal, which leaves one triangle.
     keep_lower = (n_missing == 0) | ((n_missing == 1) & (is_missing[0] | is_missing[3]))
     keep_upper = (n_missing == 0) | ((n_missing == 1) & (is_missing[1] | is_missing[2]))
     return np.concatenate(
@@ -133,7 +145,7 @@ def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
 def _interpolate_on_triangles(
     heights: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
-    """Height of the triangulated grid at fractional rows and columns; NaN where it has none."""
+    """Return the height of the triangulated grid at fractional rows and columns; NaN outside."""
     rows, columns = heights.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
     j = np.clip(np.floor(column), 0, columns - 2).astype(np.int64)
@@ -142,7 +154,7 @@ def _interpolate_on_triangles(
     lower = a + u * (b - a) + v * (c - b)
     upper = a + u * (c - d) + v * (d - a)
     value = np.where(u >= v, lower, upper)
-    # A cell that lacks one corner is cut along the other diagonal if that is what is left of it.
+    # A cell without node a or c is cut along the other diagonal.
     value = np.where(np.isnan(a) & (u + v >= 1), c + (1 - u) * (d - c) + (1 - v) * (b - c), value)
     value = np.where(np.isnan(c) & (u + v <= 1), a + u * (b - a) + v * (d - a), value)
     inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
@@ -150,11 +162,27 @@ def _interpolate_on_triangles(
 
 
 def refine(terrain: Terrain, *, factor: int) -> Terrain:
-    """Terrain with `factor` times as many steps a side, through all the given heights.
+    """Refine a terrain by a cubic spline through all its heights.
 
-    A cubic spline: slopes are continuous, so that a narrow beam sees no facets of the survey's
-    posts. A new node has a height where all the nodes around it have one. ValueError for a
-    factor below 1 or a grid too small for a cubic.
+    Slopes of the spline are continuous, so that a narrow beam does not see the facets of the
+    original grid. A new node has a height if all original nodes around it have heights.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        Grid of at least 4 x 4 nodes.
+    factor : int
+        Number of new grid steps per original step, >= 1.
+
+    Returns
+    -------
+    Terrain
+        Grid with `factor` times as many steps along each side.
+
+    Raises
+    ------
+    ValueError
+        If the factor is below 1, the grid is too small, or the terrain has no heights.
     """
     from scipy.interpolate import RectBivariateSpline
     from scipy.ndimage import distance_transform_edt
@@ -165,7 +193,7 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
     heights, holes = terrain.heights, ~np.isfinite(terrain.heights)
     if holes.all():
         raise ValueError("the terrain has no heights at all")
-    if holes.any():  # each is given the height of the nearest node that has one
+    if holes.any():  # fill each hole with the height of the nearest node
         heights = heights[
             tuple(distance_transform_edt(holes, return_distances=False, return_indices=True))
         ]
@@ -182,10 +210,19 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
 
 
 def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
-    """Terrain blurred by a Gaussian of that standard deviation [m]; holes stay holes.
+    """Smooth a terrain by a Gaussian filter; holes stay holes and have no weight.
 
-    ValueError for a negative width, or one beyond the ground's longer side: its memory goes by
-    it.
+    Parameters
+    ----------
+    terrain : Terrain
+        Terrain to smooth.
+    standard_deviation : float
+        Standard deviation of the Gaussian [m], from 0 to the longer side of the terrain.
+
+    Raises
+    ------
+    ValueError
+        If the standard deviation is out of range; memory grows with it.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -207,13 +244,28 @@ def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
 
 
 def cut_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
-    """Cut out a square of a terrain about (x, y) [m]; ValueError where it holds no cell."""
+    """Cut a square out of a terrain.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        Terrain to cut.
+    centre : sequence of float
+        World x and y of the square's centre [m].
+    size : float
+        Side of the square [m]. The result covers the square, as far as the terrain reaches.
+
+    Raises
+    ------
+    ValueError
+        If the square contains no cell of the terrain.
+    """
     node_ranges, corner = [], terrain.origin.copy()
     for axis in (1, 0):
         step, number = terrain.spacing[axis], terrain.heights.shape[1 - axis]
         middle = (centre[axis] - terrain.origin[axis]) / step
         half_width = size / 2 / abs(step)
-        # A hair past a node is that node: positions come from sums that were rounded.
+        # Positions are rounded sums: tolerate 1e-9 of a step beyond a node.
         first = max(math.floor(middle - half_width + 1e-9), 0)
         last = min(math.ceil(middle + half_width - 1e-9), number - 1)
         if last <= first:
@@ -224,7 +276,13 @@ def cut_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Ter
 
 
 def square_bounds(terrain: Terrain, *, centre: Sequence[float], size: float) -> AreaBounds:
-    """Bounds of a square about (x, y) [m], as far as there is ground; ValueError for none."""
+    """Return the bounds of a square with centre (x, y) [m], clipped to the terrain.
+
+    Raises
+    ------
+    ValueError
+        If the square lies outside the terrain.
+    """
     west, south, east, north = terrain.bounds
     (x, y), half = centre[:2], size / 2
     bounds = max(x - half, west), max(y - half, south), min(x + half, east), min(y + half, north)
@@ -234,6 +292,7 @@ def square_bounds(terrain: Terrain, *, centre: Sequence[float], size: float) -> 
 
 
 def _no_ground_error(centre: Sequence[float], size: float) -> ValueError:
+    """Return the error for a square without terrain."""
     return ValueError(
         f"there is no ground within {size / 2:g} m of ({centre[0]:g}, {centre[1]:g}) m"
     )
@@ -248,34 +307,61 @@ def draw_fractal_relief(
     rms_slope: float,
     baseline: float,
 ) -> np.ndarray:
-    """Self-affine relief: a fractional Brownian surface, (rows, columns) [m], 0 at its first node.
+    """Draw self-affine relief: a fractional Brownian surface.
 
-    The difference of height of two nodes, a distance L apart, is normal with the standard
-    deviation ``rms_slope * baseline * (L / baseline)**hurst``: the deviogram by which planetary
-    roughness is measured (Shepard et al., J. Geophys. Res. 106, 32777, 2001). Drawn by Stein's
-    exact method (J. Comput. Graph. Stat. 11, 587, 2002): a stationary field whose covariance
-    differs from the fractal's by a paraboloid only, plus the random plane that makes up for it.
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    shape : (int, int)
+        Number of rows and columns.
+    spacing : (float, float)
+        Grid steps along x and y [m].
+    hurst : float
+        Hurst exponent, 0 < hurst < 1: 0.5 for a random walk, towards 1 for smooth ground.
+    rms_slope : float
+        Standard deviation of the height difference over the baseline, divided by the baseline.
+    baseline : float
+        Distance at which `rms_slope` is stated [m].
 
-    Hurst's exponent, 0 < . < 1, is 0.5 for a random walk, towards 1 for smooth ground. Lunar
-    ground has a median near 0.95 in the highlands and 0.76 in the maria over 57 m to 2.7 km
-    (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
+    Returns
+    -------
+    ndarray, shape (rows, columns)
+        Heights [m], 0 at the first node.
+
+    Notes ----- The height difference of two nodes at distance L is normal with standard deviation
+    ``rms_slope * baseline * (L / baseline)**hurst``, the deviogram by which planetary roughness is
+    measured [1]_. Stein's exact method [2]_ draws a stationary field whose covariance differs from
+    the fractal's by a paraboloid only, and adds a random plane that compensates for the paraboloid.
+
+    The lunar surface has a median Hurst exponent near 0.95 in the highlands and 0.76 in the maria,
+    over 57 m to 2.7 km [3]_.
+
+    References
+    ----------
+    .. [1] Shepard et al., J. Geophys. Res. 106, 32777 (2001).
+    .. [2] Stein, J. Comput. Graph. Stat. 11, 587 (2002).
+    .. [3] Rosenburg et al., J. Geophys. Res. 116, E02001 (2011).
     """
     steps = abs(spacing[1]), abs(spacing[0])
     diagonal = math.hypot(*((n - 1) * step for n, step in zip(shape, steps, strict=True)))
-    # In units of the grid's diagonal, the longest distance that must be right is 1.
+    # Distances are in units of the grid's diagonal: the covariance must be exact up to distance 1.
     period, paraboloid, covariance = _stein_covariance(2 * hurst)
     relative_steps = [step / diagonal for step in steps]
     stationary = _draw_gaussian_field(generator, shape, relative_steps, covariance, period)
     plane_slopes = generator.standard_normal(2) * math.sqrt(2 * paraboloid)
     rows, columns = (np.arange(n) * step for n, step in zip(shape, relative_steps, strict=True))
     relief = stationary + (plane_slopes[0] * rows)[:, None] + plane_slopes[1] * columns
-    # The field's differences have the variance 2 r^(2H); the wanted one is per baseline.
+    # Differences of the field have the variance 2 r^(2H); scale them to the slope at the baseline.
     scale = rms_slope * baseline * (diagonal / baseline) ** hurst / math.sqrt(2)
     return np.asarray((relief - relief[0, 0]) * scale)
 
 
 def _stein_covariance(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
-    """Torus period, coefficient of the paraboloid and the covariance on the torus."""
+    """Return the torus's period, the coefficient of the paraboloid and the covariance function.
+
+    `alpha` is twice the Hurst exponent. Distances are in units of the grid's diagonal.
+    """
     if alpha <= 1.5:
         torus_half_period, tail_coefficient, paraboloid = 1.0, 0.0, alpha / 2
         constant = 1 - alpha / 2
@@ -309,15 +395,33 @@ def draw_hills(
     rms_height: float,
     correlation_length: float,
 ) -> np.ndarray:
-    """Smooth rolling ground with a Gaussian covariance, (rows, columns) [m].
+    """Draw smooth rolling ground: a stationary field with a Gaussian covariance.
 
-    The covariance of two nodes L apart is ``rms_height**2 * exp(-(L /
-    correlation_length)**2)``. Other parameters are as of `fractal`; steps are finer than a
-    third of the correlation length.
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    shape : (int, int)
+        Number of rows and columns.
+    spacing : (float, float)
+        Grid steps along x and y [m], smaller than a third of the correlation length.
+    rms_height : float
+        Standard deviation of the height [m].
+    correlation_length : float
+        Distance at which the correlation is 1/e [m].
+
+    Returns
+    -------
+    ndarray, shape (rows, columns)
+        Heights [m], of expected mean 0.
+
+    Notes ----- The covariance of two nodes at distance L is ``rms_height**2 * exp(-(L /
+    correlation_length)**2)``.
     """
     steps = abs(spacing[1]), abs(spacing[0])
     relative_steps = [step / correlation_length for step in steps]
-    # Beyond 6 correlation lengths the covariance is 2e-16: the two ends of the torus are apart.
+    # Beyond 6 correlation lengths the correlation is 2e-16: opposite edges of the grid are
+    # independent although the torus is periodic.
     longest_side = max((n - 1) * step for n, step in zip(shape, relative_steps, strict=True))
     field = _draw_gaussian_field(
         generator, shape, relative_steps, lambda r: np.exp(-(r**2)), longest_side + 6.0
@@ -326,7 +430,12 @@ def draw_hills(
 
 
 def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
-    """Stationary Gaussian field of a function of distance, on a torus of at least a period."""
+    """Draw a stationary Gaussian field on a torus of at least `period`.
+
+    Return its corner of `shape`.
+
+    `covariance` is a function of distance, in the unit of `steps` and `period`.
+    """
     torus_shape = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
     if math.prod(torus_shape) > 2e8:
         raise ValueError(
@@ -336,7 +445,7 @@ def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: 
         (np.minimum(np.arange(n), n - np.arange(n)) * step) ** 2
         for n, step in zip(torus_shape, steps, strict=True)
     ]
-    covariances = np.empty(torus_shape)  # a torus may be large; what makes it need not be
+    covariances = np.empty(torus_shape)  # computed in batches, because a torus may be large
     batch_rows = max(_NODES_PER_BATCH // torus_shape[1], 1)
     for row_range in (
         slice(first, first + batch_rows) for first in range(0, torus_shape[0], batch_rows)

@@ -1,8 +1,9 @@
-"""Tiles of one grid: rasters that touch, joined so that no seam is left between them.
+"""Joining of adjacent rasters of one grid without seams.
 
-The nodes of a raster lie at the centres of its pixels, so between the last nodes of a tile and the
-first ones of the next there is a gap a pixel wide. A tile is continued by one row and one column of
-its neighbours' nodes, towards rising rows and columns, so that each gap is closed once.
+The nodes of a raster lie at the centres of its pixels. Between the last nodes of one tile and the
+first nodes of the next there is therefore a gap of one pixel. Each tile is extended by one row and
+one column of its neighbours' nodes, towards rising rows and columns, so that each gap is closed
+once.
 
 ::
 
@@ -22,14 +23,27 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Distance from whole cells, in cells, up to which two grids are one."""
+"""Largest deviation from a whole number of cells at which two grids count as one [cells]."""
 
 _TOUCHING_GAP_MAX_CELLS = 2.0
-"""Gap between two grids, in the larger one's cells, up to which they are taken to touch."""
+"""Largest gap at which two grids count as adjacent [cells of the coarser grid]."""
 
 
 def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[str]]:
-    """Tiles by name, each continued by its neighbours' first nodes; warnings of gaps that stay."""
+    """Extend each tile by the first nodes of its neighbours.
+
+    Parameters
+    ----------
+    tiles : Mapping of str to Terrain
+        Tiles by name.
+
+    Returns
+    -------
+    joined : dict of str to Terrain
+        Extended tiles by name.
+    warnings : list of str
+        Sentences about gaps that remain between adjacent rasters with different grids.
+    """
     names = list(tiles)
     joined = {}
     warnings = []
@@ -48,7 +62,10 @@ def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[s
 
 
 def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
-    """Row and column of the other's first node on a tile's grid; None if the grids differ."""
+    """Return row and column of another tile's first node on a tile's grid.
+
+    None if the grids differ.
+    """
     (dx, dy), (rows, columns) = tile.spacing, other.heights.shape
     for step, other_step, number in ((dx, other.spacing[0], columns), (dy, other.spacing[1], rows)):
         if not abs(other_step - step) * number <= _ALIGNMENT_TOLERANCE_CELLS * abs(step):
@@ -61,13 +78,13 @@ def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
 
 
 def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
-    """Tile with one more row and column, as far as its neighbours have nodes there."""
+    """Return a tile with one more row and column, if its neighbours have nodes there."""
     rows, columns = tile.heights.shape
     heights = np.full((rows + 1, columns + 1), np.nan)
     heights[:rows, :columns] = tile.heights
     for other in others:
         offset = _grid_offset(tile, other)
-        # One that overlaps the tile covers the ground between them itself.
+        # An overlapping neighbour leaves no gap.
         if offset is None or not (offset[0] == rows or offset[1] == columns):
             continue
         row, column = offset
@@ -84,7 +101,10 @@ def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
 
 
 def _gap_width(tile: Terrain, other: Terrain) -> float:
-    """Width of the gap between grids that touch and are no tiles of one grid [m]; 0 for none."""
+    """Return the width of the gap between adjacent rasters of different grids [m].
+
+    0 if there is none.
+    """
     if _grid_offset(tile, other) is not None:
         return 0.0
     tile_bounds, other_bounds = (
@@ -93,7 +113,7 @@ def _gap_width(tile: Terrain, other: Terrain) -> float:
     )
     separation = np.maximum(tile_bounds[0], other_bounds[0]) - np.minimum(
         tile_bounds[1], other_bounds[1]
-    )  # below 0 where they overlap
+    )  # negative if they overlap
     cell_size = np.maximum(np.abs(tile.spacing), np.abs(other.spacing))
     for axis in (0, 1):
         if (
