@@ -110,7 +110,7 @@ def _open_refusing_irregular(
 ) -> int:
     """Open a regular file, or a directory if `flags` include O_DIRECTORY.
 
-    Errors use `path_in_messages`.
+    Errors name the file as `path_in_messages`.
     """
     descriptor = -1
     try:
@@ -195,7 +195,7 @@ def stream_below(
 def checked_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
     """Return the size of an open file [bytes].
 
-    Raise `RefusedFileError` if it exceeds ``bytes_max``.
+    Raise `RefusedFileError` if the size exceeds ``bytes_max``.
     """
     size = os.fstat(descriptor).st_size
     check_size(size, bytes_max, path_in_messages)

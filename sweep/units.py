@@ -41,21 +41,31 @@ NO_VALUE_TEXT = "none"
 """Text for nan, such as a fraction of nothing."""
 
 _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
+"""Pattern of a number in decimal notation."""
 _POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
+"""Pattern of a power of two integers, such as ``2^17``."""
 _EXPONENT_MAX = 999
 """Largest magnitude of the exponent in a power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
+"""Pattern of the text after a number that may be a unit."""
 _QUANTITY_PATTERN = re.compile(
     rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
 )
+"""Pattern of a number or power with an optional unit."""
 _EXPONENT_PATTERN = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
+"""Pattern of the exponent of a unit, such as ``^2``, ``^0.5`` or ``^(2/3)``."""
 _GROUPED_NUMBER_PATTERN = re.compile(
     r"\s*[+-]?\d+(?:[.]\d+)*(?:,\d+|(?:[_' ]\d{3}(?!\d|\s*/))+(?:[.,]\d+)?)+", re.ASCII
 )
+"""Pattern of a number with grouped digits or a decimal comma, which is refused."""
 _UNIT_FACTOR_PATTERN = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT_PATTERN})?")
+"""Pattern of one factor of a unit: a name with an optional exponent."""
 _UNIT_OPERATOR_PATTERN = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
+"""Pattern of the operator between two factors of a unit."""
 _NOT_FINITE_PATTERN = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
+"""Pattern of nan and infinity."""
 _SQUARE_ROOT_PATTERN = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
+"""Pattern of a square root of a unit, such as ``rtHz`` or ``√Hz``."""
 _ASCII_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
 """ASCII spelling of special characters in units."""
 

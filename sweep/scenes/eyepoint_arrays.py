@@ -1,6 +1,6 @@
 """Conversion of eyepoints to the arrays of a store and back.
 
-Names as in :mod:`sweep.model.outputs`.
+The arrays are named as in :mod:`sweep.model.outputs`.
 """
 
 from __future__ import annotations

@@ -176,7 +176,7 @@ def height_factor(
 def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
     """Return the unit of heights that a raster states, and metres per unit.
 
-    None if it states none.
+    The result is None if the raster states no unit.
     """
     crs = _crs_from_wkt(wkt) if wkt else None
     axis = _vertical_axis(crs) if crs is not None else None

@@ -53,7 +53,7 @@ _MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf":
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """Triangles without topology."""
+    """Triangles with the numbers of their surfaces, before cleaning."""
 
     vertices: np.ndarray
     """Vertices (n, 3) relative to the origin [m].
@@ -268,7 +268,7 @@ def _require_faces(n_left: int, n_given: int) -> None:
 
 
 def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of distinct rows, first occurrences, and each row's index among these."""
+    """Return the ascending indices of unique rows (first occurrences), and the inverse mapping."""
     order = np.lexsort(rows.T)  # stable: the first of equal rows is kept
     is_new = np.ones(len(rows), dtype=bool)
     is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)

@@ -342,7 +342,7 @@ def _falling_time_error(
 ) -> SceneError:
     """Return the error for a time that does not exceed the previous one.
 
-    Both are given with their line.
+    Both times are given with their line.
     """
     (line, time), (next_line, next_time) = earlier, later
     if next_time == time:

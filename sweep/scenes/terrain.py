@@ -432,7 +432,7 @@ def draw_hills(
 def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
     """Draw a stationary Gaussian field on a torus of at least `period`.
 
-    Return its corner of `shape`.
+    Return the corner of the torus of `shape` (rows, columns).
 
     `covariance` is a function of distance, in the unit of `steps` and `period`.
     """

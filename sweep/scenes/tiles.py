@@ -64,7 +64,7 @@ def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[s
 def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
     """Return row and column of another tile's first node on a tile's grid.
 
-    None if the grids differ.
+    The result is None if the grids differ.
     """
     (dx, dy), (rows, columns) = tile.spacing, other.heights.shape
     for step, other_step, number in ((dx, other.spacing[0], columns), (dy, other.spacing[1], rows)):
@@ -103,7 +103,7 @@ def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
 def _gap_width(tile: Terrain, other: Terrain) -> float:
     """Return the width of the gap between adjacent rasters of different grids [m].
 
-    0 if there is none.
+    The width is 0 if there is no gap.
     """
     if _grid_offset(tile, other) is not None:
         return 0.0

@@ -46,6 +46,7 @@ _MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 dataset."""
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
+"""Pattern of the name of a zipped axis."""
 _LISTED_VALUES_MAX = 64
 """Maximum number of values that the identity of an axis lists; longer axes are given by a
 digest."""
@@ -268,6 +269,7 @@ def _axis_rule(path: str, location: Location) -> Rule:
 
 
 _FIXED_PROBLEM = "is the same for a whole study"
+"""Text of the finding for a parameter that no axis may set."""
 
 
 def _axis_refusal(path: str) -> tuple[str, str]:
@@ -629,7 +631,7 @@ def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[Piece
     Raises
     ------
     FindingsError
-        With every mistake in the values.
+        The error holds every mistake in the values.
     """
     if isinstance(raw_value, dict):
         return [_read_generator(raw_value, rule, location)]

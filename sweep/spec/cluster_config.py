@@ -29,6 +29,7 @@ from sweep.units import QuantityError
 LOOPBACK_ADDRESS = "127.0.0.1"
 """Address at which a service accepts connections from its own machine alone."""
 NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
+"""Value for no dashboard, and the usual port of Dask's dashboard."""
 _WORKERS_RULE = NumericRule(
     description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
 )
@@ -316,7 +317,7 @@ def load_cluster_config(path: str | Path) -> AnyClusterConfig:
     Raises
     ------
     SpecError
-        With every mistake in the file.
+        The error holds every mistake in the file.
     """
     return _read_cluster_config(read_document(Path(path)), Path(path).absolute().parent)
 
@@ -341,7 +342,7 @@ def cluster_config_from_mapping(
     Raises
     ------
     SpecError
-        With every mistake in the data.
+        The error holds every mistake in the data.
     """
     return _read_cluster_config(
         Document(drop_extensions(to_plain_data(mapping))), Path(base).absolute()

@@ -33,6 +33,7 @@ from sweep.spec.rules import (
 )
 
 AUTO, ON, OFF = EFFECT_MODES
+"""Modes of an effect."""
 ModelClasses = tuple[type[BaseModel], ...]
 """Models that a value may be validated as."""
 KeyPath = tuple[str, ...]
@@ -418,7 +419,7 @@ def kind_of_model(model: type[BaseModel]) -> str:
 def _element_annotation(annotation: Any) -> Any:
     """Return the annotation of the values of a mapping or the elements of a list.
 
-    None for others.
+    The result is None for other annotations.
     """
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:

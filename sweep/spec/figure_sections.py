@@ -22,8 +22,11 @@ from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
 from sweep.units import QuantityError, read_number
 
 CoordinateSelection = str | int | float | tuple[str | int | float, ...]
+"""One value or several values of a coordinate, as written."""
 PublishedNumbers = tuple[Any, ...]
+"""Numbers as published, in nested tuples."""
 CropLimits = tuple[float, ...]
+"""Lower and upper limit of a scene's coordinate [m], or of time [s]."""
 
 
 def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:

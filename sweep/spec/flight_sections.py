@@ -21,6 +21,7 @@ from sweep.spec.rules import Json, ListRule, Rule, read_element
 from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
+"""Components of a vector in SI units."""
 TimeSpan = tuple[float, float]
 """Start and stop of a time interval [s]."""
 

@@ -56,15 +56,16 @@ FULL_SCALE_PATH = "instrument.processing.full_scale"
 DETECTION_PATH = "instrument.processing.detection"
 BINS_COUNTED_PATH = "instrument.processing.bins_counted"
 LINE_WIDTH_PATH, LINE_SHAPE_PATH = "instrument.laser.line_width", "instrument.laser.line_shape"
+"""Paths of the width and the shape of the laser's line."""
 ROUGHNESS_PATH = "target.roughness"
 TRAINING_PATH, GUARD_PATH, RANK_PATH = (
     DETECTOR_PREFIX + name for name in ("training", "guard", "rank")
 )
+"""Paths of the cells of a CFAR detector."""
 
 _WINDOW_TRIAL_SAMPLES_MAX = 16
-"""Maximum number of samples of the window that is computed as a trial. All windows exist above this
-number.
-"""
+"""Maximum number of samples of a trial window. `WindowFunctionRule` tests names with as many
+samples, and a window that exists with so many exists with more."""
 _SPECTRUM_BINS_MIN = 8
 """Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
 
@@ -80,8 +81,8 @@ class GridValues:
     """
 
     values: Mapping[str, Any]
-    """SI values of the parameters by dotted path. A parameter on an axis has the value of its field
-    here."""
+    """SI values of the parameters by dotted path; for a parameter on an axis the value of its
+    field, which `axes` overrides."""
     axes: tuple[Axis, ...] = ()
     """Axes of the study."""
     effect_modes: Mapping[str, str] = field(default_factory=dict)
@@ -279,7 +280,10 @@ def _time_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 class _EchoLateness(NamedTuple):
-    """Smallest delay of the echo after an end, over a grid; negative if it arrives before."""
+    """Smallest time over a grid from an end to the echo's arrival [s].
+
+    Negative values mean that the echo arrives before the end.
+    """
 
     chirp: float
     """Time from the end of the chirp [s]."""
@@ -288,9 +292,9 @@ class _EchoLateness(NamedTuple):
 
 
 def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
-    """Return the smallest lateness of the echo over the grid.
+    """Return the smallest times over a grid from the ends of chirp and record to the echo.
 
-    None if a parameter could not be read, or if the grid is too large to evaluate.
+    The result is None if a parameter could not be read, or if the grid is too large to evaluate.
     """
     if not grid.has_values(*ECHO_TIME_PATHS):
         return None

@@ -25,6 +25,7 @@ _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
 """Uses of random numbers; the index of a use selects its random stream."""
 
 Vector = tuple[float, ...]
+"""Components of a vector in SI units."""
 
 
 def random_generator(purpose: str, seed: int) -> np.random.Generator:
@@ -196,7 +197,7 @@ class Ground(Material, ABC):
         """Raise `ValueError` if the fields of the section define an invalid grid."""
 
     def grid_step(self) -> float | None:
-        """Return the larger grid step after refining [m]; None if it is known from a file alone."""
+        """Return the larger grid step after refining [m]; None if only a file defines it."""
         return None
 
 
@@ -340,7 +341,7 @@ class ImageGround(PlacedGround):
     black: float = declare.length("Height of black", "0 m", default=0.0)
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the heights of the image, linear in brightness between `black` and `white`."""
+        """Return the heights of the image, linear in the grey level between `black` and `white`."""
         from sweep.scenes.rasters import read_image
 
         path = files.resolve(self.file)

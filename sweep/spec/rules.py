@@ -51,7 +51,7 @@ _ON_WORDS = {"yes", "y", "true", "always", "enable", "enabled", "1", "on"}
 
 @dataclass(frozen=True, order=True)
 class Mistake:
-    """One mistake in a spec; texts are empty if there is nothing to report."""
+    """One mistake in a user's spec; text fields may be empty."""
 
     path: str
     """Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``."""
@@ -199,6 +199,7 @@ RULE_ERROR_TYPE = "broken_rule"
 """Type of pydantic errors that are raised by rules."""
 
 Json = dict[str, Any]
+"""JSON object."""
 
 
 def rule_error(problem: str, suggestion: str) -> PydanticCustomError:
@@ -231,7 +232,7 @@ class Rule:
         Raises
         ------
         QuantityError
-            With the broken rule and a suggestion.
+            The error states the broken rule and a suggestion.
         """
         raise QuantityError("holds nothing that can be read")
 
@@ -359,7 +360,7 @@ class NumericRule(Rule):
         Raises
         ------
         QuantityError
-            With the broken rule and a suggestion.
+            The error states the broken rule and a suggestion.
         """
         if self.keyword and raw_value == self.keyword:
             return self.keyword_value
@@ -386,7 +387,7 @@ class NumericRule(Rule):
     def _read_number(self, raw_value: object) -> float | int:
         """Return the SI value of a written number within the bounds.
 
-        An int if integers are required.
+        The value is an int if the rule requires integers.
         """
         number, unit = self.read_exact(raw_value)
         if self.is_integer and number.denominator != 1:
@@ -742,6 +743,7 @@ SCIPY_WINDOWS = (
 )  # fmt: skip
 """Names of scipy's windows that are suggested to users."""
 _WINDOW_PATTERN = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]*)\))?")
+"""Pattern of a window's name with its parameters."""
 _KAISER_REMEDY = "write e.g. 'kaiser(8.6)'"
 
 
@@ -783,7 +785,7 @@ class WindowFunctionRule(Rule):
 def _check_scipy_window(name: str, parameters: tuple[float, ...]) -> None:
     """Compute a window with scipy.
 
-    Raise `QuantityError` if it is unknown or its parameters are invalid.
+    Raise `QuantityError` if the window is unknown or its parameters are invalid.
     """
     from scipy.signal import get_window  # slow to import and rarely needed
 

@@ -402,7 +402,7 @@ _BEAM_PATHS = (
     beam.OSCILLATOR_WAIST_PATH,
     beam.COUPLING_PATH,
 )
-"""Parameters that determine the width of the beam."""
+"""Parameters of the beam from which its width follows."""
 _ARRANGEMENT_PATHS = (
     PATTERN_PATH,
     "footprint.phases",
@@ -485,7 +485,7 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for each axis that is impossible with a single set of rays."""
+    """Yield a finding for axes that a single set of rays can't serve, or a pattern for planes."""
     parameters = {path: default_value(path) for path in _ARRANGEMENT_PATHS} | dict(grid.values)
     if parameters[PATTERN_PATH] in ("line", "square"):
         problem = "stands for a plane alone, and the ground of a scene is none"

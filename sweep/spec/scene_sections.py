@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 
 Vector = tuple[float, ...]
+"""Components of a vector in SI units."""
 
 WORLD_ORIGIN = "world"
 """Name of the origin of a scene that keeps the coordinates of its objects."""
@@ -468,7 +469,7 @@ class BuiltScene(NamedTuple):
     body_flights: tuple[MovingBody | None, ...]
     """Motion of each body of the caster; None for the body at rest."""
     mesh_reports: tuple[str, ...]
-    """One line per object: repairs and remaining defects of its mesh."""
+    """One line per object: the size of its mesh, and the repairs made on loading."""
     origin: np.ndarray
     """Origin (3,) that was subtracted from the objects' own coordinates [m]."""
     warnings: tuple[str, ...] = ()

@@ -15,7 +15,7 @@ from sweep.spec.specs import GridSpec, SceneSpec
 from sweep.spec.yaml_document import library_instruments
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-"""Dialect of the schema."""
+"""URI of the JSON Schema dialect that the schema uses."""
 
 _INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
 """Names of the models of an instrument's sections."""

@@ -596,7 +596,7 @@ def default_value(path: str) -> Any:
 def short_name(path: str) -> str:
     """Return the last part of a parameter's path.
 
-    The part before it if the last part is ``kind``.
+    If the last part is ``kind``, return the part before it.
     """
     *parent_names, last_name = path.split(".")
     return parent_names[-1] if last_name == "kind" and parent_names else last_name

@@ -169,7 +169,7 @@ class BaseSpec(SpecSection):
         Raises
         ------
         SpecError
-            With every mistake in the data.
+            The error holds every mistake in the data.
         """
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", format_raw_value(mapping))])
@@ -218,7 +218,7 @@ class BaseSpec(SpecSection):
         Raises
         ------
         SpecError
-            With every mistake in the document.
+            The error holds every mistake in the document.
         """
         user_values = {} if base is None else _user_values_on_axes(document.content)
         takes_floor = "error_floor" in cls.model_fields
@@ -319,7 +319,7 @@ class BaseSpec(SpecSection):
         Raises
         ------
         SpecError
-            With every mistake in the values and in their combination.
+            The error holds every mistake in the values and in their combination.
         """
         parameters = self.parameters()
         findings = []
@@ -451,7 +451,7 @@ class BaseSpec(SpecSection):
         return copy.deepcopy(self._yaml_mapping)
 
     def _fill_defaults(self, raw_spec: dict[str, Any]) -> dict[str, Any]:
-        """Return the spec with its defaults, without its execution and without what axes set."""
+        """Return the written spec with defaults, without ``execution`` and fields set by axes."""
         mapping = copy.deepcopy(
             {name: value for name, value in raw_spec.items() if name != "execution"}
         )
@@ -633,7 +633,7 @@ class SceneSpec(BaseSpec):
         Raises
         ------
         SpecError
-            With every mistake in the document.
+            The error holds every mistake in the document.
         """
         spec = super().from_document(document, base)
         if base is not None:
@@ -704,7 +704,7 @@ class SceneSpec(BaseSpec):
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
         """Return the materials of the scene's surfaces, in the order of their numbers.
 
-        Reads no file.
+        No file is read.
         """
         return scene_sections.scene_surfaces(self.scene)
 
@@ -829,7 +829,7 @@ class SceneSpec(BaseSpec):
     def footprint_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
         """Return the function from range to footprint angles.
 
-        None if the divergence is constant.
+        The result is None if the divergence is constant.
         """
         parameters = self.parameters()
         return (
@@ -844,7 +844,7 @@ class SceneSpec(BaseSpec):
         Raises
         ------
         SpecError
-            With every mistake in the new values.
+            The error holds every mistake in the new values.
         """
         raw_fields = {
             path[-1]: rule.format(value) for path, rule, value in iter_values(self.interface)
@@ -951,7 +951,7 @@ def load(path: str | Path) -> GridSpec | SceneSpec:
     Raises
     ------
     SpecError
-        With every mistake in the file, each with its path, its line and a remedy.
+        The error holds every mistake in the file, each with its path, its line and a remedy.
     TypeError
         If `path` is no path.
     """

@@ -191,7 +191,7 @@ class Document:
     ) -> dict[str, Any]:
         """Return the fields of a mapping under a merge key.
 
-        Record the positions of those not overridden.
+        Record the positions of fields that are not overridden.
 
         Mistakes in the merged mapping are reported where it is defined, and not here.
         """
@@ -289,7 +289,7 @@ class Document:
     def to_mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
         """Return findings as mistakes without duplicates, sorted by line.
 
-        Those in other files come last.
+        Mistakes in other files come last.
         """
         mistakes = dict.fromkeys(self.to_mistake(finding) for finding in findings)
         return sorted(
@@ -401,7 +401,7 @@ def drop_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
 def _read_text(path: Path) -> str:
     """Return the text of a file of at most `FILE_BYTES_MAX` bytes.
 
-    Raise `SpecError` if unreadable.
+    Raise `SpecError` if the file is unreadable.
     """
     try:
         with open(open_regular(path), "rb") as file:
