@@ -29,8 +29,7 @@ FILE_CELLS_MAX = 1_000_000_000
 """Maximum number of heights in a raster file: all of them are read for its digest."""
 
 BYTES_PER_CELL = 220
-"""Memory per height while triangles and their tree are built, upper bound by measurement
-[bytes]."""
+"""Measured upper bound of the memory per height while triangles and tree are built [bytes]."""
 
 _STRIP_CELLS = 1 << 22
 """Number of heights that are read from a file at a time."""

@@ -85,9 +85,11 @@ def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw
 class MartianRockLaw:
     """Size-frequency law of rocks on the Martian plains, from their cumulative fractional area.
 
-    Notes ----- The fraction of the ground under rocks of at least diameter D (in metres) is ``F(D)
-    = k exp(-q D)`` with ``q = 1.79 + 0.152/k`` [1]_. A rock covers ``pi D^2 / 4``, so that the
-    number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The fraction k under
+    Notes
+    -----
+    The fraction of the ground under rocks of at least diameter D (in metres) is
+    ``F(D) = k exp(-q D)`` with ``q = 1.79 + 0.152/k`` [1]_. A rock covers ``pi D^2 / 4``, so that
+    the number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The fraction k under
     rocks of any size is 0.02 to 0.2 at the landing sites.
 
     References
@@ -229,8 +231,10 @@ def fresh_depth(diameter: np.ndarray) -> np.ndarray:
     diameter : ndarray
         Diameters from rim crest to rim crest [m].
 
-    Notes ----- The depth is ``0.196 D^1.010`` in km, about a fifth of the diameter, for lunar
-    craters up to 15 km [1]_.
+    Notes
+    -----
+    The depth is ``0.196 D^1.010`` in km, about a fifth of the diameter, for lunar craters up to 15
+    km [1]_.
 
     References
     ----------
@@ -277,8 +281,10 @@ def crater_profile(
     ndarray
         Heights [m], of the shape that the parameters broadcast to.
 
-    Notes ----- The bowl is a paraboloid from floor to rim crest. Outside, the thickness of ejecta
-    falls with the third power of the distance [1]_; it is lowered so that it ends without a step at
+    Notes
+    -----
+    The bowl is a paraboloid from floor to rim crest. Outside, the thickness of ejecta falls with
+    the third power of the distance [1]_; it is lowered so that it ends without a step at
     `EJECTA_REACH_RADII`.
 
     References
@@ -321,9 +327,11 @@ def draw_craters(
     CraterArrays
         Craters whose ejecta or bowl reach into the rectangle.
 
-    Notes ----- Ground in equilibrium has craters of every state from fresh to almost gone.
-    Freshness is uniform from `least_fresh` to 1: a simplification, because wear by diffusion leaves
-    more shallow craters.
+    Notes
+    -----
+    Ground in equilibrium has craters of every state from fresh to almost gone. Freshness is uniform
+    from `least_fresh` to 1: a simplification, because wear by diffusion leaves more shallow
+    craters.
     """
     margin = EJECTA_REACH_RADII * largest / 2
     wider_bounds = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin

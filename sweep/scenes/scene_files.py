@@ -187,8 +187,8 @@ class WaypointTable(NamedTuple):
 def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> WaypointTable:
     """Read the waypoints of a CSV table.
 
-    The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
-    [m]``. The attitude is either a quaternion ``qw, qx, qy, qz`` (body to world) or angles. The
+    The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]`` and
+    ``z [m]``. The attitude is either a quaternion ``qw, qx, qy, qz`` (body to world) or angles. The
     angles are ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
     ``roll [deg]`` (left side up); a missing angle is 0. Lines that begin with # are skipped.
 

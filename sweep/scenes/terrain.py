@@ -329,7 +329,9 @@ def draw_fractal_relief(
     ndarray, shape (rows, columns)
         Heights [m], 0 at the first node.
 
-    Notes ----- The height difference of two nodes at distance L is normal with standard deviation
+    Notes
+    -----
+    The height difference of two nodes at distance L is normal with standard deviation
     ``rms_slope * baseline * (L / baseline)**hurst``, the deviogram by which planetary roughness is
     measured [1]_. Stein's exact method [2]_ draws a stationary field whose covariance differs from
     the fractal's by a paraboloid only, and adds a random plane that compensates for the paraboloid.
@@ -415,8 +417,10 @@ def draw_hills(
     ndarray, shape (rows, columns)
         Heights [m], of expected mean 0.
 
-    Notes ----- The covariance of two nodes at distance L is ``rms_height**2 * exp(-(L /
-    correlation_length)**2)``.
+    Notes
+    -----
+    The covariance of two nodes at distance L is
+    ``rms_height**2 * exp(-(L / correlation_length)**2)``.
     """
     steps = abs(spacing[1]), abs(spacing[0])
     relative_steps = [step / correlation_length for step in steps]

@@ -1,6 +1,6 @@
 """Sections of a spec for motion and beam directions: paths, attitudes, platform and scan patterns.
 
-World frame: x, y and z form a right-handed system with z up. Body frame: x forward, y left, z up.
+World frame: metres, z up. Body frame: x forward, y left, z up.
 """
 
 from __future__ import annotations

@@ -443,9 +443,11 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
 def _width_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the width of beams that their aperture or the paraxial limit exclude.
 
-    Notes ----- The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D).
-    A waist may be at most the radius of the aperture, and must be so wide that the beam spreads by
-    at most 90 deg.
+    Notes
+    -----
+    The narrowest full divergence of an aperture of diameter D is 4 M^2 lambda / (pi D). A waist may
+    be at most the radius of the aperture, and must be so wide that the beam spreads by at most 90
+    deg.
     """
     remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
     if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):

@@ -40,9 +40,11 @@ def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]
         Probability of a false alarm in at least one chirp, and in both chirps, for each sampled
         combination. Combinations with a user-defined detector are left out.
 
-    Notes ----- Noise in the up- and down-chirp is independent, so that the probability of a false
-    alarm in both chirps is the product of the two. A chirp's probability follows from that of a bin
-    and the number of independent bins that have as many alarms (`alarm_equivalent_bins`).
+    Notes
+    -----
+    Noise in the up- and down-chirp is independent, so that the probability of a false alarm in both
+    chirps is the product of the two. A chirp's probability follows from that of a bin and the
+    number of independent bins that have as many alarms (`alarm_equivalent_bins`).
     """
     axes = [
         axis for axis in spec.axes

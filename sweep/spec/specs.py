@@ -798,9 +798,11 @@ class SceneSpec(BaseSpec):
     def _line_drift_bins(self) -> float:
         """Return the largest drift of a speckled line within a record, due to acceleration [bins].
 
-        Notes ----- Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda
-        within a record of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda
-        bins. The result is 0 below `DRIFT_BINS_MIN`, and for ground without developed speckle.
+        Notes
+        -----
+        Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda within a record
+        of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda bins. The result
+        is 0 below `DRIFT_BINS_MIN`, and for ground without developed speckle.
         """
         p = self.parameters()
         if p["footprint.speckle"] != "developed":
