@@ -142,7 +142,7 @@ _LEVEL_RULE = declare.quantity_rule("Level, in the quantity's unit", "", "0.9", 
 
 
 class SurfaceFigure(GridFigureBase):
-    """A quantity over two coordinates, seen from above."""
+    """Map of a quantity over two coordinates."""
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["surface"]
@@ -156,7 +156,7 @@ class SurfaceFigure(GridFigureBase):
 
 
 class SlicesFigure(GridFigureBase):
-    """A quantity along one coordinate, a line for each value of another."""
+    """Curves of a quantity along one coordinate, one for each value of another coordinate."""
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["slices"]
@@ -175,7 +175,7 @@ class SlicesFigure(GridFigureBase):
 
 
 class TableFigure(GridFigureBase):
-    """A quantity averaged over all but rows and columns."""
+    """Table of a quantity, averaged over all coordinates except those of rows and columns."""
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["table"]
@@ -190,9 +190,10 @@ class TableFigure(GridFigureBase):
 
 
 class FalseAlarmTable(GridFigureBase):
-    """False alarms of a shot over the three cuts of Tables 4.3 to 4.5, a row for each value.
+    """Table of the false alarms of a shot over the three cuts of Tables 4.3 to 4.5.
 
-    Columns are 15 deg, 85 deg and 3500 m; ranges up to 5 m are left out.
+    Rows are the values of one coordinate. Columns are the cuts at 15 deg, 85 deg and 3500 m; ranges
+    up to 5 m are left out.
     """
 
     kind: Literal["false_alarm_table"]
@@ -201,7 +202,7 @@ class FalseAlarmTable(GridFigureBase):
 
 
 class ThresholdTable(GridFigureBase):
-    """False alarms of a bin for each threshold, as in Table 4.2."""
+    """Table of the false alarms of a bin by threshold, as in Table 4.2."""
 
     kind: Literal["threshold_table"]
     by: str = _coordinate_field("tnr")
@@ -298,7 +299,7 @@ class SceneFigureBase(FigureBase):
 
 
 class CloudFigure(SceneFigureBase):
-    """A point cloud."""
+    """Picture of a point cloud."""
 
     FILE_NAME_PARTS = ("scanner", "colour")
     kind: Literal["cloud"]
@@ -317,7 +318,7 @@ class CloudFigure(SceneFigureBase):
 
 
 class ScatterFigure(SceneFigureBase):
-    """A quantity of shots or points over another."""
+    """Scatter plot of one quantity of shots or points over another."""
 
     FILE_NAME_PARTS = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
@@ -331,7 +332,7 @@ class ScatterFigure(SceneFigureBase):
 
 
 class ShotSpectraFigure(SceneFigureBase):
-    """The three spectra of one shot, with threshold, noise and detections."""
+    """Spectra of the three segments of a shot, with threshold, noise and detections."""
 
     FILE_NAME_PARTS = ("scanner", "shot")
     kind: Literal["shot_spectra"]
@@ -357,13 +358,13 @@ class _NavigationFigureBase(SceneFigureBase):
 
 
 class NavigationFigure(_NavigationFigureBase):
-    """Statistics of navigation over altitude, a line a scanner."""
+    """Curves of the statistics of navigation over altitude, one for each scanner."""
 
     kind: Literal["navigation"]
 
 
 class NavigationTable(_NavigationFigureBase):
-    """Statistics of navigation over altitude, as a table."""
+    """Table of the statistics of navigation over altitude."""
 
     kind: Literal["navigation_table"]
 

@@ -27,7 +27,7 @@ TimeSpan = tuple[float, float]
 
 
 class StraightPath(SpecSection):
-    """A straight line, the speed changing at a constant rate."""
+    """Straight path with constant acceleration along it."""
 
     kind: Literal["straight"]
     begin: Vector = declare.position("Where it begins", alias="from")
@@ -46,7 +46,7 @@ class StraightPath(SpecSection):
 
 
 class AccelerationPath(SpecSection):
-    """A constant acceleration, 0 by default."""
+    """Path of constant acceleration, 0 by default."""
 
     kind: Literal["acceleration"]
     position: Vector = declare.position("Position at the beginning")
@@ -61,7 +61,7 @@ class AccelerationPath(SpecSection):
 
 
 class WaypointPath(SpecSection):
-    """A path through the waypoints of a table."""
+    """Path through the waypoints of a table."""
 
     kind: Literal["waypoints"]
     file: str = declare.file_path("CSV table with time, x, y, z and, if it likes, attitude")
@@ -76,7 +76,7 @@ class WaypointPath(SpecSection):
 
 
 class StationaryPath(SpecSection):
-    """No movement."""
+    """Path of a body at rest."""
 
     kind: Literal["still"]
     position: Vector = declare.position("Where it stays")
@@ -105,7 +105,7 @@ AnyPath = Annotated[
 
 
 class Orientation(SpecSection):
-    """A turn of a body against the world, or of an instrument against its body."""
+    """Rotation of a body relative to the world, or of an instrument relative to its body."""
 
     heading: float = declare.angle("Of forward, from x, counter-clockwise from above", default=0.0)
     pitch: float = declare.angle("Nose up", "10 deg", "-90 deg", "90 deg", default=0.0)
@@ -130,7 +130,7 @@ class Orientation(SpecSection):
 
 
 class NadirAttitude(SpecSection):
-    """Level, so that a beam along -z points straight down."""
+    """Level attitude: a beam along -z points straight down."""
 
     kind: Literal["nadir"]
     heading: float | str = declare.angle(
@@ -144,7 +144,7 @@ class NadirAttitude(SpecSection):
 
 
 class AlongTrackAttitude(SpecSection):
-    """Forward along the velocity."""
+    """Attitude whose forward axis points along the velocity."""
 
     kind: Literal["along_track"]
     roll: float = declare.angle("Left side up", default=0.0)
@@ -155,7 +155,7 @@ class AlongTrackAttitude(SpecSection):
 
 
 class FixedAttitude(Orientation):
-    """One attitude throughout."""
+    """Constant attitude."""
 
     kind: Literal["fixed"]
 
@@ -165,7 +165,7 @@ class FixedAttitude(Orientation):
 
 
 class SpinningAttitude(Orientation):
-    """Turning at a constant rate; the angles are those at the path's beginning."""
+    """Attitude of constant angular velocity; the angles are those at the start of the path."""
 
     kind: Literal["spin"]
     angular_velocity: Vector = declare.vector(
@@ -178,7 +178,7 @@ class SpinningAttitude(Orientation):
 
 
 class TabulatedAttitude(SpecSection):
-    """The attitude of the waypoints' table."""
+    """Attitude from a table, that of the waypoints by default."""
 
     kind: Literal["track"]
     file: str | None = declare.file_path(
@@ -213,7 +213,7 @@ AnyAttitude = Annotated[
 
 
 class RigidMotion(SpecSection):
-    """Rigid movement of a target."""
+    """Motion of a rigid target."""
 
     path: AnyPath
     attitude: AnyAttitude = FixedAttitude(kind="fixed")
@@ -256,7 +256,7 @@ class RigidMotion(SpecSection):
 
 
 class Platform(RigidMotion):
-    """Carrier of the instrument, and its steadiness."""
+    """Carrier of the instrument: path, attitude, mounting and pointing jitter."""
 
     attitude: AnyAttitude = NadirAttitude(kind="nadir")
     lever_arm: Vector = declare.position(
@@ -370,7 +370,7 @@ _EVEN_INTERVAL_FIELD = declare.duration(
 
 
 class ConeScanner(SpecSection):
-    """Beams evenly round nadir, all of them in every cycle."""
+    """Beams at equal azimuth steps on a cone around nadir; all of them fire in every cycle."""
 
     kind: Literal["cone"]
     beams: int = declare.count("Beams", "3", at_most=str(BEAMS_MAX))
@@ -388,7 +388,7 @@ class ConeScanner(SpecSection):
 
 
 class FixedBeamsScanner(SpecSection):
-    """Beams at stated directions, all of them in every cycle."""
+    """Beams at given directions; all of them fire in every cycle."""
 
     kind: Literal["fixed"]
     beams: tuple[Vector, ...] = declare.field_of_rule(
@@ -412,7 +412,7 @@ class FixedBeamsScanner(SpecSection):
 
 
 class CornersScanner(SpecSection):
-    """One steered beam that visits the corners of a square."""
+    """One beam steered to the corners of a square."""
 
     kind: Literal["corners"]
     angle: float = declare.angle("Of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
@@ -427,7 +427,7 @@ class CornersScanner(SpecSection):
 
 
 class SquaresScanner(SpecSection):
-    """One beam steered by stacked elements, square after square; a cycle is a square."""
+    """One beam steered by stacked elements along squares; a cycle is a square."""
 
     kind: Literal["squares"]
     elements: Vector = declare.list_of(
@@ -444,7 +444,7 @@ class SquaresScanner(SpecSection):
 
 
 class RasterScanner(SpecSection):
-    """One steered beam that visits a grid of directions; a cycle is a frame."""
+    """One beam steered over a grid of directions; a cycle is a frame."""
 
     kind: Literal["raster"]
     columns: int = declare.count("Directions across", "32", at_most=str(BEAMS_MAX))
@@ -462,7 +462,7 @@ class RasterScanner(SpecSection):
 
 
 class LineScanner(SpecSection):
-    """Beams swept together from side to side; a cycle is one measurement of each."""
+    """Beams swept together from side to side; a cycle is one measurement of each beam."""
 
     kind: Literal["line"]
     half_angle: float = declare.angle(

@@ -56,7 +56,7 @@ OPTICAL_FIELDS = tuple(Material.model_fields)
 
 
 class Relief(SpecSection):
-    """Fractal relief, for what a survey is too coarse to show."""
+    """Fractal relief at scales that a survey does not resolve."""
 
     hurst: float = declare.number("Hurst exponent", "0.9", "1e-3", "0.999")
     rms_slope: float = declare.number(
@@ -93,7 +93,7 @@ class Relief(SpecSection):
 
 
 class Craters(SpecSection):
-    """Simple craters by the lunar size-frequency law."""
+    """Simple craters with the lunar size-frequency law."""
 
     smallest: float = declare.positive_length("Smallest diameter, three grid steps or more", "20 m")
     largest: float = declare.positive_length("Largest diameter", "300 m")
@@ -224,7 +224,7 @@ class PlacedGround(Ground):
 
 
 class JacksboroGround(PlacedGround):
-    """The Jacksboro fault, Tennessee: real terrain that is always there, at posts of 74 m x 92 m.
+    """Terrain of the Jacksboro fault, Tennessee, from matplotlib's data: posts of 74 m x 92 m.
 
     Heights are above sea level.
     """
@@ -308,7 +308,7 @@ class RasterGround(Ground):
 
 
 class ArrayGround(PlacedGround):
-    """Heights of a NumPy file."""
+    """Heights from a NumPy file."""
 
     kind: Literal["array"]
     file: str = declare.file_path("The file, .npy or .npz")
@@ -332,7 +332,7 @@ class ArrayGround(PlacedGround):
 
 
 class ImageGround(PlacedGround):
-    """Heights of a grey image: row 0 is the northern one."""
+    """Heights from a grey image; row 0 is the northern one."""
 
     kind: Literal["image"]
     file: str = declare.file_path("The image, of 8 or 16 bits")
@@ -390,7 +390,7 @@ class SquareGround(PlacedGround):
 
 
 class PlaneGround(SquareGround):
-    """A square plane."""
+    """Square plane with an optional slope."""
 
     kind: Literal["plane"]
     height: float = declare.length("Height of its middle", "0 m", default=0.0)
@@ -413,7 +413,7 @@ class PlaneGround(SquareGround):
 
 
 class ReliefGround(Relief, SquareGround):
-    """Fractal ground, of mean height 0."""
+    """Fractal ground with mean height 0."""
 
     kind: Literal["relief"]
     spacing: float = declare.positive_length("Grid step", "5 m")
@@ -426,7 +426,7 @@ class ReliefGround(Relief, SquareGround):
 
 
 class HillsGround(SquareGround):
-    """Smooth rolling ground, of mean height 0."""
+    """Smooth rolling ground of mean height 0."""
 
     kind: Literal["hills"]
     spacing: float = declare.positive_length("Grid step", "1 m")

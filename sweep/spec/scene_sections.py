@@ -78,7 +78,7 @@ class SolidObject(Material, ABC):
 
 
 class MeshObject(SolidObject):
-    """A mesh from a file."""
+    """Mesh from a file."""
 
     kind: Literal["mesh"]
     file: str = declare.file_path(
@@ -96,7 +96,7 @@ class MeshObject(SolidObject):
 
 
 class Sphere(SolidObject):
-    """A sphere of triangles whose corners lie on it."""
+    """Sphere of triangles whose vertices lie on its surface."""
 
     kind: Literal["sphere"]
     radius: float = declare.positive_length("Radius", "1 m")
@@ -112,7 +112,7 @@ class Sphere(SolidObject):
 
 
 class Box(SolidObject):
-    """A box."""
+    """Box with given side lengths."""
 
     kind: Literal["box"]
     size: Vector = declare.vector("Length along x, y and z", "m", "2 m")
@@ -125,7 +125,7 @@ class Box(SolidObject):
 
 
 class MartianRocks(SpecSection):
-    """Rocks of the Martian plains (Golombek and Rapp 1997)."""
+    """Size-frequency law of rocks on the Martian plains (Golombek and Rapp 1997)."""
 
     kind: Literal["martian_rocks"]
     abundance: float = declare.number("Fraction of the ground under rocks", "5 %", "1e-9", "0.9")
@@ -138,7 +138,7 @@ class MartianRocks(SpecSection):
 
 
 class PowerLaw(SpecSection):
-    """A number per area that falls with a power of the diameter."""
+    """Size-frequency law whose number per area falls with a power of the diameter."""
 
     kind: Literal["power"]
     density: float = declare.quantity(
@@ -154,7 +154,7 @@ class PowerLaw(SpecSection):
 
 
 class Boulders(Material):
-    """Half-ellipsoids on a ground."""
+    """Half-ellipsoids on a ground, with random positions and sizes."""
 
     kind: Literal["boulders"]
     on: str = declare.name("Ground that they lie on")
@@ -201,7 +201,7 @@ class Boulders(Material):
 
 
 class TreeMeasures(SpecSection):
-    """Mean measures of the trees of a clump."""
+    """Mean dimensions of the trees of a clump."""
 
     height: float = declare.positive_length("From the ground to the top", "12 m", default=12.0)
     crown_diameter: float = declare.positive_length("Across", "7 m", default=7.0)
@@ -218,7 +218,7 @@ class TreeMeasures(SpecSection):
 
 
 class Trees(SpecSection):
-    """A clump of broad-leaved trees on a ground, of two materials."""
+    """Clump of broad-leaved trees on a ground, with materials for leaves and trunks."""
 
     kind: Literal["trees"]
     on: str = declare.name("Ground that they grow on")
@@ -293,7 +293,7 @@ def named_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Mat
 
 
 class Scene(SpecSection):
-    """Scene that the instrument flies over."""
+    """Objects below the instrument, and the sunlight on them."""
 
     origin: str = declare.name(
         "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN
@@ -325,7 +325,7 @@ class SceneDraws(SpecSection):
 
 
 class Navigation(SpecSection):
-    """Velocity and altitude from each measurement cycle."""
+    """Estimation of velocity and altitude from each measurement cycle."""
 
     test_level: float = declare.number(
         "Chance that a test for faulty beams rejects a good cycle; 0 leaves it out",
@@ -359,7 +359,7 @@ class Navigation(SpecSection):
 
 
 class ErrorFloor(SpecSection):
-    """Standard deviations of an instrument's errors that no echo is strong enough to lower."""
+    """Standard deviations of instrument errors that do not decrease with signal strength."""
 
     pointing_error: float = declare.angle(
         "Error of each beam's known direction, on each of two axes; the same all flight long, and "
@@ -388,9 +388,11 @@ _CLIPPING_NOTE = "what lies beyond is clipped and reported as invalid"
 
 
 class Interface(SpecSection):
-    """Reports of the unit as its interface control document states them; no part of the study's id.
+    """Reports of the unit according to its interface control document.
 
-    ``sweep export --as reports`` makes them of stored points: nothing is computed anew.
+    No part of the study's identity.
+
+    ``sweep export --as reports`` makes reports from stored points, without a new simulation.
     """
 
     range_quantum: float | None = declare.length(
@@ -446,7 +448,7 @@ class Interface(SpecSection):
 
 
 class SceneStorage(SpecSection):
-    """Division of results in the store; part of a study's identity."""
+    """Division of results into blocks in the store; part of a study's identity."""
 
     block_shots: int = declare.count("Shots that one block holds at most", "4096", default=4096)
     block_draws: int = declare.count("Draws that one block holds at most", "64", default=64)

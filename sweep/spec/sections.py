@@ -68,7 +68,7 @@ class Laser(SpecSection):
 
 @add_effect_parameters("instrument.chirp")
 class Chirp(SpecSection):
-    """Segments of a shot: linear sweeps of the frequency, and the light without one."""
+    """Segments of a shot: linear frequency sweeps, and the segment without a sweep."""
 
     bandwidth: float = declare.quantity(
         "Frequency swept in one chirp", "Hz", "1 GHz", *_FREQUENCY_BOUNDS
@@ -200,7 +200,7 @@ class Receiver(SpecSection):
 
 
 class Detector(SpecSection):
-    """Detector of bins in a spectrum, where whole spectra are drawn."""
+    """Detector applied to the bins of drawn spectra."""
 
     kind: str = declare.field_of_rule(
         ChoiceOrFunctionRule(
@@ -226,7 +226,7 @@ class Detector(SpecSection):
 
 
 class Estimator(SpecSection):
-    """Estimator that places a detected peak between bins, where whole spectra are drawn."""
+    """Estimator of the frequency of a detected peak between bins of drawn spectra."""
 
     kind: str = declare.field_of_rule(
         ChoiceOrFunctionRule(
@@ -249,7 +249,10 @@ def _search_limit_field(description: str, *rule_arguments: str) -> Any:
 
 
 class SearchBand(SpecSection):
-    """Band of ranges and radial velocities that is searched: those bins that they put a beat in."""
+    """Band of ranges and radial velocities in which echoes are searched.
+
+    It selects bins by their beats.
+    """
 
     min_range: float | None = _search_limit_field("Least range looked for", "m", "10 m", "0 m")
     max_range: float | None = _search_limit_field("Largest range looked for", "m", "2 km", "0 m")
@@ -354,7 +357,7 @@ class Processing(SpecSection):
 
 
 class LooksOfShot(SpecSection):
-    """Several records of each segment, from which a shot is detected: the waveform N times over."""
+    """Combination of several looks (records of each segment) into one detection of a shot."""
 
     number: int = declare.count(
         "Records of each segment. A shot lasts so many times as long, and false alarms are those "
@@ -379,7 +382,7 @@ class LooksOfShot(SpecSection):
 
 
 class Instrument(SpecSection):
-    """A Doppler lidar."""
+    """Instrument: an FMCW Doppler lidar."""
 
     laser: Laser
     chirp: Chirp
@@ -406,7 +409,7 @@ REFLECTANCE_FIELD = declare.number("Fraction of light scattered back", "0.1", "0
 
 @add_effect_parameters("target")
 class Target(SpecSection):
-    """A flat plane, seen at an angle."""
+    """Flat target, seen at a grazing angle."""
 
     range: float = declare.length("Distance to the target", "2 km", "1 nm", "1e15 m")
     grazing_angle: float = declare.angle(
@@ -426,7 +429,7 @@ class Target(SpecSection):
 
 @add_effect_parameters("footprint")
 class Footprint(SpecSection):
-    """The spot on the target, as a sum of beamlets."""
+    """Sampling of the illuminated spot by beamlets."""
 
     beamlets: int = declare.count(
         "Number of beamlets; auto: as many as accuracy.tolerance needs where powers add "
@@ -442,12 +445,12 @@ class Footprint(SpecSection):
 
 @add_effect_parameters("atmosphere")
 class Atmosphere(SpecSection):
-    """The air between instrument and target."""
+    """Atmosphere between instrument and target."""
 
 
 @add_effect_modes
 class Effects(SpecSection):
-    """Modes of physical effects: simulated where the tolerance needs it, always or never."""
+    """Modes of physical effects: simulated if the tolerance requires it, always or never."""
 
 
 def _tolerance_share_field(description: str) -> Any:
@@ -527,7 +530,7 @@ class Draws(SpecSection):
 
 
 class Storage(SpecSection):
-    """Division of results in the store; part of a study's identity."""
+    """Division of results into blocks in the store; part of a study's identity."""
 
     block_points: int = declare.count(
         "Points that one block holds at most; 0 for 65536, and more in studies so large that "
@@ -537,7 +540,7 @@ class Storage(SpecSection):
 
 
 class Execution(SpecSection):
-    """Execution of a study; never part of its identity, as it changes no result."""
+    """Execution of a study; no part of its identity, because it changes no result."""
 
     workers: int = declare.count(
         "Worker processes; 0 for one a core", "4", "0", "100000", default=0

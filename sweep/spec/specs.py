@@ -535,9 +535,9 @@ def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
 
 
 class GridSpec(BaseSpec):
-    """A study of a flat target over a grid of parameters, every value read and checked.
+    """Spec of a study of a flat target over a grid of parameters, with all values checked.
 
-    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    `load` makes a spec from a file, `from_mapping` from plain data. Values are in SI units.
     """
 
     target: sections.Target
@@ -601,9 +601,9 @@ class GridSpec(BaseSpec):
 
 
 class SceneSpec(BaseSpec):
-    """A study of a flight over a scene, every value read and checked.
+    """Spec of a study of a flight over a scene, with all values checked.
 
-    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    `load` makes a spec from a file, `from_mapping` from plain data. Values are in SI units.
     """
 
     scene: scene_sections.Scene
