@@ -1,17 +1,18 @@
-"""Compilation of kernels by numba, and the folder in which compiled kernels are cached.
+"""Compilation of numba kernels, and the folder in which compiled kernels are cached.
 
-A compiled kernel has the kernels that it calls built in, and the constants that it reads. The cache
-of numba looks at the file of the kernel alone, and would go on with old code after a change of
-another file. Kernels are therefore cached in a folder named by a fingerprint of all files of the
-model, and of the libraries and settings that compile them:
+The code of a compiled kernel contains the kernels that it calls and the constants that it reads.
+Numba's cache checks only the file of the kernel itself. After a change of another file it would
+continue with outdated code. Kernels are therefore cached in a folder named by a fingerprint. It
+covers all files of the model, and the libraries and settings that compile them:
 
     BASE/sweep-kernels-UID/FINGERPRINT
 
-BASE is `NUMBA_CACHE_DIR` if it is set, else the user's cache, else the folder for temporary files.
-Compiled kernels are code that is run: the folder is used only if nobody else can write to it.
+BASE is `NUMBA_CACHE_DIR` if it is set, else the user's cache directory, else the directory for
+temporary files. Compiled kernels are executable code, so the folder is used only if no other user
+can write to it.
 
-The folder may be removed at any time, by whomever: kernels are compiled again. Folders of other
-fingerprints are removed once no process has used them for a month.
+Anyone may delete the folder at any time: kernels are then compiled again. Folders of other
+fingerprints are deleted once no process has used them for a month.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from platformdirs import user_cache_dir
 
-#: Time without any use after which the kernels of another fingerprint are removed [s].
+#: Time without use after which the kernels of another fingerprint are deleted [s].
 UNUSED_CACHE_AGE_MAX = 30 * 86400.0
 
-#: Time after which the date of use of a folder is renewed [s].
+#: Age of a cache folder's modification time at which a use renews it [s].
 USE_DATE_RENEWAL_INTERVAL = 86400.0
 
-#: Settings of numba that have no part in the code that it compiles.
+#: Numba settings that do not change the compiled code, so the fingerprint leaves them out.
 NUMBA_SETTINGS_WITHOUT_EFFECT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
 
-#: Options of numba that kernels have unless they say otherwise.
+#: Default options of `numba.njit` for every kernel.
 DEFAULT_NJIT_OPTIONS = {"nogil": True}
 
 _numba_settings: Any = numba.config
@@ -63,33 +64,39 @@ _declaration_lock = threading.RLock()
 
 
 class CacheFolder(NamedTuple):
-    """Folder in which this process caches kernels."""
+    """Folder in which this process caches compiled kernels."""
 
-    path: Path | None  # None where kernels are not cached
-    reason: str = ""  # why they are not cached
+    path: Path | None  # None if kernels are not cached
+    reason: str = ""  # why kernels are not cached
 
 
 class _CacheState:
-    """State of the kernel cache of this process."""
+    """Flags of this process: whether it may still read and write the kernel cache."""
 
-    can_read = True  # False once a file of the model has changed since it was fingerprinted
+    can_read = True  # False once a model file has changed since the fingerprint was taken
     can_write = True
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function as `numba.njit` does, and cache it by the fingerprint of the model.
 
-    A kernel may read constants and call kernels of its own file and of the model, and no others:
-    the cache does not notice changes of other files. A kernel releases the interpreter's lock, so
-    that signals are seen and workers answer while it runs.
+    A kernel may read only constants, and call only kernels, of its own file and of the model: the
+    cache does not notice changes of other files. A kernel releases the global interpreter lock, so
+    that signals are handled and workers respond while it runs.
 
     Parameters
     ----------
     **options
-        Those of `numba.njit`, and `borrows`: true of a kernel that neither makes arrays nor returns
-        any. It then counts no references to the arrays of its arguments, which else takes most of
-        the time of a short kernel that is handed records of arrays. An array that is made in it
-        or returned is an error of compilation.
+        Options of `numba.njit`, and `borrows`. `borrows=True` declares that the kernel neither
+        creates
+        nor returns arrays. The kernel then skips reference counting of the arrays in its arguments.
+        Counting takes most of the time of a short kernel that receives records of arrays. Creating
+        or returning an array in such a kernel is a compilation error.
+
+    Returns
+    -------
+    callable
+        Decorator that returns the compiled kernel.
 
     Examples
     --------
@@ -100,12 +107,13 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     1.5
     """
     is_cached, borrows = options.pop("cache", False), options.pop("borrows", False)
-    # Numba has no public name for it. Unless it is said, a kernel has it from the one that calls.
+    # Reference counting (NRT) has no public option in numba. A kernel without an explicit value
+    # inherits that of the kernel that calls it.
     options["_nrt"] = not borrows
 
     def declare(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**(DEFAULT_NJIT_OPTIONS | options))(function)
-        if is_cached and isinstance(kernel, Dispatcher):  # else compilation is disabled
+        if is_cached and isinstance(kernel, Dispatcher):  # no Dispatcher: NUMBA_DISABLE_JIT is set
             _enable_cache(kernel, borrows)
         return kernel
 
@@ -113,15 +121,15 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class KernelCache(FunctionCache):
-    """Cache of a kernel, without which computing goes on.
+    """Cache of one kernel's compiled code; its failures never stop a computation.
 
-    A file that is damaged, cut short or out of reach counts as absent.
+    A file that is damaged, truncated or unreadable counts as absent.
     """
 
     borrows = False
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kernel compiled for a signature, or None."""
+        """Return the kernel compiled for a signature, or None if it is not cached."""
         if not _CacheState.can_read:
             return None
         if _had_changed_at_first_load():
@@ -129,33 +137,33 @@ class KernelCache(FunctionCache):
             return None
         try:
             result = super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling of damaged bytes raises
+        except Exception:  # unpickling damaged bytes may raise any exception
             return None
-        # Two processes that save different signatures at once may take the same file for them.
+        # Two processes that save different signatures at once may use the same file name.
         if result is None or tuple(result.signature.args) != tuple(normalize_signature(sig)[0]):
             return None
         _renew_use_date(Path(self.cache_path).parent)
         return result
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save a compiled kernel; log once where that can't be done."""
+        """Save a compiled kernel; log a warning once if it can't be saved."""
         if self.borrows and _holds_arrays(data.signature.return_type):
             name = data.fndesc.qualname
             raise TypeError(f"{name} borrows arrays, and returns {data.signature.return_type}")
         if not _CacheState.can_write:
             return
-        if _any_file_has_changed():  # a constant that is built in may be of another state
+        if _any_file_has_changed():  # compiled-in constants may come from another file version
             _CacheState.can_write = False
             return
         folder = Path(self.cache_path).parent
         try:
             try:
                 super().save_overload(sig, data)
-            except FileNotFoundError:  # the folder was removed meanwhile: it is made again
+            except FileNotFoundError:  # the folder was deleted meanwhile: numba creates it again
                 super().save_overload(sig, data)
             except OSError:
                 raise
-            except Exception:  # the index is damaged, which unpickling can raise anything of
+            except Exception:  # unpickling a damaged index may raise any exception
                 self.flush()
                 super().save_overload(sig, data)
         except OSError as error:
@@ -167,38 +175,39 @@ class KernelCache(FunctionCache):
 
 
 def _holds_arrays(kind: Any) -> bool:
-    """Tell whether a type of numba's is that of an array, or of a tuple with one."""
-    parts = getattr(kind, "types", ())  # of a tuple
+    """Tell whether a numba type is an array type, or a tuple type that contains one."""
+    parts = getattr(kind, "types", ())  # member types of a tuple
     return isinstance(kind, types.Array) or any(map(_holds_arrays, parts))
 
 
 def _enable_cache(kernel: Any, borrows: bool) -> None:
-    """Have a kernel cached in the folder of the fingerprint, if there is one.
+    """Cache a kernel in the folder of the fingerprint, if there is one.
 
-    ``borrows``: as of :func:`njit`.
+    ``borrows``: as in :func:`njit`.
     """
     folder = cache_folder()
     if folder.path is None:
         _log_uncached(folder.reason)
         return
     if _file_has_changed(kernel.py_func.__code__.co_filename):
-        # The modules of this process are of different states: no fingerprint is theirs.
+        # This process has loaded modules of different versions: no fingerprint describes them.
         _CacheState.can_read = _CacheState.can_write = False
     with _declaration_lock, _numba_cache_dir(str(folder.path)):
         try:
             kernel_cache = KernelCache(kernel.py_func)
-        except RuntimeError:  # numba has no place to cache it in
+        except RuntimeError:  # numba found no writable cache folder for this file
             return
     kernel_cache.borrows = borrows
     if folder.path in Path(kernel_cache.cache_path).parents:
-        # As numba's `enable_caching` does with its own class. There is no public way to another
-        # one, and that one ends a program on a damaged file, and takes those of other signatures.
+        # Numba's `enable_caching` sets the same attribute to its own cache class. Numba has no
+        # public way to set another class. Its own class raises on a damaged file, and may load
+        # a file that was compiled for another signature.
         kernel._cache = kernel_cache
 
 
 @contextmanager
 def _numba_cache_dir(path: str) -> Iterator[None]:
-    """Set numba's cache folder while a kernel is declared; that of other functions stays."""
+    """Set numba's cache folder while a kernel is declared, and restore it for other functions."""
     previous_dir = _numba_settings.CACHE_DIR
     _numba_settings.CACHE_DIR = path
     try:
@@ -209,7 +218,11 @@ def _numba_cache_dir(path: str) -> Iterator[None]:
 
 @cache
 def cache_folder() -> CacheFolder:
-    """Return the folder in which this process caches compiled kernels."""
+    """Return the folder in which this process caches compiled kernels.
+
+    The first base directory that can be made private is used: `NUMBA_CACHE_DIR`, the user's cache
+    directory, the directory for temporary files.
+    """
     with _declaration_lock:
         if not (fingerprint := _fingerprint()):
             return CacheFolder(None, "the sources of the model are not files")
@@ -217,7 +230,7 @@ def cache_folder() -> CacheFolder:
         for find_base in (_configured_cache_base, user_cache_dir, tempfile.gettempdir):
             try:
                 base = find_base()
-                if os.path.isabs(base):  # the user's is not without a home
+                if os.path.isabs(base):  # without a home directory, user_cache_dir is relative
                     root = Path(base) / f"sweep-kernels-{os.getuid()}"
                     _make_private(root)
                     _log.info("compiled kernels are kept in %s", root / fingerprint)
@@ -228,19 +241,19 @@ def cache_folder() -> CacheFolder:
                     if error.filename
                     else error.strerror or str(error)
                 )
-            except RuntimeError as error:  # no home: neither $HOME nor the uid has one
+            except RuntimeError as error:  # no home directory: neither $HOME nor the uid has one
                 reasons.append(str(error))
         return CacheFolder(None, "; ".join(reasons))
 
 
 def _configured_cache_base() -> str:
-    """Folder that numba is told to cache in; empty where it is told none."""
+    """Return numba's configured cache directory as an absolute path; '' if none is set."""
     cache_dir = _numba_settings.CACHE_DIR
     return os.path.abspath(cache_dir) if cache_dir else ""
 
 
 def _make_private(root: Path) -> None:
-    """Make a folder that nobody else can write to; OSError where that can't be had."""
+    """Create a folder that no other user can write to; raise OSError if that is impossible."""
     root.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
         root.mkdir(mode=0o700)
@@ -256,7 +269,7 @@ def _make_private(root: Path) -> None:
 
 @cache
 def _sources() -> dict[str, tuple[str, int, int]]:
-    """Name, size and time of change of each file of the model, by its path."""
+    """Return name, size [bytes] and modification time [ns] of each model file, by its path."""
     return {
         str(path): (path.relative_to(_MODEL_DIR).as_posix(), status.st_size, status.st_mtime_ns)
         for path in sorted(_MODEL_DIR.rglob("*.py"))
@@ -266,7 +279,7 @@ def _sources() -> dict[str, tuple[str, int, int]]:
 
 @cache
 def _fingerprint() -> str:
-    """Digest of all that compiled kernels follow from; empty where sources are not files."""
+    """Return a digest of everything that determines compiled kernels; '' without source files."""
     digest = hashlib.sha256()
     parts = [numba.__version__, llvmlite.__version__, np.__version__, repr(DEFAULT_NJIT_OPTIONS)]
     parts += [
@@ -283,7 +296,10 @@ def _fingerprint() -> str:
 
 
 def _file_has_changed(path: str) -> bool:
-    """Tell whether a file of the model is another than when it was fingerprinted."""
+    """Tell whether a model file has changed since the fingerprint was taken.
+
+    Files outside the model count as unchanged.
+    """
     if (fingerprinted := _sources().get(path)) is None:
         return False
     try:
@@ -294,19 +310,19 @@ def _file_has_changed(path: str) -> bool:
 
 
 def _any_file_has_changed() -> bool:
-    """Tell whether any file of the model is another than when it was fingerprinted."""
+    """Tell whether any model file has changed since the fingerprint was taken."""
     return any(map(_file_has_changed, _sources()))
 
 
 @cache
 def _had_changed_at_first_load() -> bool:
-    """Tell whether any had changed when the first kernel was looked for; once a process."""
+    """Tell whether any model file had changed at the first load of a kernel; once per process."""
     return _any_file_has_changed()
 
 
 @cache
 def _renew_use_date(folder: Path) -> None:
-    """Date the use of a folder of kernels, so that others let it be; once a process."""
+    """Renew a cache folder's modification time, so that others keep it; once per process."""
     with suppress(OSError):
         if time.time() - folder.stat().st_mtime > USE_DATE_RENEWAL_INTERVAL:
             os.utime(folder)
@@ -314,9 +330,9 @@ def _renew_use_date(folder: Path) -> None:
 
 @cache
 def _remove_unused_caches(used_folder: Path) -> None:
-    """Remove the folders of other fingerprints that nobody has used for a month; once a process.
+    """Delete the caches of other fingerprints that were not used for a month; once per process.
 
-    Where one is in use all the same, its process has its kernels in memory, or compiles them anew.
+    A process that still uses a deleted folder has its kernels in memory, or compiles them again.
     """
     with suppress(OSError):
         folders = {
@@ -331,7 +347,7 @@ def _remove_unused_caches(used_folder: Path) -> None:
 
 @cache
 def _log_uncached(reason: str) -> None:
-    """Log that each process has to compile anew, and the remedy."""
+    """Log that every process compiles its kernels anew, with the reason and the remedy."""
     _log.warning(
         "compiled kernels are not cached, so that each start takes a minute more: %s. "
         "NUMBA_CACHE_DIR names another folder for them, of your own and with room",
@@ -341,7 +357,10 @@ def _log_uncached(reason: str) -> None:
 
 @intrinsic
 def high_word(typing_context, a, b):
-    """Return the upper 64 bits of the product of two 64-bit numbers, one instruction."""
+    """Return the upper 64 bits of the 128-bit product of two unsigned 64-bit integers.
+
+    The product compiles to one machine instruction.
+    """
 
     def generate(context, builder, signature, factors):
         from llvmlite import ir

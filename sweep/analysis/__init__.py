@@ -1,1 +1,1 @@
-"""Datasets, figures and tables of stores. Reads stores, runs nothing."""
+"""Datasets, figures and tables made from stores; nothing here runs a study."""

@@ -1,4 +1,4 @@
-"""Settings that `sweep accuracy` tried: who beats whom, in tables, words and a figure."""
+"""Results of `sweep accuracy`: comparison of settings by time and error, in tables and a figure."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from sweep.storage.locations import Location, output_dir
 from sweep.storage.store_format import OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
+#: Errors for which the table shows the cheapest setting.
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 NEGLIGIBLE_ERROR = 1e-9
-"""Error below which settings are alike: that of the reference itself."""
+"""Error below which settings count as equally accurate: the error of the reference itself."""
 
 AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
     "as written",
@@ -49,44 +50,49 @@ FIXED_KINDS = (
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
 )
-"""Kinds of settings that are the same at every point."""
+"""Kinds of settings that are the same at every point of a study."""
 
 FIXED_SPEEDUP_MIN, THESIS_SPEEDUP_MIN = 1 / 1.1, 5.0
-"""Goals of adaptive settings: against the best fixed one, against the thesis's way."""
+"""Required speed-up of adaptive settings over the best fixed setting, and over the thesis's way."""
 
 THESIS_BEAMLETS = 109
-"""Beamlets of the thesis's way."""
+"""Number of beamlets in the thesis."""
 
 MEDIAN_ROUNDS_MIN = 3
-"""Rounds of which fewer have no median that one slow trial would not move."""
+"""Least number of rounds for a median that one slow round does not change."""
 
 RANDOM_ERROR_QUANTILE = 0.95
-"""Share of the points whose error counts where errors are random; else all of them do."""
+"""Quantile over the points that counts as a setting's error if errors are random.
+
+Otherwise the largest error counts.
+"""
 
 
 @dataclass(frozen=True)
 class MeasuredSetting:
-    """A rung, in numbers."""
+    """Measured times and errors of one accuracy setting."""
 
     name: str
     kind: str
     tolerance: float
-    seconds_by_round: np.ndarray  # seconds a point by round
-    planning_seconds: float  # seconds a point in the best round
-    pd_error: np.ndarray  # by point
-    log10_pfa_error: float  # largest over the points; nan where it has none, as the next two
-    magnitude_error: float
-    leakage_error: float  # no part of what is promised: it jumps where a bin comes to the threshold
-    error_quantile: float  # share of the points that :attr:`error` is of
+    seconds_by_round: np.ndarray  # time per point [s], (rounds,)
+    planning_seconds: float  # planning time per point in the best round [s]
+    pd_error: np.ndarray  # largest error of pd at each point, (points,)
+    log10_pfa_error: float  # largest over the points; nan if there is none
+    magnitude_error: float  # largest relative error of |X| over the points; nan if there is none
+    # Largest over the points; nan if there is none. It is not covered by the tolerance, because it
+    # jumps if a bin reaches the threshold.
+    leakage_error: float
+    error_quantile: float  # quantile over the points that is :attr:`largest_error`
 
     @property
     def best_seconds(self) -> float:
-        """A point, in the best of the rounds."""
+        """Time per point in the fastest round [s]."""
         return float(np.min(self.seconds_by_round))
 
     @property
     def largest_error(self) -> float:
-        """Return the largest error of all promised; if random, that of pd at most points."""
+        """Largest error covered by the tolerance; a quantile of pd's errors if they are random."""
         if self.error_quantile < 1.0:
             return self.pd_error_quantile(self.error_quantile)
         promised_errors = self.pd_error_quantile(1.0), self.log10_pfa_error, self.magnitude_error
@@ -94,19 +100,20 @@ class MeasuredSetting:
 
     @property
     def is_complete(self) -> bool:
-        """True where it simulates all that is asked for, or lacks what makes no larger an error."""
+        """True unless the setting lacks leakage, and leakage is its largest error."""
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
         )
 
     def pd_error_quantile(self, fraction: float) -> float:
-        """Error of pd that this share of the points stays below."""
+        """Return a quantile of pd's errors over the points."""
         return float(np.nanquantile(self.pd_error, fraction))
 
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
-        """Time of another over that of this, round by round, in the median; of few rounds, at best.
+        """Return the time of another setting over that of this one: the median over the rounds.
 
-        Both with what a point takes besides [s].
+        If there are few rounds, the ratio of the fastest rounds is returned. ``extra_seconds``:
+        time per point that is added to both [s].
         """
         if self.seconds_by_round.size < MEDIAN_ROUNDS_MIN:
             return (other.best_seconds + extra_seconds) / (self.best_seconds + extra_seconds)
@@ -118,7 +125,7 @@ class MeasuredSetting:
 
 
 def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
-    """Return the settings of a store that `sweep accuracy` made, in its order."""
+    """Return the settings in a store of `sweep accuracy`, in the store's order."""
     array_by_name = {name: array.values for name, array in dataset.variables.items()}
     error_quantile = (
         RANDOM_ERROR_QUANTILE if np.isfinite(array_by_name["standard_error"]).any() else 1.0
@@ -143,17 +150,17 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
 
 
 def select_kinds(settings: Iterable[MeasuredSetting], *kinds: str) -> list[MeasuredSetting]:
-    """Return settings of some kinds."""
+    """Return the settings of the given kinds."""
     return [setting for setting in settings if setting.kind in kinds]
 
 
 def without_reference(settings: Iterable[MeasuredSetting]) -> list[MeasuredSetting]:
-    """All but the reference, which has no error of its own."""
+    """Return all settings except the reference, which has no error by definition."""
     return [setting for setting in settings if setting.kind != REFERENCE_KIND]
 
 
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return the settings that none is both as fast and as accurate as, the fastest first."""
+    """Return the settings that no other setting beats in both time and error, fastest first."""
     front_settings: list[MeasuredSetting] = []
     for setting in sorted(settings, key=lambda s: (s.best_seconds, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
@@ -166,28 +173,28 @@ def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
 def cheapest_within_error(
     settings: Sequence[MeasuredSetting], error_max: float
 ) -> MeasuredSetting | None:
-    """Return the fastest setting whose error is no larger."""
+    """Return the fastest setting with at most the given error, or None."""
     error_limit = max(error_max, NEGLIGIBLE_ERROR)
     accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
     return min(accurate_settings, key=lambda s: s.best_seconds, default=None)
 
 
 class SettingComparison(NamedTuple):
-    """An adaptive setting against another, both with no more than an error; None where none is."""
+    """Comparison of an adaptive setting with another one (or None) of no larger error."""
 
     adaptive: MeasuredSetting
     other: MeasuredSetting | None
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
-        """Time of the other over that of the adaptive one; inf against nothing.
+        """Return the time of the other setting over that of the adaptive one; inf without another.
 
-        Both with what a point takes besides [s].
+        ``extra_seconds``: time per point that is added to both [s].
         """
         return self.adaptive.speedup_over(self.other, extra_seconds) if self.other else math.inf
 
 
 def compare_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
-    """For each error that adaptive settings have: the fastest of them, the fastest fixed one."""
+    """Compare the fastest adaptive with the fastest fixed setting at each adaptive error."""
     adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
         setting for setting in select_kinds(settings, *FIXED_KINDS) if setting.is_complete
@@ -209,7 +216,10 @@ def compare_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingCompa
 def compare_with_thesis(
     settings: Sequence[MeasuredSetting], kind: str = THESIS_KIND
 ) -> list[SettingComparison]:
-    """Return the fastest adaptive setting as accurate as each form of the thesis's way."""
+    """Compare each form of the thesis's way with the fastest adaptive setting of its error.
+
+    The error of the adaptive setting is no larger.
+    """
     adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
     cheapest_by_thesis = (
         (cheapest_within_error(adaptive_settings, thesis_form.largest_error), thesis_form)
@@ -224,20 +234,20 @@ def compare_with_thesis(
 
 SETTING_COLUMNS = ("setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
            "magnitude", "leakage", "front")  # fmt: skip
-"""Time, its share of planning, and errors: three quantiles of pd's, the largest of the others."""
+"""Columns of a setting: time, planning time, quantiles of pd's error, and largest other errors."""
 
 
 SHORT_SETTING_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
-"""The same in few columns."""
+"""Columns of a setting in the terminal's shorter table."""
 
 CHEAPEST_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
 
 STORING_ATTRIBUTE = "storing_seconds"
-"""Attribute that stores of earlier versions lack."""
+"""Attribute with the time of storing the study [s]; stores of earlier versions lack it."""
 
 
 def setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a row for each setting, by COLUMNS."""
+    """Return a row for each setting, in the columns of `SETTING_COLUMNS`."""
     front_settings = pareto_front(without_reference(settings))
     return [
         [
@@ -253,7 +263,7 @@ def setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
 
 
 def short_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return the rows by SHORT: settings on the Pareto front have a star before their names."""
+    """Return rows in the columns of `SHORT_SETTING_COLUMNS`; a star marks the Pareto front."""
     return [
         [f"{front_mark or ' '} {name}", f"{time} us", *errors]
         for name, time, _, _, *errors, front_mark in setting_rows(settings)
@@ -275,7 +285,7 @@ def cheapest_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
 
 
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
-    """Conclusions in words."""
+    """Return the conclusions from a measurement as sentences."""
     attributes = dataset.attrs
     conclusions = [_as_written_sentence(dataset, settings)]
     conclusions += _fixed_sentences(compare_with_fixed(settings), attributes)
@@ -293,7 +303,7 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
 
 
 def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> TablePage:
-    """Tables and sentences under the study's title."""
+    """Return the tables and conclusions as a page with the study's title."""
     page_tables = [
         PageTable("Settings", SETTING_COLUMNS, setting_rows(settings)),
         PageTable("Cheapest setting for each error", CHEAPEST_COLUMNS, cheapest_rows(settings)),
@@ -335,7 +345,7 @@ def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
 
 
 def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict) -> list[str]:
-    """Statement on adaptive against fixed settings."""
+    """Return the sentences that compare adaptive with fixed settings."""
     if not comparisons:
         return []
     worst_comparison = min(comparisons, key=SettingComparison.speedup)
@@ -360,7 +370,10 @@ def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict)
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """By how much an adaptive setting is slower, and what that is of all that the study takes."""
+    """Return how much time the slowest adaptive setting loses, in words.
+
+    The time is also compared with the time of the whole study, including storing.
+    """
     n_points = attributes["study_points"]
     extra_seconds = worst_comparison.adaptive.best_seconds * (1 - worst_comparison.speedup())
     lost_text, planning_text = (
@@ -377,7 +390,7 @@ def _slowdown_text(
 
 
 def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> list[str]:
-    """Statements on adaptive settings against the thesis's way, as described and improved."""
+    """Return the sentences that compare adaptive settings with the thesis's way, also improved."""
     comparisons = compare_with_thesis(settings)
     if not comparisons:
         return []
@@ -403,7 +416,7 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
 
 
 def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
-    """One sentence for each adaptive setting and error."""
+    """Return a sentence with the speed-ups of each adaptive setting and error."""
     speedups_by_case: dict[str, list[str]] = {}
     for comparison in comparisons:
         if comparison.other:
@@ -419,7 +432,10 @@ def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
 
 
 def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
-    """Compare the closed form with the thesis's way: same beamlets, same effects."""
+    """Return the sentences that compare the closed form with the thesis's way.
+
+    Both have the same beamlets and effects.
+    """
     described_text, improved_text = (
         "; ".join(
             f"{closed_form_setting.speedup_over(thesis_setting):.2g} over {thesis_setting.name}"
@@ -461,13 +477,13 @@ def _format_duration(seconds: float) -> str:
 
 
 def format_microseconds(seconds: float) -> str:
-    """Return a time in microseconds, in three digits."""
+    """Return a time [s] as text in microseconds with three digits."""
     value = 1e6 * seconds
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def format_error(value: float) -> str:
-    """Return an error in two digits; 0 below what counts, nothing for nan."""
+    """Return an error as text with two digits; '<1e-9' if negligible, '-' for nan."""
     if math.isnan(value):
         return "-"
     return (
@@ -484,10 +500,10 @@ NUMBERED_KINDS = (
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
 )
-"""Kinds whose settings are told apart by the number that their names begin with."""
+"""Kinds whose settings have names that begin with their number of beamlets or draws."""
 
 CONNECTED_KINDS = (ADAPTIVE_KIND, *NUMBERED_KINDS)
-"""Kinds whose settings are one method, looked at more or less closely."""
+"""Kinds whose settings differ only in resolution, so that a line connects their marks."""
 
 MARK_BY_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
@@ -503,11 +519,11 @@ MARK_BY_KIND = {
     IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
     AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
 }
-"""Marker, colour and words of each kind."""
+"""Marker, colour and legend text of each kind."""
 
 
 def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
-    """Return the figure of a store that `sweep accuracy` made."""
+    """Return the figure of a store of `sweep accuracy`: error over time of all settings."""
     plotted_settings = without_reference(settings)
     sheet, (axes,) = canvas.sheet_with_axes(10.0, 6.2, 1, 1)
     axes.step(
@@ -547,7 +563,10 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
 
 
 def _draw_mark(axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str) -> None:
-    """Draw a mark at the largest error, a line down to pd's of 90 %, a dot at its median."""
+    """Draw a setting: a mark at its largest error, and quantiles of pd's errors.
+
+    A bar leads down to the 90 % quantile, and a dot is at the median.
+    """
     time, largest_error = _plot_position(setting)
     error_90, error_median = (
         max(setting.pd_error_quantile(fraction), NEGLIGIBLE_ERROR) for fraction in (0.9, 0.5)
@@ -572,12 +591,12 @@ def _draw_mark(axes: Axes, setting: MeasuredSetting, marker: str, colour: str, l
 
 
 def _plot_position(setting: MeasuredSetting) -> tuple[float, float]:
-    """Time [us] and error at which a setting is drawn."""
+    """Return the time [us] and the error at which a setting is drawn."""
     return 1e6 * setting.best_seconds, max(setting.largest_error, NEGLIGIBLE_ERROR)
 
 
 def _short_name(setting: MeasuredSetting) -> str:
-    """Short name that tells a setting from others of its kind."""
+    """Return a short name that distinguishes a setting within its kind."""
     if setting.kind == ADAPTIVE_KIND:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
     if setting.kind == THESIS_KIND:
@@ -604,7 +623,7 @@ def _set_axes(axes: Axes, error_min: float, error_max: float) -> None:
 
 
 def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
-    """Return the notes that explain the figure."""
+    """Return the caption that explains the marks, the reference and the study."""
     attributes = dataset.attrs
     error_quantile = settings[0].error_quantile
     mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
@@ -627,7 +646,10 @@ def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str
 
 
 def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetting]]:
-    """Return the store as a dataset, read whole, and its settings; NotAStoreError if it is none."""
+    """Load a store of `sweep accuracy`: its dataset and its settings.
+
+    Raise NotAStoreError if the store is of another kind.
+    """
     study_id = read_attributes_of_kind(store, ACCURACY_KIND)["study_id"]
     with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
         loaded = dataset.load()
@@ -637,7 +659,7 @@ def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetti
 def write_sheet_and_tables(
     store: Location, directory: Path | None = None, picture_format: str = "png"
 ) -> list[Path]:
-    """Write the figure as NAME.png (pdf, svg) and the tables as NAME.txt."""
+    """Write the figure as NAME.png (or pdf, svg) and the tables as NAME.txt; return both paths."""
     dataset, settings = open_accuracy_store(store)
     stem = store.name.removesuffix(".zarr")
     folder = output_dir(store) if directory is None else directory

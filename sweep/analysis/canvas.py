@@ -1,4 +1,4 @@
-"""Pictures: sheets to draw on, their looks, charts drawn on them, and files made of them."""
+"""Figures with matplotlib: sheets, the common style, charts drawn on sheets, and picture files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from sweep.analysis.charts import (
 DPI = 150
 COLOUR_MAP_NAME = "viridis"
 MISSING_COLOUR = "0.75"
-"""Grey of what is not there: nan, or a point not computed yet."""
+"""Grey of missing values: nan, or a point that is not computed yet."""
 
 LINE_COLOURS = (
     "#0072B2",
@@ -44,22 +44,22 @@ LINE_COLOURS = (
     "#000000",
     "#785A2D",
 )
-"""Colours for lines: of Okabe and Ito (2008), and a brown that red-blind eyes tell from them."""
+"""Line colours: those of Okabe and Ito (2008), and a brown that red-blind readers distinguish."""
 
 DASH_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 
 
 PICTURE_FORMATS = ("png", "pdf", "svg")
-"""Formats of pictures; text and lines of the last two are no pixels."""
+"""File formats of pictures; pdf and svg keep text and lines as vectors."""
 
 VECTOR_FORMAT_DPI = 300
-"""Of what stays pixels in PDF and SVG: surfaces and clouds of many points."""
+"""Resolution [dpi] of the rasterised parts of PDF and SVG: surfaces and large point clouds."""
 
 RC_PARAMS: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "font.family": "DejaVu Sans",  # part of matplotlib, so the same on every machine
     "grid.color": "0.9",
     "grid.linewidth": 0.6,
-    "pdf.fonttype": 42,  # whole outlines, as publishers ask for
+    "pdf.fonttype": 42,  # embedded TrueType fonts, as publishers require
     "svg.fonttype": "path",
     "svg.hashsalt": "sweep",
     "path.simplify": True,
@@ -67,7 +67,7 @@ RC_PARAMS: dict[Any, Any] = {
 }
 
 PNG_SOURCE_FIELD = "Source"
-"""Field of a PNG's metadata that says what it was drawn from; of other formats, the subject."""
+"""PNG metadata field that names the source of the picture."""
 
 _SOURCE_FIELD_BY_FORMAT = {"png": PNG_SOURCE_FIELD, "pdf": "Subject", "svg": "Description"}
 
@@ -76,12 +76,12 @@ _OMITTED_METADATA: dict[str, dict[str, str | None]] = {
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
 }
-"""Metadata that would make a file differ from one run, or one machine, to the next."""
+"""Metadata fields left out because they differ between runs or machines."""
 
 
 @contextmanager
 def uniform_style() -> Iterator[None]:
-    """Return the one style of all pictures, whatever its user has set."""
+    """Apply the common style of all pictures, whatever the user's matplotlib settings are."""
     with rc_context():
         rcdefaults()
         rcParams.update(RC_PARAMS)
@@ -89,7 +89,7 @@ def uniform_style() -> Iterator[None]:
 
 
 def blank_sheet(width: float, height: float) -> Sheet:
-    """Return an empty sheet, width and height in inches."""
+    """Return an empty sheet of the given width and height [inches]."""
     new_sheet = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(new_sheet)
     return new_sheet
@@ -98,26 +98,26 @@ def blank_sheet(width: float, height: float) -> Sheet:
 def sheet_with_axes(
     width: float, height: float, rows: int, columns: int, **options: Any
 ) -> tuple[Sheet, list[Axes]]:
-    """Return a sheet with a grid of axes, listed row by row."""
+    """Return a sheet of the given size [inches] with a grid of axes, listed row by row."""
     new_sheet = blank_sheet(width, height)
     axes = new_sheet.subplots(rows, columns, squeeze=False, **options)
     return new_sheet, list(axes.ravel())
 
 
 def message_sheet(message: str) -> Sheet:
-    """Return a sheet that says why there is nothing on it."""
+    """Return a sheet that shows only a message, for figures without data."""
     new_sheet = blank_sheet(8.0, 2.0)
     new_sheet.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
     return new_sheet
 
 
 def set_title(target_sheet: Sheet, text: str) -> None:
-    """Title of a whole sheet, as it is written: a dollar in it is no formula."""
+    """Set the title of a sheet as plain text: a dollar sign does not start a formula."""
     target_sheet.suptitle(text, fontsize=11, fontweight="bold", parse_math=False)
 
 
 def set_caption(target_sheet: Sheet, text: str) -> None:
-    """Small print at the foot of a sheet, broken into lines that fit it."""
+    """Set the caption at the foot of a sheet, wrapped to the width of the sheet."""
     if text:
         characters_per_line = int(target_sheet.get_figwidth() * 15)
         target_sheet.supxlabel(
@@ -127,9 +127,9 @@ def set_caption(target_sheet: Sheet, text: str) -> None:
 
 
 def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> Path:
-    """Write the sheet in the format of the suffix; the same sheet gives the same bytes.
+    """Write a sheet to a file in the format of its suffix; equal sheets give equal bytes.
 
-    ``source`` says what it was drawn from, and goes into the file's metadata.
+    ``source`` names what the sheet was drawn from, and is written to the file's metadata.
     """
     file_path.parent.mkdir(parents=True, exist_ok=True)
     picture_format = file_path.suffix.removeprefix(".")
@@ -143,10 +143,10 @@ def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> P
 
 
 LINES_TOGETHER_MAX = 4
-"""Lines that one panel can hold and still be read; more have panels of their own."""
+"""Largest number of lines in one panel; above it each line has a panel."""
 
 MARKED_POINTS_MAX = 40
-"""Points up to which each has a mark."""
+"""Largest number of points of a line at which every point has a marker."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
@@ -156,11 +156,14 @@ MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INC
     (10.0, 1.75),
     (4.3, 3.0),
 )
-"""Widths of rows and heights of panels [inches]; of charts with several in a row, of a panel."""
+"""Width of a row of panels and height of a panel [inches].
+
+For SMALL_PANEL_INCHES, used with several panels in a row, the width is that of one panel.
+"""
 
 
 def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
-    """Return the sheet of a chart, with what stands over it and what is added at its foot."""
+    """Return a sheet with a chart, a heading above it, and its caption with a footnote below."""
     drawn_sheet = (
         _draw_maps(chart, chart.colour_scale) if chart.colour_scale else _draw_lines(chart)
     )
@@ -170,7 +173,7 @@ def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
 
 
 def _draw_maps(chart: Chart, colour_scale: ColourScale) -> Sheet:
-    """Arrange maps in one column, or in two if there are several parts."""
+    """Draw the maps of a chart in one column, or in two columns if it has several parts."""
     n_columns = min(2, len({panel.facet_choices["part"] for panel in chart.panels}))
     n_rows = -(-len(chart.panels) // n_columns)
     maps_sheet, axes_list = sheet_with_axes(
@@ -203,17 +206,17 @@ def _draw_maps(chart: Chart, colour_scale: ColourScale) -> Sheet:
 
 
 def colour_norm(colour_scale: ColourScale) -> Normalize:
-    """Colours' norm of a scale."""
+    """Return matplotlib's normalisation for a colour scale."""
     return (LogNorm if colour_scale.is_log else Normalize)(colour_scale.low, colour_scale.high)
 
 
 def colour_map() -> Colormap:
-    """Colour map, grey where there is no value."""
+    """Return the colour map, with grey for missing values."""
     return colormaps[COLOUR_MAP_NAME].with_extremes(bad=MISSING_COLOUR)
 
 
 def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
-    """Edges (n + 1,) of cells around their centres (n,)."""
+    """Return the edges (n + 1,) of adjacent cells with the given centres (n,)."""
     if centres.size == 1:
         return centres[0] * np.array([0.9, 1.1]) if centres[0] else np.array([-0.5, 0.5])
     positions = np.log(centres) if logarithmic else centres.astype(float)
@@ -244,7 +247,7 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
 
 
 def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> None:
-    """Contours with their levels, black with a pale rim: they stand out from every colour."""
+    """Draw labelled contours, black with a pale outline, visible on every colour."""
     levels_in_range = [
         level for level in heat_map.contour_levels if values.min() < level < values.max()
     ]
@@ -279,7 +282,7 @@ def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> 
 
 
 def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
-    """Kind and ends of an axis."""
+    """Set the scale and the limits of an axis."""
     if axis.kind != CATEGORY:
         axes.set(**{f"{axis_name}scale": axis.kind})
     if axis.limits is not None:
@@ -287,7 +290,7 @@ def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None
 
 
 def _draw_lines(chart: Chart) -> Sheet:
-    """Panels of lines one under the other, or in the chart's own rows."""
+    """Draw the panels of lines below each other, or in the rows that the chart defines."""
     drawn_panels, is_split = (
         (chart.panels, False) if chart.panels_per_row else _one_line_per_panel(chart.panels)
     )
@@ -333,7 +336,10 @@ def _draw_lines(chart: Chart) -> Sheet:
 
 
 def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
-    """Panels with a single line each, where lines of one would lie over each other."""
+    """Split panels into one panel per line if their lines would overlap too much.
+
+    Return the panels, and whether they were split.
+    """
     is_reduced = any(line.points_per_value > 1 for panel in panels for line in panel.lines)
     split_panels = [
         (panel, [line for line in panel.lines if line.style != "level"],
@@ -367,7 +373,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
-    """One line over its band."""
+    """Draw one line, with its band or error bars."""
     if line.style == "level":
         axes.axhline(line.y[0], color="0.6", linewidth=0.8, zorder=1)
         if not line.name:
@@ -404,7 +410,7 @@ def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
 
 
 def _draw_legend(lines_sheet: Sheet, axes_list: Sequence[Axes]) -> None:
-    """Each name of a line once."""
+    """Draw a legend in which each line name appears once."""
     handle_by_name: dict[str, Any] = {}
     for axes in axes_list:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):

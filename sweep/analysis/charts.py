@@ -1,7 +1,8 @@
-"""Charts as data, and those of grids: a variable over two coordinates, or along one.
+"""Charts as data: the general classes, and the charts of grids over two coordinates or along one.
 
-Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.html_page`: a
-sheet shows the panels side by side, a page one at a time, by the choice of each facet.
+:mod:`sweep.analysis.canvas` draws charts to files, and :mod:`sweep.report.html_page` to pages. A
+sheet shows all panels side by side. A page shows one panel at a time, and the reader selects it by
+its facets.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from sweep.analysis.selection import (
 LINEAR, LOG, CATEGORY = "linear", "log", "category"
 
 PROBABILITY_LIMITS = (-0.03, 1.03)
-"""Limits of an axis of probabilities."""
+"""Limits of an axis that shows probabilities."""
 
 
 @dataclass(frozen=True)
 class ChartAxis:
-    """An axis: words with units, its kind, and its ends; none where those of the data will do."""
+    """Axis of a panel: label with units, kind of scale, and limits; None for the data's extent."""
 
     label: str = ""
     kind: str = LINEAR
@@ -49,12 +50,13 @@ class ChartAxis:
 
 @dataclass(frozen=True, eq=False)
 class ChartLine:
-    """Values along an axis; nan where there is none.
+    """Line of a panel: values ``y`` over ``x``, nan where missing.
 
-    A legend has its name; a number stands for its colour, dash and mark. A band may be about
-    it. Its look is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (with errors), ``level``
-    or ``area`` (upon the areas before it). Each value stands for some points together, and may
-    have words told of it.
+    ``name`` appears in the legend. ``style_index`` selects colour, dash and marker. ``low`` and
+    ``high`` are the ends of a band about the line. ``style`` is ``line``, ``stated`` (dashed),
+    ``dots``, ``bars`` (error bars), ``level`` (horizontal line) or ``area`` (stacked on the areas
+    before it). ``points_per_value`` is the number of points that each value summarises.
+    ``hover_texts`` are texts for the values.
     """
 
     x: np.ndarray
@@ -70,7 +72,10 @@ class ChartLine:
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """Values (rows, columns) over y and x; nan where there is none. Levels have contours."""
+    """Map of values (rows, columns) over ``y`` and ``x``; nan where missing.
+
+    Contours are drawn at ``contour_levels``.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -80,7 +85,10 @@ class HeatMap:
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Colours of a variable: probabilities from 0 to 1, wide spans by decades."""
+    """Range of the colours of a variable, and whether the scale is logarithmic.
+
+    Probabilities of detection are shown from 0 to 1, wide spans on a logarithmic scale.
+    """
 
     low: float
     high: float
@@ -90,7 +98,7 @@ class ColourScale:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Lines or a map over two axes, at one choice of each facet."""
+    """Panel of a chart: lines or a heat map over two axes, for one choice of each facet."""
 
     facet_choices: Mapping[str, str]
     x: ChartAxis
@@ -100,15 +108,16 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """The choices in words."""
+        """Title of the panel: its facet choices in words."""
         return ", ".join(filter(None, self.facet_choices.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Contents of a figure: words over it, for those who do not see it, and under it; panels.
+    """Contents of a figure: heading, alternative text, caption and panels.
 
-    Facets have the name of each choice. `rows` are numbers of panels in the rows of a sheet.
+    ``facet_labels`` name the choice of each facet. ``panels_per_row`` are the numbers of panels in
+    the rows of a sheet.
     """
 
     heading: str
@@ -122,7 +131,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class ChartSizeLimits:
-    """Room for a chart: parts, cells of a map across and up and in all, maps abreast."""
+    """Limits of a chart: numbers of parts, map columns, map rows, all cells, and maps in a row."""
 
     parts_max: int
     columns_max: int
@@ -134,11 +143,11 @@ class ChartSizeLimits:
 SHEET_LIMITS = ChartSizeLimits(
     parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_abreast=2
 )
-"""Cells of a panel as wide as the sheet: no more than its pixels, so that none is lost."""
+"""Limits for a sheet: a map has no more cells than pixels, so that no cell is lost."""
 
 LINES_PER_PANEL_MAX = 8
 LINE_INTERVALS = 500
-"""Stretches into which a line of more than twice as many points is cut."""
+"""Number of intervals to which a line of more than twice as many points is reduced."""
 
 _LOG_SCALE_DECADES_MIN = 3
 _HARMFUL_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
@@ -146,7 +155,7 @@ _HARMFUL_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 
 @dataclass(frozen=True)
 class CoordinateAxis:
-    """A coordinate along an axis: in the units that a reader wants, words as they are."""
+    """Axis of a coordinate in display units; categorical values stay as they are."""
 
     axis: ChartAxis
     factor: float
@@ -154,7 +163,7 @@ class CoordinateAxis:
 
     @classmethod
     def from_points(cls, points: PointSelection, name: str) -> CoordinateAxis:
-        """Return the ruler of a coordinate."""
+        """Return the axis of a coordinate of the points."""
         values, units = np.unique(points.coordinate_values(name)), points.coordinate_units(name)
         if labels.is_categorical(values):
             return cls(ChartAxis(labels.coordinate_label(name), CATEGORY), 1.0, "")
@@ -163,13 +172,13 @@ class CoordinateAxis:
         return cls(ChartAxis(label, LOG if is_log_spaced(values) else LINEAR), factor, units)
 
     def to_axis_units(self, values: np.ndarray) -> np.ndarray:
-        """Values as they stand on the axis."""
+        """Return values in the units of the axis; categorical values as text."""
         if self.axis.kind == CATEGORY:
             return np.array([str(value) for value in values])
         return values * self.factor
 
     def describe_span(self, values: np.ndarray) -> str:
-        """First and last value in words."""
+        """Return the first and last value as text."""
         axis_values = self.to_axis_units(values)
         end_texts = [
             labels.format_quantity(v, self.units) for v in (axis_values[0], axis_values[-1])
@@ -178,7 +187,7 @@ class CoordinateAxis:
 
 
 def is_log_spaced(values: np.ndarray) -> bool:
-    """Tell whether values are spread evenly in their logarithm, over a decade or more."""
+    """Tell whether values are spaced evenly in their logarithm over at least a decade."""
     if values.size < 3 or values.min() <= 0 or values.max() < 10 * values.min():
         return False
     steps = np.diff(np.log(values))
@@ -186,7 +195,7 @@ def is_log_spaced(values: np.ndarray) -> bool:
 
 
 def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) -> ColourScale:
-    """Colours of a variable: 0..1 for probabilities of detection, else what the values span."""
+    """Return the colour scale of a variable: 0 to 1 for pd, else the extent of its values."""
     values = np.concatenate([layer.ravel() for layer in layers])
     finite_values = values[np.isfinite(values)]
     if variable.startswith("pd_") or not finite_values.size:
@@ -205,7 +214,7 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
 
 
 def worst_statistic(variable: str) -> str:
-    """Worst kind of the values that share a cell; empty if neither end is bad."""
+    """Return which extreme of a variable is the worst value of a cell; '' if neither is bad."""
     if variable.startswith(("pd_", "snr_")):
         return LOWEST
     return HIGHEST if variable.startswith(_HARMFUL_PREFIXES) else ""
@@ -214,7 +223,10 @@ def worst_statistic(variable: str) -> str:
 def split_into_parts(
     points: PointSelection, shown_names: Sequence[str], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Parts of points of which a panel shows one, and how many are left out."""
+    """Split points by all coordinates that are not shown; a panel shows one part.
+
+    Return the named parts, and the number of omitted parts.
+    """
     if not points.size:
         return [], 0
     all_parts, _ = split_by_coordinates(
@@ -229,7 +241,7 @@ def split_into_parts(
 
 
 def omission_remark(n_omitted: int) -> str:
-    """Remark that some values are left out; empty where none is."""
+    """Return a remark on the number of omitted values; '' if none is omitted."""
     return f"{labels.counted(n_omitted, 'further value')} not shown" if n_omitted else ""
 
 
@@ -243,9 +255,9 @@ def surface_chart(
     size_limits: ChartSizeLimits = SHEET_LIMITS,
     levels: Sequence[float] = (),
 ) -> Chart:
-    """Return a variable over two coordinates, a panel for each value of what else varies.
+    """Return maps of a variable over two coordinates, a panel for each value of other coordinates.
 
-    Contours are drawn at some levels of the variable, where both coordinates are numbers.
+    Contours are drawn at ``levels`` if both coordinates are numeric.
     """
     parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
     planes = [_to_plane(part, variable, x, y) for _, part in parts]
@@ -313,7 +325,7 @@ def _cells_max(
     size_limits: ChartSizeLimits,
     n_layers: int,
 ) -> tuple[int, int]:
-    """Cells across and up that all maps keep to."""
+    """Return the largest numbers of columns and rows that all maps may have."""
     columns_max = size_limits.columns_max // (size_limits.maps_abreast if len(planes) > 1 else 1)
     n_columns = min(columns_max, max(x_coordinate.values.size for _, x_coordinate, _ in planes))
     n_rows = min(
@@ -326,7 +338,10 @@ def _cells_max(
 def _to_plane(
     points: PointSelection, variable: str, x: str, y: str
 ) -> tuple[PointSelection, SortedCoordinate, SortedCoordinate]:
-    """Points over two axes, and the places along x and along y."""
+    """Return the points over two dimensions, and their sorted coordinates along x and y.
+
+    If x and y lie along one zipped axis, the points are rearranged on a grid of both.
+    """
     if points.dim_of(x) != points.dim_of(y):
         return points, points.sorted_coordinate(x), points.sorted_coordinate(y)
     x_values, column_index = np.unique(points.coordinate_values(x), return_inverse=True)
@@ -349,7 +364,7 @@ def _to_plane(
 def _reduction_remark(
     points_per_cell: int, coordinates: Sequence[SortedCoordinate], cell_statistics: Sequence[str]
 ) -> str:
-    """Remark on the number of points that share a cell; empty where none do."""
+    """Return a remark on the number of points that share a cell; '' if none do."""
     if points_per_cell == 1:
         return ""
     n_points = math.prod(coordinate.values.size for coordinate in coordinates)
@@ -372,7 +387,10 @@ def slice_chart(
     parts_max: int = 6,
     levels: Sequence[float] = (),
 ) -> Chart:
-    """Return a variable along a coordinate, a line for each value of another; lines at levels."""
+    """Return lines of a variable along ``x``, one for each value of ``by``.
+
+    Horizontal lines are drawn at ``levels``.
+    """
     line_coordinates = [by] if by else []
     parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
     named_points, n_omitted_lines = split_into_lines(parts, line_coordinates)
@@ -400,19 +418,19 @@ def slice_chart(
 
 
 def _level_lines(panel: Panel, levels: Sequence[float]) -> list[ChartLine]:
-    """Return level lines as long as the other lines of a panel."""
+    """Return horizontal lines at levels, over the x values of the panel's first line."""
     x = panel.lines[0].x
     return [ChartLine(x, np.full(x.size, level), f"{level:g}", style="level") for level in levels]
 
 
 NamedPoints = tuple[str, str, PointSelection]
-"""The part that a line is of, its name, and its points."""
+"""Part that a line belongs to, name of the line, and its points."""
 
 
 def split_into_lines(
     parts: Sequence[tuple[str, PointSelection]], line_coordinates: Sequence[str]
 ) -> tuple[list[NamedPoints], int]:
-    """Lines of every part, and how many are left out."""
+    """Split every part into lines by coordinates; also return the number of omitted lines."""
     named_points: list[NamedPoints] = []
     n_omitted = 0
     for part_label, part_points in parts:
@@ -433,7 +451,7 @@ def make_panels(
     y_axis: ChartAxis,
     **further_choices: str,
 ) -> list[Panel]:
-    """Return a panel for each part; a name has the same colour in all of them."""
+    """Return a panel for each part; a line name has the same style in all panels."""
     style_by_name = {
         name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named_points))
     }
@@ -450,7 +468,7 @@ def make_panels(
 
 
 def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
-    """Extent of the lines of a panel, in words."""
+    """Return the alternative text of lines: the extent of each line of a panel."""
     line_texts = [
         f"{line.name or 'the line'}: {labels.describe_extent(line.y)}" for line in panel.lines
     ]
@@ -460,11 +478,12 @@ def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
 def lines_along(
     points_and_variables: Sequence[tuple[PointSelection, str]], x: str
 ) -> tuple[list[ChartLine], list[str]]:
-    """Variables along a coordinate, all in one reading, and remarks on how they are drawn.
+    """Read variables along a coordinate in one pass; also return remarks on how they are drawn.
 
-    A line of many points is cut into intervals: their means, in a band from the lowest to the
-    highest of their points. Else the band is the interval of each point, where pd is drawn or
-    the dataset has ``.._low`` and ``.._high``. Of other coordinates the first place is taken.
+    A line of many points is reduced to intervals: the line shows their means, and a band their
+    lowest to highest points. Otherwise the band is the interval of each point, if pd is drawn or
+    the dataset has ``.._low`` and ``.._high``. Along other dimensions the first selected index is
+    taken.
     """
     lazy_arrays: list[list[Any]] = []
     reductions: list[tuple[SortedCoordinate, int, float, bool]] = []
@@ -503,7 +522,7 @@ def lines_along(
 
 
 def _mean_and_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
-    """Mean, lowest and highest of a variable, as far as they differ; confidence of intervals."""
+    """Return a variable with the ends of its interval, if it has any, and their confidence."""
     segment = variable.removeprefix("pd_")
     if f"{variable}_low" in dataset:
         variable_by_statistic = {
@@ -523,7 +542,7 @@ def _mean_and_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, floa
 
 
 def _band_remark(points_per_value: int, confidence: float, has_ends: bool) -> str:
-    """Remark on how a line is reduced; empty where each point is on it."""
+    """Return a remark on the reduction and the band of a line; '' for a plain line."""
     interval_text = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
     if points_per_value > 1:
         ends_note = f", their {interval_text}s included" if confidence else ""

@@ -1,4 +1,4 @@
-"""Stores as xarray Datasets and DataTrees; `ds.sweep` and `tree.sweep`, answers from them."""
+"""Open stores as xarray Datasets and DataTrees, with the accessors `ds.sweep` and `tree.sweep`."""
 
 from __future__ import annotations
 
@@ -38,14 +38,17 @@ from sweep.storage.verified_store import open_verified_store
 
 BATCH_DIM = "batch"
 VALUES_PER_READ = 2**20
-"""Values of an array that are read at a time: few enough for any memory, and enough that Dask's
-list of what is to be read stays short (some 7 kB a piece; a piece of floats has 8 MB)."""
+"""Number of array values in a Dask chunk for reading.
+
+It is small enough for any memory: a chunk of floats has 8 MB. It is large enough to keep Dask's
+task graph short, which takes about 7 kB per chunk.
+"""
 
 SHOTS_PER_READ = 8192
-"""Shots, times draws, that are read at a time."""
+"""Number of shots, times draws, that are read at once."""
 
 COUNT_MISSING = -1
-"""Value of a count in a block that is not computed."""
+"""Value of a count in a block that is not computed yet."""
 
 GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
 _DESCRIPTION_BY_KIND = {
@@ -54,7 +57,7 @@ _DESCRIPTION_BY_KIND = {
     ACCURACY_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
     "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
 }
-"""Contents of the kinds of stores, and the functions that open them."""
+"""Description of each kind of store, with the function that opens it."""
 
 
 def open(
@@ -62,39 +65,43 @@ def open(
     *,
     dim: str = "design",
 ) -> xr.Dataset:
-    """Open the store of a study as a dataset, or those of several as one, a design each.
+    """Open the store of a study as a dataset, or several stores as one dataset of designs.
 
-    Dimensions bear the names of the study's axes, coordinates are in the units that the study was
-    written in, and every variable has its units and what it is. Arrays are read when they are
-    needed, as Dask arrays in pieces of whole chunks of the store. Points not computed yet are nan;
-    -1 for counts of draws, which are summed over their batches, and for their number `n_draws`.
+    Dimensions are named by the axes of the study. Coordinates are in the units of the study's spec.
+    Every variable has its units and its description as attributes. Arrays are read lazily, as Dask
+    arrays whose chunks are multiples of the store's chunks. Points that are not computed yet are
+    nan. Counts of draws are summed over their batches. Counts that are not computed yet, `n_draws`
+    among them, are -1.
 
     Parameters
     ----------
     path
-        The store, complete or not. A list of stores, or a mapping from names of designs to stores,
-        is joined along a new dimension; designs of a list are named by the titles of their studies.
-        Answers of `ds.sweep` from the result are per design, from each design's own spec.
+        Store, complete or not. A list of stores, or a mapping from names of designs to stores, is
+        joined along a new dimension. The designs of a list are named by the titles of their
+        studies.
+        Answers of `ds.sweep` from a join are given per design, from the spec of each design.
     dim
-        Name of that dimension.
+        Name of the new dimension of a join.
 
     Returns
     -------
     xarray.Dataset
-        Its coordinate `study_id` is the id of the study. With the marker, a coordinate named by
-        that id, it proves to `ds.sweep` that a part of the dataset is of one study. Its
-        attributes are the store's and: `started`, `finished` (UTC; empty where there is nothing to
-        tell), `points`, `points_committed`, `blocks` and `blocks_committed`.
+        Dataset with the scalar coordinate `study_id`, the id of the study. A marker coordinate,
+        which
+        has the id in its name, proves to `ds.sweep` that a part of the dataset comes from one
+        study.
+        Its attributes are those of the store, and `started` and `finished` (UTC; empty if not
+        known), `points`, `points_committed`, `blocks` and `blocks_committed`.
 
     Raises
     ------
     NotAStoreError
-        Where there is no store of a study, or one whose coordinates are lost or damaged.
+        The path has no store of a study, or a store whose coordinates are lost or damaged.
     StoreReplacedError
-        Later, where values are read that are not read yet, and another study's store is in the
-        place by then: the store was extended, or run anew.
+        Raised when values are read later, if the store was extended or replaced after it was
+        opened.
     ValueError
-        Studies that can't be joined: `dim` is taken, one comes twice, or zipped axes differ.
+        The studies can't be joined: `dim` is taken, a study occurs twice, or zipped axes differ.
 
     Examples
     --------
@@ -123,7 +130,7 @@ def open(
 
 
 def _name_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
-    """Return datasets by the titles of their studies, with the ids of those that share a title."""
+    """Return datasets by the titles of their studies; equal titles are followed by the study id."""
     titles = [str(dataset.attrs["title"]) for dataset in datasets]
     dataset_by_name = {
         comparison.title_with_id(dataset) if titles.count(title) > 1 else title: dataset
@@ -137,7 +144,7 @@ def _name_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
 
 
 def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
-    """Load coordinates, words as numpy's own type of text, which xarray plots and writes."""
+    """Load coordinates into memory; text becomes NumPy strings, which xarray plots and writes."""
     loaded = {name: array.compute() for name, array in dataset.coords.items()}
     return dataset.assign_coords({
         name: array.copy(data=np.array(array.values.tolist(), str))
@@ -147,7 +154,7 @@ def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
-    """Return a dataset with its study's id and marker as coordinates, and flat attributes."""
+    """Return a dataset with the study's id and marker as coordinates, and flat attributes."""
     id_attributes = {"long_name": "id of the study"}
     marker_attributes = {
         "long_name": "marker of the study, which shows where another's points join"
@@ -160,40 +167,44 @@ def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
 
 
 def open_scene(path: str | Location) -> xr.DataTree:
-    """Open the store of a scene's point clouds as a tree: a group for each scanner.
+    """Open the store of a flight's point clouds as a tree with a group for each scanner.
 
-    Arrays are read when they are needed, as Dask arrays in the chunks of the store. Values not
-    computed yet are nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
+    Arrays are read lazily, as Dask arrays in the chunks of the store. Values that are not computed
+    yet are nan, -1 for numbers of beams, surfaces and cycles, and 0 for flags.
 
     Parameters
     ----------
     path
-        The store, complete or not.
+        Store, complete or not.
 
     Returns
     -------
     xarray.DataTree
-        Its attributes are the store's and: `started`, `finished` (UTC; empty where there is
-        nothing to tell), `points`, `points_committed` (shots times draws), `blocks` and
+        Tree whose attributes are those of the store, and `started` and `finished` (UTC; empty if
+        not
+        known), `points` and `points_committed` (shots times draws), `blocks` and
         `blocks_committed`.
 
     Raises
     ------
     NotAStoreError
-        Where there is no store of a scene.
+        The path has no store of a scene.
     """
     return open_tree(parse_location(path), chunks={})
 
 
 def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
-    """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
+    """Open a scene's store as :func:`open_scene` does, with the given Dask chunks.
+
+    With ``chunks=None`` arrays are NumPy-backed, and read when they are sliced.
+    """
     attributes = read_attributes_of_kind(store_path, SCENE_KIND)
     refuse_lost_coordinates(store_path)
     store = open_verified_store(store_path, attributes["study_id"])
     whole_tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **OPEN_ZARR_KWARGS)
     groups = {name: group.to_dataset(inherit=False) for name, group in whole_tree.children.items()}
     root = whole_tree.to_dataset()
-    if _OLD_MAP_NAMES.keys() <= root.variables.keys():  # where earlier versions have it
+    if _OLD_MAP_NAMES.keys() <= root.variables.keys():  # a store of an earlier version
         groups[MAP_GROUP] = root[list(_OLD_MAP_NAMES)].rename(_OLD_MAP_NAMES)
         root = root.drop_vars(list(_OLD_MAP_NAMES))
     for name in attributes["scanners"]:
@@ -210,30 +221,33 @@ def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.
 
 
 _OLD_MAP_NAMES = {"map_x": "x", "map_y": "y", "map_height": "height"}
-"""Names of the scene's map in the root of stores of earlier versions, and in its group."""
+"""Map variables in the root of stores of earlier versions, with their names in the map's group."""
 
 
 def _count_chunks(array: xr.DataArray) -> int:
-    """Return the number of chunks that an array is stored in."""
+    """Return the number of chunks in which an array is stored."""
     return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
 
 
 def chunk_length(array: xr.DataArray, dim: str) -> int:
-    """Length along a dimension of the chunks that an array is stored in."""
+    """Return the length of an array's stored chunks along a dimension."""
     return int(array.encoding.get("preferred_chunks", {}).get(dim, array.sizes[dim]))
 
 
 def read_slices(
     array: xr.DataArray, dim: str, slice_length_max: int = SHOTS_PER_READ
 ) -> list[slice]:
-    """Slices along a dimension: whole chunks of the array in each, and few of them."""
+    """Return slices along a dimension, each of whole stored chunks and up to a largest length."""
     length, stored_chunk = array.sizes[dim], chunk_length(array, dim)
     step = stored_chunk * max(1, slice_length_max // stored_chunk)
     return [slice(start, min(start + step, length)) for start in range(0, length, step)]
 
 
 def refuse_lost_coordinates(store_path: Location) -> None:
-    """Refuse a store whose coordinates are lost or changed; of a lost one Zarr reads zeros."""
+    """Raise NotAStoreError if coordinates of a store are lost or changed.
+
+    Zarr would read the values of a lost coordinate as zeros.
+    """
     document = store_format.read_root_metadata(store_path)
     nodes = {"": document, **document["consolidated_metadata"]["metadata"]}
     coordinate_paths = set()
@@ -257,7 +271,10 @@ def refuse_lost_coordinates(store_path: Location) -> None:
 
 
 def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, Any]:
-    """Attributes of a store, which must hold a ``grid`` or a ``scene`` where that is asked for."""
+    """Return the attributes of a store; raise NotAStoreError unless it is of the given kind.
+
+    ``kind``: ``grid``, ``scene`` or ``accuracy``; empty for any kind.
+    """
     attributes = store_format.read_attributes(store_path)
     if kind and attributes["kind"] != kind:
         raise NotAStoreError(f"{store_path} holds {_DESCRIPTION_BY_KIND[attributes['kind']]}")
@@ -265,9 +282,10 @@ def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, A
 
 
 def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
-    """Arrays as Dask arrays, in pieces of whole stored chunks of no more than `PIECE` values.
+    """Return a dataset of Dask arrays in chunks of at most `VALUES_PER_READ` values.
 
-    A piece grows along the last dimension first, in which values lie next to each other.
+    A chunk consists of whole stored chunks. It grows first along the last dimension, along which
+    values are adjacent in the files.
     """
     largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
     chunk_sizes = dict(zip(largest_array.dims, largest_array.encoding["chunks"], strict=True))
@@ -278,7 +296,7 @@ def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def sum_batches(dataset: xr.Dataset) -> xr.Dataset:
-    """Sum counts of draws over their batches; -1 if any of these is."""
+    """Sum counts of draws over their batches; the sum is -1 if any batch is not computed."""
     batched_counts = {
         name: array for name, array in dataset.data_vars.items() if BATCH_DIM in array.dims
     }
@@ -292,7 +310,7 @@ def sum_batches(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> dict[str, Any]:
-    """Return times and amount of what is committed of all points and blocks, as attributes."""
+    """Return start and end time, and the committed numbers of points and blocks, as attributes."""
     receipts = read_receipt_totals(store_path, n_blocks)
     sessions = iter_records(store_path / JOURNAL_DIR / "sessions.jsonl")
     start_times = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
@@ -316,9 +334,9 @@ def _format_utc(time: float) -> str:
 def _as_accessor_method(
     answer: Callable[..., Any], *, require_axes: bool = False
 ) -> Callable[..., Any]:
-    """Return a function of a dataset as a method, with its words and arguments.
+    """Return a function of a dataset as an accessor method with the same docstring and signature.
 
-    The dataset has to prove that it is one study's; of a join of several the method answers per
+    The method checks that the dataset comes from one study. For a join of studies it answers per
     design. ``require_axes``: the answer needs the coordinates of all axes.
     """
 
@@ -336,9 +354,9 @@ def _as_accessor_method(
 
 @xr.register_dataset_accessor("sweep")
 class SweepAccessor:
-    """Answers from a dataset of `sweep.open`, or a part of one.
+    """Answers from a dataset of `sweep.open`, or from a selection of one.
 
-    All but `roc` and `contour` are lazy: `.compute()` works them out.
+    All answers except `roc` and `contour` are lazy: `.compute()` evaluates them.
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
@@ -346,15 +364,15 @@ class SweepAccessor:
 
     @property
     def spec(self) -> GridSpec:
-        """The study."""
+        """Spec of the study."""
         return dataset_lookup.grid_spec_of_dataset(
             provenance.check_single_study(self._dataset, require_axes=False)
         )
 
     def sel(self, *, method: str | None = None, **coordinates: Any) -> xr.Dataset:
-        """Points by physical value: ``ds.sweep.sel(range="2 km", grazing_angle="20 deg")``.
+        """Select points by physical value: ``ds.sweep.sel(range="2 km", grazing_angle="20 deg")``.
 
-        Values, and what is raised, are those of :func:`.dataset_lookup.select_points`.
+        Accepted values, and errors, are described in :func:`.dataset_lookup.select_points`.
         """
         return dataset_lookup.select_points(self._dataset, coordinates, method=method)
 
@@ -378,17 +396,17 @@ class SweepAccessor:
 
 @xr.register_datatree_accessor("sweep")
 class FlightAccessor:
-    """Answers from a tree of `sweep.open_scene`, lazy but for the matching of shots."""
+    """Answers from a tree of `sweep.open_scene`; all but the matching of shots are lazy."""
 
     def __init__(self, tree: xr.DataTree) -> None:
         self._tree = tree
 
     @property
     def spec(self) -> GridSpec | SceneSpec:
-        """The study."""
+        """Spec of the study."""
         return dataset_lookup.spec_of_dataset(self._tree)
 
     @wraps(comparison.compare_flights)
     def compare(self, other: xr.DataTree) -> xr.DataTree:
-        """Compare two flights; as :func:`.comparison.compare_flights`."""
+        """Compare two flights as :func:`.comparison.compare_flights` does."""
         return comparison.compare_flights(self._tree, other)

@@ -1,4 +1,4 @@
-"""Words and units for axes, legends and captions."""
+"""Text for axes, legends, tables and captions: names, numbers, and units."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from sweep.messages import counted as counted
 
 KILOMETRES_FROM = 1000.0
-"""Median of distances [m] from which on they are shown in km."""
+"""Median distance [m] above which distances are shown in km."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
 _UNITLESS = ("", "1")
@@ -20,7 +20,10 @@ _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:
-    """Factor and units in which a reader wants values: long distances in km, angles in degrees."""
+    """Return the display units of values, and the factor to convert to them.
+
+    Long distances are shown in km, angles in radians as degrees.
+    """
     if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRES_FROM:
         return 1e-3, "km"
     if units == "rad":
@@ -29,12 +32,12 @@ def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str
 
 
 def axis_label(name: str, units: str) -> str:
-    """Name of an axis with its units: ``range (km)``."""
+    """Return the label of an axis: its name with units, ``range (km)``."""
     return name if units in _UNITLESS else f"{name} ({_SYMBOL_BY_UNIT.get(units, units)})"
 
 
 def column_label(name: str, units: str) -> str:
-    """Name of a column with its units as stores have them: ``range [m]``."""
+    """Return the label of a table column: its name with units as in stores, ``range [m]``."""
     return name if units in _UNITLESS else f"{name} [{units}]"
 
 
@@ -48,7 +51,7 @@ def format_quantity(value: object, units: str = "") -> str:
 
 
 def format_coordinate_value(name: str, value: object, units: str = "") -> str:
-    """Return a coordinate with a value of it: ``grazing angle 15°``."""
+    """Return the name of a coordinate with a value: ``grazing angle 15°``."""
     return f"{coordinate_label(name)} {format_quantity(value, units)}"
 
 
@@ -61,29 +64,29 @@ def format_with_prefix(value: float, units: str) -> str:
 
 
 def format_number(value: float) -> str:
-    """Return a number in few digits; large powers of two as such."""
+    """Return a number with up to six digits; powers of two from 1024 as ``2^n``."""
     if value >= 1024 and value == int(value) and int(value).bit_count() == 1:
         return f"2^{int(math.log2(value))}"
     return f"{value:.6g}"
 
 
 def coordinate_label(name: str) -> str:
-    """Return a coordinate's name in words."""
+    """Return the name of a coordinate as words: ``grazing angle``."""
     return {"tnr": "TNR", "fft_size": "FFT size"}.get(name, name.replace("_", " "))
 
 
 def join_sentences(phrases: list[str]) -> str:
-    """Parts of a caption as sentences, empty ones left out."""
+    """Join phrases as sentences; skip empty phrases."""
     return " ".join(part[0].upper() + part[1:].rstrip(".") + "." for part in phrases if part)
 
 
 def is_categorical(values: np.ndarray) -> bool:
-    """Tell whether a coordinate's values are words."""
+    """Tell whether the values of a coordinate are words, not numbers."""
     return values.dtype.kind not in "fiu"
 
 
 def describe_extent(values: np.ndarray) -> str:
-    """Lowest, median and highest of values."""
+    """Return the lowest, median and highest finite value as text."""
     finite_values = values[np.isfinite(values)]
     if not finite_values.size:
         return "no value is known"
@@ -92,7 +95,7 @@ def describe_extent(values: np.ndarray) -> str:
 
 
 def source_note(attributes: Mapping[Any, Any], counted_unit: str) -> str:
-    """Words at a picture's foot: its study, and how much of that is computed."""
+    """Return the source note of a picture: study, model version, and progress if incomplete."""
     note = (
         f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
         f"model {attributes['model_version']}"

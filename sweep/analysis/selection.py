@@ -1,7 +1,7 @@
-"""Points of a study, as all combinations of some places along each of its axes; cuts through it.
+"""Selections of a study's points by index along each axis, their statistics, and published cuts.
 
-Chosen are places along axes: nothing of the arrays is read before their values are asked for.
-Arrays of any size are reduced to as many cells as a picture or a page can hold, chunk by chunk.
+A selection stores indices along axes. Arrays are read only when values are requested. Large arrays
+are reduced, chunk by chunk, to the number of cells that a figure or a page can show.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
 
 VALUES_PER_SUM = 2**20
-"""Values that are added up at a time."""
+"""Number of values that are summed at once."""
 
 
 @dataclass(frozen=True)
 class SortedCoordinate:
-    """A dimension as a figure runs along it: places in rising order of a coordinate's values."""
+    """Dimension of a figure: its indices in rising order of a coordinate's values."""
 
     dim: str
     indices: np.ndarray
     values: np.ndarray
 
     def points_per_cell(self, cells_max: int) -> int:
-        """Return the number of neighbours in a cell, so that there are `most` cells or fewer."""
+        """Return the number of adjacent points per cell that gives at most ``cells_max`` cells."""
         return 1 if labels.is_categorical(self.values) else -(-self.values.size // cells_max)
 
     def cell_means(self, cells_max: int) -> np.ndarray:
-        """Mean value of the coordinate in each cell."""
+        """Return the mean value of the coordinate in each cell."""
         cell_size = self.points_per_cell(cells_max)
         if cell_size == 1:
             return self.values
@@ -52,15 +52,16 @@ class SortedCoordinate:
 
 
 def to_float_with_nan(array: xr.DataArray) -> xr.DataArray:
-    """Return an array as floats; nan where a count is not made yet."""
+    """Return an array as floats; missing counts, which are negative, become nan."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
 @dataclass(frozen=True)
 class PointSelection:
-    """Points of a dataset: all combinations of some places along its dimensions.
+    """Selection of points of a dataset: all combinations of selected indices along its dimensions.
 
-    Places are rows of their dimension's table: their number, and the coordinates there.
+    ``dim_tables`` has a table for each dimension. Its rows are the selected indices, its columns
+    the coordinates along the dimension.
     """
 
     dataset: xr.Dataset
@@ -68,7 +69,7 @@ class PointSelection:
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> PointSelection:
-        """All points of a dataset."""
+        """Return the selection of all points of a dataset."""
         largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
         columns_by_dim: dict[str, dict[str, np.ndarray]] = {
             str(dim): {} for dim in largest_array.dims
@@ -84,45 +85,45 @@ class PointSelection:
 
     @property
     def size(self) -> int:
-        """Number of points."""
+        """Number of selected points."""
         return math.prod(map(len, self.dim_tables.values()))
 
     def dim_of(self, name: str) -> str:
-        """Return the dimension of a coordinate; a zipped axis, which is none, is its own."""
+        """Return the dimension of a coordinate, or the name itself if it is a zipped axis."""
         return next((dim for dim, table in self.dim_tables.items() if name in table), name)
 
     def coordinate_values(self, name: str) -> np.ndarray:
-        """Return a coordinate, or the number of the place, at each place along its dimension."""
+        """Return the values of a coordinate along its dimension, or the indices if it has none."""
         table = self.dim_tables[self.dim_of(name)]
         return np.asarray(table.get(name, table.index))
 
     def coordinate_units(self, name: str) -> str:
-        """Units of a coordinate."""
+        """Return the units of a coordinate."""
         coordinate = self.dataset.coords.get(name)
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
     def isel(self, dim: str, indices: np.ndarray) -> PointSelection:
-        """Points at some of the places along a dimension, by their indices or a mask."""
+        """Return the selection restricted to positions, or a mask, along a dimension."""
         return replace(
             self, dim_tables={**self.dim_tables, dim: self.dim_tables[dim].iloc[indices]}
         )
 
     def sel(self, name: str, values: list[object]) -> PointSelection:
-        """Points at which a coordinate has one of the values."""
+        """Return the points at which a coordinate has one of the values."""
         return self.isel(self.dim_of(name), matches_any(self.coordinate_values(name), values))
 
     def drop_duplicates(self) -> PointSelection:
-        """Points without repetition of all their coordinates."""
+        """Return the selection without rows that repeat all coordinates of their dimension."""
         tables = {dim: table.drop_duplicates() if len(table.columns) else table
                   for dim, table in self.dim_tables.items()}  # fmt: skip
         return replace(self, dim_tables=tables)
 
     def unique_values(self, name: str) -> list[object]:
-        """Values of a coordinate, in the order in which they first appear."""
+        """Return the values of a coordinate, in the order in which they first appear."""
         return list(pandas.unique(self.coordinate_values(name)))
 
     def varying_coordinates(self) -> list[str]:
-        """Coordinates with more than one value."""
+        """Return the names of coordinates with more than one value."""
         return [
             n
             for table in self.dim_tables.values()
@@ -131,11 +132,11 @@ class PointSelection:
         ]
 
     def distinguishing_coordinates(self, names: Sequence[str]) -> list[str]:
-        """Coordinates that tell points apart which those named leave together, the fewest."""
+        """Return the fewest other coordinates needed to distinguish points of equal ``names``."""
         return [name for dim in self.dim_tables for name in self.distinguishing_along(dim, names)]
 
     def distinguishing_along(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Those of :meth:`distinguishing_coordinates` that lie along a dimension."""
+        """Return :meth:`distinguishing_coordinates` restricted to one dimension."""
         table = self.dim_tables[dim]
         given_names = [name for name in names if name in table]
         distinguishing: list[str] = []
@@ -148,7 +149,7 @@ class PointSelection:
         return distinguishing
 
     def group_by(self, name: str) -> list[tuple[object, PointSelection]]:
-        """Points of each value of a coordinate, in the order in which the values first appear."""
+        """Return the points of each value of a coordinate, in the order of first appearance."""
         dim = self.dim_of(name)
         groups = self.dim_tables[dim].groupby(
             self.coordinate_values(name), sort=False, dropna=False
@@ -159,7 +160,10 @@ class PointSelection:
         ]
 
     def sorted_coordinate(self, name: str) -> SortedCoordinate:
-        """Places along a coordinate, once a value: numbers rising, words as they appear."""
+        """Return a coordinate's unique values, with an index of each.
+
+        Numbers are sorted in rising order, words in the order of first appearance.
+        """
         values, first_rows = np.unique(self.coordinate_values(name), return_index=True)
         if labels.is_categorical(values):
             order = np.argsort(first_rows)
@@ -168,7 +172,7 @@ class PointSelection:
         return SortedCoordinate(dim, np.asarray(self.dim_tables[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
-        """Return the first place along every dimension but those of some sides."""
+        """Return the first selected index along every dimension except those of the coordinates."""
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])
@@ -179,10 +183,11 @@ class PointSelection:
     def coarsen(
         self, variable: str, coordinates: Sequence[tuple[SortedCoordinate, int]], statistic: str
     ) -> xr.DataArray:
-        """Return a variable in cells along some sides, at the first place along the others; lazy.
+        """Return a variable reduced to cells along some coordinates, lazily.
 
-        Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
-        ``highest``.
+        ``coordinates`` are pairs of a coordinate and its largest number of cells. ``statistic`` is
+        ``mean``, ``lowest`` or ``highest``. Along other dimensions the first selected index is
+        taken.
         """
         array = self.dataset[variable].isel(
             self.first_indices(*(coordinate for coordinate, _ in coordinates))
@@ -204,7 +209,7 @@ class PointSelection:
 
 
 def matches_any(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
-    """Mask of the values that are among those wanted, to the last digits of a float."""
+    """Return a mask of the values that match a wanted value; floats to a relative 1e-9."""
     if values.dtype.kind not in "fiu":
         return np.isin([str(v) for v in values], [str(w) for w in wanted_values])
     matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted_values]  # type: ignore[arg-type]
@@ -214,7 +219,7 @@ def matches_any(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
 def select_where(
     points: PointSelection, spec: GridSpec, where: Mapping[str, object]
 ) -> PointSelection:
-    """Points at which coordinates have one of some values, as written in the study."""
+    """Return the points at which coordinates have given values, written as in the spec."""
     for name, raw_value in where.items():
         wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
         if name in points.dataset.coords:
@@ -226,7 +231,10 @@ def select_where(
 def split_by_coordinates(
     points: PointSelection, names: Sequence[str], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Points apart by the values of coordinates, in words; and the number of parts left out."""
+    """Split points by the values of coordinates, and name each part.
+
+    Return at most ``parts_max`` parts, evenly spread, and the number of omitted parts.
+    """
     parts = [("", points)]
     for name in names:
         units = points.coordinate_units(name)
@@ -246,7 +254,7 @@ def split_by_coordinates(
 def thin_evenly(
     parts: list[tuple[str, PointSelection]], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """At most so many parts, spread over all, and the number of those left out."""
+    """Return at most ``parts_max`` of the parts, evenly spread, and the number of omitted parts."""
     if len(parts) <= parts_max:
         return parts, 0
     return [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)], len(
@@ -255,12 +263,12 @@ def thin_evenly(
 
 
 def find_axis_parameter(spec: GridSpec, path: str) -> AxisParameter | None:
-    """Return the parameter of a path where it is on an axis."""
+    """Return the axis parameter of a path, or None if it is not on an axis."""
     return next((m for axis in spec.axes for m in axis.parameters if m.path == path), None)
 
 
 def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -> dict[str, Any]:
-    """SI values of all parameters at a position along the axes, by dotted path."""
+    """Return the SI values of all parameters at a position along the axes, by dotted path."""
     return dict(spec.parameters()) | {
         axis_parameter.path: np.asarray(axis_parameter.values)[axis_indices[axis.name]].item()
         for axis in spec.axes
@@ -275,12 +283,15 @@ PUBLISHED_CUTS = (
     (RANGE_PATH, "3500 m"),
 )
 MEAN_RANGE_MIN = "5 m"
-"""Nearer ranges are left out of means: there the echo's own shot noise counts [T 4.2]."""
+"""Range below which points are excluded from means: the echo's own shot noise matters [T 4.2]."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """One coordinate at a value, the other along the cut; both empty for a whole study."""
+    """Cut through a study: one coordinate fixed at a value, the other varying.
+
+    All names are empty for the cut that is the complete study.
+    """
 
     name: str
     fixed_name: str
@@ -288,7 +299,7 @@ class Cut:
     varying_name: str
 
     def select_from(self, points: PointSelection) -> PointSelection:
-        """Points of the cut, each once."""
+        """Return the points of the cut without duplicates."""
         return (
             points.sel(self.fixed_name, [self.fixed_value]).drop_duplicates()
             if self.fixed_name
@@ -297,7 +308,11 @@ class Cut:
 
 
 def study_cuts(spec: GridSpec) -> list[Cut]:
-    """Cuts of a study's zipped axis through range and angle; else the published three; else all."""
+    """Return the cuts through range and grazing angle of a study.
+
+    A zipped axis of both defines its cuts. Otherwise they are the three published cuts, or one cut
+    that is the complete study.
+    """
     range_parameter, angle_parameter = (
         find_axis_parameter(spec, RANGE_PATH),
         find_axis_parameter(spec, GRAZING_ANGLE_PATH),
@@ -345,7 +360,10 @@ def study_cuts(spec: GridSpec) -> list[Cut]:
 
 
 def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
-    """Stretches of a zipped axis in which one parameter stays and another varies, in order."""
+    """Return runs of a zipped axis in which one parameter is constant, in order.
+
+    Each run is the constant parameter with its value.
+    """
     axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
     runs: list[tuple[AxisParameter, object]] = []
     run_start = 0
@@ -369,7 +387,7 @@ def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
 def select_beyond(
     points: PointSelection, spec: GridSpec, distance: str, *, inclusive: bool = False
 ) -> PointSelection:
-    """Points farther than a distance (or at it), where range is on an axis."""
+    """Return the points beyond a range, or at it with ``inclusive``, if range is on an axis."""
     range_parameter = find_axis_parameter(spec, RANGE_PATH)
     if range_parameter is None:
         return points
@@ -383,7 +401,7 @@ def select_beyond(
 
 @dataclass(frozen=True)
 class Statistics:
-    """Number of the finite values of some points; their mean, median and extremes, nan of none."""
+    """Statistics of the finite values of points; nan if there are none."""
 
     n_finite: int
     mean: float
@@ -393,11 +411,11 @@ class Statistics:
 
     @classmethod
     def from_values(cls, values: np.ndarray) -> Statistics:
-        """Return those of values without infinity, which are sorted in place."""
+        """Return the statistics of values, nan or finite; the values are sorted in place."""
         total = sum(
             np.nansum(part) for part in np.array_split(values, values.size // VALUES_PER_SUM + 1)
         )
-        values.sort()  # nan comes last
+        values.sort()  # nan is sorted to the end
         n_finite = int(np.searchsorted(values, np.nan))
         if not n_finite:
             return cls(0, *[math.nan] * 4)
@@ -408,7 +426,7 @@ class Statistics:
 
 
 def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[Statistics]:
-    """Statistics of a variable over the points of each group, read once for all of them."""
+    """Return the statistics of a variable over the points of each group, in one reading pass."""
     indices_by_group = [
         {dim: np.asarray(table.index) for dim, table in g.dim_tables.items()} for g in groups
     ]
@@ -416,7 +434,7 @@ def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[
         to_float_with_nan(g.dataset[variable].isel(group_indices))
         for g, group_indices in zip(groups, indices_by_group, strict=True)
     ]
-    with TemporaryFile() as file:  # which holds the values, as memory may not
+    with TemporaryFile() as file:  # the values may exceed the memory
         sizes = [array.size for array in arrays]
         buffer = np.memmap(file, float, "w+", shape=(sum(sizes) + 1,)).view(np.ndarray)
         group_buffers = np.split(buffer, np.cumsum(sizes))[:-1]

@@ -1,4 +1,4 @@
-"""One shot of a grid or of a scene: spectra with what is detected in them, drawn and told."""
+"""Spectra of a single shot, of a grid or of a scene, with its detections, as figure and report."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SEGMENT_NAMES = ("up-chirp", "Doppler", "down-chirp")
 
 @dataclass(frozen=True)
 class BinGroup:
-    """Places of adjacent bins above the threshold: the first, the last, and the strongest."""
+    """Indices of adjacent bins above the threshold: first, last, and strongest bin."""
 
     first_index: int
     last_index: int
@@ -47,12 +47,11 @@ class BinGroup:
 
 @dataclass(frozen=True)
 class SegmentSpectrum:
-    """Spectrum of a segment and what is found in it.
+    """Spectrum of a segment, with its detections.
 
-    Bins are in the order of their frequencies, those of a complex record with signs. Frequencies
-    and carrier are in Hz; |X| of each bin in V, of the signal alone, and with noise
-    where that is drawn. The SNR and the probability of detection are those of the strongest
-    bin.
+    Bins are sorted by frequency; a complex record has negative ones too. Frequencies and carrier
+    are in Hz. ``signal_magnitude`` is |X| of the signal alone and ``magnitude`` is |X| with noise,
+    if it is drawn, both in V. ``snr`` and ``pd`` are those of the strongest bin.
     """
 
     name: str
@@ -69,13 +68,13 @@ class SegmentSpectrum:
 
     @property
     def peak_index(self) -> int:
-        """Place of the strongest bin."""
+        """Index of the strongest bin."""
         return int(np.argmax(self.magnitude))
 
 
 @dataclass(frozen=True)
 class SimulatedShot:
-    """One shot: its parameters, levels, spectra, and what it reports."""
+    """Simulated shot: parameters, prepared shot, spectra, and reported range and velocity."""
 
     label: str
     parameters: Parameters
@@ -87,7 +86,7 @@ class SimulatedShot:
 
     @property
     def bin_deviation(self) -> float:
-        """Noise of a bin, per quadrature [V]."""
+        """Standard deviation of a bin's noise, per quadrature [V]."""
         return float(self.prepared_shot.bin_noise_sigma[0])
 
     @property
@@ -101,13 +100,13 @@ class SimulatedShot:
         return float(np.sqrt(2)) * self.bin_deviation
 
     def to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
-        """|X| as the amplitude of a tone that would give it, in dB above 1 V."""
+        """Return the amplitude of a tone with magnitude |X|, in dB relative to 1 V."""
         with np.errstate(divide="ignore"):
             return 20 * np.log10(2 * np.asarray(magnitude) / self.prepared_shot.window.sum)
 
     @property
     def is_detected(self) -> bool:
-        """Tell whether the segments that detect a shot have a group."""
+        """True if the segments that decide about a shot have groups of bins above the threshold."""
         if self.prepared_shot.any_two:
             return sum(bool(segment.bin_groups) for segment in self.segments) >= 2
         return all(
@@ -122,7 +121,7 @@ def simulate_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """One shot on a flat plane."""
+    """Simulate one shot at a flat target; with a seed, noise is drawn."""
     ((_, prepared_shot),) = prepare_shots(parameters, effects)
     return simulate_prepared_shot(prepared_shot, parameters, label=label, seed=seed)
 
@@ -134,7 +133,7 @@ def simulate_prepared_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """One shot that is prepared already, whatever it looks at."""
+    """Simulate one prepared shot, of a grid or a scene; with a seed, noise is drawn."""
     segment_results = shot_model.evaluate_segments(prepared_shot)
     segments = tuple(
         _segment_spectrum(prepared_shot, segment_results[k, :, 0], k, seed)
@@ -215,9 +214,10 @@ def _segment_spectrum(
 def draw_noise_spectrum(
     prepared_shot: shot_model.Shots, *, seed: int, segment: int, look: int = 0
 ) -> np.ndarray:
-    """Noise of a look's windowed record, spectrum (N/2 + 1,) [V]; (N,) of a complex record.
+    """Draw the noise spectrum of one look's windowed record [V].
 
-    It is added to the signal's |X|, whose phase from bin to bin is lost.
+    The spectrum is (N/2 + 1,) for a real and (N,) for a complex record. It is added to |X| of the
+    signal, which does not keep the phase between bins.
     """
     window_shape = prepared_shot.window
     spawn_key = (segment, look) if look else (segment,)
@@ -245,7 +245,10 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
 def range_or_velocity_at(
     shot: SimulatedShot, segment: SegmentSpectrum, frequency: np.ndarray
 ) -> np.ndarray:
-    """Range [m] or velocity [m/s] that a frequency seen in a segment stands for near its beat."""
+    """Return the range [m], or for the Doppler segment the velocity [m/s], at observed frequencies.
+
+    Frequencies are unfolded as the segment's beat frequency is.
+    """
     prepared_shot = shot.prepared_shot
     sample_rate = float(prepared_shot.sample_rate[0])
     fold_frequency = np.rint(segment.beat_frequency / sample_rate) * sample_rate
@@ -267,22 +270,22 @@ SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
     "black",
 )
 MARGIN_BELOW_DB, MARGIN_ABOVE_DB = 25.0, 12.0
-"""Decibels shown below the noise level, and above the strongest bin."""
+"""Margins of the plot below the noise level and above the strongest bin [dB]."""
 
 VIEW_HALF_WIDTH_MIN_BINS = 12
-"""Least half-width of the view around the peak, in bins."""
+"""Least half-width of the view around the peak [bins]."""
 
 VIEW_MARGIN_MIN_BINS = 8
-"""Bins shown beside the outermost detections, at least."""
+"""Least margin of the view around the outermost detections [bins]."""
 
 NEAR_DETECTION_BAND_FRACTION = 0.05
-"""Distance from the strongest peak up to which detections are in the same view, of the band."""
+"""Largest distance of a detection from the strongest peak in a view, as a fraction of the band."""
 
 
 def draw_spectra_sheet(
     shots: Sequence[SimulatedShot], *, title: str, footnote: str, shows_detections: bool = False
 ) -> Sheet:
-    """Spectra of shots side by side: a row a segment, the whole band and around the peak."""
+    """Return a sheet of spectra: a row per segment; for each shot the full band and the peak."""
     n_rows, n_columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
     sheet, axes = canvas.sheet_with_axes(width * n_columns, 3.1 * n_rows + 1.2, n_rows, n_columns)
@@ -321,7 +324,7 @@ def draw_spectra_sheet(
 
 
 def _decibel_limits(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
-    """Decibels that show all of the noise and of the peaks."""
+    """Return the limits of a level axis that shows noise and peaks of all shots [dB]."""
     low = min(float(shot.to_dbv(shot.noise_rms)) for shot in shots) - MARGIN_BELOW_DB
     high = max(
         float(shot.to_dbv(max(segment.magnitude.max(), shot.threshold)))
@@ -334,7 +337,7 @@ def _decibel_limits(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
 def _draw_spectrum(
     axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum, view: slice, line_width: float
 ) -> None:
-    """Spectrum, threshold, noise level and detections."""
+    """Draw spectrum, threshold, noise level and detections of a view."""
     frequency_mhz = segment.frequency[view] / 1e6
     level_db = np.maximum(shot.to_dbv(segment.magnitude[view]), -500.0)
     marker = "." if frequency_mhz.size <= 200 else ""
@@ -367,7 +370,7 @@ def _draw_spectrum(
 
 
 def _annotate(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None:
-    """Signal-to-noise ratio and pd in a corner, range or velocity of the frequencies on top."""
+    """Annotate SNR and pd in a corner, and range or velocity on the top axis."""
     annotation_lines = (
         [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
     )
@@ -401,7 +404,7 @@ def _annotate(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None
 
 
 def peak_view(magnitude: np.ndarray) -> slice:
-    """Bins that show the peak and what spreads around it, down to a tenth of its height."""
+    """Return the slice of bins around the peak, down to a tenth of its height."""
     peak = int(np.argmax(magnitude))
     strong_bins = np.flatnonzero(magnitude >= 0.1 * magnitude[peak])
     nearby_bins = strong_bins[np.abs(strong_bins - peak) < magnitude.size // 8]
@@ -412,7 +415,7 @@ def peak_view(magnitude: np.ndarray) -> slice:
 
 
 def detection_view(segment: SegmentSpectrum) -> slice:
-    """Bins that show all detections near to the strongest peak, and what spreads around it."""
+    """Return the slice of bins around the peak that also contains all nearby detections."""
     view, n_bins = peak_view(segment.signal_magnitude), segment.signal_magnitude.size
     peak = int(np.argmax(segment.signal_magnitude))
     near_groups = [
@@ -441,7 +444,7 @@ def draw_scene_shot_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Spectra of a shot of a scene, and where its beamlets' lines are."""
+    """Return the spectra of a scene's shot, with marks at the lines of its beamlets."""
     notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
     sheet = draw_spectra_sheet(
         [shot], title=title, footnote=labels.join_sentences(notes), shows_detections=True
@@ -472,7 +475,7 @@ def draw_scene_shot_sheet(
 
 
 def _noise_table(shot: SimulatedShot) -> PageTable:
-    """Noise at the ADC by source, in volts and shares of the variance."""
+    """Return a table of the noise at the ADC by source, in volts and shares of the variance."""
     variance_by_source = {
         n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_variances.items()
     }
@@ -516,7 +519,7 @@ def _segment_table(shot: SimulatedShot) -> PageTable:
 
 
 def _measurement_table(shot: SimulatedShot) -> PageTable:
-    """Range and radial velocity: true, reported, and the error in the units of a bin."""
+    """Return a table of range and radial velocity: true, reported, and error."""
     prepared_shot = shot.prepared_shot
     rows = [
         (
@@ -551,7 +554,7 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
 
 
 DRAWN_VALUES_MAX = 3
-"""Values of a study's only axis up to which each is drawn."""
+"""Largest number of values of a study's only axis at which every value is drawn."""
 
 _DESCRIBED_PATHS = (
     "target.range",
@@ -578,11 +581,11 @@ def write_shot_report(
     seed: int = 0,
     picture_format: str = "png",
 ) -> tuple[str, list[Path]]:
-    """Spectra, threshold, noise level and detections of one shot: text, and the files written.
+    """Write spectra, threshold, noise level and detections of one shot; return text and files.
 
-    Parameters on an axis take the values in `at`, written with their units, or the first; a
-    study with a single axis of few values is drawn at each of them. SpecError for what can't be
-    read.
+    Parameters on an axis take the values in ``coordinate_values``, written with units, or else
+    their first value. If a study has a single axis of few values and none is given, all of them are
+    drawn. Raise SpecError for values that can't be read.
     """
     effect_modes = spec.effect_modes()
     effects = [e.name for e in EFFECTS if not e.is_random and effect_modes[e.name] != "off"]
@@ -614,7 +617,7 @@ def write_shot_report(
 def select_shot_parameters(
     spec: GridSpec, coordinate_values: Mapping[str, str]
 ) -> list[tuple[str, Parameters]]:
-    """Parameters of the shots to draw, each with its label."""
+    """Return the parameters of the shots to draw, each with its label."""
     axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
     path_by_name, rule_by_path = {m.coordinate: m.path for m in axis_parameters}, parameter_rules()
     names_by_path: dict[str, str] = {}
@@ -632,7 +635,7 @@ def select_shot_parameters(
         raw_values: dict[str, object] = {
             m.path: rule_by_path[m.path].format(m.values[i]) for m in axis_parameters
         }
-        # what is no coordinate is left for the spec to read, or to refuse
+        # Names that are no coordinates are passed on as paths: the spec reads or refuses them.
         raw_values |= {
             path_by_name.get(name, name): value for name, value in coordinate_values.items()
         }
@@ -647,16 +650,16 @@ def select_shot_parameters(
 
 
 def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Parameters as a user would write them, by name."""
+    """Return parameters by name, with values as a user would write them."""
     rule_by_path = parameter_rules()
     descriptions = []
     for path in paths:
         value = shot.parameters.get(path)
-        if value is None:  # the threshold is set otherwise
+        if value is None:  # another parameter sets the threshold
             continue
         if (
             path in (DIVERGENCE_PATH, WAIST_PATH) and value == 0
-        ):  # the beam is stated by the other one
+        ):  # the other parameter defines the beam
             continue
         if isinstance(value, str):
             value_text = value
@@ -669,7 +672,7 @@ def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tu
 
 
 def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
-    """Parameters that all shots share, in a line."""
+    """Return the parameters that all shots share, as one line of text."""
     descriptions = [_describe_parameters(shot, _DESCRIBED_PATHS) for shot in shots]
     return ", ".join(
         f"{name} {value_text}"
@@ -679,7 +682,7 @@ def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
 
 
 def _shot_tables(shots: list[SimulatedShot]) -> list[PageTable]:
-    """Tables of all shots, each under its label."""
+    """Return the tables of all shots, headed by their labels."""
     tables = []
     for shot in shots:
         prefix = f"{shot.label}: " if shot.label else ""

@@ -1,4 +1,4 @@
-"""All figures and tables of a study, of a grid or of a scene, as its spec asks for them."""
+"""Figures and tables of a study, of a grid or of a scene, as defined in its spec."""
 
 from __future__ import annotations
 
@@ -64,38 +64,38 @@ from sweep.spec.figure_sections import (
 from sweep.storage.locations import Location, output_dir, parse_location
 
 LONG_AXIS_VALUES_MIN = 8
-"""Values from which on an axis is worth a side of a surface."""
+"""Least number of values of an axis that can be a side of a surface."""
 
 DEFAULT_VARIABLES = ("pd_shot", "pd_doppler")
 
 
 @dataclass(frozen=True)
 class GridResults:
-    """A store opened, with the spec that it holds."""
+    """Opened store of a grid, with its spec."""
 
     dataset: xr.Dataset
     spec: GridSpec
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> GridResults:
-        """Return the study in a store."""
+        """Open the store of a grid."""
         dataset = open_store(store_path)
         return cls(dataset, GridSpec.from_stored(dataset.attrs["spec"]))
 
     @property
     def points(self) -> PointSelection:
-        """All points."""
+        """Selection of all points."""
         return PointSelection.from_dataset(self.dataset)
 
     @property
     def figure_specs(self) -> list[GridFigure]:
-        """The figures that it asks for; a usual set where it asks for none."""
+        """Figures that the spec defines, or a default set."""
         return list(self.spec.figures) or default_grid_figures(self.spec)
 
     def make_chart(
         self, figure_spec: SurfaceFigure | SlicesFigure, size_limits: charts.ChartSizeLimits
     ) -> charts.Chart | None:
-        """Return the chart of a figure, or None if no point is within its limits."""
+        """Return the chart of a figure, or None if no point matches its selection."""
         points = select_where(self.points, self.spec, figure_spec.where)
         if not points.size:
             return None
@@ -124,7 +124,7 @@ class GridResults:
     def make_page(
         self, figure_spec: TableFigure | FalseAlarmTable | ThresholdTable
     ) -> tables.TablePage:
-        """Tables of one that it asks for."""
+        """Return the page of a table."""
         title = figure_spec.title or self.spec.title
         if isinstance(figure_spec, TableFigure):
             units = str(self.dataset[figure_spec.variable].attrs.get("units", ""))
@@ -136,7 +136,7 @@ class GridResults:
         )
 
     def render_figure(self, figure_spec: GridFigure) -> canvas.Sheet | tables.TablePage | str:
-        """Return the sheet or the page of a figure; why there is none."""
+        """Return the sheet or the page of a figure, or a message why there is none."""
         if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
             return self.make_page(figure_spec)
         chart = self.make_chart(figure_spec, charts.SHEET_LIMITS)
@@ -150,7 +150,7 @@ class GridResults:
 
 
 def describe_selection(figure_spec: SurfaceFigure | SlicesFigure) -> str:
-    """Words for what a figure is confined to."""
+    """Return the selection of a figure in words."""
     return ", ".join(
         f"{labels.coordinate_label(name)} {value}"
         for name, value in figure_spec.where.items()
@@ -162,28 +162,28 @@ def describe_selection(figure_spec: SurfaceFigure | SlicesFigure) -> str:
 def draw_figures(
     store_path: str | Location, directory: str | Path | None = None, picture_format: str = "png"
 ) -> list[Path]:
-    """Every figure and table that the spec in a store asks for; a usual set where it asks for none.
+    """Draw every figure and table that the spec of a store defines, or a default set.
 
     Parameters
     ----------
     store_path
-        The store, complete or not.
+        Store, complete or not.
     directory
-        Where to; by default ``NAME-figures`` for ``NAME.zarr``, in the folder of the store, or
-        in this one for an object store.
+        Output directory. The default for ``NAME.zarr`` is ``NAME-figures``, next to the store, or
+        in the current directory for an object store.
     picture_format
         ``png``, ``pdf`` or ``svg``. The same store gives the same bytes.
 
     Returns
     -------
     list of Path
-        The files written: pictures of figures, TXT and CSV of tables.
+        Written files: pictures of figures, TXT and CSV of tables.
 
     Raises
     ------
     NotAStoreError
-        Where there is no store of a grid of points, of a scene or of what accuracy costs; or the
-        eyepoints that a figure needs are gone.
+        The path has no store of a grid, a scene or an accuracy measurement, or eyepoints that a
+        figure needs are missing.
     """
     store = parse_location(store_path)
     attributes = read_attributes_of_kind(store)
@@ -223,18 +223,19 @@ def draw_figures(
 
 
 def picture_source(study_id: str, figure_spec: GridFigure | SceneFigure) -> str:
-    """Words that tell whether a picture is of a study and a figure as these are now.
+    """Return a text that identifies the study and the figure of a picture.
 
-    The id of a study counts all that its results depend on, the model's version included.
+    The study id depends on everything that determines the results, including the model version.
     """
     spec_json = json.dumps(figure_spec.model_dump(mode="json"), sort_keys=True)
     return f"study {study_id}, figure {hashlib.sha256(spec_json.encode()).hexdigest()[:16]}"
 
 
 def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
-    """Surfaces where two axes are long; slices along a zipped or the longest axis.
+    """Return default figures: surfaces over two long axes, else slices along one axis.
 
-    Axes of words alone make slices, by category, and tables.
+    Slices run along a zipped or the longest axis. Axes of words alone make slices by category, and
+    tables.
     """
     zipped_axes = [axis for axis in spec.axes if axis.is_zipped][:1]
     axes = zipped_axes or sorted(spec.axes, key=lambda axis: -axis.size)
@@ -246,7 +247,7 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
     ]
     long_axes = [axis for axis, _ in numeric_parameters if axis.size >= LONG_AXIS_VALUES_MIN]
     if not zipped_axes and len(long_axes) >= 2:
-        # range and angle before others, and the angle up
+        # Prefer range and angle to other axes, with the angle as vertical axis.
         path_by_axis = {axis.name: axis.parameters[0].path for axis in long_axes}
         rank = {RANGE_PATH: 0, GRAZING_ANGLE_PATH: 1}
         axis_names = sorted(path_by_axis, key=lambda name: rank.get(path_by_axis[name], 2))[:2]
@@ -279,7 +280,10 @@ DEFAULT_CLOUD_COLOURS = ("range", "radial_velocity")
 
 
 def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
-    """Each scanner's cloud by range, with the flight path, and by velocity; navigation."""
+    """Return default figures: each scanner's cloud by range and by velocity, and navigation.
+
+    The cloud by range also shows the flight path.
+    """
     scanners = [str(name) for name in tree.attrs["scanners"]]
     figure_specs: list[SceneFigure] = [
         CloudFigure(kind="cloud", scanner=scanner, colour=colour, path=colour == "range")
@@ -296,7 +300,7 @@ def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
 
 @dataclass(frozen=True)
 class SceneResults:
-    """A store of point clouds opened, with the spec that it holds."""
+    """Opened store of point clouds, with its spec."""
 
     store_path: Location
     tree: xr.DataTree
@@ -304,7 +308,7 @@ class SceneResults:
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> SceneResults:
-        """Return the study in a store."""
+        """Open the store of a scene."""
         tree = open_tree(parse_location(store_path))
         return cls(parse_location(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
 
@@ -315,21 +319,21 @@ class SceneResults:
 
     @property
     def surface_labels(self) -> list[str]:
-        """Names of surfaces by number."""
+        """Display names of the surfaces, by number."""
         return [labels.coordinate_label(str(name)) for name in self.tree.attrs["surfaces"]]
 
     @property
     def source_note(self) -> str:
-        """Words at a picture's foot."""
+        """Source note for the caption of a picture."""
         return labels.source_note(self.tree.attrs, "blocks")
 
     @property
     def figure_specs(self) -> list[SceneFigure]:
-        """The figures that it asks for; a usual set where it asks for none."""
+        """Figures that the spec defines, or a default set."""
         return list(self.spec.figures) or default_scene_figures(self.tree)
 
     def render_figure(self, figure_spec: SceneFigure) -> canvas.Sheet | TablePage | str:
-        """Return the sheet or the page of a figure; why there is none."""
+        """Return the sheet or the page of a figure, or a message why there is none."""
         draw_by_type: dict[
             type, Callable[[SceneResults, Any, AxisPosition], canvas.Sheet | TablePage | str]
         ] = {
@@ -344,12 +348,12 @@ class SceneResults:
         )
 
     def figure_title(self, figure_spec: SceneFigure, default_title: str) -> str:
-        """Title of a figure."""
+        """Return the title of a figure, headed by that of the study."""
         return "\n".join([self.spec.title, figure_spec.title or default_title])
 
 
 SCATTER_POINTS_MAX = 200_000
-"""Points that a scatter still shows apart; more is thinned."""
+"""Largest number of points in a scatter plot; more are thinned."""
 
 NO_POINT_MESSAGE = "there is no point within the figure's limits"
 
@@ -365,7 +369,7 @@ def _figure_recording(
 def _picture_remarks(
     results: SceneResults, recording: Recording, axis_position: AxisPosition, figure_spec: Any
 ) -> list[str]:
-    """Scanner, ranges, draw and place of what is shown, as far as there is a choice."""
+    """Return scanner, ranges, draw and axis position of a picture, as far as there is a choice."""
     choice_texts = []
     if len(results.scanners) > 1:
         choice_texts.append(f"scanner {labels.coordinate_label(recording.scanner)}")

@@ -1,4 +1,4 @@
-"""Tables as text and as CSV: of any variable, and of false alarms as the thesis prints them."""
+"""Tables as text and CSV: of any variable, and of false alarms in the form of the thesis."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Cell = str | float | int
 
 @dataclass(frozen=True)
 class PageTable:
-    """One table of a page: a heading, the names of its columns, its rows."""
+    """Table of a page: heading, column names, and rows of cells."""
 
     heading: str
     columns: Sequence[str]
@@ -48,7 +48,7 @@ class PageTable:
 
 @dataclass(frozen=True)
 class TablePage:
-    """Tables under one title, with notes; and the same figures as records for a CSV file."""
+    """Page of tables with a title and notes; its records hold the same numbers for a CSV file."""
 
     title: str
     page_tables: Sequence[PageTable]
@@ -73,14 +73,14 @@ class TablePage:
 
 
 def format_cell(cell: Cell) -> str:
-    """Return a cell's text; nothing for nan."""
+    """Return the text of a cell; '-' for nan."""
     if isinstance(cell, float):
         return "-" if math.isnan(cell) else f"{cell:.5g}"
     return str(cell)
 
 
 def align_columns(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """Columns side by side: text to the left, numbers to the right."""
+    """Return rows as text with aligned columns: words to the left, numbers to the right."""
     cells = [list(columns), *([format_cell(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
     is_left_aligned = [not any(_is_numeric(row[i]) for row in rows) for i in range(len(columns))]
@@ -95,7 +95,7 @@ def align_columns(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str
 
 
 def _is_numeric(cell: Cell) -> bool:
-    """Tell whether a cell holds a number, as such or as text."""
+    """Tell whether a cell holds a number, or the text of one."""
     try:
         float(str(cell).removesuffix(" %").replace(",", ""))
     except ValueError:
@@ -106,7 +106,7 @@ def _is_numeric(cell: Cell) -> bool:
 def mean_table_page(
     points: PointSelection, spec: GridSpec, table_spec: TableSpec, units: str, title: str
 ) -> TablePage:
-    """Return a variable's mean and median over all but rows and columns."""
+    """Return the mean and median of a variable for each row and column coordinate value."""
     points = select_where(points, spec, table_spec.where)
     if table_spec.minimum_range:
         points = select_beyond(points, spec, f"{table_spec.minimum_range!r} m", inclusive=True)
@@ -165,7 +165,10 @@ def mean_table_page(
 
 
 def _printed_value(printed_rows: Any, row: int, column: int) -> float:
-    """Return the printed figure of a row and column; of one row of numbers, that of the row."""
+    """Return the published value of a row and column; nan if none is given.
+
+    A row that is a single number has only its first column.
+    """
     if row >= len(printed_rows):
         return math.nan
     row_values = (
@@ -181,7 +184,7 @@ def _cross_table(
     records: list[dict[str, Cell]],
     column_names: list[str],
 ) -> PageTable:
-    """One figure of every record, rows down and columns across."""
+    """Return a table of one quantity of each record, over row and column names."""
     rows: dict[str, list[Cell]] = {}
     for record in records:
         rows.setdefault(str(record["row"]), []).append(record[record_key])
@@ -191,7 +194,7 @@ def _cross_table(
 
 
 def outputs_page(dataset: xr.Dataset) -> TablePage:
-    """Every variable of a study of a single point."""
+    """Return a table of all variables of a study with a single point."""
     records: list[dict[str, Cell]] = [
         {
             "variable": str(name),
@@ -206,11 +209,15 @@ def outputs_page(dataset: xr.Dataset) -> TablePage:
     return TablePage(str(dataset.attrs.get("title", "")), [outputs_table], [], records)
 
 
+#: Largest number of rows of a table.
 TABLE_ROWS_MAX = 100
 
 
 def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
-    """Mean and median of the leakage of points, and of noise or leakage in both chirps."""
+    """Return mean and median of the leakage probabilities of each group of points.
+
+    They are for the up- and down-chirp, and for noise or leakage in both chirps.
+    """
     dataset = groups[0].dataset
     dataset_with_shot = dataset.assign(
         shot_with_leakage=false_alarms_per_shot(dataset, leakage=True)
@@ -229,9 +236,10 @@ def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
 def noise_only_reference(
     spec: GridSpec, setting_parameters: dict[str, Any]
 ) -> tuple[dict[str, Cell], float]:
-    """Noise alone, in closed form and by the model with a target that reflects nothing.
+    """Return false alarms of noise alone, in closed form and by the model without an echo.
 
-    Of a shot at a setting of the instrument, a part of a record; and of a bin, by the model.
+    The model has a target of reflectance 0. Return a partial record of a shot at a setting of the
+    instrument, and the model's pfa of a bin.
     """
     first_parameters = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first_parameters | setting_parameters | {"target.reflectance": 0.0}
@@ -253,7 +261,10 @@ def noise_only_reference(
 def split_by_setting(
     points: PointSelection, spec: GridSpec, by: str
 ) -> list[tuple[str, dict[str, Any], PointSelection]]:
-    """Points apart by `by` and what else varies but range and angle: name, SI values, points."""
+    """Group points by `by` and every other varying coordinate except range and angle.
+
+    Return name, SI values of the setting's parameters, and points of each group.
+    """
     cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
     paths = [spec.axis_parameter(name).path for name in names]
@@ -268,7 +279,7 @@ def split_by_setting(
 def false_alarm_records(
     grid_points: PointSelection, spec: GridSpec, *, by: str, printed: Sequence[Sequence[float]] = ()
 ) -> list[dict[str, Cell]]:
-    """Make a record of false alarms of each setting of the instrument in each cut."""
+    """Return a record of false alarms for each setting of the instrument and each cut."""
     setting_parts = split_by_setting(grid_points, spec, by)
     noise_references = [noise_only_reference(spec, setting)[0] for _, setting, _ in setting_parts]
     cut_groups = [
@@ -330,13 +341,13 @@ _THRESHOLD_COLUMNS = {
     "printed": ("printed", ".3g"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".3f%"),
 }  # fmt: skip
-"""Columns of tables: the figure of a record in each, and its format."""
+"""Columns of the tables: the record key of each, and its number format."""
 
 
 def false_alarm_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate."""
+    """Return the form of tables 4.3 to 4.5 [T]: false alarms of a shot by value of a coordinate."""
     records = false_alarm_records(points, spec, by=by, printed=printed)
     has_printed = any(record["printed"] == record["printed"] for record in records)
     page_tables = [
@@ -363,7 +374,7 @@ def false_alarm_page(
 def threshold_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Table 4.2: false alarms of a bin, a row for each threshold."""
+    """Return the form of table 4.2 [T]: false alarms of a bin for each threshold."""
     records: list[dict[str, Cell]] = []
     setting_parts = split_by_setting(points, spec, by)
     pfa_statistics = compute_statistics(
@@ -405,7 +416,7 @@ _COMMON_NOTES = (
 def _record_table(
     heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, Cell]]
 ) -> PageTable:
-    """Return a table of some figures of each record."""
+    """Return a table with the columns' values of each record."""
     rows = [
         [_format_value(record[key], number_format) for key, number_format in columns.values()]
         for record in records

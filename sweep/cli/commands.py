@@ -1,4 +1,4 @@
-"""The `sweep` command: reads what is asked for, hands it on, prints what comes back."""
+"""The commands of `sweep`: each parses its arguments, calls the package and prints the result."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ from sweep.messages import PrintableStream, suggest_shell_commands
 from sweep.storage.locations import Location
 from sweep.tasks.engine.text_streams import forgiving_output
 
-#: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
+#: Errors of a path that can't be used: no permission, no space, or an obstacle at the path.
 UNUSABLE_PATH_ERRNOS = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
 
 
-#: Errors of a disk that takes no more.
+#: Errors of a disk that can't take any more data.
 DISK_FULL_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def _make_output_printable() -> None:
-    """Filter what is written to standard output and error from here on."""
+    """Wrap standard output and standard error so that unprintable characters are escaped."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is not None and not isinstance(stream, PrintableStream):
@@ -65,9 +65,9 @@ def _make_output_printable() -> None:
 
 
 class _StandardError(logging.StreamHandler[Any]):
-    """Log handler that writes to what is standard error at that time, above a bar if there is one.
+    """Log handler that writes to the current standard error, above a progress bar if any.
 
-    Parallel to Python's handler of last resort.
+    Python's handler of last resort also looks up the stream at each write.
     """
 
     @property
@@ -80,13 +80,13 @@ class _StandardError(logging.StreamHandler[Any]):
         """Ignore the stream that the base class keeps."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, if anything can be written."""
+        """Write a log record, unless standard error is closed."""
         if self.stream is not None:
             super().emit(record)
 
 
 def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
-    """Write the log of the package to standard error: its steps, and each task if asked twice."""
+    """Write the package's log to standard error: steps with -v, and each task with -vv."""
     if not verbosity:
         return
     log, handler = logging.getLogger("sweep"), _StandardError()
@@ -98,17 +98,17 @@ def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
 
     def restore() -> None:
         log.removeHandler(handler)
-        log.setLevel(level)  # which also clears what loggers below have cached of it
+        log.setLevel(level)  # this also clears the cached levels of child loggers
         log.propagate = propagates
 
     ctx.call_on_close(restore)
 
 
 class CommandGroup(click.Group):
-    """Commands whose users' mistakes end in plain words and exit code 2."""
+    """Group of commands that reports users' mistakes in plain words, with exit code 2."""
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
-        """Add a command, listed with the whole first paragraph of its help, that can be verbose."""
+        """Add a command with the option --verbose; list it with its first paragraph of help."""
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
         cmd.params.append(
             click.Option(
@@ -122,10 +122,10 @@ class CommandGroup(click.Group):
         super().add_command(cmd, name)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line; whatever it prints, a traceback too, is printable.
+        """Run the command line; all output is printable, including tracebacks.
 
-        The exit code does not depend on anybody hearing what it says. Streams stay wrapped, as
-        Python prints the traceback of an error after this function.
+        The exit code is the same if output streams are closed. Streams stay wrapped, as Python
+        prints the traceback of an error after this function.
         """
         try:
             with forgiving_output():
@@ -136,7 +136,7 @@ class CommandGroup(click.Group):
             _make_output_printable()
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; what is not a mistake of the user's keeps its traceback."""
+        """Run a command; errors that are not the user's mistake keep their traceback."""
         try:
             Path.cwd()
         except FileNotFoundError:
@@ -176,7 +176,7 @@ class CommandGroup(click.Group):
 
 
 def _unusable_path_message(error: OSError) -> str:
-    """Words for a file, folder or disk that is not to be used; empty for any other error."""
+    """Return a message for a file, folder or disk that can't be used; '' for any other error."""
     from sweep.storage.locations import os_error_reason
 
     if error.errno in (errno.EMFILE, errno.ENFILE):
@@ -184,7 +184,7 @@ def _unusable_path_message(error: OSError) -> str:
     if error.filename and error.errno in UNUSABLE_PATH_ERRNOS:
         cause = os_error_reason(error, Path(os.fsdecode(error.filename)))
         return f"{os.fsdecode(error.filename)}: {cause}: mend that, or name another place"
-    if error.errno in DISK_FULL_ERRNOS:  # writing, which names no file
+    if error.errno in DISK_FULL_ERRNOS:  # an error of a write has no file name
         return f"{error.strerror}: make room where the output goes, or name another place"
     return ""
 
@@ -265,7 +265,7 @@ def run(
     if overwrite and resuming:
         raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
     study_spec, path = load(spec), store or _default_store(spec)
-    if is_free(path) or not resuming:  # else it was asked as it was begun
+    if is_free(path) or not resuming:  # else the user confirmed when the study began
         confirm_large_study(study_spec, path, yes=yes)
     outcome = driver.run(study_spec, store=path, overwrite=overwrite, resume=resuming, **options)
     print_outcome_and_exit(outcome, shorten_path(path))
@@ -324,7 +324,7 @@ def plan(spec: Path, workers: int | None) -> None:
         effects = study_effects_table(study_spec, _default_store(spec))
     if alarms := false_alarm_text(study_spec):
         rows.append(("false alarms", alarms))
-    # Nothing is printed before all is known: any of it may find a point that can't be simulated.
+    # All rows are computed before printing: each may find a point that can't be simulated.
     for name, value in rows:
         click.echo(wrap_text(f"{name:>12}  {value}", 2 + len(name)))
     print_effects(effects)

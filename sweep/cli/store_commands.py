@@ -1,4 +1,4 @@
-"""Commands that look at stores: how far one is, whether every byte is as it was, a page of it."""
+"""Commands that read stores: status, verify, finalize, report and compare."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
 
-#: Damaged objects of one store that are listed.
+#: Largest number of damaged objects that are listed for a store.
 LISTED_OBJECTS_MAX = 20
 
 
@@ -198,7 +198,7 @@ def _print_verify_report(report: Report) -> None:
 
 
 def _print_verify_remedies(store: Location, reports: list[Report]) -> None:
-    """Print what mends what was found."""
+    """Print the commands that repair the reported damage."""
     for report in reports:
         if report.unmarked:
             echo_wrapped(
@@ -307,7 +307,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
 
 def _open_store(path: Location) -> OpenedStore:
-    """Return a store of a grid as a dataset, of a flight as a tree."""
+    """Open a store: a dataset for a grid, a data tree for a flight."""
     from sweep.analysis.datasets import SCENE_KIND, open_scene, read_attributes_of_kind
     from sweep.analysis.datasets import open as open_grid
 

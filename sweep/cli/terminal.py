@@ -1,4 +1,4 @@
-"""Terminal of the commands: options that several share, plans before a run, tables after it."""
+"""Terminal interface of the commands: shared options, plans before a run, tables after a run."""
 
 from __future__ import annotations
 
@@ -36,23 +36,27 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.study_plan import EffectRow, EffectsTable, StudyPlan
 
 ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 86400.0
-"""Size of a study, and its time on one core [s], beyond which a run asks before it begins."""
+"""Points, bytes and time on one core [s] above which a run asks before it starts."""
 
 MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
-"""Points times draws beyond which a run measures the time that it takes, before it begins."""
+"""Product of points and draws above which a run estimates its time before it starts."""
 
 SENTENCE_COLUMN_WIDTH_MIN, COLUMN_GAP, UNBROKEN_CELL_WIDTH_MAX = 14, 3, 36
-"""Characters of a table: least column of sentences, between columns, most of an unbroken cell."""
+"""Widths in a table [characters].
+
+They are the least width of a column of sentences, the gap between columns, and the width below
+which a cell is never broken in a row that is printed as a list.
+"""
 
 
 class LocalPathType(click.Path):
-    """A path here, in which ~ stands for the user's own folder, after `--output=` too."""
+    """Click type of a local path; expands ~ to the user's home, also after `--output=`."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, as click checks it; for one that is not there, say what is near it."""
+        """Return the path, checked by click; if it is missing, the error suggests a similar one."""
         path = Path(os.path.expanduser(value))
         if self.exists and not path.exists():
             self.fail(
@@ -67,9 +71,9 @@ class LocalPathType(click.Path):
 
 
 def _missing_file_hint(path: Path) -> str:
-    """Remark on a file whose name is like that of a missing one, or on the YAML files beside it.
+    """Return a hint for a missing file: a similar name, or the YAML files of its folder.
 
-    A link that leads nowhere is there, and has no near one.
+    A dangling link exists, so the hint names its target instead.
     """
     from sweep.spec.yaml_document import suggest_similar_file
 
@@ -87,28 +91,28 @@ def _missing_file_hint(path: Path) -> str:
 
 
 class StoreLocationType(click.ParamType):
-    """A path, or an address in an object store."""
+    """Click type of a store's location: a path, or an address in an object store."""
 
     name = "path"
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
-        """Return the place that is meant."""
+        """Return the location of an address."""
         return parse_location(str(value))
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Paths, as the shell completes them."""
+        """Let the shell complete paths."""
         return [CompletionItem(incomplete, type="file")]
 
 
 def shorten_path(path: Location) -> Location:
-    """Return a place as short as it can be written from here."""
+    """Return a path relative to the current folder, if it lies below that folder."""
     try:
         current_dir = Path.cwd()
-    except OSError:  # removed meanwhile
+    except OSError:  # the current folder was removed
         return path
     if isinstance(path, Path) and path.is_relative_to(current_dir):
         return path.relative_to(current_dir)
@@ -118,7 +122,7 @@ def shorten_path(path: Location) -> Location:
 def parse_assignments(
     assignment_texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
 ) -> dict[str, str]:
-    """Values by name, as written after an option; refused where one is not NAME=VALUE."""
+    """Return values by name from texts NAME=VALUE; raise BadParameter for any other text."""
     values = {}
     for text in assignment_texts:
         name, separator, value = text.partition("=")
@@ -185,12 +189,12 @@ FORMAT_OPTION = click.option(
 
 
 def at_option(help: str) -> Callable[..., Any]:
-    """Option of values by name; :func:`parse_assignments` reads them."""
+    """Return the option --at, which takes NAME=VALUE; :func:`parse_assignments` parses it."""
     return click.option("--at", "at", multiple=True, metavar="NAME=VALUE", help=help)
 
 
 def output_dir_option(help: str) -> Callable[..., Any]:
-    """Option of the folder that files are put into."""
+    """Return the option --output, which takes the folder for output files."""
     return click.option("--output", type=LocalPathType(file_okay=False), help=help)
 
 
@@ -214,7 +218,7 @@ ALLOW_CODE_OPTION = click.option(
 
 
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options of all that compute, which it hands on as they are."""
+    """Decorate a command with the options of all computing commands, passed on unchanged."""
     options = (
         WORKERS_OPTION,
         SCHEDULER_OPTION,
@@ -231,9 +235,9 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def wrap_text(text: str, hanging_indent: int = 2, *, err: bool = False, margin: int = 0) -> str:
-    """Text in lines of the terminal's width, or so much narrower; unchanged for no terminal.
+    """Wrap text to the terminal's width less ``margin``; return it unchanged without a terminal.
 
-    Lines break between words, and commands in backquotes, which are copied, stay whole.
+    Lines break between words. Commands in backquotes stay on one line, so that users can copy them.
     """
     if not is_terminal(sys.stderr if err else sys.stdout):
         return text
@@ -250,14 +254,14 @@ def wrap_text(text: str, hanging_indent: int = 2, *, err: bool = False, margin: 
 
 
 def echo_wrapped(text: str, *, err: bool = False) -> None:
-    """Print sentences, folded to the terminal's width."""
+    """Print text, wrapped to the terminal's width."""
     click.echo(wrap_text(text, err=err), err=err)
 
 
 def instrument_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the file of an instrument of the library says, as a file that a spec may name.
+    """Yield the lines of a library instrument as a YAML file that a spec may name.
 
-    Words are comments of its YAML.
+    Descriptive text becomes comments of the YAML.
     """
     import yaml
 
@@ -274,7 +278,7 @@ def instrument_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
         ]
     comments += ["", "must reproduce (docs/instruments.md has what is simulated):"]
     for published_number in instrument_file["numbers"].values():
-        is_text = isinstance(published_number["published"], str)  # which have their unit
+        is_text = isinstance(published_number["published"], str)  # texts include their unit
         unit = "" if is_text else f" {published_number['unit']}"
         comments.append(
             f"- {published_number['about']}: {published_number['published']}{unit}".rstrip()
@@ -292,9 +296,9 @@ def instrument_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
 
 
 def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
-    """Say what a run has come to, and leave with its exit code.
+    """Print the outcome of a run; exit with code 3 if the run is incomplete.
 
-    The store is the one that the user named: one that is being extended lies next to it.
+    ``store`` is the path that the user named. A store that is being extended is built next to it.
     """
     from sweep.tasks.engine.progress import duration_text
 
@@ -303,7 +307,7 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
             _print_summary(outcome.store)
             print_accuracy(outcome.store)
             print_inconsistencies(outcome.store)
-        except Exception as error:  # the study is computed all the same
+        except Exception as error:  # without the tables the study is still computed
             echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
     for scanner, rays in outcome.rays.items():
         rays_text = f"{counted(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
@@ -336,7 +340,7 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
 
 
 def _error_text(error: Exception) -> str:
-    """Text of an error, with its kind where that is no error of this program's."""
+    """Return the text of an error, with its type unless it is an error of this program."""
     from sweep.storage.store_format import StoreError
     from sweep.storage.verified_store import DamagedChunkError
 
@@ -406,7 +410,7 @@ def _print_scene_summary(store: Location) -> None:
 
 
 def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
-    """Return what is not checked of the number of beamlets, and why; '' where it is estimated."""
+    """Return why the error of the number of beamlets is not checked; '' if it is estimated."""
     from sweep.model.beamlet_counts import BEAMLETS_PATH, beamlets_converge
 
     parameters = spec.parameters()
@@ -432,7 +436,7 @@ def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
 
 
 def print_inconsistencies(store: Location, scanner: str | None = None) -> None:
-    """Print which quantities of a flight are off by far more than their standard errors."""
+    """Warn of quantities of a flight whose errors far exceed their standard errors."""
     from sweep.tasks.studies import study_loading
 
     if study_loading.read_study(store)[0]["kind"] != "scene":
@@ -444,7 +448,7 @@ def print_inconsistencies(store: Location, scanner: str | None = None) -> None:
 
 
 def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> None:
-    """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
+    """Print points without results, the uncertainty of draws, and the error of few beamlets."""
     from sweep.tasks.studies import study_loading
     from sweep.tasks.studies.store_summary import (
         count_unsupported_points,
@@ -503,10 +507,10 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
 def print_table(
     title: str, headings: list[str], rows: list[list[str]], sentence_heading: str = ""
 ) -> None:
-    """Print a table, folded to the terminal's width; nothing is folded where there is none.
+    """Print a table, wrapped to the terminal's width; without a terminal nothing is wrapped.
 
-    `words` names a column of sentences. No number is ever broken or cut: where a terminal is too
-    narrow for a table, a row is a list.
+    ``sentence_heading`` names the column that contains sentences. Numbers are never broken or
+    truncated. If the terminal is too narrow for the table, each row is printed as a list.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -529,7 +533,7 @@ def print_table(
         return
     for heading, full_width, width in zip(
         headings, full_widths, min_widths, strict=True
-    ):  # words come last
+    ):  # spare width goes to the first columns; sentences come last
         spare_width, width = (
             spare_width - min(full_width - width, spare_width),
             width + min(full_width - width, spare_width),
@@ -544,7 +548,7 @@ def print_table(
 
 
 def _print_rows_as_lists(title: str, headings: list[str], rows: list[list[str]]) -> None:
-    """Print each row of a table as a list of its cells, as many to a line as it has room for."""
+    """Print each row of a table as a list of its cells, wrapped to the terminal's width."""
     echo_wrapped(title)
     for row in rows:
         labelled_cells = (
@@ -559,7 +563,10 @@ def _print_rows_as_lists(title: str, headings: list[str], rows: list[list[str]])
 
 
 def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
-    """Width of a column whose words, and where they are no sentences whose numbers, stay whole."""
+    """Return the least width of a column in which no word is broken, and no number either.
+
+    In a column of sentences only words count.
+    """
     heading, *cells = column
     numbers = [] if is_sentences else [cell for cell in cells if any(map(str.isdigit, cell))]
     longest = max(map(len, [*heading.split(), *" ".join(cells).split(), *numbers]), default=0)
@@ -573,7 +580,7 @@ def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
 def plan_rows(
     spec: GridSpec | SceneSpec, store: Location, workers: int | None
 ) -> Iterator[tuple[str, str]]:
-    """Lines, with their headings, of what a study will take."""
+    """Yield heading and text of each line of a study's plan."""
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.progress import duration_text
     from sweep.tasks.engine.session import RunOptions
@@ -651,7 +658,7 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
 
 
 def print_effects(table: EffectsTable) -> None:
-    """Print the effects that a study simulates, where, and their costs; warn of what is off."""
+    """Print where effects are simulated, and their cost; warn of effects that are forced off."""
     active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
     print_table("Effects", headings, [_effect_cells(row) for row in active_rows], "called for")
@@ -666,7 +673,7 @@ def print_effects(table: EffectsTable) -> None:
 
 
 def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: bool) -> None:
-    """Ask before a study begins that is larger than most; leave where that is declined."""
+    """Ask for confirmation before a very large study starts; exit if the user declines."""
     if yes or not (excess := _excess_text(*_study_size(spec, store))):
         return
     if not (is_terminal(sys.stdin) and is_terminal(sys.stderr)):
@@ -676,7 +683,10 @@ def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: boo
 
 
 def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, float]:
-    """Points and bytes of a study, and its seconds on one core where it has many draws."""
+    """Return points, bytes and time on one core [s] of a study; time 0 if not estimated.
+
+    The time is estimated only for many draws, and only if points and bytes raise no question.
+    """
     from sweep.spec import GridSpec
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import plan_study
@@ -690,7 +700,7 @@ def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, 
 
 
 def _excess_text(points: int, size_bytes: int, seconds: float) -> str:
-    """Sizes of a study beyond the usual, in words."""
+    """Return the sizes of a study that exceed the limits for asking, in words; '' for none."""
     from sweep.tasks.engine.progress import duration_text
 
     excess_parts = [f"{points:,} points"] if points > ASK_ABOVE_POINTS else []
@@ -702,7 +712,7 @@ def _excess_text(points: int, size_bytes: int, seconds: float) -> str:
 
 
 def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
-    """Probability of a false alarm in a shot, in words; empty where it is not known."""
+    """Return the false-alarm probabilities of a shot in words; '' if they are not known."""
     from sweep.spec.noise_alarms import alarm_probabilities
 
     if not (alarms := alarm_probabilities(spec)):
@@ -719,9 +729,9 @@ def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
 
 
 def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
-    """Warn of a beam too narrow for its aperture, of a scene and a path, of many false alarms.
+    """Print warnings about a spec, such as a too narrow beam, its scene, path and false alarms.
 
-    SceneError for a flight that sees nothing.
+    Raise SceneError for a flight whose beams never hit the scene.
     """
     from sweep.tasks.studies.study_warnings import spec_warnings
 
@@ -732,7 +742,7 @@ def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
 
 
 def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
-    """Warn of echoes that arrive after their record, and of those that are read as others."""
+    """Warn of echoes that arrive after their record, and of ambiguous ones."""
     from sweep.tasks.studies.echo_warnings import echo_warnings
     from sweep.tasks.studies.study_loading import make_study
 
@@ -743,7 +753,7 @@ def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
 def study_effects_table(
     spec: GridSpec | SceneSpec, store: Location, *, costs: bool = True
 ) -> EffectsTable:
-    """Table of the effects that a study simulates, where, and their costs if asked for."""
+    """Return the table of effects of a study; ``costs`` measures their share of the time."""
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import effects_table
 
@@ -751,7 +761,7 @@ def study_effects_table(
 
 
 def print_effects_warnings(table: EffectsTable) -> None:
-    """Say which effects are forced off though they matter."""
+    """Warn of effects that are forced off although they matter."""
     for warning in table.warnings():
         echo_wrapped(f"warning: {warning}", err=True)
 
@@ -778,9 +788,10 @@ def _effect_cells(row: EffectRow) -> list[str]:
 def print_accuracy_measurement(
     store: Location, *, has_results: bool
 ) -> tuple[list[Location], bool]:
-    """Print what settings came to, and draw it: the files, and whether it was not interrupted.
+    """Print the measured settings and draw their figure.
 
-    Leaves with the exit code of what is incomplete where nothing was measured.
+    Return the written files, and whether the measurement was not interrupted. Exit with the code
+    for incomplete results if nothing was measured.
     """
     if not has_results:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)

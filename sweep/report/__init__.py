@@ -1,1 +1,1 @@
-"""A study as one page that is read in a browser, without a network."""
+"""Report of a study: one HTML page that opens in a browser without a network."""

@@ -1,4 +1,4 @@
-"""Charts of the detector: characteristic, noise by source, false alarms, maximum range."""
+"""Charts of the detector: ROC curves, noise by source, false alarms, maximum range."""
 
 from __future__ import annotations
 
@@ -47,19 +47,19 @@ from sweep.report.html_page import HtmlTable
 from sweep.units import percent
 
 CHART_PARTS_MAX = 6
-"""Values that a chart offers to choose from, at the most."""
+"""Largest number of parts of a study that a chart offers for selection."""
 
 NOISE_BUDGET_POINTS = 24
-"""Places along a coordinate at which the noise is told by source."""
+"""Number of points along a coordinate at which the noise is split by source."""
 
 ROC_PD_VALUES = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection near which points are taken whose characteristic is drawn."""
+"""Probabilities of detection; points closest to each of them get a ROC curve."""
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
-"""Probabilities of a false alarm in a bin, over which characteristics are drawn."""
+"""False-alarm probabilities of a bin at which ROC curves are computed."""
 
 ROC_DRAWS = 400
-"""Draws of each point whose characteristic is random."""
+"""Number of draws for the ROC curve of a point with random effects."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
 
@@ -72,7 +72,7 @@ _LABEL_BY_ALARM = {
     "p_leakage_down": "leakage, down",
     PFA_WITH_LEAKAGE_NAME: "either, both",
 }
-"""Variables in as few words as a legend has room for."""
+"""Short legend labels of the false-alarm variables."""
 
 _RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
 
@@ -88,18 +88,18 @@ class GridProfile:
 
     @property
     def coordinate_axis(self) -> CoordinateAxis:
-        """The main coordinate along an axis."""
+        """Axis of the main coordinate."""
         return CoordinateAxis.from_points(self.points, self.coordinate_name)
 
     def spread_indices(self, n_max: int) -> np.ndarray:
-        """Return some of its places, spread over all."""
+        """Return at most ``n_max`` indices along the profile, evenly spread."""
         if self.coordinate is None:
             return np.zeros(1, int)
         size = self.coordinate.values.size
         return np.unique(np.linspace(0, size - 1, min(n_max, size)).round().astype(int))
 
     def axis_indices(self, index: Any) -> dict[str, Any]:
-        """Position along every axis of one of its places, or of several."""
+        """Return the index along every axis for one or several indices along the profile."""
         if self.coordinate is None:
             return self.points.first_indices()
         return self.points.first_indices(self.coordinate) | {
@@ -107,14 +107,14 @@ class GridProfile:
         }
 
     def variable_values(self, variable: str, indices: np.ndarray) -> np.ndarray:
-        """Return a variable at some of its places."""
+        """Return a variable at indices along the profile."""
         return np.ravel(self.points.dataset[variable].isel(self.axis_indices(indices)).values)
 
 
 def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
-    """Tracks along the main coordinate, and how many are left out.
+    """Return profiles along the main coordinate, and the number of omitted profiles.
 
-    The main coordinate is range where it varies, else the longest one of numbers.
+    The main coordinate is range if it varies, else the numeric coordinate with most values.
     """
     axis_parameters = [
         axis_parameter for axis in results.spec.axes for axis_parameter in axis.parameters
@@ -139,7 +139,7 @@ def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
 
 
 def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: int) -> Chart:
-    """Probability of detection over that of a false alarm, as the threshold moves."""
+    """Return the chart of ROC curves: pd over the false-alarm probability for all thresholds."""
     panels = [panel for profile in profiles for panel in _roc_panels(results, profile)]
     line_names = [line.name for line in panels[0].lines if line.name]
     return Chart(
@@ -169,11 +169,11 @@ _PFA_FROM_BIN = {
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
-"""Probability of a false alarm from that in a bin, and the number of bins that are counted."""
+"""Functions that give a false-alarm probability from that of a bin and the number of bins."""
 
 
 def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
-    """Return a panel for each kind of false alarm: line and dot of some points."""
+    """Return a panel for each kind of false alarm, with curves and dots of selected points."""
     lines_by_alarm: dict[str, list[ChartLine]] = {alarm: [] for alarm in _PFA_FROM_BIN}
     for style_index, index in enumerate(_roc_indices(profile)):
         point = results.dataset.isel(profile.axis_indices(index)).compute()
@@ -217,7 +217,7 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 
 def _roc_indices(profile: GridProfile) -> np.ndarray:
-    """Places along a track whose probability of detection is near to those looked for."""
+    """Return the indices along a profile at which pd is closest to `ROC_PD_VALUES`."""
     indices = profile.spread_indices(4 * charts.LINE_INTERVALS)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
@@ -231,7 +231,7 @@ def _roc_indices(profile: GridProfile) -> np.ndarray:
 def noise_budget_of_grid(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
-    """Share of each source in the noise at the ADC, along the main coordinate."""
+    """Return the chart of each source's share of the noise at the ADC along the main coordinate."""
     panels = []
     for profile in profiles:
         indices = profile.spread_indices(NOISE_BUDGET_POINTS)
@@ -265,7 +265,10 @@ def noise_budget_panel(
     x: np.ndarray,
     budgets: Sequence[Mapping[str, Any]],
 ) -> Panel:
-    """Shares of sources of noise from their variances [V^2] at some places, the largest first."""
+    """Return the shares of noise sources from their variances [V^2] at each point, in a panel.
+
+    The source that is largest at the first point comes first.
+    """
     variances_by_point = [
         {n: float(np.ravel(v)[0]) for n, v in budget.items()} for budget in budgets
     ]
@@ -293,7 +296,7 @@ def noise_budget_panel(
 
 
 def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
-    """Shares of sources of noise, a panel at a time."""
+    """Return the chart of noise shares, with one panel shown at a time."""
     share_texts = ", ".join(
         f"{line.name} {percent(line.y[0] / 100)} at first" for line in panels[0].lines
     )
@@ -304,7 +307,7 @@ def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart
 def false_alarm_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart | None:
-    """Return false alarms of noise and leakage along the main coordinate, if there is one."""
+    """Return the chart of false alarms by noise and leakage along the main coordinate, or None."""
     if profiles[0].coordinate is None:
         return None
     coordinate_name = profiles[0].coordinate_name
@@ -320,7 +323,7 @@ def false_alarm_chart(
             (profile.label, alarm_label, replace(profile.points, dataset=alarm_dataset))
             for profile in profiles
         ]
-        # a reading each: together their chunks would wait for each other in memory
+        # One reading pass per variable: in a joint pass chunks would accumulate in memory.
         lines, remarks = charts.lines_along(
             [(points, variable) for _, _, points in variable_points], coordinate_name
         )
@@ -328,7 +331,7 @@ def false_alarm_chart(
         named_points += variable_points
     x_axis = CoordinateAxis.from_points(results.points, coordinate_name)
     panels = charts.make_panels(named_points, drawn_lines, x_axis, ChartAxis("probability", LOG))
-    # The same for all points where no axis moves it, and no number of bins.
+    # All points share one threshold if no axis changes it or the looks.
     off_axes = results.spec.parameters_off_axes()
     has_one_threshold = (
         set(THRESHOLD_PATHS[:3]) & off_axes.keys()
@@ -358,7 +361,7 @@ PD_LEVEL = 0.9
 
 UNBROKEN_LABEL = "kept all the way"
 ANSWER_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
-"""Answers of :func:`.limits.limit` by what is chosen of them."""
+"""Variables of :func:`.detection_limits.limit`, by the label of their choice."""
 
 LABEL_BY_END = {"low": "lower end", "high": "upper end"}
 
@@ -376,9 +379,9 @@ MAXIMUM_RANGE_CAPTION = [
 
 
 def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
-    """Maximum range along another coordinate; a table where there is none to go along.
+    """Return the maximum range along another coordinate, as a table if no other one varies.
 
-    None where range does not vary.
+    Return None if range does not vary.
     """
     range_parameter = find_axis_parameter(results.spec, RANGE_PATH)
     if range_parameter is None:
@@ -411,14 +414,14 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
 
 
 def is_empty(item: Chart | HtmlTable | None) -> bool:
-    """Return whether a chart has no value, as where pd is above the level at every range."""
+    """Tell whether a chart has no finite value, for example if pd never falls below the level."""
     if not isinstance(item, Chart):
         return False
     return not any(np.isfinite(line.y).any() for panel in item.panels for line in panel.lines)
 
 
 def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
-    """Maximum range in a sentence, as a chart or table of :func:`maximum_range_item` has it."""
+    """Return sentences on the maximum range in a result of :func:`maximum_range_item`."""
     unbroken_label = next(iter(ANSWER_BY_LABEL))
     if isinstance(item, Chart):
         range_label, unbroken_panels = (
@@ -460,7 +463,7 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
 
 
 def _maximum_range_points(points: PointSelection, name: str, unit_factor: float) -> PointSelection:
-    """Return the maximum range in the units shown, and its coordinates; lazy."""
+    """Return the maximum range of points, in display units; lazy."""
     dim = points.dim_of(name)
     indices = np.sort(points.sorted_coordinate(name).indices)
     dataset = points.dataset
@@ -476,7 +479,7 @@ def _maximum_range_points(points: PointSelection, name: str, unit_factor: float)
 
 
 def _choose_x(results: GridResults, points: PointSelection) -> str:
-    """Return the grazing angle if it varies, or the longest coordinate of numbers."""
+    """Return the name of the grazing angle if it varies, else of the longest numeric coordinate."""
     varying_names = points.varying_coordinates()
     angle_parameter = find_axis_parameter(results.spec, GRAZING_ANGLE_PATH)
     if angle_parameter is not None and angle_parameter.coordinate in varying_names:
@@ -492,7 +495,7 @@ def _choose_x(results: GridResults, points: PointSelection) -> str:
 def _maximum_range_chart(
     max_ranges: Sequence[tuple[str, PointSelection]], x: str, range_label: str, n_omitted: int
 ) -> Chart:
-    """Both answers of every part, a line for each value of what has few."""
+    """Return a chart of both answers for each part, with lines by a coordinate of few values."""
     first_points = max_ranges[0][1]
     line_coordinates = [
         n
@@ -545,7 +548,7 @@ def _maximum_range_chart(
 def _maximum_range_table(
     max_ranges: Sequence[tuple[str, PointSelection]], range_label: str
 ) -> HtmlTable:
-    """Both answers of each part, with their intervals or why there are none."""
+    """Return a table of both answers for each part, with intervals and the reason of a nan."""
     rows = []
     for part, range_points in max_ranges:
         max_range: xr.Dataset = range_points.dataset.isel(range_points.first_indices()).compute()

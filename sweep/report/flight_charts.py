@@ -1,4 +1,4 @@
-"""Charts of a flight: its point clouds to turn, shots over time, navigation and noise."""
+"""Charts of a flight: rotatable point clouds, shots over time, navigation errors and noise."""
 
 from __future__ import annotations
 
@@ -59,26 +59,28 @@ from sweep.report.html_page import (
 from sweep.spec import SceneSpec
 
 CLOUD_COLOURS = ("range", "radial_velocity", "snr")
-"""Quantities that points can be coloured by."""
+"""Quantities by which points can be coloured."""
 
 PAGE_POINTS_MAX = 36_000
-"""Points of all clouds of a page together."""
+"""Largest number of points of all clouds on a page."""
 
 PAGE_CLOUDS_MAX = 8
-"""Scanners times places along the study's axes."""
+"""Largest number of clouds on a page: scanners times positions along the study's axes."""
 
 TERRAIN_NODES_MAX = 90
-"""Nodes of the terrain along a side."""
+"""Largest number of terrain nodes along a side."""
 
 TERRAIN_DEPTH_FRACTION = 0.012
-"""Depth at which terrain is drawn below itself, of the picture's size: points lie on it."""
+"""Depth by which terrain is lowered, as a fraction of the map, so that points on it are visible."""
 
 FIELD_OF_VIEW = math.radians(45)
-"""Angle from the lower to the upper edge of what the library shows of a scene."""
+"""Vertical field of view of plotly's camera [rad]."""
 
 VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
-"""Share of the field of view that the picture takes, so that its labels have room; width of the
-narrowest sheets, a phone's, over their height."""
+"""Fraction of the field of view that the box fills, and least width-to-height ratio of a page.
+
+The rest of the field of view is for labels. The least ratio is that of a phone.
+"""
 
 EYE_BY_VIEW = {
     "at an angle": {"x": 1.1, "y": -1.3, "z": 0.6},
@@ -86,15 +88,15 @@ EYE_BY_VIEW = {
     "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
     "from the east": {"x": 1.8, "y": 0.0, "z": 0.1},
 }
-"""Places of the eye, in the lengths that the library counts in."""
+"""Camera positions by view, in plotly's units of length."""
 
 LOOK_AT_POINT = {"x": 0.0, "y": 0.0, "z": -0.1}
-"""Point that the eye looks at."""
+"""Point at which the camera looks, in plotly's units of length."""
 
 
 @dataclass(frozen=True)
 class LabelledRecording:
-    """Recording of a scanner at one place along the study's axes."""
+    """Recording of a scanner at one position along the study's axes, with a label."""
 
     label: str
     recording: Recording
@@ -102,7 +104,7 @@ class LabelledRecording:
 
 
 def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], int]:
-    """Scanners at places along the axes, as many as a page shows, and how many are left out."""
+    """Return recordings at axis positions for a page, and the number of omitted ones."""
     axis_index_tuples = product(*(range(axis.size) for axis in results.spec.axes))
     candidates = list(product(results.scanners, axis_index_tuples))
     chosen_numbers = np.unique(
@@ -124,7 +126,7 @@ def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], i
 def cloud_plot(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording], n_omitted: int
 ) -> Plot | None:
-    """All clouds, one at a time; none where there is no point at all."""
+    """Return a plot of all clouds, shown one at a time, or None if there are no points."""
     points_max = PAGE_POINTS_MAX // len(labelled_recordings)
     cloud_by_label = {
         labelled.label: gather_cloud(
@@ -220,7 +222,7 @@ def _xyz_columns(
 def _cloud_traces(
     cloud_label: str, cloud: PointCloud, height_map: HeightMap | None
 ) -> Iterator[go.Scatter3d | go.Surface]:
-    """Terrain, path, and points in each colour."""
+    """Yield the traces of terrain, flight path, and points in each colouring."""
     if height_map is not None:
         yield from _terrain_traces(cloud_label, cloud, height_map)
     yield go.Scatter3d(
@@ -269,7 +271,7 @@ def _cloud_traces(
 def _terrain_traces(
     cloud_label: str, cloud: PointCloud, height_map: HeightMap
 ) -> Iterator[go.Surface]:
-    """Draw the ground around the points seen, shaded, just below itself."""
+    """Yield the shaded terrain around the points, slightly lowered."""
     map_limits = {}
     for axis in ("x", "y"):
         values = np.concatenate([cloud.points[axis], cloud.path[axis]])
@@ -293,13 +295,13 @@ def _camera(view: str) -> dict[str, dict[str, float]]:
 
 
 def _hidden_axis(view: str) -> dict[str, bool]:
-    """Hide the axis that a view looks along, whose labels would overlap."""
+    """Hide the axis along the viewing direction, whose labels would overlap."""
     low, _, high = sorted(WORLD_AXES, key=lambda axis: abs(EYE_BY_VIEW[view][axis]))
     return {f"scene.{high}axis.visible": False} if EYE_BY_VIEW[view][low] == 0 else {}
 
 
 def _longest_side(side_ratios: np.ndarray) -> float:
-    """Longest side at which all of a box is seen from every view, in the library's lengths."""
+    """Return the largest side at which a box fits into every view, in plotly's units of length."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * side_ratios
     eye_positions = [np.array([view[axis] for axis in WORLD_AXES]) for view in EYE_BY_VIEW.values()]
     side_lengths = np.linspace(2.0, 0.1, 191).tolist()
@@ -312,7 +314,7 @@ def _longest_side(side_ratios: np.ndarray) -> float:
 
 
 def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
-    """Tell whether an eye has (n, 3) corners within its field of view."""
+    """Tell whether corners (n, 3) are within the field of view from an eye position."""
     view_direction = np.array([LOOK_AT_POINT[axis] for axis in WORLD_AXES]) - eye
     view_direction /= np.linalg.norm(view_direction)
     right_direction = np.cross(view_direction, [0.0, 0.0, 1.0])
@@ -327,7 +329,10 @@ def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
 
 
 def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
-    """Limits around the true points of all clouds, and their paths, to one scale."""
+    """Return axis limits around the true points of all clouds, and optionally their paths.
+
+    All axes have the same scale.
+    """
     axis_ranges: dict[str, Any] = {}
     lengths = {}
     for axis in WORLD_AXES:
@@ -363,20 +368,20 @@ def _scene_layout() -> dict[str, Any]:
 
 
 SHOT_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
-"""Quantities of shots that are shown over time."""
+"""Quantities of shots in the charts over time."""
 
 MEASURED_QUANTITIES = ("range", "radial_velocity")
-"""Quantities of a point that have a truth."""
+"""Quantities of a point that have a true value in the store."""
 
 PAGE_SHOTS_MAX = 12_000
-"""Shots of all charts over time of a page together."""
+"""Largest number of shots of all charts over time on a page."""
 
 ALTITUDE_BINS = 20
-"""Bins of altitude that errors are told in."""
+"""Number of altitude bins for navigation errors."""
 
 
 def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Quantities of shots over time; none where none is computed."""
+    """Return the chart of shot quantities over time, or None if nothing is computed."""
     quantities = [
         name for name in SHOT_QUANTITIES if name in labelled_recordings[0].recording.dataset
     ]
@@ -401,7 +406,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
 
 
 def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Errors of range and velocity of true points against truth; none where there are none."""
+    """Return the chart of range and velocity errors of true points, or None without any."""
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
         is_true = (column_arrays["flags"].astype(int) & TRUE_FLAG) > 0
@@ -437,14 +442,17 @@ def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | Non
 
 
 QuantityLines = tuple[str, ChartAxis, list[ChartLine]]
-"""Words for a quantity, its axis, and its lines over time."""
+"""Label of a quantity, its axis, and its lines over time."""
 
 
 def _time_panels(
     labelled_recordings: Sequence[LabelledRecording], noun: str, names: Sequence[str],
     quantity_lines: Callable[[dict[str, np.ndarray]], Iterator[QuantityLines]],
 ) -> tuple[list[Panel], str]:  # fmt: skip
-    """Panels of what is drawn of shots or points, and a remark where some are left out."""
+    """Return the panels of quantities over time, and a remark if rows were thinned.
+
+    ``quantity_lines`` yields the quantities of columns of shots or points.
+    """
     panels: list[Panel] = []
     thinning_step = 1
     for labelled in labelled_recordings:
@@ -464,13 +472,13 @@ def _time_panels(
 
 
 def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
-    """Return a chart of quantities over time; none without panels."""
+    """Return a chart of quantities over time, or None without panels."""
     facets = {"cloud": "Shown for", "quantity": "Quantity"}
     return Chart(heading, alt, caption, panels, facets) if panels else None
 
 
 def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[ChartLine]:
-    """Return marks of each beam; of all together where there are more than colours."""
+    """Return the marks of each beam; those of all beams together if they outnumber the colours."""
     values = to_shown_units(name, column_arrays[name])
     beams = np.unique(column_arrays["beam"])
     if beams.size > len(canvas.LINE_COLOURS):
@@ -489,7 +497,7 @@ def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[Char
 
 
 def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
-    """Shots and points by kind of each scanner, over all draws."""
+    """Return a table of shots, and points by kind, of each scanner over all draws."""
     rows = []
     for labelled in labelled_recordings:
         kind_counts, n_shots = np.zeros(len(POINT_KINDS), int), 0
@@ -510,9 +518,10 @@ def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable
 def returns_sentences(
     returns_frame: pandas.DataFrame, groups: Sequence[xr.Dataset], n_omitted: int = 0
 ) -> list[str]:
-    """Points and solved velocities in sentences; `returned` as :func:`returns_table` has it.
+    """Return sentences on points and on solved velocities.
 
-    `fewer` is the number of parts of the study that the page leaves out, and `returned` with it.
+    ``returns_frame`` is the frame of :func:`returns_table`. ``n_omitted`` is the number of parts of
+    the study that the page and the frame leave out.
     """
     n_shots, n_true = (int(returns_frame[name].sum()) for name in ("shots", "true"))
     n_false = int(returns_frame.iloc[:, 2:].sum(axis=None)) - n_true
@@ -540,7 +549,7 @@ def returns_sentences(
 def navigation_error_chart(
     spec: SceneSpec, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
-    """Errors of velocity and altitude over altitude; none where no scanner navigates."""
+    """Return velocity and altitude errors over altitude, or None if no scanner navigates."""
     named_recordings = [(labelled.label, labelled.recording) for labelled in labelled_recordings]
     error_curves = [
         curve
@@ -554,7 +563,7 @@ def navigation_error_chart(
 
 
 def _error_floor_remarks(spec: SceneSpec) -> list[str]:
-    """Errors that no echo lowers, and errors that are not stated."""
+    """Return remarks on the error floor of the spec, and on errors that it does not state."""
     floor_mapping = spec.to_yaml_mapping()["error_floor"]
     floor_texts = [
         f"{labels.coordinate_label(name)} {floor_mapping[name]}"
@@ -568,7 +577,7 @@ def _error_floor_remarks(spec: SceneSpec) -> list[str]:
 def noise_budget_of_flight(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
-    """Share of each source in the noise along the flight; none where eyepoints are gone."""
+    """Return the chart of noise shares along the flight, or None if eyepoints are missing."""
     try:
         panels = [
             panel
@@ -588,7 +597,7 @@ def noise_budget_of_flight(
 
 
 def _noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
-    """Return sources of noise of some of the shots that see something."""
+    """Return the noise shares of shots spread over the flight, as far as they hit a target."""
     recording = labelled.recording
     n_shots = recording.n_shots
     shot_indices = np.unique(

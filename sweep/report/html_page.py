@@ -1,4 +1,4 @@
-"""Pages: charts drawn by plotly with their choices, tables, texts, and the one file of all."""
+"""HTML pages: interactive plotly plots with controls, tables, texts, and their single file."""
 
 from __future__ import annotations
 
@@ -32,16 +32,19 @@ LINE_COLOURS = {
     "dark": ("#56B4E9", "#FF9A4D", "#3CF0C3", "#FF4BB4", "#F0E442", "#6987FF", "#FFFFFF",
              "#B4875A"),
 }  # fmt: skip
-"""At a contrast of 4.5 or more to the page, and at a CIEDE2000 of 10 or more from each other for
-every eye (the first four 12): found from the colours of Okabe and Ito (2008)."""
+"""Line colours for a light and a dark page, derived from those of Okabe and Ito (2008).
+
+Their contrast to the page is 4.5 or more. Their CIEDE2000 distance from each other is 10 or more
+(12 for the first four) for normal and colour-blind vision.
+"""
 
 DASH_STYLES = (
     "solid", "dash", "dashdot", "dot", "longdash", "longdashdot", "5px 2px 1px 2px", "2px 6px",
 )  # fmt: skip
-"""Lines differ in these as well, so that colour is not all that tells them apart."""
+"""Dash styles of lines, so that lines differ not only by colour."""
 
 _COLOUR_MAP_PARTS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
-"""Parts of the colour scale that stand out from the page."""
+"""Parts of the colour map that contrast with the page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
 
@@ -49,14 +52,15 @@ COLOUR_BAR: dict[str, Any] = {
     "orientation": "h", "x": 0.5, "yref": "container", "y": 0.91, "yanchor": "top", "len": 1.0,
     "thickness": 12,
 }  # fmt: skip
-"""A colour bar over the chart, as wide as it is, which suits narrow screens too."""
+"""Horizontal colour bar above the chart, which also fits narrow screens."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """A choice that a plot offers: its name as traces call it, and the text next to it.
+    """Control of a plot that selects one of several options.
 
-    `relayout` is what each option changes of the layout.
+    `name` is the key of the choice in a trace's `meta`, and `label` its text on the page.
+    `relayout` has the layout changes of each option.
     """
 
     name: str
@@ -66,16 +70,17 @@ class Control:
 
     @property
     def initial_option(self) -> int:
-        """The option chosen at the start: the middle one of a study's parts, else the first."""
+        """Index of the initial option: the middle one for parts of a study, else the first."""
         return (len(self.options) - 1) // 2 if self.name == "part" else 0
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A chart as a page shows it, with its choices; one of a single option is left out.
+    """Interactive chart of a page, with its controls; a control with one option is not shown.
 
-    `meta` of a trace says when it is shown and which colour it takes (see :func:`trace_meta`). The
-    first heat map shown may be `cut` along either side; a solid view is `tall`.
+    `meta` of a trace defines when it is shown and which colour it takes (see :func:`trace_meta`).
+    With `has_cut` the page offers cuts through the first heat map. `is_tall` is for views in three
+    dimensions.
     """
 
     heading: str
@@ -88,17 +93,17 @@ class Plot:
 
 
 def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, Any]:
-    """`meta` of a trace: at which choices it is shown, and which colour of the palette it takes."""
+    """Return `meta` of a trace: the choices at which it is shown, and its index in the palette."""
     return {"when": choices} | ({} if palette_index is None else {"series": palette_index})
 
 
 def to_sentences(parts: Sequence[str]) -> list[str]:
-    """Parts as sentences, empty ones left out."""
+    """Return parts as sentences; skip empty parts."""
     return [labels.join_sentences([part]) for part in parts if part]
 
 
 def make_plot(chart: Chart) -> Plot:
-    """Return a chart to choose from, hover and zoom."""
+    """Return a chart as an interactive plot."""
     first_panel = chart.panels[0]
     layout_options: dict[str, Any] = {}
     area_lines = [line for line in first_panel.lines if line.style == "area"]
@@ -130,7 +135,7 @@ def make_plot(chart: Chart) -> Plot:
 
 
 def _make_control(panels: Sequence[Panel], name: str, label: str) -> Control:
-    """Return the choice of a facet's options, which may change the upright axis."""
+    """Return the control of a facet; an option changes the y axis if panels differ in it."""
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
         axes_by_option.setdefault(panel.facet_choices[name], set()).add(panel.y)
@@ -149,7 +154,7 @@ def _make_control(panels: Sequence[Panel], name: str, label: str) -> Control:
 
 
 def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[Any]:
-    """Traces of a panel's lines, or of its map."""
+    """Yield the traces of a panel's lines, or of its map."""
     for line in panel.lines:
         yield from _line_traces(panel, line)
     if (heat_map := panel.heat_map) is None or colour_scale is None:
@@ -194,12 +199,12 @@ def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[An
 
 
 def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Numbers in the digits that a screen can show."""
+    """Return floats in single precision, which is enough for a screen."""
     return values.astype(np.float32) if values.dtype.kind == "f" else values
 
 
 def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]:
-    """Return the line, over its band where it has one."""
+    """Yield the traces of a line, preceded by its band if it has one."""
     meta = trace_meta(line.style_index, **panel.facet_choices)
     if panel.y.kind == LOG:
         line = _mask_nonpositive(line)
@@ -246,7 +251,7 @@ def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]
 
 
 def _mask_nonpositive(line: ChartLine) -> ChartLine:
-    """Return the line where it is above zero, as an axis of decades needs."""
+    """Return a line with nan for values that a logarithmic axis can't show."""
     masked_values: dict[str, Any] = {
         name: np.where(values > 0, values, np.nan)
         for name, values in (("y", line.y), ("low", line.low), ("high", line.high))
@@ -258,7 +263,7 @@ def _mask_nonpositive(line: ChartLine) -> ChartLine:
 def _band_trace(
     line: ChartLine, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
 ) -> go.Scatter:
-    """Return the area between the ends of a line's band."""
+    """Return the trace of the area between the ends of a line's band."""
     finite_indices = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     reversed_indices = finite_indices[::-1]
     return go.Scatter(
@@ -274,7 +279,7 @@ def _band_trace(
 
 
 def colour_themes() -> dict[str, Any]:
-    """Palette, scales and template of each colour scheme, for the page's script."""
+    """Return palette, colour scales and template of each colour scheme, for the page's script."""
     fractions, colours = np.linspace(0, 1, 11), colormaps[canvas.COLOUR_MAP_NAME]
     return {
         scheme: {
@@ -289,7 +294,7 @@ def colour_themes() -> dict[str, Any]:
 
 
 def plot_layout(**options_set: Any) -> dict[str, Any]:
-    """Layout of a plot: legend above, no title (the page has it), room for labels."""
+    """Return the layout of a plot: legend above, margins for labels, no title."""
     default_options: dict[str, Any] = {
         "margin": {"l": 10, "r": 16, "t": 30, "b": 55},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -304,12 +309,12 @@ def plot_layout(**options_set: Any) -> dict[str, Any]:
 
 
 def wrap_html(text: str, width: int = 44) -> str:
-    """Words in lines that fit next to a plot."""
+    """Return text with line breaks in HTML, so that it fits next to a plot."""
     return "<br>".join(textwrap.wrap(text, width, break_on_hyphens=False))
 
 
 def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
-    """Return an axis with its name, kind and ends."""
+    """Return the layout of an axis: title, scale and limits."""
     label = wrap_html(axis.label) if options_set else axis.label
     axis_options = {"title": {"text": label, "standoff": 12}, "zeroline": False, "type": axis.kind}
     if axis.limits is not None:
@@ -318,15 +323,15 @@ def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
         )
     if axis.kind == "log":
         axis_options["nticks"] = (
-            6  # decades without digits 2 and 5 between them, unless there are few
+            6  # few ticks, so that only decades are labelled and not 2 and 5 between them
         )
-    if axis.label.startswith("number of") and axis.kind == "linear":  # 8,000 rather than 0.8 10^4
+    if axis.label.startswith("number of") and axis.kind == "linear":  # 8,000, not 8 x 10^3
         return axis_options | {"exponentformat": "none", "separatethousands": True} | options_set
     return axis_options | {"exponentformat": "power"} | options_set
 
 
 def title_layout(text: str) -> dict[str, Any]:
-    """Title over the bar of colours."""
+    """Return the layout of the title above the colour bar."""
     return {
         "text": wrap_html(text, 48), "x": 0.5, "xanchor": "center", "yref": "container", "y": 1,
         "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
@@ -335,7 +340,7 @@ def title_layout(text: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class HtmlTable:
-    """Rows that can be sorted, searched and downloaded as `file`.csv, under some sentences."""
+    """Table that the reader can sort, search and download as `file`.csv, below a caption."""
 
     heading: str
     caption: Sequence[str]
@@ -345,7 +350,7 @@ class HtmlTable:
 
 @dataclass(frozen=True)
 class TextItem:
-    """Text that keeps its lines, to read, copy or download as `file` (empty: not to download)."""
+    """Preformatted text to read, copy, or download as `file`; '' for no download."""
 
     heading: str
     caption: Sequence[str]
@@ -358,7 +363,7 @@ PageItem = Plot | HtmlTable | TextItem
 
 @dataclass(frozen=True)
 class PageSection:
-    """A part of the page, with paragraphs at its head; the anchor is its name in addresses."""
+    """Section of a page: paragraphs and items; `anchor` is its name in links."""
 
     anchor: str
     title: str
@@ -368,7 +373,7 @@ class PageSection:
 
 @dataclass(frozen=True)
 class ReportPage:
-    """A whole report: facts to know first, remarks not to be overlooked, sections in order."""
+    """Complete report: key facts, important remarks, and sections in order."""
 
     title: str
     question: str
@@ -378,15 +383,15 @@ class ReportPage:
 
 
 TABLE_ROWS_SHOWN = 10
-"""Rows of a table that are shown at a time."""
+"""Number of table rows that are shown at once."""
 
 
 LONG_CELL_CHARACTERS = 40
-"""Characters from which on a cell holds a sentence."""
+"""Length above which the text of a cell counts as a sentence [characters]."""
 
 
 def render_html(page: ReportPage) -> str:
-    """Return the page as the text of a file."""
+    """Return the page as HTML."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sweep.report"),
         autoescape=True,
@@ -411,19 +416,19 @@ def render_html(page: ReportPage) -> str:
 
 
 def _compress_base64(text: str) -> str:
-    """Text compressed, a third of what it is, in letters that can stand in a page."""
+    """Return text compressed by gzip and encoded in base64, about a third of its size."""
     return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
 def _chart_json(plot: Plot) -> str:
-    """JSON of a plot for the page's script."""
+    """Return the JSON of a plot for the page's script."""
     relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
     content = {"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.has_cut}
     return str(to_json_plotly(content))
 
 
 def _table_json(table: HtmlTable) -> str:
-    """JSON of a table for the page's script, with its sorting, searching and downloading."""
+    """Return the JSON of a table for the page's script, including its sorting and download."""
     csv_button = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
     widths = table.frame.map(lambda cell: len(str(cell))).max()
     with pandas.option_context("display.float_format", "{:.6g}".format):
@@ -441,12 +446,12 @@ def _table_json(table: HtmlTable) -> str:
             ],
             buttons=[csv_button, "copyHtml5"],
         )
-    # As words the library refuses them here; the template has the class. It lists its options
-    # in another order from run to run.
+    # The template sets class and style, which the script does not accept as options. Keys are
+    # sorted, because the order of itables' options varies from run to run.
     table_options = {k: v for k, v in arguments.items() if k not in ("classes", "style")}
     return json.dumps(table_options, sort_keys=True)
 
 
 def _data_url(text_item: TextItem) -> str:
-    """Return a text as an address that can be saved."""
+    """Return a text as a data URL, which the browser can save."""
     return f"data:text/plain;charset=utf-8;base64,{b64encode(text_item.text.encode()).decode()}"

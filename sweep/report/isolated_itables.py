@@ -1,8 +1,8 @@
-"""The tables of itables, without settings of the folder that a report is made in, or the user's.
+"""Import of itables without configuration files of the current folder or of the user.
 
-itables looks for them as it is imported, in the current folder, all above it and in the user's own.
-Pages would differ from place to place, and where a user has no such folder (an unknown number, as
-in containers, and no HOME) the import fails.
+itables searches for configuration as it is imported, in the current folder, in all folders above it
+and in the user's home. Pages would therefore differ from place to place. Without a home folder
+(unknown user id and no HOME, as in containers) the import would fail.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 
 _user_setting = os.environ.get("ITABLES_CONFIG")
-os.environ["ITABLES_CONFIG"] = ""  # its own word for: no settings
+os.environ["ITABLES_CONFIG"] = ""  # itables reads the empty string as "no configuration"
 try:
     import itables.options as options
     from itables.javascript import get_itable_arguments

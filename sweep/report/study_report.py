@@ -1,4 +1,4 @@
-"""The report of a store: what is on it, in which order, and the file that it becomes."""
+"""Report of a store: the selection and order of its contents, and the HTML file."""
 
 from __future__ import annotations
 
@@ -56,10 +56,13 @@ PAGE_LIMITS = ChartSizeLimits(
     cells_max=400_000,
     maps_abreast=1,
 )
-"""Cells of all heat maps of a page together, which keep it to a few megabytes."""
+"""Limits of charts on a page.
+
+The limit of cells applies to all heat maps together, which keeps a page to a few megabytes.
+"""
 
 TABLE_POINTS_MAX = 1000
-"""Points in a table."""
+"""Largest number of points in a table."""
 
 GRID_TABLE_VARIABLES = (
     "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
@@ -76,28 +79,33 @@ CLOUD_TABLE_QUANTITIES = (
 
 
 def write_report(store: str | Location, file: str | Path) -> Path:
-    """Write the report of a study as one page that needs nothing else.
+    """Write the report of a study as a single self-contained HTML file.
 
     Parameters
     ----------
     store
-        Store of a grid of points or of a scene, complete or not.
+        Store of a grid or of a scene, complete or not.
     file
-        The page to write; nothing is in its place before it is whole.
+        HTML file to write. It appears only once it is complete.
+
+    Returns
+    -------
+    Path
+        Written file.
 
     Raises
     ------
     NotAStoreError
-        Where there is no store of a grid or of a scene.
+        The path has no store of a grid or of a scene.
     OSError
-        Where the file can't be written.
+        The file can't be written.
     """
     store, file = parse_location(store), Path(file)
     kind = read_attributes_of_kind(store)["kind"]
     if kind == ACCURACY_KIND:
         raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
     if kind not in (GRID_KIND, SCENE_KIND):
-        read_attributes_of_kind(store, GRID_KIND)  # says what it holds instead
+        read_attributes_of_kind(store, GRID_KIND)  # raises an error that names its kind
     page = _scene_report(store) if kind == SCENE_KIND else _grid_report(store)
     html = render_html(page)
     with atomic_path(file, replace=True) as draft_path:
@@ -121,7 +129,7 @@ def _grid_report(store: Location) -> ReportPage:
     detector_items: list[SectionItem] = [
         detector_charts.noise_budget_of_grid(results, *profiles_and_omitted)
     ]
-    if not spec.draws.draws_whole_spectra:  # of what looks at those there are no closed forms
+    if not spec.draws.draws_whole_spectra:  # detectors of whole spectra have no closed forms
         detector_items = [
             detector_charts.roc_chart(results, *profiles_and_omitted),
             detector_charts.false_alarm_chart(results, *profiles_and_omitted),
@@ -146,7 +154,7 @@ def _grid_report(store: Location) -> ReportPage:
 def _answer_section(
     spec: AnySpec, groups: Sequence[xr.Dataset], counted_unit: str, further_sentences: Sequence[str]
 ) -> PageSection:
-    """Section that opens the page: detection, false alarms, and whether the tolerance is kept."""
+    """Return the first section: detection, false alarms, and if the tolerance is kept."""
     tolerance, pd_level = spec.accuracy.tolerance, detector_charts.PD_LEVEL
     limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
     lazy_counts = []
@@ -158,7 +166,7 @@ def _answer_section(
         lazy_counts.append(
             (pd.count(), (pd >= pd_level).sum(), pd.sum(), pd.min(), missed.sum(), unchecked.sum())
         )
-    counts_by_statistic = np.array(dask.compute(lazy_counts)[0], float).T  # a column a group
+    counts_by_statistic = np.array(dask.compute(lazy_counts)[0], float).T  # one column per group
     n_computed, n_at_level, pd_sum, _, missed, unchecked = counts_by_statistic.sum(axis=1)
     if not n_computed:
         return PageSection("answer", "Answer", ["No result is there yet."])
@@ -191,7 +199,7 @@ def _answer_section(
 def _request_section(
     spec: AnySpec, effect_flags: Sequence[xr.DataArray], dataset: xr.Dataset
 ) -> PageSection:
-    """Section on the study's fields, the effects simulated and the accuracy reached."""
+    """Return the section on the study's fields, simulated effects and accuracy."""
     items = [
         _axis_table(spec),
         _effect_table(effect_flags, spec.effect_modes()),
@@ -206,7 +214,7 @@ def _report_page(
     spec: AnySpec, attributes: Mapping[Any, Any], counted_unit: str,
     first_facts: Sequence[tuple[str, str]], sections: Sequence[PageSection], store: Location,
 ) -> ReportPage:  # fmt: skip
-    """Return the page: a summary, its sections, and how to make it again."""
+    """Return the report: summary, sections, and instructions to reproduce it."""
     facts = [
         *first_facts,
         ("study", attributes["study_id"][:8]),
@@ -229,7 +237,7 @@ def _report_page(
 
 
 def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
-    """Charts of the surfaces and slices that a study asks for, or of a usual set."""
+    """Yield the charts of the surfaces and slices in the spec, or of a default set."""
     figure_specs = [
         figure_spec
         for figure_spec in results.figure_specs
@@ -251,7 +259,7 @@ def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
 
 
 def _study_tables(results: GridResults) -> Iterator[HtmlTable]:
-    """Return the tables that a study asks for; every output of a single point."""
+    """Yield the tables in the spec; for a study of a single point all its outputs."""
     if not results.spec.axes:
         yield from _html_tables(outputs_page(results.dataset), "outputs")
     for figure_spec in results.figure_specs:
@@ -260,7 +268,7 @@ def _study_tables(results: GridResults) -> Iterator[HtmlTable]:
 
 
 def _html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
-    """Tables of a page of tables."""
+    """Yield the tables of a page of tables."""
     for table_number, page_table in enumerate(table_page.page_tables):
         frame = pandas.DataFrame(
             [list(row) for row in page_table.rows], columns=list(page_table.columns)
@@ -319,7 +327,7 @@ def _scene_report(store: Location) -> ReportPage:
 
 
 def consistency_sentences(tree: xr.DataTree) -> list[str]:
-    """Return sentences on errors against the standard errors that are stated."""
+    """Return sentences that compare errors with their stated standard errors."""
     results = check_consistency(tree)
     if messages := [result.message for result in results if not result.is_consistent]:
         return messages
@@ -336,7 +344,7 @@ def _page_section(
 
 
 def _grid_point_table(results: GridResults) -> HtmlTable | None:
-    """Points of a grid, every k-th along its longest axes; none where there is a single one."""
+    """Return a table of a grid's points, thinned along its longest axes; None without axes."""
     dataset = results.dataset
     if not results.spec.axes:
         return None
@@ -374,7 +382,7 @@ def _reduction_caption(n_rows: int, n_total: int) -> list[str]:
 
 
 def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTable:
-    """Points of clouds of the first draw, with what a reader wants of each."""
+    """Return a table of the points of all clouds in the first draw, thinned."""
     frames, n_total = [], 0
     for labelled in labelled_recordings:
         thinned = labelled.recording.thinned_rows(
@@ -399,7 +407,7 @@ def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTabl
 
 
 def _field_table(spec: AnySpec) -> HtmlTable:
-    """Every field of the spec with what it means."""
+    """Return a table of every field of the spec, with its description."""
     rule_by_path = parameter_rules()
     spec_mapping = spec.to_yaml_mapping()
     rows = [
@@ -428,7 +436,7 @@ def _format_field(value: object) -> str:
 
 
 def _axis_table(spec: AnySpec) -> HtmlTable | None:
-    """Axes with their values."""
+    """Return a table of the axes with their values, or None without axes."""
     rows = [
         (
             axis.name,
@@ -453,7 +461,7 @@ def _format_values(values: np.ndarray, units: str) -> str:
 
 
 def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> HtmlTable:
-    """Effects that were simulated: at how many points, and in which part of the study."""
+    """Return a table of the effects: share of points with each, and extent of these points."""
     lazy_counts = []
     for k in range(len(EFFECTS)):
         presence = [array // 2**k % 2 > 0 for array in flag_arrays]
@@ -504,7 +512,7 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
 
 
 def _describe_presence(presence: xr.DataArray) -> str:
-    """Return ends of the coordinates along a dimension between which an effect is present."""
+    """Return the extent of coordinates along a dimension within which an effect is present."""
     is_present, extent_texts = presence.values, []
     for name, coordinate in presence.coords.items():
         if coordinate.ndim != 1 or is_present.all() or not is_present.any():
@@ -523,7 +531,7 @@ def _describe_presence(presence: xr.DataArray) -> str:
 
 
 def accuracy_sentences(dataset: xr.Dataset, spec: AnySpec) -> list[str]:
-    """Accuracy of the results, in sentences."""
+    """Return sentences on the accuracy of the results."""
     tolerance = spec.accuracy.tolerance
     sentences = [
         f"Asked for: no probability of detection off by more than {tolerance:g}"
@@ -555,7 +563,7 @@ def accuracy_sentences(dataset: xr.Dataset, spec: AnySpec) -> list[str]:
 def _reproduction_section(
     attributes: Mapping[Any, Any], spec: AnySpec, store_path: str
 ) -> PageSection:
-    """Citation of the study, and commands that make it again."""
+    """Return the section with the citation of the study, and commands to reproduce it."""
     version_by_package = parse_software_versions(attributes)
     version = version_by_package.get("sweep", "")
     year = str(attributes.get("finished") or attributes.get("started") or "")[:4]

@@ -1,1 +1,1 @@
-"""Places of stores, on disk or in an object store, and their logs and documents."""
+"""Locations of stores, on disk or in an object store, and the format of their files and logs."""

@@ -1,8 +1,9 @@
-"""Files that users and other programs have put into the folder of a store.
+"""Foreign files: files that users and other programs have put into the folder of a store.
 
-They are listed, and never removed: where another store takes the place of this one, they move
-into it. A store's document and its list of objects name its arrays. Their metadata and chunks, and
-the files of the journal, are sweep's; all else is foreign.
+Foreign files are listed and never deleted. If another store replaces this one, they are moved into
+the new store. The root document of a store and its manifest name the arrays of the store. The
+metadata and chunks of these arrays, and the files of the journal, belong to sweep. Everything else
+is foreign.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sweep.regular_files import read_below
 from sweep.safe_json import parse_json
 from sweep.storage.size_checks import METADATA_BYTES_MAX
 
-#: Files that programs leave in any folder; nobody misses them.
+#: Patterns of files that operating systems and file managers leave in any folder.
 LITTER_PATTERNS = (
     ".DS_Store", "._*", ".snakemake_timestamp", ".nfs*", ".fuse_hidden*", ".directory",
     "Thumbs.db", "desktop.ini",
@@ -33,7 +34,7 @@ _DRAFT_NAME = re.compile(r".+\.[0-9a-f]{32}\.partial")
 
 
 def is_litter(name: str) -> bool:
-    """Tell whether a file is one that programs leave everywhere.
+    """Tell whether a file is one that operating systems and file managers leave in any folder.
 
     >>> is_litter(".DS_Store"), is_litter("pd_up/.nfs000000000123"), is_litter("notes.txt")
     (True, True, False)
@@ -43,12 +44,12 @@ def is_litter(name: str) -> bool:
 
 
 def is_draft(name: str) -> bool:
-    """Tell whether a file is one that sweep had not finished writing."""
+    """Tell whether a file is an unfinished draft: one that sweep had not finished writing."""
     return bool(_DRAFT_NAME.fullmatch(name))
 
 
 def list_foreign_files(store: Path) -> list[str]:
-    """Names of what is in the folder of a store and not sweep's; of folders with a slash behind."""
+    """List foreign files and folders of a store, by relative path; folders end in a slash."""
     node_names = _node_names(store)
     return sorted(
         _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
@@ -56,7 +57,7 @@ def list_foreign_files(store: Path) -> list[str]:
 
 
 def _node_names(store: Path) -> set[str]:
-    """Arrays and groups that a store was made with, as far as it still says so."""
+    """Return the names of a store's arrays and groups, as far as its documents can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         root_metadata = parse_json(read_below(store, "zarr.json", METADATA_BYTES_MAX))
@@ -68,13 +69,13 @@ def _node_names(store: Path) -> set[str]:
                 object_name = str(parse_json(line).get("object", ""))
                 if object_name.endswith("/zarr.json"):
                     node_names.add(object_name.removesuffix("/zarr.json"))
-    if not node_names:  # spectra, and what has lost both
+    if not node_names:  # stores of spectra, and stores that have lost both documents
         node_names |= {path.parent.name for path in store.glob("*/zarr.json")}
     return node_names
 
 
 def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
-    """Return the groups that nodes lie in."""
+    """Yield the names of the groups that contain the nodes."""
     for node in node_names:
         while node := node.rpartition("/")[0]:
             yield node
@@ -90,7 +91,7 @@ def _iter_foreign_files(
                 yield from _iter_foreign_journal_files(entry.path) if is_folder else ()
             elif entry.name == "c" and prefix.rstrip("/") in node_names:
                 yield from _iter_foreign_chunk_files(entry.path, f"{name}/") if is_folder else ()
-            elif name in known_folders:  # a link in its place is damage, and no file of the user's
+            elif name in known_folders:  # a link instead of the folder is damage, not foreign
                 nested_foreign_files = _iter_foreign_files(
                     Path(entry.path), f"{name}/", node_names, known_folders
                 )
@@ -119,9 +120,9 @@ def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
 
 
 def move_foreign_files(old_store: Path, new_store: Path) -> None:
-    """Move what is foreign in a folder to the one that takes its place; OSError where it can't.
+    """Move the foreign files of a store to its replacement; raise OSError if one can't be moved.
 
-    A file whose name is taken there gets a number behind its name.
+    If the name of a file exists there already, a number is appended to its name.
     """
     if not old_store.is_dir() or old_store.is_symlink():
         return
@@ -134,5 +135,5 @@ def move_foreign_files(old_store: Path, new_store: Path) -> None:
             target = (new_store / name).with_name(f"{Path(name).name}.{suffix_number}")
             suffix_number += 1
         target.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):  # another process has moved it
+        with suppress(FileNotFoundError):  # another process has already moved it
             os.rename(old_store / name, target)

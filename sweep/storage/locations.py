@@ -1,18 +1,19 @@
-"""Places of stores: a folder on disk, or a key in an object store, and what is put there whole.
+"""Locations of stores, on disk or in an object store, and atomic writes to them.
 
-The environment gives credentials and endpoint of an object store; nothing of it is kept in a store.
+The environment supplies credentials and endpoint of an object store. None of them is written into a
+store.
 
-Files and folders are made in the folder of what they replace, under a hidden name, and renamed into
-its place. The old one is renamed aside and removed last. The hidden names in the folder of
+A file or folder that replaces another is written next to it under a hidden name, and then renamed.
+The old one is first renamed to a hidden name, and deleted last. The hidden names in the folder of
 ``NAME`` are
 
-    .NAME.next                                 a store that is to take the place of NAME, under way
-    .NAME.creating-HOST-PID.START-ab12cd34     half made by a process
-    .NAME.replaced-HOST-PID.START-ab12cd34     what stood at NAME until it was replaced
-    .NAME.removing-HOST-PID.START-ab12cd34     half removed
+    .NAME.next                                 unfinished store that will replace NAME
+    .NAME.creating-HOST-PID.START-ab12cd34     draft that a process is writing
+    .NAME.replaced-HOST-PID.START-ab12cd34     former content of NAME, until it is deleted
+    .NAME.removing-HOST-PID.START-ab12cd34     content that is being deleted
 
-and `settle` sees to the last three where a process has died. In an object store, which has no
-renaming, nothing is ever replaced.
+:func:`recover_interrupted_replace` handles the last three after a process has died. An object store
+can't rename, so nothing in it is ever replaced.
 """
 
 from __future__ import annotations
@@ -39,22 +40,22 @@ from typing import Any, TypeVar
 from sweep.messages import escape_unprintable
 from sweep.regular_files import check_size, open_below, read_below
 
-#: Kinds of addresses; `memory` is for tests, and lives as long as its process.
+#: URL schemes of object stores; `memory` is for tests, and exists only within its process.
 URL_SCHEMES = ("s3", "gs", "az", "memory")
 
 #: Directory of the journal inside a store.
 JOURNAL_DIR = ".sweep"
 
-#: What the name of a file ends in that is still being written.
+#: Suffix of a file that is still being written.
 DRAFT_SUFFIX = ".partial"
 
-#: Attribute of a copy of a store with many chunks to a file.
+#: Attribute that marks a packed copy of a store: its files are shards of many chunks.
 PACKED_ATTRIBUTE = "packed"
 
-#: Requests to an object store at once: each takes some ms, nearly all of it waiting.
+#: Concurrent requests to an object store. A request takes milliseconds, mostly waiting.
 CONCURRENT_REQUESTS_MAX = 16
 
-#: What is tried again, and for how long: replies of 500 and more, none in time, lost connections.
+#: Retries after HTTP status 500 and above, timeouts and lost connections.
 RETRY_CONFIG = {
     "max_retries": 8,
     "retry_timeout": timedelta(seconds=90),
@@ -65,7 +66,7 @@ RETRY_CONFIG = {
     },
 }
 
-#: The same at first contact, where a wrong address is likelier than a passing fault.
+#: Retries at the first contact, when a wrong address is likelier than a transient fault.
 FIRST_CONTACT_RETRY_CONFIG = {
     **RETRY_CONFIG,
     "max_retries": 3,
@@ -75,12 +76,12 @@ FIRST_CONTACT_RETRY_CONFIG = {
 CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
-"""Mark by which an object store knows a state of an object."""
+"""Tag (ETag or version) by which an object store identifies one version of an object."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: Words of the library for a body that is cut, and for a list that is.
+#: Error texts of the library for a truncated response body and a truncated listing.
 _CUT = ("body error", "invalid list response")
 
 _clients: dict[str, Any] = {}
@@ -88,7 +89,7 @@ _clients_lock = threading.RLock()
 
 
 class ObjectStoreError(OSError):
-    """An object store that can't be used as asked: the text says why and what to do."""
+    """Error of an object store; its text states the cause and the remedy."""
 
     def __str__(self) -> str:
         return escape_unprintable(f"{self.filename}: {self.strerror}")
@@ -96,9 +97,9 @@ class ObjectStoreError(OSError):
 
 @dataclass(frozen=True, order=True)
 class ObjectPath:
-    """A key in an object store, spoken to as far as needed in the words of `pathlib`."""
+    """Key in an object store, with the part of the interface of `pathlib.Path` that sweep needs."""
 
-    bucket_url: str  # kind and bucket: s3://bucket
+    bucket_url: str  # scheme and bucket, such as s3://bucket
     key: str  # without a slash at either end
 
     def __str__(self) -> str:
@@ -110,30 +111,33 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the key below this one."""
+        """Return the key with further parts appended."""
         return self / "/".join(others)
 
     @property
     def name(self) -> str:
-        """Last part of the key."""
+        """Last part of the key, after the last slash."""
         return self.key.rpartition("/")[2]
 
     @property
     def parent(self) -> ObjectPath:
-        """The key without its last part."""
+        """Path of the key without its last part."""
         return ObjectPath(self.bucket_url, self.key.rpartition("/")[0])
 
     def with_name(self, name: str) -> ObjectPath:
-        """Return a key in the same folder."""
+        """Return the path with its last part replaced."""
         return self.parent / name
 
     def absolute(self) -> ObjectPath:
-        """Itself."""
+        """Return the path unchanged: every key is absolute."""
         return self
 
     @property
     def client(self) -> Any:
-        """The object store, connected once a process; the first contact checks that it exists."""
+        """Client of the bucket, connected once per process.
+
+        The first access lists the bucket, which checks that it exists and can be read.
+        """
         with _clients_lock:
             if self.bucket_url not in _clients:
                 with translate_errors(self):
@@ -144,28 +148,28 @@ class ObjectPath:
             return _clients[self.bucket_url]
 
     def _head_object(self) -> Any:
-        """Metadata of the object; None where there is none."""
+        """Return the metadata of the object, or None if it does not exist."""
         with translate_errors(self), suppress(FileNotFoundError):
             return self.client.head(self.key)
 
     def exists(self) -> bool:
-        """Tell whether there is an object at the key, or a Zarr group or array under it."""
+        """Tell whether an object has this key, or a Zarr group or array lies under it."""
         return self.size() >= 0 or (self / "zarr.json").size() >= 0
 
     def size(self) -> int:
-        """Bytes of the object; -1 where there is none."""
+        """Return the size of the object [bytes], or -1 if it does not exist."""
         head = self._head_object()
         return -1 if head is None else int(head["size"])
 
     def last_modified(self) -> float | None:
-        """Time at which the object was last written [s since the epoch]; None without one."""
+        """Return the time of the last write [s since the epoch], or None if no object exists."""
         head = self._head_object()
         return None if head is None else float(head["last_modified"].timestamp())
 
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
-        """Return the object whole; once more where the body of the answer is cut.
+        """Read the whole object, and once more if the response body is truncated.
 
-        RefusedFileError where it is larger than so many bytes.
+        Raise RefusedFileError if the object is larger than ``bytes_max``.
         """
         from obstore.exceptions import BaseError
 
@@ -179,17 +183,17 @@ class ObjectPath:
                 return bytes(self.client.get(self.key).bytes())
 
     def write_bytes(self, content: bytes) -> None:
-        """Put an object, whole, in the place of whatever is there."""
+        """Write a whole object; replace the existing one, if any."""
         with translate_errors(self):
             self.client.put(self.key, content)
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Take the object away; that there is none is no error, whatever is asked for."""
+        """Delete the object; a missing object is never an error, whatever ``missing_ok`` is."""
         with translate_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)
 
     def iter_objects_below(self) -> Iterator[tuple[str, int]]:
-        """Keys under this one, relative to it, and their sizes, a page in memory at a time."""
+        """Yield the relative key and size [bytes] of each object below this key, page by page."""
         from obstore.exceptions import BaseError
 
         last, is_repeated = None, False
@@ -204,7 +208,7 @@ class ObjectPath:
                 except BaseError as error:
                     if is_repeated or not _is_cut(error):
                         raise
-                    is_repeated = True  # the list goes on after the last key that came
+                    is_repeated = True  # list again, from the last key that was received
 
     def _child_names(self) -> list[str]:
         with translate_errors(self):
@@ -213,15 +217,15 @@ class ObjectPath:
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def is_dir(self) -> bool:
-        """Tell whether keys lie under this one."""
+        """Tell whether any keys lie under this one."""
         return bool(self._child_names())
 
     def glob(self, pattern: str) -> list[ObjectPath]:
-        """Keys right under this one whose name fits a pattern."""
+        """Return the direct children of this key whose name matches a pattern."""
         return [self / name for name in self._child_names() if fnmatch(name, pattern)]
 
     def read_with_version(self) -> tuple[bytes, ObjectVersion] | None:
-        """Return the object and the tag of what it holds; None where there is none."""
+        """Return the content of the object and its version tag, or None if it does not exist."""
 
         def ask() -> tuple[bytes, ObjectVersion]:
             response = self.client.get(self.key)
@@ -232,9 +236,10 @@ class ObjectPath:
         return None
 
     def refuse_cut(self, content: bytes) -> None:
-        """Raise ObjectStoreError if an answer with this content lacks a part of the object.
+        """Raise ObjectStoreError if a response with this content is a truncated object.
 
-        A proxy may announce the part of a body that it has as the whole of it.
+        A proxy may send a truncated body with a matching content length, so the client can't
+        notice.
         """
         if len(content) < self.size():
             raise ObjectStoreError(errno.EIO, _cut_in_words(self.bucket_url), str(self))
@@ -242,7 +247,11 @@ class ObjectPath:
     def put_if_unchanged(
         self, content: bytes, expected_version: ObjectVersion | None
     ) -> ObjectVersion | None:
-        """Put an object if none is there, or only what has a tag; None if somebody was quicker."""
+        """Write an object only if its version is still the expected one.
+
+        Return the new version, or None if another process has written the object meanwhile. An
+        ``expected_version`` of None means that no object may exist.
+        """
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
         mode = "create" if expected_version is None else expected_version
@@ -253,7 +262,7 @@ class ObjectPath:
 
 
 def _ask_twice(ask: Callable[[], Result]) -> Result:
-    """Return what an object store answers, asked once more where the answer is cut."""
+    """Return the response of a request, which is repeated once if the response is truncated."""
     from obstore.exceptions import BaseError
 
     try:
@@ -265,7 +274,7 @@ def _ask_twice(ask: Callable[[], Result]) -> Result:
 
 
 def _is_cut(error: Exception) -> bool:
-    """Tell whether the body of an answer, or the document of a list in it, was cut short."""
+    """Tell whether an error means that the body or the listing of a response was truncated."""
     return any(words in str(error) for words in _CUT)
 
 
@@ -300,7 +309,7 @@ def _s3_endpoint() -> str:
 
 @contextmanager
 def translate_errors(location: object) -> Iterator[None]:
-    """Errors of an object store in words, with what to do; nothing where a path is a file's."""
+    """Raise ObjectStoreError, with the remedy, for errors of an object store; ignore file paths."""
     if not isinstance(location, ObjectPath):
         yield
         return
@@ -314,14 +323,20 @@ def translate_errors(location: object) -> Iterator[None]:
 
 
 def to_readable_error(error: Exception) -> Exception:
-    """Put an error into words if an object store raised it through Zarr or xarray."""
+    """Return an ObjectStoreError for an error that an object store raised through Zarr or xarray.
+
+    Any other error is returned as it is.
+    """
     if type(error).__module__.partition(".")[0] != "obstore":
         return error
     return ObjectStoreError(*classify_error_text(str(error), ""), "the store")
 
 
 def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
-    """Return the number and words of what an object store's library says, of a kind and bucket."""
+    """Translate an error text of the object-store library to an errno and a message with remedy.
+
+    ``bucket_url``: scheme and bucket that the message names.
+    """
     bucket, service = bucket_url.partition("://")[2], _service(bucket_url)
     error_summary = error_text.partition("\n\nDebug source")[0]
     status_match = re.search(
@@ -361,11 +376,14 @@ def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
 
 
 Location = Path | ObjectPath
-"""A place; both know `/`, `name`, `parent`, `exists()` and `read_bytes()`."""
+"""Path of a store or file; both types have `/`, `name`, `parent`, `exists()`, `read_bytes()`."""
 
 
 def parse_location(address: str | Location) -> Location:
-    """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``."""
+    """Parse the address of a store: a path, ``s3://bucket/key``, ``gs://...`` or ``az://...``.
+
+    Raise ObjectStoreError for an address that is neither.
+    """
     if isinstance(address, ObjectPath):
         return address
     if not isinstance(address, str | os.PathLike):
@@ -391,7 +409,7 @@ def parse_location(address: str | Location) -> Location:
 
 
 def to_zarr_store(location: Location) -> Any:
-    """Return a place as Zarr and xarray open it."""
+    """Return a location in the form in which Zarr and xarray open it."""
     if isinstance(location, Path):
         return location
     from zarr.storage import ObjectStore, StorePath
@@ -402,7 +420,7 @@ def to_zarr_store(location: Location) -> Any:
 def map_concurrently(
     location: Location, function: Callable[[Item], Result], items: Iterable[Item]
 ) -> list[Result]:
-    """Map a function, in order; concurrently if each call is a request over the network."""
+    """Apply a function to all items, in order; use threads if the location is an object store."""
     if isinstance(location, Path):
         return [function(item) for item in items]
     return list(_request_pool().map(function, items))
@@ -414,14 +432,17 @@ def _request_pool() -> ThreadPoolExecutor:
 
 
 def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
-    """Read a file below a place whole; RefusedFileError where it is none, or larger than that."""
+    """Read a whole file below a location.
+
+    Raise RefusedFileError if it is no regular file, or larger than ``bytes_max``.
+    """
     if isinstance(location, ObjectPath):
         return (location / object_name).read_bytes(bytes_max)
     return read_below(location, object_name, bytes_max)
 
 
 def iter_names_below(location: Location) -> Iterator[str]:
-    """Names of all that is below a place but folders, relative to it, however many; also links."""
+    """Yield the relative paths of all files and links below a location, but not of folders."""
     if isinstance(location, ObjectPath):
         yield from (name for name, _ in location.iter_objects_below())
         return
@@ -430,9 +451,9 @@ def iter_names_below(location: Location) -> Iterator[str]:
 
 
 def iter_entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
-    """Everything below a folder but folders; no link is followed."""
+    """Yield the directory entries of all files and links below a folder; no link is followed."""
     with os.scandir(folder) as entries:
-        for entry in entries:  # no look at a file: there may be millions
+        for entry in entries:  # no stat of a file: there may be millions
             if entry.is_dir(follow_symlinks=False):
                 yield from iter_entries_below(entry.path)
             else:
@@ -440,19 +461,22 @@ def iter_entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
 
 
 def file_sizes_below(location: Location) -> dict[str, int]:
-    """Sizes of all files below a place by their names, relative to it."""
+    """Return the sizes [bytes] of all files below a location, by relative path."""
     if isinstance(location, ObjectPath):
         return dict(location.iter_objects_below())
     return {name: (location / name).lstat().st_size for name in iter_names_below(location)}
 
 
 def output_dir(location: Location) -> Path:
-    """Folder for what is made of a store: where it is, or here where it is in an object store."""
+    """Return the folder for files derived from a store.
+
+    It is the folder of a store on disk, and the current folder for one in an object store.
+    """
     return location.parent if isinstance(location, Path) else Path()
 
 
 def atomic_write(location: Location, content: bytes) -> None:
-    """Write a small file in one step: readers, and power cuts, find the old one or the new one."""
+    """Write a small file atomically: readers, and a power cut, see the old or the new content."""
     if isinstance(location, ObjectPath):
         location.write_bytes(content)
     else:
@@ -460,9 +484,10 @@ def atomic_write(location: Location, content: bytes) -> None:
 
 
 def atomic_write_file(file_path: str, content: bytes, *, durable: bool = False) -> None:
-    """Write a file on disk in one step, also where a directory has got into its place.
+    """Write a file on disk atomically, even if a directory has its name.
 
-    A power cut can't leave the name of a `durable` one with nothing behind it.
+    With ``durable``, the content is on the disk before the file has its name, even after a power
+    cut.
     """
     draft_path = f"{file_path}.{uuid.uuid4().hex}{DRAFT_SUFFIX}"
     try:
@@ -494,37 +519,39 @@ def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
         os.close(descriptor)
 
 
+#: Suffix of the hidden name of a store that will replace another once it is complete.
 STAGING_SUFFIX = ".next"
 
-#: Seconds after which what another host has half made is taken for abandoned.
+#: Age at which a draft of another host counts as abandoned [s].
 ABANDONED_DRAFT_AGE = 86400.0
 
-#: Seconds that the clock of a file server may be behind.
+#: Largest lag of a file server's clock that is tolerated [s].
 CLOCK_SKEW_MAX = 60.0
 
 _LEFTOVER_NAME = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
     r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
-"""Names of what is left by processes; those of earlier versions name no host, or no start."""
+"""Hidden names that dead processes leave; earlier versions wrote no host, or no start id."""
 
-#: Start of a process that is there, but hidden from other users.
+#: Start id of a process that exists, but is hidden from other users.
 HIDDEN_PROCESS = -1
 
 
 PID_MAX = 2**31 - 1
-"""Largest number of a process that a system can give."""
+"""Largest process id that an operating system assigns."""
 
 
 def process_start_id(pid: int) -> int:
-    """Start of a process, which tells it from others that had its number; no clock changes it.
+    """Return the start time of a process, which distinguishes it from earlier ones of its id.
 
-    In clock ticks since the machine was started on Linux, in hundredths of a second since the
-    epoch elsewhere. 0 where no such process runs, `HIDDEN_PROCESS` where it can't be seen.
+    The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
+    other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
+    `HIDDEN_PROCESS` if it is hidden from this user.
     """
     import psutil
 
-    if not 0 < pid <= PID_MAX:  # a lock may name any number
+    if not 0 < pid <= PID_MAX:  # a damaged lock may contain any number
         return 0
     if sys.platform == "linux":
         try:
@@ -542,14 +569,17 @@ def process_start_id(pid: int) -> int:
 
 
 def resolve_links(location: Location) -> Location:
-    """Follow symbolic links: the folder is renamed, not the link. OSError where they never end."""
+    """Follow symbolic links, so that the folder is renamed and not the link to it.
+
+    Raise OSError if the links form a loop.
+    """
     if not isinstance(location, Path):
         return location
     if not location.is_symlink():
         return location.absolute()
     try:
         resolved = location.resolve()
-    except RuntimeError:  # Python's word for a loop before 3.13
+    except RuntimeError:  # Python before 3.13 reports a loop of links so
         resolved = location
     if resolved.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(location))
@@ -557,35 +587,38 @@ def resolve_links(location: Location) -> Location:
 
 
 def eyepoints_path(store: Location, geometry_id: str) -> Location:
-    """Eyepoint store of a geometry, in a folder next to the stores of the studies that use it."""
+    """Return the path of a geometry's eyepoint store, in a folder next to the study's store."""
     return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
 
 def staging_path_for(path: Path) -> Path:
-    """Place of a store that is to replace another once it is complete."""
+    """Return the path at which the replacement of a store is built until it is complete."""
     return path.with_name(f".{path.name}{STAGING_SUFFIX}")
 
 
 def final_path_for(path: Path) -> Path:
-    """Return the place that a store is made for: its own, or that of the store it replaces."""
+    """Return the final path of a store: its own, or that of the store that it will replace."""
     staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
     return path.with_name(staging_match[1]) if staging_match else path
 
 
 def is_free(location: Location) -> bool:
-    """Tell whether a store can be made at a place: nothing is there, or an empty folder."""
+    """Tell whether a store can be created at a location: it is missing, or an empty folder."""
     if isinstance(location, ObjectPath):
         return not location.exists()
     try:
         with os.scandir(location) as entries:
             return next(entries, None) is None
-    except OSError as error:  # also a file, or something below one, or in a closed folder
+    except OSError as error:  # missing, a file, below a file, or in an unreadable folder
         return error.errno != errno.ELOOP and not location.exists()
 
 
 @contextmanager
 def atomic_path(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Make a file or folder in a hidden place, and put it in its own at the end."""
+    """Yield a hidden path for a new file or folder, and rename it to ``path`` at the end.
+
+    With ``replace``, whatever is at ``path`` is replaced.
+    """
     recover_interrupted_replace(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft_path = _hidden_path(path, "creating")
@@ -600,7 +633,7 @@ def atomic_path(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def replace_path(new_path: Path, path: Path) -> None:
-    """Put a file or folder in the place of another, which is removed then."""
+    """Replace a file or folder by a new one, and delete the old one."""
     if new_path.is_file():
         os.replace(new_path, path)
         return
@@ -612,8 +645,8 @@ def replace_path(new_path: Path, path: Path) -> None:
             os.rename(new_path, path)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-                continue  # `settle` elsewhere saw the gap, and has put the old one back
-            if not path.exists():  # else it has put the new one there
+                continue  # another process recovered meanwhile, and has put the old one back
+            if not path.exists():  # else the other process has put the new one there
                 with suppress(OSError):
                     os.rename(retired_path, path)
                 raise
@@ -622,9 +655,9 @@ def replace_path(new_path: Path, path: Path) -> None:
 
 
 def remove_replaced_store(old_path: Path, new_path: Path) -> None:
-    """Remove what another has taken the place of, but for files of the user's: they move there.
+    """Delete a replaced store, after moving its foreign files to the new one.
 
-    All of it stays, under its hidden name, where they can't be moved.
+    If they can't be moved, the old store stays under its hidden name.
     """
     from sweep.storage.foreign_files import move_foreign_files
 
@@ -636,7 +669,7 @@ def remove_replaced_store(old_path: Path, new_path: Path) -> None:
 
 
 def remove_atomically(path: Path) -> None:
-    """Take a file or folder away, out of its place in one step."""
+    """Delete a file or folder; a single rename hides it before its content is deleted."""
     removal_path = _hidden_path(path, "removing")
     with suppress(FileNotFoundError):
         os.rename(path, removal_path)
@@ -644,11 +677,11 @@ def remove_atomically(path: Path) -> None:
 
 
 def recover_interrupted_replace(location: Location) -> None:
-    """Finish or undo what processes that died have left in the folder of a store.
+    """Complete or undo replacements that dead processes have left in the folder of a store.
 
-    A store whose replacement was interrupted is replaced if its successor is whole, or is put
-    back. Drafts of dead processes are removed. Everything is left alone where the folder can't
-    be written.
+    If the replacement of a store was interrupted, a complete new store takes its path; otherwise
+    the old store is restored. Drafts of dead processes are deleted. Nothing happens if the folder
+    can't be written.
     """
     if not isinstance(location, Path):
         return
@@ -662,11 +695,15 @@ def recover_interrupted_replace(location: Location) -> None:
 
 
 def store_identity(location: Location) -> tuple[int, ...] | None:
-    """Identity of the store at a place, unlike any other that was or will be there; or None."""
+    """Return the identity of the store at a location; no other store has it at any time.
+
+    The fields are those of the `stat` of its root document. Return None in an object store, or if
+    the document can't be opened.
+    """
     if not isinstance(location, Path):
         return None
     try:
-        descriptor = open_below(location, "zarr.json")  # opened: a file server is asked anew
+        descriptor = open_below(location, "zarr.json")  # opening asks a file server anew
     except OSError:
         return None
     try:
@@ -688,7 +725,7 @@ def _recover_leftover(leftover: Path, leftover_match: re.Match[str]) -> None:
 
 
 def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
-    """Tell whether the process that makes a draft may still be at it."""
+    """Tell whether the process that writes a draft may still be running."""
     import psutil
 
     modified_time = draft_path.stat().st_mtime
@@ -699,7 +736,7 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
             int(leftover_match["start"]),
             HIDDEN_PROCESS,
         )
-    try:  # a process that is younger than the draft has got its maker's number
+    try:  # a process that started after the draft was made has reused its writer's id
         return (
             psutil.Process(int(leftover_match["pid"])).create_time()
             < modified_time + CLOCK_SKEW_MAX
@@ -727,11 +764,11 @@ def _remove_tree(path: Path) -> None:
             path.unlink()
 
 
-#: Words for a disk that has room, but takes no further file.
+#: Message for a disk that has free space, but no free inode for another file.
 NO_INODES_TEXT = "No inodes left on device"
 
 
-#: What to do where a store can't be written, by the number of the error.
+#: Remedy for a store that can't be written, by errno.
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "make room on its disk",
     errno.EDQUOT: "make room in your quota",
@@ -744,9 +781,9 @@ REMEDY_BY_ERRNO = {
 
 
 def os_error_reason(error: OSError, path: object) -> str:
-    """Words for why a place can't be written or read.
+    """Return the reason why a path can't be read or written.
 
-    The system says "no space" also where a disk has room, but no inode for a further file.
+    The system reports "no space" also if a disk has space, but no free inode for another file.
     """
     reason_text = error.strerror or str(error)
     if error.errno == errno.ENOSPC and isinstance(path, Path) and _lacks_inodes(path):
@@ -755,14 +792,14 @@ def os_error_reason(error: OSError, path: object) -> str:
 
 
 def write_remedy(error: OSError, place: object, otherwise: str) -> str:
-    """Return what to do where a place can't be written: by the error, or else as is proposed."""
+    """Return the remedy for a path that can't be written; ``otherwise`` if the error has none."""
     if NO_INODES_TEXT in (error.strerror, os_error_reason(error, place)):
         return "remove files from its disk, or have one with more inodes"
     return REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)
 
 
 def _lacks_inodes(path: Path) -> bool:
-    """Tell whether the disk of a place, which need not exist, has no inodes left."""
+    """Tell whether the disk of a path, which need not exist, has no free inodes."""
     while not path.exists() and path != path.parent:
         path = path.parent
     with suppress(OSError):

@@ -1,8 +1,9 @@
-"""Files of a store's arrays, looked at before Zarr decodes them: their size, and what they declare.
+"""Size checks of array files before Zarr decodes them.
 
-A few kilobytes of zstd can declare, and decode to, more than any memory holds. The metadata of an
-array, which are checked before, give the size of its chunks. So a file that is larger than it can
-be, or a frame that declares another size, or none, is refused unread.
+A few kilobytes of zstd can declare a decoded size, and decode to one, that exceeds any memory. The
+metadata of an array, which are checked before, define the size of its chunks. A file is therefore
+refused unread if it is larger than possible. So is a chunk whose zstd frame declares another size,
+or none.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from zarr.storage import LocalStore, ObjectStore
 from sweep.messages import suggestion
 from sweep.regular_files import RefusedFileError, check_size, read_below
 
-#: Bytes of the document of a group or an array at most.
+#: Largest size of the metadata document of a group or an array [bytes].
 METADATA_BYTES_MAX = 64 << 20
 
-#: Bytes of a word on a text axis at most.
+#: Largest size of a string on a text axis [bytes].
 STRING_BYTES_MAX = 1 << 16
 
-#: Bytes of any file of an array at most: 2 GB before compression, which may add a little.
+#: Largest size of an array file [bytes]: 2 GiB of values, and the overhead of compression.
 ARRAY_FILE_BYTES_MAX = (1 << 31) + (1 << 25)
 
 _CHECKSUM_BYTES = 4
-_SHARD_INDEX_ENTRY_BYTES = 16  # offset and length of a chunk in a shard
+_SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
 _EMPTY_INDEX_ENTRY = 2**64 - 1
 _ZSTD_HEADER_BYTES_MAX = 18  # of a zstd frame
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -41,7 +42,7 @@ _ZSTD_CODEC = Zstd()
 
 
 def compressed_bytes_max(raw_bytes: int) -> int:
-    """Bytes that so many can come to as a chunk: zstd's own bound, and the checksum's.
+    """Return the largest size of a compressed chunk [bytes]: zstd's bound, plus the checksum.
 
     >>> compressed_bytes_max(1_000_000)
     1003974
@@ -50,15 +51,15 @@ def compressed_bytes_max(raw_bytes: int) -> int:
 
 
 class ArrayFileLayout(NamedTuple):
-    """Form of the files of an array."""
+    """Numbers of values and chunks in each file of an array."""
 
-    values_per_chunk: int  # values of a chunk
-    bytes_per_value: int  # 0 of text
-    chunks_per_shard: int  # of a shard; 0 where a file is one chunk
+    values_per_chunk: int  # number of values in a chunk
+    bytes_per_value: int  # size of a value [bytes]; 0 for strings
+    chunks_per_shard: int  # number of chunks in a shard; 0 if a file is a single chunk
 
     @classmethod
     def from_metadata(cls, node: Mapping[str, Any]) -> ArrayFileLayout:
-        """Return the form that the checked metadata of an array declare."""
+        """Return the layout that the checked metadata of an array declare."""
         file_shape = chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
         is_string = node["data_type"] == "string"
         codec, chunks_per_shard = node["codecs"][0], 0
@@ -73,14 +74,14 @@ class ArrayFileLayout(NamedTuple):
 
     @property
     def chunk_bytes_max(self) -> int:
-        """Bytes of a chunk before compression; of text at most."""
+        """Size of an uncompressed chunk [bytes]; for strings the largest."""
         if self.bytes_per_value:
             return self.values_per_chunk * self.bytes_per_value
         return 4 + self.values_per_chunk * (4 + STRING_BYTES_MAX)
 
     @property
     def file_bytes_max(self) -> int:
-        """Bytes that a file can have."""
+        """Largest size of a file [bytes]."""
         if not self.chunks_per_shard:
             return compressed_bytes_max(self.chunk_bytes_max)
         compressed_chunk_bytes = compressed_bytes_max(self.chunk_bytes_max)
@@ -90,7 +91,7 @@ class ArrayFileLayout(NamedTuple):
         )
 
     def check_file(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse a file with a chunk that would not decode to its size; RefusedFileError."""
+        """Raise RefusedFileError if a chunk of a file would not decode to its declared size."""
         for chunk in self._iter_chunks(content):
             self.check_chunk(chunk, path_in_messages)
 
@@ -100,7 +101,7 @@ class ArrayFileLayout(NamedTuple):
             return
         index_end = len(content) - _CHECKSUM_BYTES
         if index_end < self.chunks_per_shard * _SHARD_INDEX_ENTRY_BYTES:
-            return  # too short for an index: Zarr says so
+            return  # too short for an index: Zarr raises an error
         index = np.frombuffer(
             content[index_end - self.chunks_per_shard * _SHARD_INDEX_ENTRY_BYTES : index_end], "<u8"
         ).reshape(-1, 2)
@@ -109,9 +110,9 @@ class ArrayFileLayout(NamedTuple):
             yield content[offset : offset + bytes_needed]
 
     def check_chunk(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse a packed chunk that would not decode to its size; RefusedFileError.
+        """Raise RefusedFileError if a compressed chunk would not decode to its expected size.
 
-        One that is no zstd frame is left to the codecs, which refuse it.
+        Content that is no zstd frame is left to the codecs, which refuse it.
         """
         if not content.startswith(_ZSTD_MAGIC):
             return
@@ -134,11 +135,14 @@ class ArrayFileLayout(NamedTuple):
             self._check_string_count(content, path_in_messages)
 
     def _check_string_count(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse text that declares another number of words: room is made for all of them."""
+        """Refuse a chunk of strings that declares a wrong number of strings.
+
+        The decoder allocates memory for the declared number.
+        """
         try:
             decoded = bytes(_ZSTD_CODEC.decode(content[:-_CHECKSUM_BYTES]))
         except RuntimeError:
-            return  # damaged: the codecs say so
+            return  # damaged: the codecs raise an error
         if int.from_bytes(decoded[:4], "little") != self.values_per_chunk:
             raise RefusedFileError(
                 errno.EINVAL, "has another number of words than its array", path_in_messages
@@ -146,9 +150,9 @@ class ArrayFileLayout(NamedTuple):
 
 
 def zstd_content_bytes(frame: bytes) -> int | None:
-    """Size that a zstd frame declares for what is packed in it; None where it declares none.
+    """Return the content size that a zstd frame declares [bytes], or None if it declares none.
 
-    The header is that of RFC 8878, section 3.1.1.1.
+    RFC 8878, section 3.1.1.1, defines the header.
 
     >>> zstd_content_bytes(bytes(Zstd().encode(b"x" * 1000)))
     1000
@@ -168,7 +172,7 @@ def zstd_content_bytes(frame: bytes) -> int | None:
 
 
 class StoreFileLimits:
-    """Files of a store by its checked document: which there are, and what they may hold."""
+    """File names of a store and their largest sizes, derived from its checked root document."""
 
     def __init__(self, root_metadata: Mapping[str, Any]) -> None:
         nodes = root_metadata["consolidated_metadata"]["metadata"]
@@ -179,20 +183,20 @@ class StoreFileLimits:
         }
 
     def array_layout(self, file_name: str) -> ArrayFileLayout | None:
-        """Form of the array that a file is a chunk of; None of a document."""
+        """Return the layout of the array whose chunk a file is; None for a metadata document."""
         return self._layouts.get(file_name.rpartition("/c/")[0] or file_name.removesuffix("/c"))
 
     def file_bytes_max(self, file_name: str) -> int:
-        """Bytes that a file of the store can have, by its name."""
+        """Return the largest size of a file of the store [bytes], by its name."""
         layout = self.array_layout(file_name)
         return METADATA_BYTES_MAX if layout is None else layout.file_bytes_max
 
     def check_content(
         self, file_name: str, content: bytes, path_in_messages: str, *, is_single_chunk: bool
     ) -> None:
-        """Refuse content that would not decode to its size.
+        """Raise RefusedFileError if content would not decode to its expected size.
 
-        ``is_single_chunk``: it is one chunk of a shard.
+        ``is_single_chunk``: the content is one chunk of a shard, not a whole file.
         """
         if layout := self.array_layout(file_name):
             (layout.check_chunk if is_single_chunk else layout.check_file)(
@@ -201,29 +205,29 @@ class StoreFileLimits:
 
 
 class SingleWriterLocalStore(LocalStore):
-    """A store on disk that only this process knows yet, made on a disk without hard links too."""
+    """Local store that only this process uses, also on a disk without hard links."""
 
     async def set_if_not_exists(self, key: str, value: Any) -> None:
-        """Write a file unless there is one; Zarr's own way, by a link, is for several writers."""
+        """Write a file unless it exists. Zarr's own method uses hard links, for several writers."""
         if not await self.exists(key):
             await self.set(key, value)
 
 
 class SizeCheckedLocalStore(LocalStore):
-    """A store on disk, to be read: what is no plain file, or can't be right, raises."""
+    """Read-only store on disk that raises for files that are not regular or have a wrong size."""
 
     def __init__(self, root: Path, limits: StoreFileLimits) -> None:
         super().__init__(root, read_only=True)
         self._limits = limits
 
     def with_read_only(self, read_only: bool = False) -> SizeCheckedLocalStore:
-        """Return itself, which is for reading."""
+        """Return the store itself; raise ValueError if a writable store is requested."""
         if not read_only:
             raise ValueError("the store is opened to be read")
         return self
 
     def read(self, key: str, byte_range: Any) -> bytes | None:
-        """Return the bytes of a file, or of a part of one; None where there is none."""
+        """Return the bytes of a file, or of a part of it; None if the file does not exist."""
         bytes_max = self._limits.file_bytes_max(key)
         try:
             content = read_below(self.root, key, bytes_max, _to_slice(byte_range))
@@ -242,16 +246,16 @@ class SizeCheckedLocalStore(LocalStore):
         return content
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the bytes of a file, checked."""
+        """Return the checked bytes of a file."""
         content = await asyncio.to_thread(self.read, key, byte_range)
         return _to_zarr_buffer(content, prototype)
 
     def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
-        """As :meth:`get`, at once."""
+        """Return the checked bytes of a file, synchronously."""
         return _to_zarr_buffer(self.read(key, byte_range), prototype)
 
     async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
-        """Return parts of files, checked."""
+        """Return the checked bytes of parts of files."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
 
@@ -262,7 +266,7 @@ def _to_zarr_buffer(content: bytes | None, prototype: Any) -> Any:
 
 
 def _to_slice(byte_range: Any) -> slice:
-    """Part of a file that Zarr asks for."""
+    """Return a byte range of Zarr as a slice."""
     match byte_range:
         case RangeByteRequest():
             return slice(byte_range.start, byte_range.end)
@@ -275,20 +279,20 @@ def _to_slice(byte_range: Any) -> slice:
 
 
 class SizeCheckedObjectStore(ObjectStore[Any]):
-    """A store in an object store, to be read: objects that can't be right raise."""
+    """Read-only store in an object store that raises for objects of a wrong size."""
 
     def __init__(self, client: Any, key_prefix: str, limits: StoreFileLimits) -> None:
         super().__init__(client, read_only=True)
         self._key_prefix, self._limits = key_prefix, limits
 
     def with_read_only(self, read_only: bool = False) -> SizeCheckedObjectStore:
-        """Return itself, which is for reading."""
+        """Return the store itself; raise ValueError if a writable store is requested."""
         if not read_only:
             raise ValueError("the store is opened to be read")
         return self
 
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
-        """Return the bytes of an object, checked."""
+        """Return the checked bytes of an object."""
         import obstore
 
         file_name = key.removeprefix(f"{self._key_prefix}/")

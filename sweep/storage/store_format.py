@@ -1,11 +1,12 @@
-"""Stores, and the logs of their journals, read only as this program writes them.
+"""Format of stores and of their journal logs; only data that this program writes is read.
 
-Zarr decodes whatever the metadata of arrays declare, objects to unpickle and codecs of plug-ins
-too. The document of a store's root has the metadata of all its arrays: it is checked first, and
-arrays are opened by it alone.
+Zarr decodes whatever the metadata of arrays declare, including pickled objects and codecs of
+plug-ins. The root document of a store contains the metadata of all its arrays. It is checked first,
+and arrays are opened only through it.
 
-A log has lines of JSON with their own digests at the end. It is a file that is appended to; in an
-object store it is a row of numbered objects, each written whole, with the lines of some seconds.
+A log consists of lines of JSON, each with its own digest at the end. On disk a log is a file to
+which lines are appended. In an object store a log is a sequence of numbered objects. Each is
+written whole, with the lines of about a second.
 """
 
 from __future__ import annotations
@@ -58,19 +59,19 @@ from sweep.storage.size_checks import (
     StoreFileLimits,
 )
 
-#: What a store is made of before there are results, and the digest of each object, in the journal.
+#: Manifest: journal file with the digest of each object that a store has before any results.
 MANIFEST_FILE = "template.jsonl"
 
 #: Version of the layout of stores.
 LAYOUT_VERSION = 5
 
-#: How chunks of every array are compressed.
+#: Level of the zstd compression of every array chunk.
 ZSTD_LEVEL = 1
 
-#: For xarray's functions: so they read the document that was checked, and no other.
+#: Arguments of xarray's open functions, which make them read only the checked root document.
 OPEN_ZARR_KWARGS: dict[str, Any] = {"consolidated": True, "zarr_format": 3}
 
-#: Bytes of a file of an array at most, before compression, and chunks of an array.
+#: Largest uncompressed size of an array file [bytes], and largest number of chunks of an array.
 UNCOMPRESSED_FILE_BYTES_MAX = ARRAY_CHUNKS_MAX = 2**31
 
 _ATTRIBUTES_BY_STORE_KIND = {
@@ -79,7 +80,7 @@ _ATTRIBUTES_BY_STORE_KIND = {
     "eyepoints": ("geometry", "shots_a_cycle"),
     "accuracy": ("title", "spec", "coordinates"),
 }
-"""Attributes of each kind of store, besides those of all."""
+"""Required attributes of each kind of store, in addition to the common ones."""
 
 _COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
 
@@ -92,16 +93,16 @@ _ARRAY_ATTRIBUTE_TYPES = {
     "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
     "confidence": float,
 }  # fmt: skip
-"""Attributes of arrays. xarray acts on others, such as `scale_factor`."""
+"""Permitted attributes of arrays, with types. xarray interprets others, such as `scale_factor`."""
 
 _FILL_VALUES_BY_TYPE: dict[str, tuple[Any, ...]] = {
     "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
     "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
 }  # fmt: skip
-"""Types of arrays, and what stands where nothing is written."""
+"""Permitted data types of arrays, with the permitted fill values of each."""
 
 MAP_GROUP = "scene_map"
-"""Group of the map of a flight's ground."""
+"""Name of the group with the terrain map of a flight."""
 
 _VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 
@@ -120,21 +121,24 @@ _SHARD_INDEX_CONFIGURATION = {
 
 
 class StoreError(PrintableError):
-    """A store that can't be used as asked."""
+    """Error of a store that can't be used as requested."""
 
 
 class NotAStoreError(StoreError, ValueError):
-    """A path at which there is no store of a study, or none that this program can read."""
+    """No store of a study exists at a path, or this program can't read it."""
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
-    """Attributes of a store; raises as :func:`read_root_metadata`."""
+    """Return the checked attributes of a store; raise as :func:`read_root_metadata`."""
     attributes: dict[str, Any] = read_root_metadata(path)["attributes"]
     return attributes
 
 
 def read_root_metadata(path: Location) -> dict[str, Any]:
-    """Read the document of a store's root, checked; NotAStoreError for what is not as ours."""
+    """Return the checked root document of a store.
+
+    Raise NotAStoreError if it differs from what this program writes.
+    """
     root_metadata = _read_root_document(path)
     attributes = check_attributes(path, root_metadata["attributes"])
     try:
@@ -164,7 +168,7 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
 
 
 def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
-    """Attributes of a store, where this version of the program writes such; or NotAStoreError."""
+    """Return the attributes of a store; raise NotAStoreError unless this version writes such."""
     checked_attributes = _require_sweep_attributes(path, attributes)
     if (layout := checked_attributes.get("layout")) != LAYOUT_VERSION:
         raise NotAStoreError(
@@ -189,10 +193,10 @@ def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
 
 
 def format_versions(software: Any) -> Any:
-    """Return versions by name as text, ``numba 0.60, numpy 2.1``; anything but a mapping as it is.
+    """Return software versions as text, ``numba 0.60, numpy 2.1``; return non-mappings unchanged.
 
-    Attributes that are text, numbers or lists of these go into any file format. Stores of earlier
-    versions have mappings.
+    Attributes that are text, numbers or lists of both can be written to any file format. Stores of
+    earlier versions have mappings.
     """
     if not isinstance(software, dict):
         return software
@@ -200,13 +204,13 @@ def format_versions(software: Any) -> Any:
 
 
 def parse_software_versions(attributes: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the versions of the software that a store was begun with, by name."""
+    """Return the versions of the software that created a store, by name."""
     text = str(format_versions(attributes["software"]))
     return dict(part.rsplit(" ", 1) for part in text.split(", ") if " " in part)
 
 
 def refuse_foreign_store(path: Location) -> None:
-    """Refuse what no version of this program has made."""
+    """Raise NotAStoreError if no version of this program has made the store."""
     _require_sweep_attributes(path, _read_root_document(path)["attributes"])
 
 
@@ -219,7 +223,10 @@ def _require_sweep_attributes(path: Location, attributes: Any) -> dict[str, Any]
 
 
 def _read_root_document(path: Location) -> dict[str, Any]:
-    """Read the document of a store's root, a group."""
+    """Read and parse the root document of a store.
+
+    Raise NotAStoreError, with the likely cause and the remedy, if there is none.
+    """
     recover_interrupted_replace(path)
     detail = ""
     try:
@@ -262,7 +269,7 @@ _NAMES_SHOWN_MAX = 3
 
 
 def _first_names_text(path: Location) -> str:
-    """Names of the first files and folders in a folder; '' for none."""
+    """Return the names of the first files and folders in a folder, as text; '' if it has none."""
     if not isinstance(path, Path) or not path.is_dir():
         return ""
     with suppress(OSError), os.scandir(path) as entries:
@@ -273,7 +280,7 @@ def _first_names_text(path: Location) -> str:
 
 
 def _read_json(path: Location, name: str) -> Any:
-    """Parse a document; once more from an object store, whose answer may have been cut."""
+    """Parse a JSON document; read it again from an object store if the response was truncated."""
     try:
         return parse_json(read_object(path, name, METADATA_BYTES_MAX))
     except ValueError:
@@ -288,9 +295,10 @@ def has_digest(
     expected_digest: str,
     bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
 ) -> bool:
-    """Tell whether stored objects have a digest; read once more from an object store if not.
+    """Tell whether stored objects have the expected digest.
 
-    Errors, and ``bytes_max``, are as of :func:`stored_objects_digest`.
+    A mismatch in an object store is checked by a second read. ``bytes_max``, and errors, are as in
+    :func:`stored_objects_digest`.
     """
     matches = stored_objects_digest(path, object_names, bytes_max) == expected_digest
     return matches or (
@@ -300,7 +308,7 @@ def has_digest(
 
 
 def read_manifest_attributes(path: Location) -> dict[str, Any]:
-    """Attributes of a store by the list of what it was made of; empty where that is damaged."""
+    """Return the attributes of a store from its manifest; empty if the manifest is damaged."""
     attributes: dict[str, Any] = next(iter_records(path / JOURNAL_DIR / MANIFEST_FILE), {}).get(
         "attributes", {}
     )
@@ -308,7 +316,7 @@ def read_manifest_attributes(path: Location) -> dict[str, Any]:
 
 
 def read_study_id(path: Location) -> str:
-    """Id of the study in a store of any version, damaged or not; empty where there is none."""
+    """Return the study id of a store of any version, damaged or not; '' if it has none."""
     try:
         return str(
             _require_sweep_attributes(path, _read_root_document(path)["attributes"])["study_id"]
@@ -318,7 +326,7 @@ def read_study_id(path: Location) -> str:
 
 
 def repair_hint(path: Location) -> str:
-    """Remark on how to put back what a store was made of, where it says what that was."""
+    """Return a hint how to restore the objects of a store's manifest; '' without a manifest."""
     if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
         return ""
     if read_manifest_attributes(path):
@@ -328,7 +336,7 @@ def repair_hint(path: Location) -> str:
 
 
 def _nearby_stores_hint(path: Location) -> str:
-    """Remark on the stores in a directory or beside a path; empty where there are none."""
+    """Return a hint that lists stores in or next to a path; '' if there are none."""
     directory = path if path.is_dir() else path.parent
     metadata_files = directory.glob("*.zarr/zarr.json") if directory.is_dir() else ()
     names = sorted(str(metadata_file.parent) for metadata_file in metadata_files)
@@ -337,7 +345,7 @@ def _nearby_stores_hint(path: Location) -> str:
 
 
 def _check_node(node_name: str, node: dict[str, Any]) -> None:
-    """Refuse a group or an array that is declared otherwise than this program declares them."""
+    """Raise ValueError if a group or array is declared otherwise than this program declares it."""
     if not all(map(_VALID_NAME.fullmatch, node_name.split("/"))):
         raise ValueError(f"an array has the name {node_name!r:.60}")
     if node["zarr_format"] != 3:
@@ -345,7 +353,8 @@ def _check_node(node_name: str, node: dict[str, Any]) -> None:
     if node["node_type"] == "group":
         attributes = node["attributes"]
         if node_name != MAP_GROUP:
-            if not re.fullmatch("[0-9a-f]{32}", attributes["geometry_id"]):  # part of a path
+            # The id becomes part of a path, so it must not contain a slash.
+            if not re.fullmatch("[0-9a-f]{32}", attributes["geometry_id"]):
                 raise ValueError(f"the group {node_name} has no eyepoints")
             attributes["coordinates"].split()
         expected = {"node_type": "group", "zarr_format": 3, "attributes": attributes}
@@ -358,7 +367,10 @@ def _check_node(node_name: str, node: dict[str, Any]) -> None:
 
 
 def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, Any]:
-    """Metadata of an array as this program writes them, with what may differ, once checked."""
+    """Return the metadata that this program would write for an array of this shape and type.
+
+    The parts that may differ between arrays are taken from ``node`` and checked; ValueError.
+    """
     data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
     if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_TYPE.get(data_type, ()):
         raise ValueError(
@@ -406,7 +418,7 @@ def _check_shape(
     dims: list[str],
     value_bytes: int,
 ) -> None:
-    """Refuse an array that is cut in no way into files, and these into chunks, of bearable size."""
+    """Raise ValueError unless an array is divided into files and chunks of valid size."""
     chunk_lengths = [*file_shape, *chunk_shape]
     if (
         not len(shape) == len(file_shape) == len(chunk_shape) == len(dims)
@@ -425,7 +437,7 @@ def _check_shape(
 
 
 def _check_dimensions(nodes: Mapping[str, Any]) -> None:
-    """Refuse arrays of a group that don't agree on the length of a dimension."""
+    """Raise ValueError if the arrays of a group disagree on the length of a dimension."""
     lengths: dict[tuple[str, str], int] = {}
     for node_name, node in nodes.items():
         group = node_name.rpartition("/")[0]
@@ -437,19 +449,19 @@ def _check_dimensions(nodes: Mapping[str, Any]) -> None:
 
 
 def _check_journal_files(path: Location) -> None:
-    """Refuse a journal with links, which lead out, or pipes, which never end."""
+    """Refuse a journal that contains links, which may lead out of it, or pipes, which never end."""
     for name, problem in irregular_journal_files(path).items():
         raise NotAStoreError(f"{path}/{name} {problem}: remove it")
 
 
 def irregular_journal_files(path: Location) -> dict[str, str]:
-    """Links, pipes and devices in the journal of a store, and which of these they are, by name."""
+    """Return links, pipes and devices in a store's journal: their kind in words, by name."""
     if not isinstance(path, Path) or not (path / JOURNAL_DIR).is_dir():
         return {}
     modes = {JOURNAL_DIR: (path / JOURNAL_DIR).lstat().st_mode}
     with os.scandir(path / JOURNAL_DIR) as entries:
         for entry in entries:
-            with suppress(FileNotFoundError):  # a lock that is given up meanwhile
+            with suppress(FileNotFoundError):  # a lock that was released meanwhile
                 mode = entry.stat(follow_symlinks=False).st_mode
                 modes[f"{JOURNAL_DIR}/{entry.name}"] = mode
     return {
@@ -460,11 +472,11 @@ def irregular_journal_files(path: Location) -> dict[str, str]:
 
 
 class StoreReplacedError(PrintableError, ValueError):
-    """A store that was extended or replaced since it was opened."""
+    """The store was extended, replaced or removed after it was opened."""
 
 
 class StudyBoundLocalStore(SizeCheckedLocalStore):
-    """A store on disk whose every read fails once another study's store is in its place."""
+    """Store on disk that refuses every read once another study's store has its path."""
 
     def __init__(self, root: Path, limits: StoreFileLimits, study_id: str) -> None:
         super().__init__(root, limits)
@@ -472,15 +484,15 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
         self._last_identity: tuple[int, ...] | None = None
 
     def read(self, key: str, byte_range: Any) -> bytes | None:
-        """Return the bytes of a file; the identity of the store is checked afterwards."""
+        """Return the bytes of a file, then check that the store is still that of the study."""
         try:
             return super().read(key, byte_range)
-        finally:  # another study's file may also be of another size
+        finally:  # also after an error: a file of another study may have another size
             self._check_same_study()
 
     def _check_same_study(self) -> None:
         identity = store_identity(self.root)
-        if identity is None or identity != self._last_identity:  # repaired, or another's
+        if identity is None or identity != self._last_identity:  # repaired or replaced
             if read_study_id(self.root) != self._study_id:
                 raise StoreReplacedError(
                     f"{self.root} was extended, replaced or removed since it was opened: "
@@ -490,9 +502,9 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
 
 def open_size_checked_store(location: Location, study_id: str = "") -> Any:
-    """Open a store for Zarr or xarray, to read it lazily; raises as :func:`read_root_metadata`.
+    """Open a store for Zarr or xarray, for lazy reading; raise as :func:`read_root_metadata`.
 
-    Reading fails once it is no longer the store of the study ``study_id``, where one is given.
+    If ``study_id`` is given, reads fail once the store is no longer that of this study.
     """
     limits = StoreFileLimits(read_root_metadata(location))
     if isinstance(location, ObjectPath):
@@ -506,19 +518,20 @@ def open_size_checked_store(location: Location, study_id: str = "") -> Any:
     )
 
 
+#: Journal file with a receipt for each committed block.
 RECEIPTS_FILE = "receipts.jsonl"
 
-#: Bytes of a line of a log at most; the recipe of eyepoints has their spec in one.
+#: Largest length of a log line [bytes]; the recipe of eyepoints has their spec in one line.
 LOG_LINE_BYTES_MAX = 64 << 20
 
-#: Seconds for which lines are gathered before they are put as one object.
+#: Time for which lines are collected before they are written as one object [s].
 LOG_OBJECT_INTERVAL = 1.0
 
-#: Objects of a log beyond which they are put into few, and bytes of one of those.
+#: Number of objects of a log above which they are merged, and size of a merged object [bytes].
 LOG_OBJECTS_MAX = 64
 MERGED_LOG_OBJECT_BYTES = 16 << 20
 
-#: Errors of opening what is no log.
+#: Errors of opening a path at which there is no log.
 _NO_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
 
 _DIGEST_FIELD = b',"sum":"'
@@ -532,29 +545,32 @@ _RECEIPT_WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
 
 
 def encode_record(record: dict[str, Any]) -> bytes:
-    """Write a record, not empty, as a line of JSON that ends with a digest of the others."""
+    """Encode a non-empty record as a line of JSON whose last field is a digest of the others."""
     return append_line_digest(json.dumps(record, separators=(",", ":")).encode()[:-1])
 
 
 def append_line_digest(line_body: bytes) -> bytes:
-    """Return a line of the fields of a record, written without the last brace."""
+    """Return a log line: the encoded fields without the closing brace, and their digest."""
     return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LINE_END
 
 
 def decode_record(line: bytes) -> dict[str, Any] | None:
-    """Return the record of a line, or None if any byte of it has changed."""
+    """Return the record of a log line, or None if any byte of the line has changed."""
     line_body = verified_body(line)
     if line_body is None:
         return None
     try:
         record = parse_json(line_body + b"}", allow_non_utf8=True)
-    except ValueError:  # a stranger's, with a digest of its own
+    except ValueError:  # written by another program, but with a valid digest
         return None
     return record if isinstance(record, dict) else None
 
 
 def verified_body(line: bytes) -> bytes | None:
-    """Return the unread fields of a line, less the last brace; None as of :func:`decode_record`."""
+    """Return the encoded fields of a line without the closing brace, or None if it is damaged.
+
+    The fields are not parsed; the digest is checked.
+    """
     line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD)
     return line_body if digest_field and line_end == _line_digest(line_body) + _LINE_END else None
 
@@ -564,13 +580,13 @@ def _line_digest(body: bytes) -> bytes:
 
 
 def iter_lines_and_records(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
-    """Lines of a log, and their records: None where damaged or cut short."""
+    """Yield each line of a log with its record; the record is None if damaged or truncated."""
     for line in iter_raw_lines(path):
         yield line, decode_record(line)
 
 
 def iter_records(path: Location) -> Iterator[dict[str, Any]]:
-    """Read the records of a log, in order; damaged or truncated lines are skipped."""
+    """Yield the records of a log, in order; skip damaged or truncated lines."""
     return (record for _, record in iter_lines_and_records(path) if record is not None)
 
 
@@ -579,10 +595,10 @@ def stored_objects_digest(
     object_names: Iterable[str],
     bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
 ) -> str:
-    """blake2b-128 of names and bytes of stored objects, in hex.
+    """Return the blake2b-128 digest of names, sizes and bytes of stored objects, in hex.
 
-    OSError where one can't be read; RefusedFileError where it is no plain file, or larger than
-    ``bytes_max`` of its name.
+    Raise OSError if an object can't be read. Raise RefusedFileError if it is no regular file, or
+    larger than ``bytes_max`` returns for its name.
     """
     if isinstance(path, ObjectPath):
         object_names = list(object_names)
@@ -600,7 +616,7 @@ def stored_objects_digest(
 
 
 def contents_digest(contents: Iterable[tuple[str, bytes]]) -> str:
-    """As :func:`stored_objects_digest`, of names and bytes at hand."""
+    """Return the digest of :func:`stored_objects_digest` for names and bytes in memory."""
     hasher = hashlib.blake2b(digest_size=16)
     for name, content in contents:
         hasher.update(f"{name}\0{len(content)}\0".encode())
@@ -609,13 +625,16 @@ def contents_digest(contents: Iterable[tuple[str, bytes]]) -> str:
 
 
 class FileLog:
-    """A file that is appended to, and not kept open; on the disk at once where it is `durable`."""
+    """Append-only log in a file, which is opened for each write.
+
+    With ``durable``, each append returns only once the lines are on the disk.
+    """
 
     def __init__(self, path: Path, *, durable: bool = False) -> None:
         self._path, self._durable = path, durable
 
     def append(self, lines: bytes) -> None:
-        """Append whole lines, all or none; OSError where they can't be written."""
+        """Append complete lines, all or none; raise OSError if they can't be written."""
         log = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         try:
             size = os.fstat(log).st_size
@@ -628,18 +647,18 @@ class FileLog:
             os.close(log)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Tell whether all is written: what is appended is."""
+        """Return True: appended lines are already written."""
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Drop the lines that are not sound."""
+        """Rewrite the log without the lines for which ``is_sound`` is false."""
         if self._path.is_dir() or not all(map(is_sound, iter_raw_lines(self._path))):
             lines = iter_raw_lines(self._path)
             atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
 
 
 class ObjectLog:
-    """A row of objects under a key, numbered in the order of writing."""
+    """Append-only log in an object store: objects under a key, numbered in order of writing."""
 
     def __init__(self, path: ObjectPath) -> None:
         self._path = path
@@ -650,13 +669,13 @@ class ObjectLog:
         self._last_put_time = 0.0
 
     def append(self, lines: bytes) -> None:
-        """Append whole lines; they are there after the next `flush` that writes."""
+        """Append complete lines; the next `flush` that writes stores them."""
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Put what was appended as an object, now or `LOG_OBJECT_INTERVAL` s after the last.
+        """Write the pending lines as one object if `LOG_OBJECT_INTERVAL` has passed since the last.
 
-        True if none is left.
+        With ``force`` write them now. Return True if no lines are pending any more.
         """
         if not self._pending_lines:
             return True
@@ -670,7 +689,7 @@ class ObjectLog:
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Drop the lines that are not sound; where objects are many, put their lines in few."""
+        """Remove lines for which ``is_sound`` is false; merge the objects if they are many."""
         object_names = list_log_objects(self._path)
         is_merging = len(object_names) > LOG_OBJECTS_MAX
         names_in_group: list[str] = []
@@ -691,7 +710,10 @@ class ObjectLog:
     def _rewrite_objects(
         self, object_names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
     ) -> None:
-        """Put sound lines of objects in the last one's place; cut short, they are there twice."""
+        """Write the sound lines of objects to one new object, and delete the old objects.
+
+        After an interruption some lines are stored twice.
+        """
         sound_lines = [line for line in lines if is_sound(line)]
         if len(object_names) == 1 and len(sound_lines) == len(lines):
             return
@@ -704,7 +726,7 @@ class ObjectLog:
 
 
 def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectLog:
-    """Open a log to append to; the caller ensures that nobody else does."""
+    """Open a log for appending; the caller ensures that no other process appends to it."""
     if isinstance(path, ObjectPath):
         return ObjectLog(path)
     path.parent.mkdir(exist_ok=True)
@@ -712,7 +734,7 @@ def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectLog:
 
 
 def list_log_objects(path: ObjectPath) -> list[str]:
-    """Names of the objects of a log, in order."""
+    """Return the names of the objects of a log, in order of writing."""
     return sorted(
         object_name
         for object_name, _ in path.iter_objects_below()
@@ -721,7 +743,7 @@ def list_log_objects(path: ObjectPath) -> list[str]:
 
 
 def _new_log_object_name(number: int) -> str:
-    """Name of an object; nobody else's, should two write against all precautions."""
+    """Return a name for a log object; it is unique even if two processes write despite the lock."""
     return f"{number:08d}-{uuid.uuid4().hex[:8]}"
 
 
@@ -731,7 +753,7 @@ def _log_object_number(object_name: str) -> int:
 
 
 def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tuple[str, bytes]]:
-    """Objects of a log with their names, some of them in memory at a time."""
+    """Yield the objects of a log with their names; only a batch is in memory at a time."""
     for batch_start in range(0, len(object_names), CONCURRENT_REQUESTS_MAX):
         batch = object_names[batch_start : batch_start + CONCURRENT_REQUESTS_MAX]
         yield from zip(
@@ -742,17 +764,23 @@ def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tup
 
 
 def _read_log_object(log_object: ObjectPath) -> bytes:
-    """Read an object of a log; once more where its last line is cut, as an answer may have been."""
+    """Read a log object; read it again if its last line is incomplete.
+
+    The response may have been truncated.
+    """
     for _ in range(2):
         content = log_object.read_bytes()
         if content.endswith(b"\n"):
             return content
-    log_object.refuse_cut(content)  # else lines would count as damaged that are not
+    log_object.refuse_cut(content)  # else undamaged lines would count as damaged
     return content
 
 
 def iter_raw_lines(path: Location) -> Iterator[bytes]:
-    """Lines of a log in order, with their ends; of a small file too, in an object store."""
+    """Yield the lines of a log in order, with their line ends.
+
+    In an object store a small file of lines, such as the manifest, is read too.
+    """
     if isinstance(path, ObjectPath):
         object_names = list_log_objects(path)
         if not object_names and path.size() > 0:
@@ -771,39 +799,40 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
 
 
 def _iter_file_lines(log: BinaryIO) -> Iterator[bytes]:
-    """Lines of a log; one that is longer than any of ours in parts, without a file's holes."""
+    """Yield the lines of a log file; split a line that exceeds the limit, and skip file holes."""
     while line := log.readline(LOG_LINE_BYTES_MAX):
         yield line
         if len(line) == LOG_LINE_BYTES_MAX:
             try:
                 log.seek(os.lseek(log.fileno(), log.tell(), os.SEEK_DATA))
-            except OSError:  # nothing but a hole is left
+            except OSError:  # the rest of the file is a hole
                 return
 
 
 @dataclass
 class ReceiptTotals:
-    """Sums of a log of receipts: which blocks are done, when, how fast."""
+    """Totals of a log of receipts: committed blocks, times and recent throughput."""
 
-    points_by_block: (
-        np.ndarray
-    )  # (blocks,) int64: points of every block that is committed, 0 of the others
-    bytes_by_block: (
-        np.ndarray
-    )  # (blocks,) int64: bytes of these as they are stored, where the receipt says
-    first_time: float = np.inf
-    last_time: float = -np.inf  # times of the first and last receipt [s since the epoch]
-    recent_points: int = 0  # points committed since the time asked for
-    workers: set[bytes] = field(default_factory=set)  # hosts and processes that computed them
+    #: Number of points of each committed block, 0 for other blocks; (blocks,) int64.
+    points_by_block: np.ndarray
+    #: Stored size of each committed block [bytes], 0 if its receipt lacks it; (blocks,) int64.
+    bytes_by_block: np.ndarray
+    first_time: float = np.inf  # time of the first receipt [s since the epoch]
+    last_time: float = -np.inf  # time of the last receipt [s since the epoch]
+    recent_points: int = 0  # number of points committed at or after `since`
+    workers: set[bytes] = field(default_factory=set)  # host and process id of their workers
 
     @property
     def n_committed_blocks(self) -> int:
-        """Number of blocks that are committed."""
+        """Number of committed blocks."""
         return int(np.count_nonzero(self.points_by_block))
 
 
 def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
-    """Sum the log of a store, points and workers `since` a time; damaged lines do not count."""
+    """Return the totals of a store's receipts; damaged lines are ignored.
+
+    ``since``: time from which recent points and their workers are counted [s since the epoch].
+    """
     totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):
         line_body = verified_body(line)

@@ -1,7 +1,7 @@
-"""Arrays of stores, read with each chunk held against its checksum and the log of the journal.
+"""Stores whose chunks are checked against their checksums and the journal when they are read.
 
-Zarr reads fill values where a chunk is missing, and raises errors of its codecs where one is
-damaged. Here both are a `DamagedChunkError`, which names the block, the chunk and the remedy.
+For a missing chunk Zarr returns fill values, and for a damaged chunk it raises errors of its
+codecs. Here both raise `DamagedChunkError`, which names the block, the chunk and the remedy.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from sweep.storage.store_format import (
     read_root_metadata,
 )
 
-#: Name of a chunk: its array, and its position in the grid of chunks.
+#: Pattern of chunk names: the array, and the chunk's position in the grid of chunks.
 CHUNK_NAME = re.compile(r"(.+)/c((?:/\d+)*)")
 
-#: Dimensions of flights by which their blocks are cut, last.
+#: Dimensions of flights along which blocks are divided; they come last in the order of blocks.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
-#: Time that reads which nobody waits for have to end, as the program does [s].
+#: Time that abandoned reads have to be cancelled when the program ends [s].
 PENDING_READS_TIMEOUT = 5.0
 
 _CHECKSUM_BYTES = 4
-_SHARD_INDEX_ENTRY_BYTES = 16  # offset and length of a chunk in a shard
+_SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
 _EMPTY_INDEX_ENTRY = 2**64 - 1
 
 
 class DamagedChunkError(ValueError):
-    """A chunk of a store that is missing, or not as it was written."""
+    """A chunk of a store is missing or has changed since it was written."""
 
 
 def chunk_damage(content: bytes) -> str:
-    """Damage of a chunk in words, by the checksum that Zarr's codec put at its end."""
+    """Return the damage of a chunk in words, '' if its CRC32C at the end matches."""
     if not content:
         return "is empty"
     checksum = google_crc32c.value(content[:-_CHECKSUM_BYTES]).to_bytes(_CHECKSUM_BYTES, "little")
@@ -65,7 +65,7 @@ def chunk_damage(content: bytes) -> str:
 
 
 def shard_damage(content: bytes, n_chunks: int) -> str:
-    """Damage of a file of several chunks in words, by the checksums of these and of their index."""
+    """Return the damage of a shard in words, '' if the checksums of its index and chunks match."""
     index_bytes = n_chunks * _SHARD_INDEX_ENTRY_BYTES + _CHECKSUM_BYTES
     if damage := chunk_damage(content[-index_bytes:]):
         return damage
@@ -77,10 +77,10 @@ def shard_damage(content: bytes, n_chunks: int) -> str:
 
 
 class ChunkBlockMap:
-    """Blocks that write the chunks of a store, by the document of its root.
+    """Map from the chunks of a store to the blocks that write them, from its root document.
 
-    The chunks of the outputs of a group make a grid, of which each block has one position. An array
-    that lacks a dimension of it is written by the blocks at its start.
+    The chunks of the outputs of a group form a grid, and each block has one position in it. An
+    array that lacks a dimension of this grid is written by the blocks at position 0 along it.
     """
 
     def __init__(self, location: Location) -> None:
@@ -100,7 +100,7 @@ class ChunkBlockMap:
             self.n_blocks += math.prod(chunks_by_dim.values())
 
     def _block_grid_shape(self, group: str) -> dict[str, int]:
-        """Chunks along each dimension that is cut, of the outputs of a group, in their order."""
+        """Return the number of chunks along each divided dimension of a group's outputs."""
         chunks_by_dim: dict[str, int] = {}
         for name, node in self._arrays.items():
             if name.rpartition("/")[0] != group or self._is_in_template(name, node):
@@ -117,7 +117,7 @@ class ChunkBlockMap:
         return "/".join([name, "c", *("0" for _ in node["shape"])]) in self.template_objects
 
     def block_of_chunk(self, chunk_name: str) -> int:
-        """Block that writes a chunk; -1 where it is none's."""
+        """Return the number of the block that writes a chunk, or -1 if no block does."""
         name_match = CHUNK_NAME.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         block_grid = self._block_grids.get(name_match[1].rpartition("/")[0]) if name_match else None
@@ -136,7 +136,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Chunks that the file of a shard has room for; 0 where a file is one chunk."""
+        """Return the number of chunks in the shard file of a name; 0 if its file is one chunk."""
         name_match = CHUNK_NAME.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
@@ -150,19 +150,19 @@ class ChunkBlockMap:
 
 
 def _chunk_counts(node: dict[str, Any]) -> dict[str, int]:
-    """Chunks of an array along each dimension."""
+    """Return the number of chunks of an array along each dimension."""
     chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
     lengths_by_dim = zip(_block_dims(node), node["shape"], chunk_shape, strict=True)
     return {dim: -(-length // chunk_length) for dim, length, chunk_length in lengths_by_dim}
 
 
 def _block_dims(node: dict[str, Any]) -> list[str]:
-    """Dimensions of an array; that of the shots of cycles, which is cut as they are, is theirs."""
+    """Return the dimensions of an array, with `shot` as `cycle`: both are divided alike."""
     return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
 
 
 class VerifiedStore(WrapperStore[Any]):
-    """A store for reading, each of whose chunks is checked before it is decoded."""
+    """Read-only Zarr store that checks each chunk before it is decoded."""
 
     def __init__(self, store: Any, location: Location, prefix: str = "") -> None:
         super().__init__(store)
@@ -172,7 +172,7 @@ class VerifiedStore(WrapperStore[Any]):
         return type(self)(store, self._location, self._prefix)
 
     def with_read_only(self, read_only: bool = False) -> VerifiedStore:
-        """Return itself, which is for reading."""
+        """Return the store itself; raise ValueError if a writable store is requested."""
         if not read_only:
             raise ValueError("the store is opened to be read")
         return self
@@ -182,7 +182,7 @@ class VerifiedStore(WrapperStore[Any]):
         return ChunkBlockMap(self._location)
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-        """Return the bytes of a file, or of a part of it; DamagedChunkError for a damaged chunk."""
+        """Return the bytes of a file or of a part; raise DamagedChunkError for a damaged chunk."""
         prototype = prototype or default_buffer_prototype()
         try:
             with translate_errors(self._location):
@@ -198,7 +198,7 @@ class VerifiedStore(WrapperStore[Any]):
             damage := self._find_damage(name, content, byte_range)
         ):
             return content
-        # Once more: the body of an answer may be cut, and another process may just have written it.
+        # Read again: the response may be truncated, or another process may be writing the chunk.
         complete_content = await self._fetch(key, prototype, None)
         if damage := self._find_damage(name, complete_content, None):
             if isinstance(self._location, ObjectPath) and complete_content is not None:
@@ -208,7 +208,7 @@ class VerifiedStore(WrapperStore[Any]):
         return await self._fetch(key, prototype, byte_range)
 
     async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
-        """Return the bytes of a file, asked for twice where the body of the first answer is cut."""
+        """Return the bytes of a file; repeat the request if the response was truncated."""
         try:
             return await self._store.get(key, prototype, byte_range)
         except Exception as error:
@@ -217,30 +217,30 @@ class VerifiedStore(WrapperStore[Any]):
             return await self._store.get(key, prototype, byte_range)
 
     async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
-        """Return parts of files, checked."""
+        """Return the checked bytes of parts of files."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     def _find_damage(self, name: str, content: Any, byte_range: Any) -> str:
-        """Damage of a chunk in words; of one that is not computed yet none."""
+        """Return the damage of a chunk in words; '' if it is sound or not yet computed."""
         if content is None:
             return "is missing" if self._should_exist(name) else ""
         if byte_range is None and (n_chunks := self._block_map.chunks_per_shard(name)):
             return shard_damage(content.to_bytes(), n_chunks)
-        return chunk_damage(content.to_bytes())  # of a chunk of a shard, or of its index
+        return chunk_damage(content.to_bytes())  # a chunk, a chunk of a shard, or a shard index
 
     def _should_exist(self, name: str) -> bool:
-        """Tell whether a chunk has to be there, by the log of what is committed."""
+        """Tell whether a chunk must exist: it was in the new store, or its block is committed."""
         block_map = self._block_map
         if block_map.is_packed or name in block_map.template_objects:
             return True
         if (block := block_map.block_of_chunk(name)) < 0 or block not in self._committed_blocks:
             return False
-        self.__dict__.pop("_committed_blocks")  # a receipt may have been withdrawn since
+        self.__dict__.pop("_committed_blocks")  # read again: a receipt may have been withdrawn
         return block in self._committed_blocks
 
     @cached_property
     def _committed_blocks(self) -> frozenset[int]:
-        """Blocks that were committed when the first missing chunk was asked for."""
+        """Numbers of the blocks that were committed when the first chunk was missing."""
         points = read_receipt_totals(self._location, self._block_map.n_blocks).points_by_block
         return frozenset(np.flatnonzero(points).tolist())
 
@@ -268,12 +268,12 @@ class VerifiedStore(WrapperStore[Any]):
 
 
 _loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
-"""Loops of Zarr's in which a read has failed, and others may be left that nobody waits for."""
+"""Event loops of Zarr in which a read has failed; other reads may still be pending there."""
 
 
 @atexit.register
 def _cancel_pending_reads() -> None:
-    """Cancel the reads that are left, of which asyncio would print a traceback each."""
+    """Cancel pending reads at exit; asyncio would print a traceback for each."""
 
     async def cancel_tasks() -> None:
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
@@ -287,20 +287,20 @@ def _cancel_pending_reads() -> None:
 
 
 def open_verified_store(location: Location, study_id: str) -> Any:
-    """Open the store of a study for Zarr and xarray, to read it lazily."""
+    """Open the store of a study for Zarr and xarray, for lazy reading of checked chunks."""
     return _wrap_in_verified_store(
         store_format.open_size_checked_store(location, study_id), location
     )
 
 
 def open_array_group(location: Location) -> zarr.Group:
-    """Open the arrays of a store to be read; raises as :func:`.store_format.read_root_metadata`."""
+    """Open the arrays of a store for reading; raise as :func:`.store_format.read_root_metadata`."""
     store = _wrap_in_verified_store(store_format.open_size_checked_store(location), location)
     return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
 
 
 def _wrap_in_verified_store(store: Any, location: Location) -> Any:
-    """Wrap a store of Zarr's, or a place in one."""
+    """Wrap a Zarr store, or a path in one, so that its chunks are checked."""
     if isinstance(location, Path):
         return VerifiedStore(store, location)
     return StorePath(VerifiedStore(store.store, location, location.key), location.key)

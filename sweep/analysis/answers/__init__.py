@@ -1,1 +1,1 @@
-"""Answers from a store in the field's words: ranges, ROC curves, alarm rates, comparisons."""
+"""Answers from a store: detection ranges, ROC curves, false-alarm rates, errors, comparisons."""

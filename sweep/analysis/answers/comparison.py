@@ -1,4 +1,4 @@
-"""Two studies, or two flights, compared where they meet: differences, table, figure, verdict."""
+"""Comparison of two studies or two flights at their common points: differences and a verdict."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABL
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 PD_ROUNDING_MAX = 1e-12
-"""Change of a probability by another processor's last digits, at the most."""
+"""Largest difference of a probability by rounding on another processor."""
 
 _SIGNIFICANT_DIGITS = 12
 
@@ -33,28 +33,28 @@ MIXED_KINDS_MESSAGE = "a grid of points and a flight have nothing to match: comp
 
 
 def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
-    """Differences, other less ours, at the points that both studies have.
+    """Return the differences, other minus ours, at the points that both studies have.
 
     Parameters
     ----------
     ours, other
-        As `sweep.open` gives them, or parts of them. Points are matched by the values of their
-        coordinates, whatever these are written in. A parameter on an axis of one study only takes
-        the value of the other, if it is there; else the axis stays.
+        Datasets of `sweep.open`, or selections of them. Points are matched by the values of their
+        coordinates, in any units. If a parameter is on an axis of only one study, that axis is
+        reduced to the fixed value of the other study. If it lacks this value, the axis stays.
 
     Returns
     -------
     xarray.Dataset
-        Lazy, over the axes of `ours` and those of `other` that stay. It has the difference of every
-        output by its name. For each probability of detection it also has `pd_.._allowed` and
-        `pd_.._agrees`. The first is the difference that the half-widths of draws and the errors of
-        skipped effects and few beamlets allow. The second is true if the difference is no larger,
-        and false where either is not computed.
+        Lazy dataset over the axes of `ours` and the remaining axes of `other`. It has the
+        difference of every output under the name of the output. For each probability of detection
+        it also has `pd_.._allowed` and `pd_.._agrees`. The first is the largest difference
+        explained by the half-widths of draws and the errors of skipped effects and few beamlets.
+        The second is true if the difference is no larger, and false if either study has no value.
 
     Raises
     ------
     ValueError
-        No point is in both, or the other is a flight.
+        The studies have no common point, or `other` is a flight.
     """
     if not isinstance(other, xr.Dataset):
         raise ValueError(MIXED_KINDS_MESSAGE)
@@ -72,7 +72,10 @@ def compute_differences(
     *,
     bounded_variables: Sequence[str],
 ) -> xr.Dataset:
-    """Differences of variables where they meet; of those that are bounded, whether they agree."""
+    """Return the differences of variables at common points.
+
+    For ``bounded_variables`` also return the allowed differences and the agreement.
+    """
     matched_ours, matched_other = _match_points(ours, other)
     result = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
     for name in variables:
@@ -96,14 +99,14 @@ def compute_differences(
 
 
 def title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
-    """Title and number of a study."""
+    """Return the title of a study, with the first digits of its id."""
     return (
         f"{opened_store.attrs.get('title', '')} ({str(opened_store.attrs.get('study_id', ''))[:8]})"
     )
 
 
 def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Known bound on the error of a probability."""
+    """Return the known bound on the error of a probability."""
     error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
     return sum(
@@ -112,7 +115,7 @@ def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Both datasets at the points that they share, along dimensions of the same names."""
+    """Return both datasets restricted to their common points, along equally named dimensions."""
     other = _select_fixed_parameters(other, ours)
     ours = _select_fixed_parameters(ours, other)
     for dim in [d for d in ours.dims if d in other.dims]:
@@ -122,7 +125,7 @@ def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.D
             raise ValueError(f"along {dim} the two studies have no value in common")
         ours = ours.isel({dim: our_index.get_indexer(common_index)})
         other = other.isel({dim: other_index.get_indexer(common_index)})
-        # the coordinates of ours stand for both, so that xarray takes no offence at last digits
+        # Both get the coordinates of ours, because xarray requires exact equality.
         other = other.drop_vars([n for n, c in other.coords.items() if dim in c.dims])
         other = other.assign_coords({n: c for n, c in ours.coords.items() if c.dims == (dim,)})
     scalar_names = [n for n, c in other.coords.items() if not c.dims]
@@ -131,7 +134,7 @@ def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.D
 
 
 def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
-    """Return a dataset at the values of the parameters that the reference has off its axes."""
+    """Select the values of parameters that are fixed, not on an axis, in the reference."""
     varying_paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
     spec = spec_of_dataset(reference)
     for coord in list(dataset.coords.values()):
@@ -151,7 +154,10 @@ def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.D
 
 
 def _dim_index(dataset: xr.Dataset, dim: str) -> pandas.Index:
-    """SI values along a dimension, to 12 digits; of several coordinates together."""
+    """Return an index of the SI values along a dimension, rounded to 12 significant digits.
+
+    Several coordinates of a dimension form a multi-index.
+    """
     coords = [c for c in dataset.coords.values() if c.dims == (dim,)]
     if not coords:
         return pandas.RangeIndex(dataset.sizes[dim])
@@ -160,7 +166,8 @@ def _dim_index(dataset: xr.Dataset, dim: str) -> pandas.Index:
     index = columns[0] if len(columns) == 1 else pandas.MultiIndex.from_arrays(columns)
     index = pandas.Index(index)
     if index.has_duplicates:
-        # A point that stands twice along a zipped axis is matched once, with the first of them.
+        # A counter distinguishes repeated points of a zipped axis, so that the n-th one is matched
+        # with the n-th one of the other study.
         index_frame = index.to_frame(index=False)
         index_frame["again"] = index_frame.groupby(list(index_frame.columns)).cumcount()
         index = pandas.MultiIndex.from_frame(index_frame)
@@ -168,7 +175,7 @@ def _dim_index(dataset: xr.Dataset, dim: str) -> pandas.Index:
 
 
 def _round_significant(values: np.ndarray) -> np.ndarray:
-    """Numbers to 12 significant digits."""
+    """Round numbers to 12 significant digits; leave other types unchanged."""
     if values.dtype.kind not in "fiu":
         return values
     values = values.astype(float)
@@ -180,19 +187,19 @@ def _round_significant(values: np.ndarray) -> np.ndarray:
 
 
 SHOT_TIME_TOLERANCE = 1e-9
-"""Difference [s] up to which shots of a beam are at the same time."""
+"""Largest time difference of matching shots of a beam [s]."""
 
 SHOT_POSITION_TOLERANCE = 1e-6
-"""Distance [m] up to which they are from the same place."""
+"""Largest distance between the platform positions of matching shots [m]."""
 
 BEAM_DIRECTION_TOLERANCE = 1e-9
-"""Angle [rad] up to which they have the same direction."""
+"""Largest angle between the beam directions of matching shots [rad]."""
 
 DETECTED_VARIABLE = "detected"
-"""Share of the draws in which a shot has a true point."""
+"""Name of the share of draws in which a shot has a true point."""
 
 ERROR_BOUND_VARIABLES = ("effects_error", "beamlets_error")
-"""Known bounds on the errors of a shot's probabilities."""
+"""Names of the error bounds of a shot's probabilities."""
 
 COMPARED_STATISTICS = tuple(
     name
@@ -202,30 +209,30 @@ COMPARED_STATISTICS = tuple(
 
 
 def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
-    """Differences, other less ours, at the shots that both flights have.
+    """Return the differences, other minus ours, at the shots that both flights have.
 
     Parameters
     ----------
     ours, other
-        As `sweep.open_scene` gives them. Scanners are matched by name; shots by time, beam,
+        Trees of `sweep.open_scene`. Scanners are matched by name. Shots are matched by time, beam,
         position and direction of the beam, to :data:`SHOT_TIME_TOLERANCE`,
-        :data:`SHOT_POSITION_TOLERANCE` and
-        :data:`BEAM_DIRECTION_TOLERANCE`; places along axes as :func:`compare` matches points.
+        :data:`SHOT_POSITION_TOLERANCE` and :data:`BEAM_DIRECTION_TOLERANCE`. Positions along axes
+        are matched as in :func:`compare`.
 
     Returns
     -------
     xarray.DataTree
-        A group for each scanner that both have, with dimensions axes and `shot`. It has the
-        differences of the probabilities and SNRs of a shot. If both stores are complete, it also
-        has the difference of `detected`, the share of draws in which the shot has a true point.
-        `.._allowed` and `.._agrees` belong to probabilities of detection and to `detected`, as in
-        :func:`compare`. The intervals of `detected` are those of Clopper and Pearson with each
-        study's confidence. The attributes `shots` and `other_shots` are the numbers of shots.
+        Group for each common scanner, over the axes and `shot`. It has the differences of the
+        probabilities and SNRs of a shot. If both stores are complete, it also has the difference of
+        `detected`, the share of draws in which the shot has a true point. Probabilities of
+        detection and `detected` also have `.._allowed` and `.._agrees`, as in :func:`compare`. The
+        intervals of `detected` are Clopper-Pearson intervals with the confidence of each study. The
+        attributes `shots` and `other_shots` are the numbers of shots of both flights.
 
     Raises
     ------
     ValueError
-        The flights have no scanner in common, or no shot of a scanner; the other is a grid.
+        The flights have no common scanner, or no common shot of a scanner; or `other` is a grid.
     """
     if not isinstance(other, xr.DataTree):
         raise ValueError(MIXED_KINDS_MESSAGE)
@@ -239,13 +246,13 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
 
 
 def scanner_names(tree: xr.DataTree) -> list[str]:
-    """Return the names of a flight's scanners; netCDF makes a word of a list of one."""
+    """Return the names of a flight's scanners; netCDF turns a list of one name into a string."""
     names = tree.attrs["scanners"]
     return [names] if isinstance(names, str) else [str(name) for name in names]
 
 
 def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
-    """Differences at the shots of a scanner."""
+    """Return the differences at the common shots of a scanner."""
     our_group, other_group = (
         provenance.check_single_study(
             tree.children[scanner].to_dataset(inherit=False).assign_attrs(tree.attrs),
@@ -257,7 +264,8 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
     shot_coords = {
         name: our_group[name].isel(shot=our_shots).compute() for name in ("time", "beam")
     }
-    # a store is complete where no draw is left to compute; a missing point would not tell
+    # Only the number of committed points shows that all draws are computed: a draw that is not
+    # computed looks like one without a point.
     all_drawn = all(t.attrs["points_committed"] >= t.attrs["points"] for t in (ours, other))
     quantities_of_both = [
         _compared_quantities(group.isel(shot=index), tree, all_drawn=all_drawn)
@@ -286,7 +294,10 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
 def _match_shots(
     ours: xr.Dataset, other: xr.Dataset, scanner: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the shots that both groups have, those of ours rising; none are computed: none."""
+    """Return the numbers of common shots in both groups, in rising order of ours.
+
+    Both are empty if either group has no computed shots.
+    """
     our_frame, other_frame = _computed_shots(ours), _computed_shots(other)
     if our_frame.empty or other_frame.empty:
         return np.empty(0, int), np.empty(0, int)
@@ -320,13 +331,16 @@ def _match_shots(
 
 
 def _computed_shots(group: xr.Dataset) -> pandas.DataFrame:
-    """Time, beam and number of the shots that are computed, by time."""
+    """Return time, beam and number of the computed shots, sorted by time."""
     frame = pandas.DataFrame({name: group[name].values for name in ("time", "beam")})
     return frame.assign(number=frame.index).dropna().sort_values("time")
 
 
 def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool) -> xr.Dataset:
-    """Quantities of a group's shots that are compared, over its axes and shots."""
+    """Return the compared quantities of a group's shots, over its axes and shots.
+
+    With ``all_drawn`` they include `detected` and its half-width.
+    """
     variables = [name for name in (*COMPARED_STATISTICS, *ERROR_BOUND_VARIABLES) if name in group]
     quantities = group[variables].assign_attrs(tree.attrs)
     if not all_drawn:
@@ -368,7 +382,7 @@ TABULATED_VARIABLES = (
 
 
 def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
-    """Differences of what a table shows, computed: by scanner, or of a grid under no name."""
+    """Compute the differences that the table shows, by scanner; a grid has the name ''."""
     result = ours.sweep.compare(other)
     is_grid = isinstance(result, xr.Dataset)
     groups = (
@@ -384,7 +398,7 @@ def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr
 
 
 def difference_rows(differences: xr.Dataset) -> list[list[str]]:
-    """Return a row for each quantity with points, in the order of `COLUMNS`."""
+    """Return a row for each quantity with values, in the columns of `DIFFERENCE_COLUMNS`."""
     return [
         _difference_row(differences, name)
         for name in TABULATED_VARIABLES
@@ -402,7 +416,7 @@ def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
         agreeing_fraction = (
             differences[f"{name}_agrees"].values & is_finite
         ).sum() / is_finite.sum()
-        # rounded down: nothing but all is 100 %
+        # Rounded down, so that 100 % means all points.
         agreement_text = f"{np.floor(1e4 * agreeing_fraction) / 100:g} %"
     n_different = int((abs_difference > 0).sum())
     return [
@@ -416,13 +430,13 @@ def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
 
 
 def _describe_point(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
-    """Coordinates of a point, in the order of the axes."""
+    """Return the coordinates of a point in words, in the order of the axes."""
     point = array.isel(dict(zip(array.dims, map(int, index), strict=True)))
     return ", ".join(_describe_coordinate(c) for c in point.coords.values())
 
 
 def _describe_coordinate(coordinate: xr.DataArray) -> str:
-    """Return a coordinate's value; with its name where no unit tells what it is."""
+    """Return the value of a coordinate; without a unit its name precedes the value."""
     units = str(coordinate.attrs.get("units", ""))
     value = labels.format_quantity(coordinate.values.item(), units)
     return (
@@ -433,7 +447,7 @@ def _describe_coordinate(coordinate: xr.DataArray) -> str:
 
 
 def describe_common_shots(differences: xr.Dataset) -> str:
-    """Return the number of the shots that two flights share, in words."""
+    """Return the number of common shots of two flights in words."""
     n_common, n_ours, n_other = (
         differences.sizes["shot"],
         differences.attrs["shots"],
@@ -445,7 +459,7 @@ def describe_common_shots(differences: xr.Dataset) -> str:
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
-    """Return ``same``, ``different`` or ``nothing``, and a sentence that says so."""
+    """Return ``same``, ``different`` or ``nothing``, and a sentence with this verdict."""
     n_points, n_different, noun, count_note = 0, 0, "point", ""
     for differences in compared_groups:
         if "shot" in differences.dims:
@@ -468,13 +482,13 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
 
 
 PLOTTED_DIFFERENCE_MIN = 1e-16
-"""Differences below it stand at the left edge of a figure."""
+"""Smallest plotted difference; smaller ones are drawn at the left edge."""
 
 
 def save_difference_figure(
     differences_by_scanner: Mapping[str, xr.Dataset], file_path: Path
 ) -> Path:
-    """Draw the shares of points that differ by more than some amount, a colour a scanner."""
+    """Draw the share of points that exceed each difference of pd, in one colour per scanner."""
     from sweep.analysis import canvas
 
     with canvas.uniform_style():
@@ -518,7 +532,7 @@ def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart 
 def _exceedance_lines(
     differences: xr.Dataset, name: str, scanner: str, style_index: int
 ) -> list[ChartLine]:
-    """Shares of points beyond each difference that is, and beyond each that is allowed."""
+    """Return lines of the share of points above each actual and each allowed difference."""
     is_finite = np.isfinite(differences[name].values)
     lines = []
     for values, label_suffix, style in (

@@ -31,15 +31,15 @@ JOIN_REMEDY = (
 _MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 
 SPECS_ATTRIBUTE = "specs"
-"""Attribute of a join of studies: JSON of spec and variable names by study identity."""
+"""Attribute of a join of studies: JSON of specs and variable names, by study id."""
 
 
 def marker_name(study_ids: Iterable[str]) -> str:
-    """Return the name of the marker coordinate of a study, or of a join of several.
+    """Return the name of the marker coordinate of a study, or of a join of several studies.
 
-    xarray drops a conflicting coordinate or keeps the first dataset's, but keeps a coordinate that
-    only one dataset has. The identity is therefore in the name: a merge of two studies has two
-    markers.
+    xarray drops conflicting coordinates, or keeps that of the first dataset. It always keeps a
+    coordinate that only one dataset has. The study id is therefore in the name: a merge of two
+    studies has two markers.
     """
     study_ids = list(study_ids)
     if len(study_ids) == 1:
@@ -48,12 +48,15 @@ def marker_name(study_ids: Iterable[str]) -> str:
 
 
 def marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
-    """Return the markers that a dataset has, by :func:`marker_name`."""
+    """Return the names of a dataset's marker coordinates, as defined by :func:`marker_name`."""
     return [name for name in map(str, dataset.coords) if _MARKER_PATTERN.fullmatch(name)]
 
 
 def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
-    """Return the spec of the study that a dataset, or a flight's tree, comes from."""
+    """Return the spec of the study that a dataset, or a flight's tree, comes from.
+
+    Raise ValueError if it combines several studies, or lacks the spec or the marker.
+    """
     spec_text = dataset.attrs.get("spec")
     _check_marker(dataset)
     if STUDY_ID in dataset.coords:
@@ -108,7 +111,7 @@ def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
 
 @lru_cache(maxsize=8)
 def _parse_stored_spec(spec_text: str) -> GridSpec | SceneSpec:
-    """Parse a stored spec; cached, because answers parse that of one dataset repeatedly."""
+    """Parse a stored spec; cached, because answers parse the spec of a dataset repeatedly."""
     return from_stored(spec_text)
 
 
@@ -121,7 +124,7 @@ def grid_spec_of_dataset(dataset: xr.Dataset) -> GridSpec:
 
 
 def require_variables(dataset: xr.Dataset, *names: str) -> None:
-    """Refuse a dataset that lacks variables which an answer needs."""
+    """Raise ValueError if a dataset lacks variables that an answer needs."""
     if missing := [name for name in names if name not in dataset]:
         raise ValueError(
             f"the dataset lacks {', '.join(missing)}, which this answer needs: take all variables "
@@ -130,7 +133,7 @@ def require_variables(dataset: xr.Dataset, *names: str) -> None:
 
 
 def parse_si(raw_value: object, *, si_unit: str, name: str) -> float:
-    """Parse a quantity such as ``"20 Hz"`` to SI; a bare number is in SI already."""
+    """Parse a quantity such as ``"20 Hz"`` to SI; a number without unit is in SI."""
     if isinstance(raw_value, int | float) and not isinstance(raw_value, bool):
         return float(raw_value)
     try:
@@ -141,7 +144,7 @@ def parse_si(raw_value: object, *, si_unit: str, name: str) -> float:
 
 
 def parse_pd_level(pd: object) -> float:
-    """Level of pd as a number, ``0.9`` or ``"90 %"``; ValueError unless it is between 0 and 1."""
+    """Return a level of pd, ``0.9`` or ``"90 %"``, as a number; ValueError unless in (0, 1)."""
     is_number = isinstance(pd, np.number) and np.ndim(pd) == 0
     try:
         value, unit = read_number(pd.item() if is_number else pd)  # type: ignore[attr-defined]
@@ -163,7 +166,7 @@ def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
-    """Convert a value such as ``"2 km"`` to a coordinate's units; a bare number is in them."""
+    """Convert a value such as ``"2 km"`` to a coordinate's units; leave a plain number as it is."""
     rule = parameter_rules().get(coord.attrs.get("path", ""))
     if isinstance(raw_value, int | float | np.number) and not isinstance(raw_value, bool):
         return float(raw_value)
@@ -194,7 +197,7 @@ def to_si(coord: xr.DataArray) -> xr.DataArray:
 def parameter_in_si(
     dataset: xr.Dataset, path: str, spec: GridSpec | SceneSpec | None = None
 ) -> xr.DataArray:
-    """Return a parameter in SI: over its axis, or as a scalar if it is the same for all points."""
+    """Return a parameter in SI: over its axis, or as a scalar if all points share its value."""
     coord = parameter_coordinate(dataset, path)
     if coord is not None:
         return to_si(coord).drop_vars(list(coord.coords), errors="ignore").assign_coords(
@@ -210,7 +213,7 @@ def parameter_in_si(
 
 
 def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
-    """Return the coordinate of a parameter, by its dotted path."""
+    """Return the coordinate of a parameter, by its dotted path; None if there is none."""
     matches = (coord for coord in dataset.coords.values() if coord.attrs.get("path") == path)
     return next(matches, None)
 
@@ -223,18 +226,18 @@ def select_points(
     Parameters
     ----------
     selection
-        By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
-        units), a list of values, or a slice with both ends included. A single value of a dimension
-        coordinate removes its dimension. A coordinate along a zipped axis keeps the matching points
-        of that axis.
+        Selected values by name or path of a coordinate: a value (``"2 km"``, or a number in the
+        coordinate's units), a list of values, or a slice that includes both ends. A single value of
+        a dimension coordinate removes its dimension. A coordinate along a zipped axis keeps the
+        matching points of that axis.
     method
-        ``nearest`` takes the nearest value, for one within the coordinate's range; by default the
-        value must match to 1e-9.
+        ``nearest`` selects the nearest value, if the wanted value lies within the coordinate's
+        range. By default the value must match to a relative 1e-9.
 
     Raises
     ------
     ValueError
-        No such coordinate, a value that cannot be read, or one that is not on the grid.
+        A coordinate does not exist, or a value can't be read or is not on the grid.
     """
     if method not in (None, "nearest"):
         raise ValueError(f"method '{method}' is unknown: take 'nearest', or none")
@@ -252,7 +255,7 @@ def select_points(
 
 
 def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None) -> np.ndarray:
-    """Return the indices of the wanted values; for slices in the coordinate's order."""
+    """Return the indices of the selected values; those of a slice in the coordinate's order."""
     coord_values = np.atleast_1d(coord.values)
     if isinstance(selected, slice):
         low = (
@@ -274,7 +277,7 @@ def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None
 def _indices_of_value(
     coord: xr.DataArray, coord_values: np.ndarray, value: float | str, method: str | None
 ) -> np.ndarray:
-    """Return the indices at which a coordinate has one value."""
+    """Return the indices at which a coordinate has a value, or the nearest one."""
     units = coord.attrs.get("units", "")
     if coord_values.dtype.kind not in "fiu":
         coord_words = [str(word) for word in coord_values]

@@ -1,8 +1,9 @@
-"""Limits along an axis at which pd falls below a level: maximum range, least grazing angle.
+"""Limits along an axis at which pd falls below a level: maximum range, minimum grazing angle.
 
-Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z).
-Q_1(a, b) is near Phi(a - b): z follows the signal's amplitude and is nearly a straight line where
-pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
+Between two grid points the position is interpolated in the normal deviate z, defined by pd =
+Phi(z). The Marcum function Q_1(a, b) is close to Phi(a - b). Therefore z follows the signal's
+amplitude and is almost linear, while pd bends from 1 to 0. Near pd = 1 the probability of a miss, 1
+- pd, supplies the digits.
 """
 
 from __future__ import annotations
@@ -19,16 +20,19 @@ LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED = range(4)
 REASON_MEANINGS = "found never_reached never_lost not_computed"
 
 _COMPLEMENT_ERROR_MAX = 1e-6
-"""Largest difference of pd + miss from 1 that rounding and means leave."""
+"""Largest deviation of pd + miss from 1 by rounding and by averaging."""
 
 _DEVIATE_MAX = 38.0
-"""Normal deviate of the least positive float, in place of those of 0 and 1."""
+"""Largest magnitude of a normal deviate, used for pd of 0 and 1.
+
+It corresponds to about the smallest positive float.
+"""
 
 
 def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Return the normal deviate z of pd = Phi(z), from the probability of a miss above one half.
+    """Return the normal deviate z of pd = Phi(z); for pd above 1/2 it is computed from the miss.
 
-    ValueError where the two probabilities do not add to 1 [when the result is computed].
+    When the result is computed, ValueError is raised if pd and miss do not add to 1.
     """
     miss_or_complement = 1 - pd if miss is None else miss
 
@@ -59,39 +63,41 @@ def limit(
     segment: str = "shot",
     from_highest: bool = False,
 ) -> xr.Dataset:
-    """Farthest value of a coordinate up to which the probability of detection keeps to a level.
+    """Return the farthest value of a coordinate at which pd still reaches a level.
 
-    pd need not fall steadily: scalloping and interference make dips. So there are two answers.
+    pd need not fall monotonically: scalloping and interference make dips. There are therefore two
+    answers, with and without dips before the limit.
 
     Parameters
     ----------
     along
-        Coordinate, each value of it once; those of a zipped axis after a selection.
+        Coordinate without repeated values. For a coordinate of a zipped axis, select points first.
     pd
-        The level, 0 < pd < 1, as 0.9 or "90 %".
+        Level, 0 < pd < 1, such as 0.9 or "90 %".
     segment
         ``shot``, ``up``, ``doppler`` or ``down``.
     from_highest
-        Whether to go from the largest value to the smallest, as for grazing angles.
+        If true, search from the largest value to the smallest, as for grazing angles.
 
     Returns
     -------
     xarray.Dataset
-        In the coordinate's units, over what other dimensions there are; lazy:
+        Lazy dataset in the coordinate's units, over the other dimensions:
 
-        - `unbroken`: the farthest value up to which pd is at the level or above all the way;
-        - `farthest`: the farthest value at which pd is at the level at all;
-        - `unbroken_reason`, `farthest_reason`: flags for the reason of a nan. Either pd is below
-          the level at the first value (or at all of them), or it is not below the level up to the
-          last value, or a deciding value is not computed.
+        - `unbroken`: the farthest value up to which pd is always at or above the level;
+        - `farthest`: the farthest value at which pd is at or above the level;
+        - `unbroken_reason`, `farthest_reason`: flags with the reason of a nan. `never_reached`: pd
+          is below the level at the first value (or at all of them). `never_lost`: pd is not below
+          the level up to the last value. `not_computed`: a deciding value is not computed.
 
-        `unbroken_low`, `unbroken_high` and so on are the answers with the lower and the upper ends
-        of pd's intervals, if it is drawn.
+        If pd is drawn, `unbroken_low`, `unbroken_high` and so on are the answers for the lower and
+        upper ends of pd's intervals.
 
     Raises
     ------
     ValueError
-        No such coordinate or level, one value only, or one that comes more than once.
+        The coordinate or level does not exist, or the coordinate has one value only or a repeated
+        one.
     """
     level = parse_pd_level(pd)
     coord = find_coordinate(dataset, along)
@@ -117,21 +123,21 @@ def limit(
 def maximum_range(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Range up to which pd keeps to a level, unbroken and at all: :func:`limit`."""
+    """Return the maximum range at which pd reaches a level; otherwise as :func:`limit`."""
     return limit(dataset, "target.range", pd, segment=segment)
 
 
 def minimum_grazing_angle(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Least grazing angle down to which pd keeps to a level: :func:`limit`."""
+    """Return the minimum grazing angle at which pd reaches a level; as :func:`limit`."""
     return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
 
 
 def _sort_along(
     dataset: xr.Dataset, coord: xr.DataArray, from_highest: bool
 ) -> tuple[xr.Dataset, str]:
-    """Sort a dataset by a coordinate, in the direction of the search; its dimension."""
+    """Sort a dataset by a coordinate, in the direction of the search; also return its dimension."""
     if coord.ndim != 1 or coord.size < 2:
         raise ValueError(f"{coord.name} has a single value: there is nothing to go along")
     order = np.argsort(coord.values, kind="stable")
@@ -150,10 +156,10 @@ def _sort_along(
 def _limits_along(
     pd: xr.DataArray, miss: xr.DataArray | None, coord: xr.DataArray, dim: str, level: float
 ) -> dict[str, xr.DataArray]:
-    """Both answers and their reasons.
+    """Return both limits along a dimension, with their reasons.
 
-    Places are counted in steps along the axis, so that they rise whichever way it is walked; those
-    that there are none of are infinite.
+    Positions are counted in steps along the dimension, so that they rise in either direction of
+    search. A position that does not exist is infinite.
     """
     z = normal_deviate(pd, miss) - float(ndtri(level))
     steps = xr.DataArray(np.arange(float(coord.size)), dims=[dim])
@@ -192,12 +198,12 @@ def _limits_along(
 
 
 def _first_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
-    """Least of the chosen places along a dimension; infinity where none is chosen."""
+    """Return the smallest of the chosen positions along a dimension; infinity if none is chosen."""
     return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
 
 
 def _value_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
-    """Value of a coordinate at a place counted in steps along it; nan stays."""
+    """Return the interpolated value of a coordinate at a position in steps; nan stays nan."""
     all_steps = np.arange(coord.size, dtype=float)
     return xr.apply_ufunc(
         lambda p: np.interp(p, all_steps, coord.values),
@@ -214,7 +220,7 @@ def _set_attributes(
     level: float,
     confidence_attributes: dict[str, float],
 ) -> xr.Dataset:
-    """Units and words of the answers."""
+    """Set units and descriptions of the answers."""
     long_names = {
         "unbroken": (
             f"farthest {coord.name} up to which pd of the {segment} stays {level:g} or more"
@@ -250,30 +256,30 @@ def contour(
     y: str = "grazing_angle",
     segment: str = "shot",
 ) -> xr.Dataset:
-    """Lines along which the probability of detection is at a level.
+    """Return the lines along which the probability of detection equals a level.
 
     Parameters
     ----------
     dataset
-        As `sweep.open` gives it; of any dimension other than the two one value selected.
+        Dataset of `sweep.open`, with one value selected along every dimension except two.
     pd
-        The level, 0 < pd < 1, as 0.9 or "90 %".
+        Level, 0 < pd < 1, such as 0.9 or "90 %".
     x, y
-        Coordinates, each with a dimension of its own.
+        Coordinates of the two dimensions.
     segment
-        ``shot``, ``y_coord``, ``doppler`` or ``down``.
+        ``shot``, ``up``, ``doppler`` or ``down``.
 
     Returns
     -------
     xarray.Dataset
-        Over `vertex`: the two coordinates in their units, and `line`, the number of the line that
-        the vertex is of, in order along it; none where pd is nowhere at the level. Between the
-        grid's points, places are interpolated in the normal deviate.
+        Dataset over `vertex`, in order along each line: both coordinates in their units, and
+        `line`, the number of the line. It is empty if pd never equals the level. Between grid
+        points, positions are interpolated in the normal deviate.
 
     Raises
     ------
     ValueError
-        A coordinate that is not there, or further dimensions.
+        A coordinate does not exist, or there are further dimensions.
     """
     level = parse_pd_level(pd)
     x_coord, y_coord = find_coordinate(dataset, x), find_coordinate(dataset, y)

@@ -1,4 +1,4 @@
-"""Errors of range and radial velocity, and the Cramer-Rao bounds on any estimate of them."""
+"""Errors of range and radial velocity, and the Cramer-Rao bounds on unbiased estimates."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PATH_BY_PARAMETER = {
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
 _RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
-"""Effects whose draws do not change an echo's footprint."""
+"""Names of random effects, whose draws do not change the footprint of an echo."""
 
 _GROUPING_PARAMETERS = (
     "architecture",
@@ -53,31 +53,32 @@ _GROUPING_PARAMETERS = (
     "delay",
     "sample_rate",
 )
-"""Parameters that points have in common whose bounds are worked out together."""
+"""Parameters that must be equal for points whose bounds are computed together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
-    """Error of the reported range, and the Cramer-Rao bound on any unbiased estimate of it.
+    """Return the error of the reported range, and the Cramer-Rao bound of unbiased estimates.
 
     Returns
     -------
     xarray.Dataset
-        [m], lazy. `reported` is the reported less the true range without noise, from whole bins.
-        `resolution` is the mean spread that whole bins make: a bin over sqrt(24), because two
-        peaks share the error. `bound` is the least standard deviation, that of a lone line with
+        Lazy dataset [m]. `reported` is the noise-free range reported from whole bins, minus the
+        true range. `resolution` is the standard deviation caused by whole bins, averaged over
+        positions within a bin: a bin over sqrt(24), because two peaks share the error. `bound` is
+        the smallest standard deviation of an unbiased estimate. It is that of a single line with
         the stored SNR in the three segments together (:mod:`sweep.model.detection.estimators`),
-        with what developed speckle adds to echoes that are detected
-        (:mod:`sweep.model.sampling.speckle_wander`). Below the
-        threshold noise is taken for signal, and no estimate comes near the bound. A study that
-        draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
+        plus the contribution of developed speckle to detected echoes
+        (:mod:`sweep.model.sampling.speckle_wander`). Below the threshold, noise is mistaken for
+        signal, and no estimate comes near the bound. A study that draws whole spectra has instead
+        its stored `bias`, `rmse` and `bound`.
     """
     return _error_dataset(dataset, "range")
 
 
 def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
-    """Error of the reported radial velocity, and the Cramer-Rao bound.
+    """Return the error of the reported radial velocity, and the Cramer-Rao bound.
 
-    Parameters and results as of :func:`range_error`, in m/s.
+    Parameters and results are those of :func:`range_error`, in m/s.
     """
     return _error_dataset(dataset, "radial_velocity")
 
@@ -119,7 +120,8 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         if quantity == "range"
         else parameters["wavelength"] / 2 * bin_frequency
     )
-    # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
+    # Range and velocity are half the sum and half the difference of two peak positions. Each
+    # position has a standard deviation of a bin over sqrt(12).
     result = xr.Dataset({
         "reported": dataset[f"{quantity}_error"],
         "resolution": bin_size / np.sqrt(24.0) + xr.zeros_like(bounds),
@@ -138,7 +140,7 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
 
 
 def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
-    """Return the deviation that developed speckle adds to an estimate; 0 where nothing fades."""
+    """Return the standard deviation that speckle adds to an estimate; 0 without fading."""
     is_fading = (dataset["effects"] & (1 << EFFECT_NAMES.index("fading"))) > 0
     if (
         spec.effect_modes()["fading"] == "off"
@@ -184,7 +186,10 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
 def _cramer_rao_bounds(
     snr: tuple[np.ndarray, ...], parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Bounds of points that share no more than their order; words and sizes one by one."""
+    """Return the bounds of points with arbitrary parameters.
+
+    Points with equal record parameters are computed together.
+    """
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
     flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}
     flat_snr = [np.broadcast_to(a, shape).ravel() for a in snr]
@@ -203,7 +208,7 @@ def _cramer_rao_bounds(
 def _bounds_of_group(
     snr: list[np.ndarray], parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Bounds of points of one architecture, waveform, window and record."""
+    """Return the bounds of points that share architecture, waveform, window and record."""
     fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
     record_parameters = {
         "fft_size": fft_size,
@@ -259,7 +264,8 @@ def _bounds_of_group(
             range=parameters["range"] - distance_moved,
             radial_velocity=parameters["radial_velocity"],
         )
-        # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
+        # The beat frequency drifts at a rate of 2 s S beta: up to the middle of the record it
+        # shifts by the rate times half the record's duration.
         walk_frequency = (
             slope
             * chirp_rate
@@ -275,7 +281,7 @@ def _bounds_of_group(
             / sample_rate
             * fft_size
         )
-        # in bins of fs/L: a padded FFT's bins are finer than the window's
+        # Offsets are in bins of fs/L, because a zero-padded FFT has finer bins than the window.
         missing_samples = waveform.count_samples_before_echo(
             delay=2 / SPEED_OF_LIGHT * (parameters["range"] - distance_moved),
             doppler_ratio=0.0,
@@ -285,7 +291,7 @@ def _bounds_of_group(
         )
         remaining_samples = record_length - np.where(
             parameters["late"], missing_samples, 0
-        )  # samples that the echo has
+        )  # samples of the record that contain the echo
         remaining_sum, relative_width = tail_sum_and_width(taper)
         bin_offset = (
             (beat_bin - np.rint(beat_bin))
@@ -293,7 +299,8 @@ def _bounds_of_group(
             * record_length
             / fft_size
         )
-        # of less of the window the line stands lower, over the noise of all of it
+        # A late echo fills only a part of the window: its line is lower, while the noise is that
+        # of the whole window.
         amplitude_loss = (
             main_lobe_spline(taper.name, record_length)(np.abs(bin_offset))
             * remaining_sum[remaining_samples]
@@ -312,7 +319,7 @@ def _bounds_of_group(
             delay=2 * parameters["range"] / SPEED_OF_LIGHT,
             duration=np.maximum(remaining_samples, 1) / sample_rate,
         )
-        # The stored SNR is that of a sum of looks, or of each of those that tell by themselves.
+        # The stored SNR is that of the coherent sum of looks, or otherwise that of a single look.
         deviation = deviation / np.sqrt(
             np.where(parameters["combine"] == COMBINE_COHERENT, 1.0, parameters["looks"])
         )
@@ -329,10 +336,10 @@ def _bounds_of_group(
 
 @lru_cache(maxsize=8)
 def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Sum, and width in time, of a window's last samples over those of all, (L + 1,) each.
+    """Return relative sum and width of a window's last n samples, for n = 0 to L, (L + 1,) each.
 
-    By the number of samples. The width is the standard deviation of the places under the window,
-    by which its main lobe is narrow.
+    Both are relative to those of all samples. The width is the standard deviation of time weighted
+    by the window. The main lobe's width is inversely proportional to it.
     """
     samples, times = taper.samples()[::-1], np.arange(taper.length) / taper.length
     cumulative_sum, first_moment, second_moment = (
@@ -348,6 +355,6 @@ def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
-    """|W(delta)| / W(0) over delta from 0 to half a bin of fs/L, to 1e-8."""
+    """Return a spline of |W(delta)| / W(0) over delta = 0 to 1/2 bin of fs/L, accurate to 1e-8."""
     taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
     return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

@@ -1,4 +1,4 @@
-"""Probabilities of detection with their intervals, false alarms by time and way, summaries."""
+"""Probabilities of detection with intervals, false-alarm rates, summaries, and ROC curves."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
 
 
 def variable_name(quantity: str, segment: str) -> str:
-    """Name of a variable of a segment, or of a shot."""
+    """Return the name of a variable of a segment, or of a shot."""
     if segment not in SEGMENTS_AND_SHOT:
         raise ValueError(
             f"there is no segment '{segment}': take one of {', '.join(SEGMENTS_AND_SHOT)}"
@@ -44,25 +44,25 @@ def variable_name(quantity: str, segment: str) -> str:
 
 
 def pd_half_width(dataset: xr.Dataset, segment: str) -> xr.DataArray | None:
-    """Half-widths of the intervals of pd; None where nothing is drawn."""
+    """Return the half-widths of pd's intervals, or None if pd is not drawn."""
     return dataset.get(f"{variable_name('pd', segment)}_half_width")
 
 
 def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Dataset:
-    """Probability of detection, and the interval that holds the true one.
+    """Return the probability of detection, and the interval that contains the true one.
 
     Parameters
     ----------
     segment
-        ``shot`` (up- and down-chirp both), ``up``, ``doppler`` or ``down``.
+        ``shot`` (up- and down-chirp), ``up``, ``doppler`` or ``down``.
 
     Returns
     -------
     xarray.Dataset
-        `pd`, `low` and `high`, 0..1, lazy as the store's arrays are. The interval is pd plus and
-        minus the half-width that is stored, within 0..1; its attribute `confidence` says how sure
-        it is. Without draws pd is a closed form, and the interval has no width. The change that
-        skipped effects may make is apart, in `effects_error`.
+        `pd`, `low` and `high`, from 0 to 1, lazy if the arrays of the store are. The interval is pd
+        plus and minus the stored half-width, clipped to 0..1. Its attribute `confidence` is the
+        confidence level. Without draws pd is a closed form, and the interval has no width. The
+        possible error of skipped effects is not included: it is the variable `effects_error`.
     """
     require_variables(dataset, variable_name("pd", segment))
     pd = dataset[variable_name("pd", segment)]
@@ -85,7 +85,10 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
 def confidence_attribute(
     dataset: xr.Dataset, interval_half_width: xr.DataArray | None
 ) -> dict[str, float]:
-    """Confidence of an interval, if it is one number; 1 if nothing is drawn."""
+    """Return an interval's confidence as an attribute, if it is the same at all points.
+
+    Without draws the confidence is 1.
+    """
     if interval_half_width is None:
         return {"confidence": 1.0}
     confidence_level = interval_half_width.attrs.get("confidence")
@@ -97,26 +100,26 @@ def confidence_attribute(
 def false_alarms_per_second(
     dataset: xr.Dataset, rate: str | float | None = None, *, leakage: bool = False
 ) -> xr.DataArray:
-    """Mean number of shots a second whose up- and down-chirp both raise a false alarm.
+    """Return the mean rate of shots whose up- and down-chirp both raise a false alarm.
 
     Parameters
     ----------
     rate
-        Shots a second, ``"20 Hz"`` or a number; by default as many as chirps leave time for,
-        one after so many segments and as many gaps as it has in all its looks.
+        Shots per second, ``"20 Hz"`` or a number. By default it is the highest rate possible, 1 /
+        (looks * segments * (duration + gap)).
     leakage
-        Whether extra groups that leaked signal raises count as well as noise. A study that draws
-        whole spectra counts every false alarm of a shot, of either cause, whatever is asked.
+        If true, extra groups raised by leaked signal count in addition to noise. A study that draws
+        whole spectra always counts every false alarm of a shot, from both causes.
 
     Returns
     -------
     xarray.DataArray
-        [1/s], lazy.
+        Rate [1/s], lazy.
 
     Raises
     ------
     ValueError
-        The rate cannot be read, or is not positive.
+        The rate can't be read, or is not positive.
     """
     shots_per_second: xr.DataArray | float
     if rate is None:
@@ -158,24 +161,24 @@ def false_alarms_per_kilometre(
     *,
     leakage: bool = False,
 ) -> xr.DataArray:
-    """Return the rate per kilometre of flight.
+    """Return the number of shots with false alarms in both chirps per kilometre of flight.
 
     Parameters
     ----------
     dataset, rate, leakage
-        As of :func:`false_alarms_per_second`.
+        As in :func:`false_alarms_per_second`.
     speed
-        Along the path, ``"50 m/s"`` or a number of m/s.
+        Speed along the path, ``"50 m/s"`` or a number in m/s.
 
     Returns
     -------
     xarray.DataArray
-        [1/km], lazy.
+        Number per distance [1/km], lazy.
 
     Raises
     ------
     ValueError
-        Speed or rate cannot be read, or are not positive.
+        Speed or rate can't be read, or are not positive.
     """
     metres_per_second = parse_si(speed, si_unit="m/s", name="the speed")
     if not metres_per_second > 0:
@@ -190,9 +193,12 @@ def false_alarms_per_kilometre(
 
 
 def false_alarms_per_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Probability of a false alarm in both chirp segments; where spectra are drawn their number."""
+    """Return the probability of a false alarm in both chirps of a shot.
+
+    For a study that draws whole spectra, return the mean number of false alarms of a shot.
+    """
     if "pfa_both_chirps" not in dataset:
-        # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
+        # Drawn spectra: false alarms were counted in all segments, including those of leakage.
         draws_spectra = grid_spec_of_dataset(dataset).draws.draws_whole_spectra
         require_variables(dataset, "false_alarms" if draws_spectra else "pfa_both_chirps")
         return dataset["false_alarms"]
@@ -210,12 +216,19 @@ def pfa_both_chirps_with_leakage(
     p_leakage_up: xr.DataArray,
     p_leakage_down: xr.DataArray,
 ) -> xr.DataArray:
-    """Probability that noise or leakage raises an extra group in both chirp segments, 0..1.
+    """Return the probability that noise or leakage raises an extra group in both chirps, 0..1.
 
-    Of noise alone in the up-chirp, and in both, a product, as the segments' numbers of bins
-    differ; of leakage in each.
+    Parameters
+    ----------
+    pfa_segment
+        Probability of a false alarm by noise in the up-chirp.
+    pfa_both_chirps
+        Probability of a false alarm by noise in both chirps, a product over the chirps. The
+        down-chirp's factor may differ, because the chirps' numbers of bins differ.
+    p_leakage_up, p_leakage_down
+        Probability of an extra group by leakage in each chirp.
     """
-    pfa_down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
+    pfa_down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # 0 / 1 if pfa_segment is 0
     p_extra_up = pfa_segment + p_leakage_up * (1 - pfa_segment)
     return p_extra_up * (pfa_down + p_leakage_down * (1 - pfa_down))
 
@@ -224,13 +237,13 @@ SUMMARY_STATISTICS = ("mean", "least", "largest", "number")
 
 
 def summary(dataset: xr.Dataset) -> xr.Dataset:
-    """Mean, extremes and number of the computed points of every output.
+    """Return mean, extremes and number of the computed points of every output.
 
     Returns
     -------
     xarray.Dataset
-        Every variable of floats over `statistic`, lazy; nan where no point is finite. The store
-        goes through memory chunk by chunk, each chunk once.
+        Every floating-point variable over `statistic`, lazy; nan if no point is finite. Each chunk
+        of the store is read once, chunk by chunk.
     """
     result = xr.Dataset(coords={"statistic": list(SUMMARY_STATISTICS)}, attrs=dataset.attrs)
     for name, array in dataset.data_vars.items():
@@ -242,7 +255,7 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
-    """Return the statistics of an array, (4,)."""
+    """Return the statistics of an array, (4,), as a lazy array."""
     delayed_chunks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
     delayed_statistics = [
         dask.delayed(_chunk_statistics)(delayed_chunk) for delayed_chunk in delayed_chunks
@@ -253,7 +266,7 @@ def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
 
 
 def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
-    """Sum, extremes and number of the finite values of a block, (4,)."""
+    """Return sum, minimum, maximum and number of the finite values of a chunk, (4,)."""
     finite_values = chunk[np.isfinite(chunk)]
     minimum, maximum = (
         (finite_values.min(), finite_values.max()) if finite_values.size else (np.inf, -np.inf)
@@ -262,7 +275,7 @@ def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
 
 
 def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
-    """Return the statistics of all blocks together."""
+    """Return mean, minimum, maximum and number over all chunks, (4,)."""
     sums, minima, maxima, counts = np.array(chunk_statistics).T
     if not counts.sum():
         return np.array([np.nan, np.nan, np.nan, 0.0])
@@ -270,31 +283,31 @@ def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
 
 
 # Receiver operating characteristics. The magnitude of a segment's strongest bin does not depend on
-# the threshold. Where nothing is random but the noise, a store therefore holds all thresholds: with
-# the SNR of that bin and b the threshold over the noise per quadrature,
+# the threshold. If only the noise is random, a store therefore determines pd at any threshold. With
+# the SNR of that bin, and b the threshold over the noise per quadrature,
 #
 #     pd = Q_1(sqrt(2 SNR), b),    pfa of a bin = exp(-b^2 / 2).
 #
-# A point tells whether this is so: no random effect was simulated there, and the closed form gives
-# back the stored pd at the study's own threshold. (It does not where bins that hold lines have more
-# noise than others, nor where any bin of an echo detects.) All other points are simulated anew at
-# every threshold, with the same draws at each. Either way the effects are those that were simulated
-# in the study, for its own threshold: far from it, what was left out may change pd by more than the
-# study's tolerance.
+# This closed form is used at a point if no random effect was simulated there, and if it reproduces
+# the stored pd at the study's threshold. (It does not if bins with lines have more noise than
+# others, or if any bin of an echo can detect it.) All other points are simulated again at every
+# threshold, with the same draws at each. The effects are always those that the study simulated for
+# its own threshold. Far from this threshold, skipped effects may change pd by more than the study's
+# tolerance.
 
 ROC_POINTS_MAX = 20_000
 ROC_SIMULATED_POINTS_MAX = 200
-"""Points whose curves are made at once, and of these such as have to be simulated anew."""
+"""Largest number of points with curves, and of points that are simulated again."""
 
 PD_MATCH_TOLERANCE = 1e-9
-"""Difference of pd up to which the closed form gives back what is stored."""
+"""Largest difference of pd at which the closed form counts as reproducing the stored pd."""
 
 CURVE_TNR = "curve_tnr"
-"""Not `tnr`, which is the study's own where that is on an axis."""
+"""Name of the TNR along a curve; `tnr` may be a coordinate of the study."""
 
 ROC_KEY_DOMAIN = "sweep.analysis.roc"
 _RANDOM_EFFECT_FLAGS = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
-"""Flags of the effects that are random."""
+"""Bit mask of the random effects."""
 
 _DETECTING_SEGMENTS = {
     "up": ("up",),
@@ -311,29 +324,29 @@ def roc(
     segment: str = "shot",
     draws: int = 1000,
 ) -> xr.Dataset:
-    """Probability of detection over the probability of a false alarm in a bin of noise.
+    """Return the probability of detection over the false-alarm probability of a noise bin.
 
     Parameters
     ----------
     pfa
-        Probabilities of a false alarm in one bin, 0 < pfa < 1; by default 1e-16 to 0.1.
+        Probabilities of a false alarm in one bin, 0 < pfa < 1; by default from 1e-16 to 0.1.
     segment
         ``shot``, ``up``, ``doppler`` or ``down``.
     draws
-        Draws of each point that has to be simulated anew and has random effects.
+        Number of draws at each point that is simulated again and has random effects.
 
     Returns
     -------
     xarray.Dataset
-        `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold to noise ratio that
-        makes each pfa_bin at each point; `simulated`, whether the point was simulated anew. With
-        draws, `half_width` with the study's confidence; 0 where pd is exact.
+        `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold-to-noise ratio for each
+        pfa_bin at each point; `simulated`, true if the point was simulated again; `half_width`,
+        that of pd's interval with the study's confidence, 0 if pd is exact.
 
     Raises
     ------
     ValueError
-        Too many points, a probability that is none, a study of whole spectra, or one whose looks
-        vary.
+        There are too many points, a pfa is not between 0 and 1, the study draws whole spectra, or
+        its looks vary.
     """
     if grid_spec_of_dataset(dataset).draws.draws_whole_spectra:
         raise ValueError(
@@ -361,7 +374,7 @@ def roc(
         looks.threshold_ratio_from_log_pfa(np.log(pfas)), dims=["pfa_bin"]
     )
     pd, is_exact = _closed_form_pd(dataset, segment, threshold_ratio, looks)
-    if segment == "shot":  # else of two segments out of three
+    if segment == "shot":  # the product is exact only if both chirps must detect
         is_exact = is_exact & (detection_rule == waveform.BOTH_CHIRPS)
     is_exact = is_exact & (peak_rule == waveform.ALL_PEAKS)
     tnr = threshold_ratio * _study_tnr(dataset) / _study_threshold_ratio(dataset, looks)
@@ -376,7 +389,7 @@ def roc(
 
 
 def _looks_of_study(spec: GridSpec) -> Looks:
-    """Return the looks of all points."""
+    """Return the looks of a study; raise ValueError if they vary between points."""
     axis_paths = (axis_parameter.path for axis in spec.axes for axis_parameter in axis.parameters)
     if varying_paths := sorted(
         {LOOKS_NUMBER_PATH, LOOKS_COMBINE_PATH, LOOKS_VOTES_PATH} & set(axis_paths)
@@ -392,7 +405,7 @@ def _looks_of_study(spec: GridSpec) -> Looks:
 def _closed_form_pd(
     dataset: xr.Dataset, segment: str, threshold_ratio: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return the closed form of pd at each level, and where it holds."""
+    """Return pd in closed form at each threshold ratio, and a mask of points where it is exact."""
     study_ratio = _study_threshold_ratio(dataset, looks)
     pd = xr.ones_like(threshold_ratio)
     is_exact = (dataset["effects"] & _RANDOM_EFFECT_FLAGS) == 0
@@ -412,7 +425,7 @@ def _closed_form_pd(
 
 
 def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
-    """Return the study's own threshold over the noise per quadrature."""
+    """Return the study's threshold over the noise per quadrature."""
     if looks.is_noncoherent:
         return xr.apply_ufunc(
             looks.threshold_ratio_from_log_pfa, np.log(10) * dataset["log10_pfa_bin"]
@@ -421,7 +434,7 @@ def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
 
 
 def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
-    """Return the study's own threshold-to-noise ratio at each point."""
+    """Return the study's threshold-to-noise ratio at each point."""
     spec, template = grid_spec_of_dataset(dataset), dataset["log10_pfa_bin"]
     if TNR_PATH in spec.parameters():
         return parameter_in_si(dataset, TNR_PATH, spec)
@@ -437,7 +450,7 @@ def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def _point_parameters(coordinates: Mapping[Any, xr.DataArray], spec: GridSpec) -> dict[str, Any]:
-    """SI values of all parameters at a point, which has these coordinates."""
+    """Return the SI values of all parameters at the point with these coordinates."""
     values = {str(c.attrs["path"]): c for c in coordinates.values() if "path" in c.attrs}
     return spec.parameters() | {path: to_si(value).values.item() for path, value in values.items()}
 
@@ -445,7 +458,7 @@ def _point_parameters(coordinates: Mapping[Any, xr.DataArray], spec: GridSpec) -
 def _crossing_probability(
     signal_ratio: np.ndarray, threshold_ratio: np.ndarray, looks: Looks
 ) -> np.ndarray:
-    """Q_1, or its like in several looks; nan where the amplitude or the level is."""
+    """Return Q_1, or its equivalent for several looks; nan if an argument is not finite."""
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
     probability = looks.pd_and_miss_steady(
         np.where(is_finite, signal_ratio, 0), np.where(is_finite, threshold_ratio, 0)
@@ -456,7 +469,7 @@ def _crossing_probability(
 def _replace_by_simulation(
     dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int
 ) -> None:
-    """Put simulated curves in the place of those that the closed form does not give."""
+    """Replace the curves of points without a closed form by simulated ones, in place."""
     spec = grid_spec_of_dataset(dataset)
     point_indices = np.argwhere(np.asarray(result["simulated"].values))
     if len(point_indices) > ROC_SIMULATED_POINTS_MAX:
@@ -482,7 +495,7 @@ def _replace_by_simulation(
 def _simulate_curve(
     spec: GridSpec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chance of detection, and its half-width, at some threshold to noise ratios of a point."""
+    """Return pd and its half-width at several threshold-to-noise ratios of a point."""
     parameters = _point_parameters(point.coords, spec)
     is_finite = np.isfinite(tnr)
     if not is_finite.all():
@@ -495,7 +508,7 @@ def _simulate_curve(
     }
     parameter_arrays[TNR_PATH] = tnr
     if flags & _RANDOM_EFFECT_FLAGS:
-        # One key for all thresholds: the same draws, so that curves fall without noise.
+        # All thresholds have one key and thus the same draws, so that curves are monotonic.
         key_parameters = {p: v for p, v in sorted(parameters.items()) if p not in THRESHOLD_PATHS}
         key_values = [[v for v in key_parameters.values() if not isinstance(v, str)]]
         keys = np.repeat(
@@ -511,7 +524,7 @@ def _simulate_curve(
 
 
 def _set_attributes(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
-    """Units and words."""
+    """Set units and descriptions of the variables."""
     long_names = {
         "pd": f"probability of detection, {segment}",
         CURVE_TNR: "threshold to noise ratio",

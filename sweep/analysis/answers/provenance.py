@@ -1,11 +1,11 @@
 """Proof that a dataset belongs to one study, and answers per design from a join of studies.
 
-A dataset of `sweep.open` has the scalar coordinate `study_id`, which selections keep. When two
-studies' datasets are combined, xarray drops it, spreads it along a dimension, or keeps the first
-one's (`compat="override"`). A second coordinate, the marker, therefore has the identity in its
-name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one dataset has, so that a
-dataset with two markers combines two studies. Attributes prove nothing: xarray keeps the first
-dataset's.
+A dataset of `sweep.open` has the scalar coordinate `study_id`, which selections keep. When the
+datasets of two studies are combined, xarray drops it, spreads it along a dimension, or keeps that
+of the first (`compat="override"`). A second coordinate, the marker, therefore has the id in its
+name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one dataset has, so a dataset
+with two markers combines two studies. Attributes prove nothing, as xarray keeps those of the first
+dataset.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 RELATIVE_TOLERANCE = 1e-9
-"""Relative tolerance for matching a value to one of an axis."""
+"""Relative tolerance for matching a value to the values of an axis."""
 
 
 def compute_answer_per_study(
@@ -45,26 +45,26 @@ def compute_answer_per_study(
     Parameters
     ----------
     dataset
-        A dataset of `sweep.open`, or a selection of it.
+        Dataset of `sweep.open`, or a selection of it.
     answer
         Function of the dataset of a single study.
     require_axes
-        Whether the answer uses the study's parameters, so that each axis must have its coordinate.
+        If true, the answer uses the study's parameters, so that each axis must have its coordinate.
 
     Returns
     -------
     Any
-        Result of `answer`; for a join, the designs' results along its dimension, if they are
-        datasets or arrays. Contours are concatenated along `vertex`.
+        Result of `answer`. For a join, the results of the designs are concatenated along its
+        dimension, if they are datasets or arrays; contours are concatenated along `vertex`.
 
     Raises
     ------
     ValueError
-        The dataset does not prove that it is one study's.
+        The dataset does not prove that it comes from one study.
     """
     names_from_sweep = {STUDY_ID, SPECS_ATTRIBUTE, "spec", "model_version", *marker_names(dataset)}
     if not require_axes and not names_from_sweep & {*dataset.coords, *dataset.attrs}:
-        return answer(dataset)  # arrays of no study, of which nothing but the arrays is used
+        return answer(dataset)  # not from a store: the answer needs nothing but the arrays
     dim = _join_dimension(dataset)
     if not dim:
         return answer(check_single_study(dataset, require_axes=require_axes))
@@ -88,13 +88,13 @@ def compute_answer_per_study(
 
 
 def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset:
-    """Check that a dataset is one study's; return it with coordinate attributes restored.
+    """Check that a dataset comes from one study; return it with coordinate attributes restored.
 
     Raises
     ------
     ValueError
-        It is of no or several studies, its coordinates were changed, a dimension is no axis, or
-        (with ``require_axes``) the coordinate of an axis is missing.
+        The dataset comes from no study or from several, its coordinates were changed, a dimension
+        is not an axis, or (with ``require_axes``) the coordinate of an axis is missing.
     """
     _join_dimension(dataset, refuse_join=True)
     spec = spec_of_dataset(dataset)
@@ -114,7 +114,7 @@ def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset
 
 
 def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise a ValueError if the coordinate of an axis is missing, so that its value is unknown."""
+    """Raise ValueError if the coordinate of an axis is missing, so that its value is unknown."""
     for axis_parameter in _axis_parameters(spec):
         if parameter_coordinate(dataset, axis_parameter.path) is None:
             raise ValueError(
@@ -128,7 +128,7 @@ def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> N
 def _join_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
     """Return the dimension along which a dataset joins studies, or '' for a single study.
 
-    Raises a ValueError if the dataset proves neither; with ``refuse_join`` also for a join.
+    Raise ValueError if the dataset proves neither; with ``refuse_join`` also for a join.
     """
     if STUDY_ID not in dataset.coords:
         raise ValueError(
@@ -164,7 +164,7 @@ def _axis_parameters(spec: GridSpec | SceneSpec) -> list[AxisParameter]:
 
 
 def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Restore path and units of coordinates where an operation dropped both."""
+    """Restore path and units of coordinates if an operation dropped both."""
     restored_coords = {}
     for axis_parameter in _axis_parameters(spec):
         coord = dataset.coords.get(axis_parameter.coordinate)
@@ -176,7 +176,7 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
 
 
 def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return whether the study has each value of a parameter's coordinate, bool array."""
+    """Return for each value of a parameter's coordinate if the study has it, a bool array."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)
@@ -212,11 +212,11 @@ def _parameter_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> l
 
 
 def _check_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Refuse coordinates with values that the study does not have."""
+    """Raise ValueError if a coordinate has values that the study does not have."""
     for coord in _parameter_coordinates(dataset, spec):
         is_value_known = _is_value_of_study(coord, spec)
         if SPECS_ATTRIBUTE in dataset.attrs and not coord.dims:
-            continue  # a value of another design: there this one has no point
+            continue  # a value of another design, at which this design has no points
         if not is_value_known.all():
             value = np.atleast_1d(coord.values)[np.argmin(is_value_known)]
             value_text = labels.format_quantity(value, str(coord.attrs.get("units", "")))
@@ -228,7 +228,7 @@ def _check_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
 
 
 def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise a ValueError if a dimension is neither an axis nor that of a parameter's coordinate."""
+    """Raise ValueError if a dimension is neither an axis nor a parameter coordinate's dimension."""
     known_dims = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
     known_dims |= {
         str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims
@@ -243,11 +243,11 @@ def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
         )
 
 
-# Joins of several studies
+# Joins of several studies.
 
 
 def _select_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Reduce one design of a join to the points and variables of its study."""
+    """Restrict one design of a join to the points and variables of its study."""
     design_record = json.loads(dataset.attrs[SPECS_ATTRIBUTE])[str(dataset[STUDY_ID].item())]
     dataset = dataset.drop_vars(set(dataset.data_vars) - set(design_record["variables"]))
     for coord in _parameter_coordinates(dataset, spec):
@@ -257,26 +257,26 @@ def _select_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Datase
 
 
 def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
-    """Join the datasets of several studies along a new dimension, each a design.
+    """Join the datasets of several studies, the designs, along a new dimension.
 
     Parameters
     ----------
     datasets
-        By the name of the design, as `sweep.open` gives them.
+        Datasets of `sweep.open` by the name of the design.
     dim
         Name of the new dimension.
 
     Returns
     -------
     xarray.Dataset
-        Over `dim` and the axes of all studies, in the units of the first. Points that a design
-        lacks are nan, -1 for counts, 0 for flags. A parameter that varies in some studies has its
-        fixed value in the others. Its attribute `specs` has the spec of each study.
+        Dataset over `dim` and the axes of all studies, in the units of the first. Points that a
+        design lacks are nan, -1 for counts, and 0 for flags. A parameter that varies only in some
+        studies has its fixed value in the others. The attribute `specs` has the spec of each study.
 
     Raises
     ------
     ValueError
-        The name of the dimension is taken, one study comes twice, or zipped axes differ.
+        The name of the dimension is taken, a study occurs twice, or zipped axes differ.
     """
     specs = {name: spec_of_dataset(dataset) for name, dataset in datasets.items()}
     _check_join_names(datasets, dim)
@@ -320,7 +320,7 @@ def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
 
 
 def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
-    """Raise a ValueError if the dimension's name is taken, or a study occurs twice."""
+    """Raise ValueError if the name of the dimension is taken, or a study occurs twice."""
     used_names = {
         str(name) for d in datasets.values() for name in [*d.dims, *d.coords, *d.data_vars]
     }
@@ -334,7 +334,7 @@ def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
 
 
 def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
-    """Return for each parameter path the coordinate of the first dataset that has one."""
+    """Return for each parameter path the coordinate of the first dataset that has it."""
     coord_by_path: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
         for coord in dataset.coords.values():

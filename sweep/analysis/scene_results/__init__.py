@@ -1,1 +1,1 @@
-"""Scenes as computed: point clouds and navigation, read from stores and drawn."""
+"""Results of flights: point clouds and navigation, read from stores, drawn and exported."""

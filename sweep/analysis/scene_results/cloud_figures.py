@@ -1,4 +1,4 @@
-"""Sheets of point clouds, at an angle or along one of the world's axes, and of scatters."""
+"""Pictures of point clouds, oblique or along a world axis, and scatter plots of quantities."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.store_format import MAP_GROUP
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
-"""Direction of the light that shades the ground [deg], from north by east; and its height."""
+"""Azimuth (from north towards east) and elevation of the light that shades the ground [deg]."""
 
 DRAWN_SLOPE_MAX = 1.5
-"""Slope above which ground is left open: at the edges of crowns and walls, which hide points."""
+"""Slope above which the ground is not drawn: edges of crowns and walls would hide points."""
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Heights of the ground (rows, columns) on an even grid; nan where there is none.
+    """Heights of the ground (rows, columns) on a regular grid [m]; nan where unknown.
 
-    World coordinates x (columns,) and y (rows,) rise; all in metres.
+    World coordinates x (columns,) and y (rows,) are in rising order [m].
     """
 
     x: np.ndarray
@@ -55,7 +55,7 @@ class HeightMap:
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
-        """Return the map of a store, or None if it has none, or nothing is on it."""
+        """Return the map of a store, or None if it has no map or an empty one."""
         if MAP_GROUP not in tree.children:
             return None
         x, y, height = (np.asarray(tree[MAP_GROUP][name].values) for name in ("x", "y", "height"))
@@ -64,7 +64,10 @@ class HeightMap:
     def crop(
         self, x: tuple[float, float], y: tuple[float, float], nodes_max: int = 120
     ) -> HeightMap | None:
-        """Return the ground within limits, interpolated; None where these miss the map."""
+        """Return the map interpolated within limits, or None if the limits lie outside the map.
+
+        ``nodes_max``: number of nodes along the longer side.
+        """
         overlaps = [
             (max(float(coordinates[0]), low), min(float(coordinates[-1]), high))
             for coordinates, (low, high) in ((self.x, x), (self.y, y))
@@ -80,12 +83,12 @@ class HeightMap:
         return HeightMap(x_nodes, y_nodes, height.values)
 
     def mask_walls(self) -> HeightMap:
-        """Return the ground without what is too steep to be drawn as a surface."""
+        """Return the map with nan where the ground is too steep to be drawn as a surface."""
         is_steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > DRAWN_SLOPE_MAX
         return HeightMap(self.x, self.y, np.where(is_steep, np.nan, self.height))
 
     def hillshade(self) -> np.ndarray:
-        """Brightness of the ground under a low sun, 0..1; slopes are stretched to stand out."""
+        """Return the brightness of the ground under a low sun, 0..1; slopes are exaggerated."""
         slope_y, slope_x = np.gradient(self.height, self.y, self.x)
         slope = np.hypot(slope_y, slope_x)
         finite_slopes = slope[np.isfinite(slope)]
@@ -102,16 +105,16 @@ class HeightMap:
 DROPOUT_COLOUR, PATH_COLOUR, GROUND_COLOUR = "#C1121F", "#1A1A1A", "0.86"
 
 OBLIQUE_WIDTH_MAX_INCHES, OBLIQUE_HEIGHT_MAX_INCHES = 7.6, 6.4
-"""Sizes of the box as drawn [inches]."""
+"""Largest size of the projected box [inches]."""
 
 OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
-"""Room for ticks and labels to its left, below, to its right and above [inches]."""
+"""Margins for ticks and labels: left, below, right and above [inches]."""
 
 _TRIAL_SIDE_INCHES = 10.0
 
 
 class ObliqueView:
-    """A picture at an angle: azimuth of the eye from x towards y, elevation above it [deg]."""
+    """Oblique picture, with azimuth of the eye from x towards y, and its elevation [deg]."""
 
     scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
 
@@ -137,7 +140,7 @@ class ObliqueView:
             title=title,
             caption=caption,
         )
-        # The square that the library draws in may reach beyond the sheet: the box within does not.
+        # Matplotlib's square axes may extend beyond the sheet, but the box inside does not.
         self.axes: Any = self.picture_sheet.add_axes(
             left - inches_per_unit * low[0],
             below - inches_per_unit * low[1],
@@ -161,12 +164,12 @@ class ObliqueView:
             axis.set_tick_params(pad=2 + 4 * (name == "z") * side_ratio)
 
     def _side_ratios(self) -> np.ndarray:
-        """Sides of the box in its longest."""
+        """Return the sides of the box relative to its longest side, (3,)."""
         sides = np.array([self.cloud.box[axis][1] - self.cloud.box[axis][0] for axis in WORLD_AXES])
         return sides / sides.max()
 
     def _set_axes(self, axes: Any, azimuth: float, elevation: float) -> None:
-        """Projection, limits, walls and grid."""
+        """Set projection, limits, walls and grid of the axes."""
         axes.patch.set_visible(False)
         axes.set_proj_type("ortho")
         axes.view_init(elev=elevation, azim=azimuth)
@@ -178,7 +181,7 @@ class ObliqueView:
             axis.pane.set_edgecolor("0.8")
 
     def _projected_box(self, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lower left and upper right corner of the box, in shares of the library's square."""
+        """Return the box's lower left and upper right corner, as fractions of the square axes."""
         trial_sheet = PictureSheet(_TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, title="", caption="")
         axes = trial_sheet.add_axes(0, 0, _TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, projection="3d")
         self._set_axes(axes, azimuth, elevation)
@@ -188,7 +191,7 @@ class ObliqueView:
 
     @staticmethod
     def _project(axes: Any, positions: np.ndarray) -> np.ndarray:
-        """World positions (3, n) as they appear, in shares of the library's square (2, n)."""
+        """Project world positions (3, n) to fractions of the square axes, (2, n)."""
         x, y, _ = proj3d.proj_transform(*positions, axes.get_proj())
         view_limits = axes.viewLim
         return np.array(
@@ -196,15 +199,15 @@ class ObliqueView:
         )
 
     def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """World positions (3, n) as the axes take them."""
+        """Return world positions (3, n) as plot coordinates of the axes."""
         return list(positions)
 
     def to_inches(self, positions: np.ndarray) -> np.ndarray:
-        """World positions (3, n) on the picture (2, n) [inches]."""
+        """Return world positions (3, n) as positions on the picture, (2, n) [inches]."""
         return self.inches_per_unit * self._project(self.axes, positions)
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Shaded relief, cut at the box and open at walls."""
+        """Draw a shaded relief, clipped to the box and without walls; return False."""
         cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"])
         if cropped is None:
             return False
@@ -228,16 +231,16 @@ class ObliqueView:
 
 
 AXIS_MARGINS_INCHES = 0.8, 0.55
-"""Room for ticks and labels at the left and at the foot [inches]."""
+"""Margins for ticks and labels at the left and at the bottom [inches]."""
 
 AXIS_VIEW_WIDTH_MAX_INCHES, AXIS_VIEW_HEIGHT_MAX_INCHES, AXIS_VIEW_SIDE_MIN_INCHES = 7.4, 7.0, 1.5
-"""Sizes of the picture [inches]."""
+"""Largest width and height of the picture, and its smallest side [inches]."""
 
 
 class AxisView:
-    """A picture along one of the world's axes: those across, up and along the look.
+    """Picture along a world axis; `axis_names` are horizontal, vertical and viewing axis.
 
-    `nearest` is 1 where the eye is at the upper end of the last, -1 at its lower one.
+    `nearest_sign` is 1 if the eye is at the upper end of the viewing axis, and -1 at its lower end.
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {}
@@ -283,21 +286,24 @@ class AxisView:
         self._set_limits()
 
     def _set_limits(self) -> None:
-        """Limits as they are meant to be, whatever is drawn."""
+        """Set the axis limits to the box, whatever was drawn."""
         self.axes.set(
             xlim=self.cloud.box[self.axis_names[0]], ylim=self.cloud.box[self.axis_names[1]]
         )
 
     def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """World positions (3, n) as the axes take them."""
+        """Return world positions (3, n) as plot coordinates of the axes."""
         return [positions[WORLD_AXES.index(axis)] for axis in self.axis_names[:2]]
 
     def to_inches(self, positions: np.ndarray) -> np.ndarray:
-        """World positions (3, n) on the picture (2, n) [inches]."""
+        """Return world positions (3, n) as positions on the picture, (2, n) [inches]."""
         return self.inches_per_unit * np.array(self.plot_coordinates(positions))
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Shaded relief with contours from above; the heights that there are from the side."""
+        """Draw relief and contours from above, or the extent of heights from the side.
+
+        Return if the legend needs an entry for the ground.
+        """
         cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"], nodes_max=480)
         if cropped is None:
             return False
@@ -355,7 +361,7 @@ class AxisView:
 
 
 def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> None:
-    """Points, false ones as crosses; dropouts and path."""
+    """Draw true points, false points as crosses, dropouts, and the flight path."""
     axes: Any = picture.axes
     cloud, to_columns = picture.cloud, picture.plot_coordinates
     positions = np.array([cloud.points[axis] for axis in WORLD_AXES])
@@ -397,13 +403,13 @@ def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> N
 
 
 def _positions_in_box(cloud: PointCloud, column_arrays: ColumnArrays) -> np.ndarray:
-    """Places (3, n), nan outside of the box."""
+    """Return world positions (3, n), with nan outside the box."""
     positions = np.array([column_arrays[axis] for axis in WORLD_AXES])
     return np.where(is_within(column_arrays, cloud.box), positions, np.nan)
 
 
 def _shaded_colours(height_map: HeightMap) -> np.ndarray:
-    """Pale shades of the ground, (rows, columns, 4); see-through where there is none."""
+    """Return pale shades of the ground, (rows, columns, 4); transparent where unknown."""
     rgba = np.array(colormaps["gray"](0.62 + 0.36 * height_map.hillshade()))
     rgba[~np.isfinite(height_map.height)] = 0.0
     return rgba
@@ -414,10 +420,10 @@ AXIS_VIEWS = {
     "side": (("x", "z", "y"), -1),
     "front": (("y", "z", "x"), 1),
 }
-"""Views along an axis: axes across, up and along the look, and which end of the last is nearest."""
+"""Views along an axis: horizontal, vertical and viewing axis, and sign of its nearest end."""
 
 OBLIQUE_ANGLES_DEG = -60.0, 28.0
-"""Azimuth and elevation of the usual view at an angle [deg]."""
+"""Azimuth and elevation of the default oblique view [deg]."""
 
 
 def draw_cloud_sheet(
@@ -430,7 +436,10 @@ def draw_cloud_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Draw a cloud, coloured by a quantity."""
+    """Return the sheet of a point cloud, coloured by a quantity.
+
+    ``view`` is the name of a view, or azimuth and elevation of the eye [deg].
+    """
     values = to_shown_units(quantity, cloud.points[quantity])
     colouring = point_styles.choose_colours(
         quantity, values, is_trusted=cloud.is_true, surfaces=surfaces
@@ -451,7 +460,7 @@ def draw_cloud_sheet(
 
 
 def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
-    """Return a legend's entries for the marks of a picture."""
+    """Return the legend entries for the marks of a picture."""
     handles: list[Any] = []
     if not cloud.is_true.all():
         handles.append(point_styles.false_point_mark())
@@ -468,7 +477,7 @@ def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
 
 
 SCATTER_SIZE_INCHES = 7.6, 4.6
-"""Size of a scatter [inches]."""
+"""Width and height of a scatter plot [inches]."""
 
 
 def draw_scatter_sheet(
@@ -481,7 +490,7 @@ def draw_scatter_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Draw one quantity over another."""
+    """Return the sheet of a scatter plot of one quantity over another, coloured by a third."""
     column_arrays = thinned_rows.to_columns()
     is_true = (
         (column_arrays["flags"] & TRUE_FLAG) > 0
@@ -534,7 +543,10 @@ def draw_scatter_sheet(
 
 
 def _axis_limits(quantity: str, values: np.ndarray, is_true: np.ndarray) -> tuple[float, float]:
-    """Return ends of an axis: those of true points, with a margin; infinite where that must be."""
+    """Return the limits of an axis around the true points, with a margin.
+
+    Without finite true values all finite values count.
+    """
     finite_values = values[is_true & np.isfinite(values)]
     finite_values = finite_values if finite_values.size else values[np.isfinite(values)]
     finite_values = (
@@ -552,7 +564,7 @@ def _axis_limits(quantity: str, values: np.ndarray, is_true: np.ndarray) -> tupl
 def _set_axes(
     axes: Axes, limits: dict[str, tuple[float, float]], quantities: tuple[str, str]
 ) -> None:
-    """Limits, scales, labels and grid."""
+    """Set limits, scales, labels and grid of the axes."""
     axis_names: tuple[Literal["x", "y"], ...] = ("x", "y")
     for axis_name, quantity in zip(axis_names, quantities, strict=True):
         axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_QUANTITIES else "linear"})

@@ -1,8 +1,9 @@
-"""Errors against standard errors of a flight, by the truth in its store.
+"""Consistency of a flight's errors with their standard errors, checked against the stored truth.
 
-A flight's store has the truth. Errors of its true points over their standard errors, and errors of
-velocity and altitude over their covariances, should be of size 1. Far larger ones
-come from effects that the standard errors leave out, such as unstated relief or speckle.
+A flight's store contains the truth. Errors of true points divided by their standard errors should
+have a size of about 1. So should errors of velocity and altitude relative to their covariances. Far
+larger ratios come from effects that the standard errors do not include, such as unstated relief or
+speckle.
 """
 
 from __future__ import annotations
@@ -18,22 +19,22 @@ from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.locations import Location
 
 ERROR_RATIO_MAX = 2.0
-"""Errors over standard errors that still count as consistent."""
+"""Largest ratio of errors to standard errors that counts as consistent."""
 
 _ERRORS_MIN = 20
-"""Errors that must be there to be judged."""
+"""Least number of errors for a judgement."""
 
 _SAMPLED_SHOTS, _SAMPLED_DRAWS, _SAMPLED_VALUES_PER_AXIS = 1 << 15, 16, 6
-"""Shots, draws, and places along each axis that are looked at, evenly apart if there are more."""
+"""Largest numbers of shots, draws, and values per axis in a sample; shots and values are spread."""
 
 _SAMPLED_INTERVALS = 16
-"""Parts along a flight that are read of a long one."""
+"""Number of intervals in which a long flight is sampled."""
 
 _ERROR_QUANTILES = 0.6827, 0.9545
-"""Shares of errors whose size is held against that of normal errors."""
+"""Quantiles of the errors that are compared with those of normal errors."""
 
 _SCALAR_REFERENCE, _VECTOR_REFERENCE = (1.0, 2.0), (1.8780, 2.8328)
-"""Multiples of the standard error that hold these shares, of a number and of a vector of three."""
+"""Quantiles of normal errors in standard errors, for a scalar and for a vector of three."""
 
 
 _REMEDIES = {
@@ -43,27 +44,27 @@ _REMEDIES = {
     "target_acceleration state may be the cause.",
     "altitude": "Relief other than navigation.relief states may be the cause.",
 }
-"""What may lie behind errors far larger than stated, by quantity."""
+"""Likely causes of errors far larger than stated, by quantity."""
 
 
 class ConsistencyResult(NamedTuple):
-    """Errors of one quantity of a scanner over the standard errors that are stated."""
+    """Ratio of a quantity's errors to their stated standard errors, for one scanner."""
 
     scanner: str
     quantity: str
     error_ratio: float
-    """Errors over what normal errors of the stated size would be; 1 where they are true."""
+    """Largest ratio of an error quantile to that of normal errors of the stated size; ideally 1."""
     n_errors: int
-    """Errors that were looked at."""
+    """Number of sampled errors."""
 
     @property
     def is_consistent(self) -> bool:
-        """Tell whether errors are about as large as stated, or too few to say."""
+        """True if errors are about as large as stated, or too few for a judgement."""
         return self.n_errors < _ERRORS_MIN or not self.error_ratio > ERROR_RATIO_MAX
 
     @property
     def message(self) -> str:
-        """Sentence on errors that are far larger than stated."""
+        """Sentence about errors that are far larger than stated."""
         return (
             f"{self.scanner}: {self.quantity} is inconsistent: residuals are "
             f"{self.error_ratio:.3g} "
@@ -72,7 +73,7 @@ class ConsistencyResult(NamedTuple):
 
 
 def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
-    """Return the ratio of errors to standard errors of each scanner and quantity of a flight."""
+    """Return the ratio of errors to standard errors for each scanner and quantity of a flight."""
     results = []
     for scanner in map(str, tree.attrs["scanners"]):
         errors_by_sample = [
@@ -99,7 +100,7 @@ def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
 def inconsistency_messages(store: str | Location, scanner: str | None = None) -> list[str]:
     """Return a sentence for each quantity whose errors are far larger than the store states.
 
-    Of one scanner, or of all; none for a grid's store.
+    ``scanner``: the only scanner to check; None for all. A grid's store gives no sentences.
     """
     from sweep.analysis.datasets import open_tree
     from sweep.storage.locations import parse_location
@@ -115,7 +116,7 @@ def inconsistency_messages(store: str | Location, scanner: str | None = None) ->
 
 
 def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Parts of a scanner's arrays, in memory: all of a small one, or parts evenly along it."""
+    """Yield samples of a scanner's arrays in memory: a small one complete, else even intervals."""
     n_shots, shots_per_cycle = group.sizes["shot"], int(group.attrs["shots_a_cycle"])
     axis_indices = {
         str(dim): np.unique(
@@ -165,14 +166,14 @@ _NEEDED_VARIABLES = (
 
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Return the errors over standard errors by quantity, without sign; only those there are."""
+    """Return absolute errors in standard errors, by quantity; only finite ones."""
     is_true = (sample["flags"] & TRUE_FLAG).values > 0
     errors_by_quantity: dict[str, np.ndarray] = {}
     for quantity, variable in _VARIABLE_BY_QUANTITY.items():
         reported = sample[f"{variable}_interpolated"].values[is_true]
         error = np.abs(reported - sample[f"true_{variable}"].values[is_true])
         standard_error = sample[f"{variable}_interpolated_standard_error"].values[is_true]
-        # A millionth of the value is what interpolation between bins is good to.
+        # Interpolation between bins is accurate to about 1e-9 of the value.
         errors_by_quantity[quantity] = _finite_only(
             error / np.maximum(standard_error, 1e-9 * np.abs(reported))
         )
@@ -194,12 +195,15 @@ def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def _is_solved(status: xr.DataArray) -> np.ndarray:
-    """Return the mask of solutions that there are; -1 stands for those not computed yet."""
+    """Return a mask of solutions that exist; a status of -1 means not computed yet."""
     return ((status >= 0) & (status <= STATUS_EXCLUDED)).values
 
 
 def _mahalanobis_distances(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the lengths of vectors (n, 3) in standard errors, by their covariances (n, 3, 3)."""
+    """Return the Mahalanobis distances of vectors (n, 3) by their covariances (n, 3, 3).
+
+    Vectors with a non-finite component or covariance are left out.
+    """
     is_finite = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     error, covariance = error[is_finite], covariance[is_finite]
     inverse_covariance = np.linalg.pinv(covariance, hermitian=True)

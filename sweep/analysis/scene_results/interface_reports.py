@@ -1,9 +1,9 @@
-"""Reports of a unit's interface: quantised, clipped, flagged, at its rate and late.
+"""Reports of a lidar unit's interface: quantised, clipped, flagged, at its own rate, and delayed.
 
-They are made of stored points and change none of them. A shot is valid where it has a return that a
-Doppler peak confirms, as far as the instrument can tell; without a Doppler segment, where it has
-one. Its first return is taken. Each beam has one report in every period of the interface's rate,
-valid or not: of the mean or the last of the period's valid shots.
+Reports are made from stored points, which stay unchanged. A shot is valid if it has a return that a
+Doppler peak confirms, as far as the instrument can tell. Without a Doppler segment any return is
+enough. The first return of a shot counts. Each beam has one report per period of the interface's
+rate, valid or not. It is the mean, or the last, of the period's valid shots.
 """
 
 from __future__ import annotations
@@ -42,13 +42,16 @@ REPORT_COLUMNS = {
     "true_range": ("m", "true range of the beam's axis at the time stamp"),
     "true_radial_velocity": ("m s-1", "true radial velocity of the beam's axis at the time stamp"),
 }  # fmt: skip
-"""Units and words of each column of reports."""
+"""Units and description of each column of reports."""
 
 _TRUTH_VARIABLES = {"true_range": "beam_range", "true_radial_velocity": "beam_radial_velocity"}
 _PERIOD_EDGE_FRACTION = 1e-6
-"""Share of a period before its end from which on a shot counts to the next: for rounded times."""
+"""Fraction of a period before its end within which a shot counts to the next one.
+
+It absorbs rounding errors of times.
+"""
 _REPORTS_PER_SHOT_MAX = 10
-"""Reports for each shot from which on an interface's rate is refused: most would be empty."""
+"""Largest number of reports per shot; a higher rate is refused, as most reports would be empty."""
 
 ColumnArrays = dict[str, np.ndarray]
 
@@ -63,32 +66,32 @@ def reports(
     where: Mapping[str, object] | None = None,
     interface: Mapping[str, object] | None = None,
 ) -> xr.Dataset:
-    """Return what a unit with a stated interface reports of a flight.
+    """Return the reports that a unit with the stated interface makes of a flight.
 
     Parameters
     ----------
     store, scanner, draw, ranges, where
-        As of :func:`sweep.export`.
+        As in :func:`sweep.export`.
     file
-        CSV file to write the reports to as well, names and units in its first line.
+        CSV file to which the reports are also written, with names and units in its first line.
     interface
-        Fields of the spec's section ``interface`` to be set anew, written as in a spec:
-        ``{"rate": "10 Hz"}``.
+        Changed fields of the spec's section ``interface``, written as in a spec: ``{"rate": "10
+        Hz"}``.
 
     Returns
     -------
     xarray.Dataset
-        Variables along ``report``, by period and beam, with units and words. Values of a report
-        without a valid shot are nan, and so are standard errors of clipped values.
+        Variables along ``report``, ordered by period and beam, with units and descriptions. Values
+        of a report without a valid shot are nan. Standard errors of clipped values are nan too.
 
     Raises
     ------
     NotAStoreError
-        Where there is no store of a scene.
+        The path has no store of a scene.
     SpecError
-        With every mistake in what is asked for.
+        The request has mistakes, all of which are listed.
     OSError
-        Where the file can't be written.
+        The file can't be written.
     """
     results, mistakes = SceneResults.from_store(store), []
     if file is not None and Path(file).suffix.lower() != ".csv":
@@ -114,7 +117,7 @@ def reports(
 
 
 def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
-    """Columns over the computed shots of a draw: geometry, and the first return of each."""
+    """Return columns over the computed shots of a draw: geometry, and the first return of each."""
     stored_by_name = {
         name: array_name(name, ranges)
         for name in (*MEASURED_QUANTITIES, *map(_standard_error_name, MEASURED_QUANTITIES))
@@ -138,10 +141,10 @@ def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
 
 
 def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArrays:
-    """Columns of reports, (m,) each, from those of shots in the order of time, (n,) each.
+    """Return the columns of reports (m,) made from columns of shots (n,), sorted by time.
 
-    Shots have ``time``, ``beam``, ``flags``, the values and standard errors of their first return,
-    and the truth on the beam's axis, ``beam_range`` and ``beam_radial_velocity``.
+    ``shot_columns`` has ``time``, ``beam``, ``flags``, the values and standard errors of the first
+    return, and the truth along the beam's axis, ``beam_range`` and ``beam_radial_velocity``.
     """
     is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED_FLAG == 0)
     report_index, report_periods = _assign_periods(shot_columns, interface.rate)
@@ -183,10 +186,10 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
 def quantise(
     values: np.ndarray, quantisation_step: float | None, low: float | None, high: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values in whole quanta, clipped to the limits, and a mask of those beyond; none for no rule.
+    """Return values rounded to quantisation steps and clipped, and a mask of those beyond limits.
 
-    Limits are clipped to their nearest whole quantum, so that what lies within them is off by half
-    a quantum at the most.
+    ``quantisation_step``, ``low`` and ``high`` are optional (None). Limits are rounded to the
+    nearest step, so that a value within them changes by at most half a step.
 
     >>> values, beyond = quantise(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
     >>> values.tolist(), beyond.tolist()
@@ -211,7 +214,10 @@ def _standard_error_name(quantity: str) -> str:
 def _assign_periods(
     shot_columns: ColumnArrays, rate: float | None
 ) -> tuple[np.ndarray, ColumnArrays]:
-    """Report of each shot, (n,); beam and middle of the period of each report, (m,)."""
+    """Return the report index of each shot (n,), and beam and time of each report (m,).
+
+    The time is the middle of the report's period, or that of the shot if there is no rate.
+    """
     if rate is None:
         return np.arange(shot_columns["time"].size), {
             name: shot_columns[name] for name in ("time", "beam")
@@ -239,7 +245,7 @@ def _assign_periods(
 def _shot_weights(
     report_index: np.ndarray, is_valid_shot: np.ndarray, n_valid: np.ndarray, reported_value: str
 ) -> np.ndarray:
-    """Weight of each shot in its report, (n,): as much as any, or all to the last."""
+    """Return the weight of each shot in its report (n,): equal weights, or 1 for the last shot."""
     if reported_value == "mean":
         return np.where(is_valid_shot, 1 / np.maximum(n_valid[report_index], 1), 0.0)
     last_shot = np.full(n_valid.size, -1)
@@ -250,7 +256,7 @@ def _shot_weights(
 def _interpolate_truth(
     time: np.ndarray, beam: np.ndarray, shot_columns: ColumnArrays, name: str
 ) -> np.ndarray:
-    """Truth of beams at times, linear between their shots; nan outside of them and of nothing."""
+    """Return the truth of beams at given times, linear between their shots; nan outside of them."""
     truth_at_times = np.full(time.size, np.nan)
     truth = np.where(np.isfinite(shot_columns[name]), shot_columns[name], np.nan)
     for beam_number in np.unique(beam):

@@ -1,4 +1,4 @@
-"""Errors of navigation by altitude: availability, bias and scatter; their chart and table."""
+"""Navigation errors over altitude: availability, bias and RMS error; their chart and table."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from sweep.model.pointcloud.navigation import STATUS_EXCLUDED, STATUS_SOLVED
 VELOCITY, ALTITUDE = "velocity", "altitude"
 
 SOLUTIONS_PER_READ = 65_536
-"""Solutions that are read at a time, about."""
+"""Approximate number of solutions that are read at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorTally:
-    """Errors of a vector of m components, by bin of altitude; parts add up to the whole.
+    """Error statistics of a vector of m components, by altitude bin; tallies of parts can be added.
 
-    Solutions asked for, and those that there were (bins,); their mean error, the sum of squares of
-    deviations from it, and the mean of the variances that they came with (bins, m).
+    Fields: numbers of attempts and of solutions (bins,), mean error, sum of squared deviations from
+    the mean, and mean of the stated variances (bins, m).
     """
 
     attempts: np.ndarray
@@ -38,7 +38,10 @@ class ErrorTally:
     mean_stated_variance: np.ndarray
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
-        """Tally of both, by Chan, Golub and LeVeque (1983), which never subtracts large sums."""
+        """Return the tally of both, by the method of Chan, Golub and LeVeque (1983).
+
+        It never subtracts large sums.
+        """
         n_solutions = self.n_solutions + other.n_solutions
         other_fraction = (other.n_solutions / np.maximum(n_solutions, 1))[..., None]
         mean_difference = other.mean_error - self.mean_error
@@ -66,7 +69,7 @@ class ErrorTally:
 
     @property
     def rmse(self) -> np.ndarray:
-        """Root mean square error of each component (..., m), bias included; nan without any."""
+        """RMS error of each component (..., m), including the bias; nan without solutions."""
         return np.sqrt(
             _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None])
             + self.mean_error**2
@@ -79,13 +82,13 @@ class ErrorTally:
 
     @property
     def stated_variance(self) -> np.ndarray:
-        """Mean variance that the solutions stated (..., m); nan without any."""
+        """Mean variance stated by the solutions (..., m); nan without solutions."""
         return np.where(self.n_solutions[..., None] > 0, self.mean_stated_variance, np.nan)
 
 
 @dataclass(frozen=True)
 class ErrorCurve:
-    """Errors of one scanner's velocity or altitude, by bins between edges of true altitude [m]."""
+    """Errors of a scanner's velocity or altitude, by bins of true altitude with given edges [m]."""
 
     scanner: str
     quantity: str
@@ -94,12 +97,12 @@ class ErrorCurve:
 
     @property
     def label(self) -> str:
-        """Name for a reader."""
+        """Display name of the scanner."""
         return labels.coordinate_label(self.scanner) or "measured"
 
     @property
     def bin_centres(self) -> np.ndarray:
-        """Altitudes in the middle of the bins [m]."""
+        """Altitudes of the bin centres [m]."""
         return (self.altitude_edges[1:] + self.altitude_edges[:-1]) / 2
 
     @property
@@ -109,17 +112,17 @@ class ErrorCurve:
 
     @property
     def rmse(self) -> np.ndarray:
-        """Root mean square error of each component and of the vector's length, (bins, m [+ 1])."""
+        """RMS error of each component, and for vectors also of their length: (bins, m [+ 1])."""
         return _append_length(self.tally.rmse)
 
     @property
     def stated_deviation(self) -> np.ndarray:
-        """Standard deviation that solutions state of themselves, as `rmse`: root of the mean."""
+        """Root mean stated variance of the solutions, in the shape of `rmse`."""
         return _append_length(np.sqrt(self.tally.stated_variance))
 
 
 def _append_length(components: np.ndarray) -> np.ndarray:
-    """Components (..., m), and of vectors the root of the sum of their squares after them."""
+    """Append to vectors (..., m) their lengths; return a single component unchanged."""
     if components.shape[-1] == 1:
         return components
     return np.concatenate([components, np.linalg.norm(components, axis=-1, keepdims=True)], axis=-1)
@@ -128,7 +131,7 @@ def _append_length(components: np.ndarray) -> np.ndarray:
 def navigation_curves(
     named_recordings: Sequence[tuple[str, Recording]], *, quantity: str, n_bins: int
 ) -> list[ErrorCurve]:
-    """Errors of scanners that navigate, all over the same bins of altitude."""
+    """Return the error curves of scanners that navigate, all with the same altitude bins."""
     navigating = [
         (name, recording.dataset)
         for name, recording in named_recordings
@@ -149,7 +152,7 @@ def navigation_curves(
 
 
 def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray | None:
-    """Edges of the bins; none where no cycle's altitude is known."""
+    """Return the edges of the altitude bins, or None if no altitude is known."""
     altitudes = [dataset["true_altitude"].chunk(cycle=SOLUTIONS_PER_READ) for dataset in datasets]
     extremes = dask.compute([altitude.min() for altitude in altitudes],
                         [altitude.max() for altitude in altitudes])  # fmt: skip
@@ -159,7 +162,7 @@ def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray |
     if high - low < 1e-6 * max(abs(high), 1.0):
         low, high, n_bins = low - 0.5, high + 0.5, 1
     edges = np.linspace(low, high, n_bins + 1)
-    edges[-1] = np.nextafter(high, np.inf)  # the highest cycle is in the last bin
+    edges[-1] = np.nextafter(high, np.inf)  # so that the last bin contains the highest cycle
     return edges
 
 
@@ -198,9 +201,9 @@ def tally_errors(
     altitude_bin: np.ndarray,
     n_bins: int,
 ) -> ErrorTally:
-    """Tally of n solutions by cell, in two passes for the digits' sake.
+    """Return the tally of n solutions by altitude bin, computed in two passes for accuracy.
 
-    Of each its error and the variance that it states (n, m), and its cell.
+    ``error`` and ``variance`` (the stated one) are (n, m); ``altitude_bin`` is (n,).
     """
     is_in_range = (altitude_bin >= 0) & (altitude_bin < n_bins)
     attempts = np.bincount(altitude_bin[is_in_range], minlength=n_bins)
@@ -216,7 +219,7 @@ def tally_errors(
     residual = error - mean_error[altitude_bin]
     mean_correction = (
         _sum_by_bin(residual, altitude_bin, n_bins) / divisor
-    )  # what rounding left in the mean
+    )  # rounding error of the mean
     squared_deviation = _sum_by_bin(residual * residual, altitude_bin, n_bins)
     mean_stated_variance = _sum_by_bin(variance, altitude_bin, n_bins) / divisor
     return ErrorTally(
@@ -225,7 +228,7 @@ def tally_errors(
 
 
 def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
-    """Tally of all, added pair by pair, then pairs of pairs: the same bits for the same order."""
+    """Return the sum of tallies, added pairwise in a fixed order for reproducible bits."""
     if not tallies:
         raise ValueError("there is no tally to merge")
     remaining_tallies = list(tallies)
@@ -238,12 +241,12 @@ def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
 
 
 def _sum_by_bin(values: np.ndarray, bin_index: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return sums of values (n, m) by cell (size, m), each in the order of the rows."""
+    """Return the sums of values (n, m) in each bin (n_bins, m), added in the order of the rows."""
     return np.stack([np.bincount(bin_index, column, n_bins) for column in values.T], axis=-1)
 
 
 def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Quotient, nan where the number is not positive."""
+    """Return the quotient, or nan where the divisor is not positive."""
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -253,11 +256,11 @@ UNIT_BY_QUANTITY = {VELOCITY: "m/s", ALTITUDE: "m"}
 LENGTH_NAME = "vector"
 
 ComponentStatistic = tuple[str, int]
-"""A statistic, and the number of the component that it is of; one past the last is the length."""
+"""Name of a statistic, and index of its component; the index m stands for the length."""
 
 
 def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
-    """Errors over altitude, a panel for each statistic and a line for each curve."""
+    """Return the chart of errors over altitude: a panel per statistic, a line per curve."""
     panels, panels_per_row = [], []
     for quantity in dict.fromkeys(curve.quantity for curve in curves):
         quantity_curves = [curve for curve in curves if curve.quantity == quantity]
@@ -281,7 +284,7 @@ def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
 
 
 def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
-    """Panels row by row: what there is over all components first, then component by component."""
+    """Return the statistics of each row of panels: joint ones first, then those of components."""
     n_components = len(COMPONENTS[quantity])
     component_indices = list(range(n_components))
     if n_components == 1:
@@ -355,7 +358,7 @@ def _statistic_panel(
 def navigation_page(
     curves: Sequence[ErrorCurve], *, show: str, title: str, remarks: Sequence[str]
 ) -> TablePage:
-    """Return a block for each curve of a quantity, a row for each bin of altitude."""
+    """Return a page with a table for each curve, and a row for each altitude bin."""
     statistics = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     page_tables, records = [], []
     for curve in curves:
@@ -377,7 +380,7 @@ def navigation_page(
 
 
 def _bin_record(curve: ErrorCurve, bin_index: int, statistics: Sequence[str]) -> dict[str, Cell]:
-    """One line of the CSV file."""
+    """Return the statistics of an altitude bin as a row of the CSV file."""
     record: dict[str, Cell] = {
         "scanner": curve.scanner,
         "from": float(curve.altitude_edges[bin_index]),

@@ -1,4 +1,4 @@
-"""Point clouds as files for other programs: CloudCompare, PyVista, GIS, spreadsheets."""
+"""Export of point clouds to files for other programs: CloudCompare, PyVista, GIS, spreadsheets."""
 
 from __future__ import annotations
 
@@ -38,9 +38,12 @@ POINT_DTYPE = np.dtype(
         ("return_number", "|u1"), ("number_of_returns", "|u1"), ("scan_angle", "<f8"),
     ]
 )  # fmt: skip
-"""Every column, in the order of files; returns of a shot and draw are numbered from 1 as stored,
-confirmed and strong ones first. The scan angle is that of the beam from nadir [deg], below 0 on the
-left of the way that the platform goes over the ground (of the x axis where it goes nowhere)."""
+"""Columns of a point, in the order of files.
+
+The returns of a shot and draw are numbered from 1 in stored order, with confirmed and strong ones
+first. The scan angle is the angle between beam and nadir [deg]. It is negative to the left of the
+ground track, or of the x axis if the platform has no horizontal velocity.
+"""
 
 POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
 UNIT_BY_COLUMN = {
@@ -48,11 +51,11 @@ UNIT_BY_COLUMN = {
     for n in POINT_COLUMNS
     if n in QUANTITY_BY_NAME and QUANTITY_BY_NAME[n].units != "1"
 }
-"""Units of the columns that have any."""
+"""Units of the columns that have a unit."""
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
 REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
-"""What a value of a column means beyond its units."""
+"""Meaning of a column's values that its units do not tell."""
 
 DESCRIPTION_BY_COLUMN = {
     name: "; ".join(filter(None, [UNIT_BY_COLUMN.get(name), REMARK_BY_COLUMN.get(name)]))
@@ -69,14 +72,14 @@ class PointTable:
     draw: int
     ranges: str
     origin: np.ndarray
-    """(3,): added to the coordinates in the store [m]."""
+    """Origin of the stored coordinates, which is added to them (3,) [m]."""
     time_origin: float = 0.0
-    """Added to the times in the store [s]."""
+    """Origin of the stored times, which is added to them [s]."""
     projection_wkt: str = ""
-    """WKT of the coordinates' map projection; empty where none is known."""
+    """WKT of the map projection of the coordinates; empty if unknown."""
 
     def iter_rows(self) -> Iterator[np.ndarray]:
-        """Rows (m,) of ROW, part by part."""
+        """Yield rows (m,) of `POINT_DTYPE`, one part of the flight at a time."""
         stored_columns = [
             name for name in POINT_COLUMNS if name not in ("number_of_returns", "scan_angle")
         ]
@@ -96,7 +99,7 @@ class PointTable:
             yield rows
 
     def _scan_angles(self, shot_slice: slice) -> np.ndarray:
-        """Angle of each shot's beam from nadir [deg], (k,), below 0 on the left."""
+        """Return the angle between each shot's beam and nadir (k,) [deg], negative to the left."""
         beam_directions, velocities = (
             self.recording.read(name, shot_slice)
             for name in ("beam_direction", "platform_velocity")
@@ -123,7 +126,7 @@ class PointTable:
         )
 
     def coordinate_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest coordinates, (3,) each [m]; infinite without a point."""
+        """Return the lowest and highest coordinates, (3,) each [m]; infinite without points."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shot_slice in self.recording.shot_slices():
             column_arrays = self.recording.point_columns("xyz", shot_slice, self.draw, self.ranges)
@@ -165,7 +168,10 @@ def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
 
 
 def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
-    """Write a CSV file with names and units in its first line, and all digits."""
+    """Write a CSV file with names and units in the first line, in full precision.
+
+    Return the number of points.
+    """
     n_points = 0
     with file_path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
@@ -177,25 +183,25 @@ def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
 
 
 LAS_STEP_MIN = 1e-4
-"""Step of coordinates in a LAS file [m]; coarser where the points lie too far apart for it."""
+"""Least quantisation step of coordinates in a LAS file [m]; coarser for a large extent."""
 
 LAS_COORDINATE_MAX = 2.0**31 - 1
 LAS_RETURN_NUMBER_MAX = 15
-"""Largest coordinates, in steps from the offset, and numbers of returns in a LAS file."""
+"""Largest coordinate in steps from the offset, and largest return number, of a LAS file."""
 
 _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
-"""Step of scan angles in a LAS file [deg]."""
+"""Quantisation step of scan angles in a LAS file [deg]."""
 
 _STORED_RETURN_FIELD = "stored_return"
-"""Extra byte that holds the number of a return in the store, from 1."""
+"""Name of the extra field with the stored return number, from 1."""
 
 _LAS_BEAM_MAX = 255
-"""Largest number of a beam that a LAS file's user data can hold."""
+"""Largest beam number that a LAS file's user data can hold."""
 
 LAS_UNCLASSIFIED, LAS_NOISE = 1, 7
-"""Classes of LAS: points as they are, and points known to be false."""
+"""LAS classes of true points and of false points."""
 
 
 def write_las(
@@ -203,10 +209,10 @@ def write_las(
 ) -> int:
     """Write a LAS 1.4 file, point format 6, with the other columns as extra bytes.
 
-    True returns of a shot are numbered by rising range, as the format asks. False points have the
-    class of noise and are numbered apart. The number of the beam stands as user data too (255 from
-    there on), times as GPS times; intensity is the signal-to-noise ratio in hundredths of a
-    decibel. The coordinates' projection is stated where it is known.
+    True returns of a shot are numbered by rising range, as the format requires. False points have
+    the class of noise, and are numbered separately. User data contains the beam number (255 for any
+    larger one). Times are GPS times. The intensity is the signal-to-noise ratio in 0.01 dB. The map
+    projection is stated if it is known. Return the number of points.
     """
     import laspy
 
@@ -241,7 +247,7 @@ def write_las(
 
 
 def _las_step(extent: float) -> float:
-    """Step of coordinates that reach so far [m]: a power of ten."""
+    """Return the quantisation step of coordinates with an extent [m]: a power of ten."""
     return LAS_STEP_MIN * 10.0 ** max(
         0, math.ceil(math.log10((extent / 2 + 1) / (LAS_STEP_MIN * LAS_COORDINATE_MAX)))
     )
@@ -270,9 +276,9 @@ def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type
 
 
 def _number_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers by rising range, from 1, and how many there are, of true points and of false.
+    """Return for each row its return number by rising range, from 1, and the number of returns.
 
-    Rows of a shot all come together.
+    True and false points are numbered separately. All rows of a shot must be in ``rows``.
     """
     is_false = (rows["flags"] & TRUE_FLAG) == 0
     order = np.lexsort((rows["range"], is_false, rows["shot"]))
@@ -293,7 +299,7 @@ WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
     ".laz": partial(write_las, compressed=True),
     ".csv": write_csv,
 }
-"""Writers of the kinds of files, by suffix."""
+"""Writer of each file format, by suffix."""
 
 
 def export(
@@ -307,27 +313,28 @@ def export(
 ) -> int:
     """Write the points of one scanner and draw to a file.
 
-    Coordinates are those of the scene's files in metres: the scene's origin is added to what is
-    stored. Of a raster in feet they are its own times the length of a foot. Times are those of the
-    platform's table of waypoints, or begin with the flight. Radial velocities are positive when
-    closing. Points are written in the order of shots and returns, part by part; those not computed
-    yet are left out. Nothing is at the file's place before it is whole.
+    Coordinates are those of the scene's files in metres: the scene's origin is added to the stored
+    ones. For a raster in feet they are its coordinates times the length of a foot. Times are those
+    of the platform's table of waypoints; without a table they begin with the flight. Radial
+    velocities are positive when closing. Points are written in the order of shots and returns, part
+    by part. Points that are not computed yet are left out. The file appears only once it is
+    complete.
 
     Parameters
     ----------
     store
         Store of a scene's point clouds, complete or not.
     file
-        Where to; its suffix says what it is: ``.ply``, ``.las``, ``.laz`` or ``.csv``.
+        File to write. Its suffix defines the format: ``.ply``, ``.las``, ``.laz`` or ``.csv``.
     scanner
-        Name of the scanner; may be left out where there is only one.
+        Name of the scanner; optional if there is only one.
     draw
         Number of the draw, from 0.
     ranges
-        ``interpolated`` or ``quantised``: which ranges, velocities, positions and standard
-        errors to write.
+        ``interpolated`` or ``quantised``: which ranges, velocities, positions and standard errors
+        to write.
     where
-        Value, as written in a spec, of every coordinate that has several.
+        Value of every coordinate that has several, written as in a spec.
 
     Returns
     -------
@@ -337,11 +344,11 @@ def export(
     Raises
     ------
     NotAStoreError
-        Where there is no store of a scene.
+        The path has no store of a scene.
     SpecError
-        With every mistake in what is asked for.
+        The request has mistakes, all of which are listed.
     OSError
-        Where the file can't be written.
+        The file can't be written.
     """
     results, file, mistakes = SceneResults.from_store(store), Path(file), []
     if file.suffix.lower() not in WRITER_BY_SUFFIX:
@@ -371,12 +378,12 @@ def resolve_recording(
     where: Mapping[str, object],
     mistakes: Sequence[Mistake] = (),
 ) -> tuple[Recording, AxisPosition]:
-    """Return the recording that is asked for, and its place along the axes.
+    """Return the requested recording, and its position along the axes.
 
     Raises
     ------
     SpecError
-        With every mistake in what is asked for, and those known before.
+        The request has mistakes; those passed in ``mistakes`` are listed too.
     """
     axis_position = find_axis_position(results.spec, where)
     if all_mistakes := [*mistakes, *_find_mistakes(results, scanner, draw, ranges, axis_position)]:
@@ -387,7 +394,7 @@ def resolve_recording(
 def _find_mistakes(
     results: SceneResults, scanner: str | None, draw: int, ranges: str, axis_position: AxisPosition
 ) -> list[Mistake]:
-    """Mistakes in what is asked for of a study."""
+    """Return the mistakes in a request for a recording."""
     mistakes = []
     scanner_list = ", ".join(results.scanners)
     if scanner is None and len(results.scanners) > 1:
@@ -408,7 +415,7 @@ def _find_mistakes(
         remedy = suggest_similar_name(ranges, (INTERPOLATED, QUANTISED))
         mistakes.append(Mistake("ranges", problem, ranges, remedy))
     for axis in results.spec.axes:
-        if axis.name in axis_position.open_axes:  # several values, and none is chosen
+        if axis.name in axis_position.open_axes:  # the request leaves several values
             axis_parameter = axis.parameters[0]
             value_list = ", ".join(
                 labels.format_quantity(v, axis_parameter.units)
@@ -426,7 +433,7 @@ def _find_mistakes(
 def _file_remarks(
     results: SceneResults, table: PointTable, axis_position: AxisPosition
 ) -> list[str]:
-    """Remarks in a file on its contents."""
+    """Return the remarks about a file's contents that are written into it."""
     surface_remarks = [f"surface {i}: {name}" for i, name in enumerate(results.surface_labels)]
     flag_remarks = [
         f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAG_BITS.items()

@@ -1,4 +1,4 @@
-"""Sheets of points: colours for amounts and names, marks, legends and ticks."""
+"""Styles of pictures of points: colours, marks, legends and ticks."""
 
 from __future__ import annotations
 
@@ -31,21 +31,25 @@ DIVERGING_COLOUR_MAP = LinearSegmentedColormap.from_list(
     "both_signs",
     [(0.0, "#7CC6EE"), (0.36, "#0072B2"), (0.5, "#2B2B33"), (0.64, "#D55E00"), (1.0, "#F5B26B")],
 )
-"""Dark at zero, blue and orange to its sides: apart for the colour-blind, and on a pale ground.
+"""Diverging colours: dark at zero, blue for negative and orange for positive values.
 
-Small values have their sign's colour already; larger ones are paler.
+They are distinct for colour-blind readers and on a pale ground. Small values already have the
+colour of their sign; larger ones are paler.
 """
 
 MISSING_POINT_COLOUR = "0.6"
-"""Colour of what has no value or name."""
+"""Colour of points without a value or name."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
-"""Share of a scale's length by which a few values may lie beyond the others and still be on it."""
+"""Largest distance of outliers from the 0.5 % and 99.5 % quantiles, as a fraction of their span.
+
+Outliers farther away do not extend the colour scale.
+"""
 
 
 @dataclass(frozen=True)
 class ContinuousColours:
-    """Colours of amounts."""
+    """Colours of a quantity with continuous values."""
 
     cmap: Colormap
     norm: Normalize
@@ -53,7 +57,7 @@ class ContinuousColours:
     extend: str = "neither"
 
     def map_values(self, values: np.ndarray) -> np.ndarray:
-        """Colours of values, (n, 4)."""
+        """Return the colours of values, (n, 4)."""
         is_finite = np.isfinite(values)
         colours = np.asarray(self.cmap(self.norm(np.where(is_finite, values, 1.0))))
         colours[~is_finite] = to_rgba(MISSING_POINT_COLOUR)
@@ -62,26 +66,26 @@ class ContinuousColours:
 
 @dataclass(frozen=True)
 class CategoryColours:
-    """Colours of names, by number."""
+    """Colours of categories, by number."""
 
     title: str
     label_by_number: Mapping[int, str]
 
     @property
     def colour_by_number(self) -> dict[int, str]:
-        """Colour of each number; what has none is grey."""
+        """Colour of each category; further categories are grey."""
         named_numbers = [number for number in self.label_by_number if number >= 0]
         return dict(zip(named_numbers, canvas.LINE_COLOURS, strict=False))
 
     def map_values(self, values: np.ndarray) -> np.ndarray:
-        """Colours of numbers, (n, 4)."""
+        """Return the colours of category numbers, (n, 4)."""
         rgba = np.tile(to_rgba(MISSING_POINT_COLOUR), (np.size(values), 1))
         for number, colour in self.colour_by_number.items():
             rgba[np.asarray(values) == number] = to_rgba(colour)
         return rgba
 
     def legend_handles(self) -> list[Line2D]:
-        """Entries of a legend."""
+        """Return a legend entry for each category."""
         return [
             legend_mark("o", name, color=self.colour_by_number.get(number, MISSING_POINT_COLOUR))
             for number, name in self.label_by_number.items()
@@ -89,19 +93,22 @@ class CategoryColours:
 
 
 def legend_mark(marker: str, label: str, **style: Any) -> Line2D:
-    """Return a legend's entry for a mark."""
+    """Return a legend entry for a mark."""
     return Line2D([], [], linestyle="", marker=marker, label=label, **{"markersize": 6} | style)
 
 
 def false_point_mark() -> Line2D:
-    """Return a legend's entry for false points."""
+    """Return a legend entry for false points."""
     return legend_mark("x", "false point", color="0.2", markersize=5)
 
 
 def choose_colours(
     quantity: str, values: np.ndarray, *, is_trusted: np.ndarray, surfaces: Sequence[str]
 ) -> ContinuousColours | CategoryColours:
-    """Colours for values of a quantity."""
+    """Return the colours for values of a quantity.
+
+    ``is_trusted``: mask of the values that set the ends of the scale.
+    """
     if quantity in CATEGORICAL_QUANTITIES:
         numbers = [int(n) for n in np.unique(values[np.isfinite(values)])]
         if quantity == "flags":
@@ -153,14 +160,14 @@ def _continuous_colours(
 
 
 LEGEND_WIDTH_INCHES = 1.75
-"""Width of what stands at the right [inches]."""
+"""Width of the legends at the right [inches]."""
 
 TITLE_HEIGHT_INCHES, CAPTION_HEIGHT_INCHES, CAPTION_LINE_HEIGHT_INCHES = 0.75, 0.55, 0.17
-"""Heights of the title and of the small print's first line and of each further one [inches]."""
+"""Heights of the title, of the caption's first line, and of each further line [inches]."""
 
 
 class PictureSheet:
-    """A sheet with a picture of a given size, and what its colours and marks mean at its right."""
+    """Sheet with a picture of a given size, and the legends of colours and marks at its right."""
 
     def __init__(self, width: float, height: float, *, title: str, caption: str) -> None:
         self.width, self.height = width, height
@@ -177,7 +184,7 @@ class PictureSheet:
     def to_sheet_fractions(
         self, left: float, bottom: float, width: float, height: float
     ) -> tuple[float, float, float, float]:
-        """Convert a rectangle in inches from the lower left corner to shares of the sheet."""
+        """Convert a rectangle in inches from the lower left corner to fractions of the sheet."""
         sheet_width, sheet_height = self.sheet.get_size_inches()
         return (
             left / sheet_width,
@@ -187,13 +194,13 @@ class PictureSheet:
         )
 
     def add_axes(self, *rectangle_inches: float, **options: Any) -> Axes:
-        """Axes in a rectangle in inches from the picture's lower left corner."""
+        """Add axes in a rectangle, in inches relative to the picture's lower left corner."""
         return self.sheet.add_axes(self.to_sheet_fractions(*rectangle_inches), **options)
 
     def draw_legends(
         self, colouring: ContinuousColours | CategoryColours, handles: Sequence[Artist]
     ) -> None:
-        """Return the colours' scale or names, and the marks' meaning."""
+        """Draw the colour bar or the legend of categories, and the legend of marks."""
         if isinstance(colouring, ContinuousColours):
             bar_height = min(0.72 * self.height, 4.2)
             axes = self.add_axes(
@@ -222,20 +229,20 @@ class PictureSheet:
 
 
 MARK_AREA_MAX = 24.0
-"""Area of the largest marks of points [square points]."""
+"""Largest area of a point's mark [square points]."""
 
 MARK_AREA_MIN_BY_POINTS = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
-"""Areas below which marks of so many points are not made [square points]."""
+"""Least area of a mark [square points], by the largest number of points to which it applies."""
 
 TICK_SPACING_X_INCHES, TICK_SPACING_Y_INCHES = 0.42, 0.25
-"""Distances of ticks that can still be read, on level and on upright axes [inches]."""
+"""Least spacing of legible ticks on horizontal and vertical axes [inches]."""
 
 OFFSET_COORDINATE_MIN = 1e5
-"""Coordinates [m] from which on axes show them relative to a round number."""
+"""Coordinate [m] above which an axis is labelled relative to a round number."""
 
 
 def mark_area(positions: np.ndarray, width: float, height: float) -> float:
-    """Area of a mark [square points] that leaves points (2, n) apart on a picture [inches]."""
+    """Return the mark area [square points] that keeps points (2, n) [inches] apart on a picture."""
     n_points = positions.shape[1]
     if n_points < 2:
         return MARK_AREA_MAX
@@ -249,7 +256,7 @@ def mark_area(positions: np.ndarray, width: float, height: float) -> float:
 
 
 def false_mark_style(area: float) -> dict[str, Any]:
-    """Look of false points among true ones of a size."""
+    """Return the style of false points among true points of a given mark area."""
     return {"marker": "x", "s": max(1.2 * area, 9.0), "linewidths": 0.7}
 
 
@@ -260,7 +267,10 @@ def set_length_axis(
     axis_inches: float,
     tick_spacing: float = TICK_SPACING_X_INCHES,
 ) -> None:
-    """Name, units and ticks of an axis of metres; far-off ones relative to a round number."""
+    """Set label, units and ticks of an axis in metres.
+
+    Large coordinates are labelled relative to a round number.
+    """
     low, high = limits
     offset = 0.0
     if max(abs(low), abs(high)) > OFFSET_COORDINATE_MIN:

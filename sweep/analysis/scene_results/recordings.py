@@ -1,4 +1,4 @@
-"""Recordings of scanners: quantities of shots and points, read part by part; clouds of them."""
+"""Recordings of scanners: shots and points read in parts, and point clouds gathered from them."""
 
 from __future__ import annotations
 
@@ -46,29 +46,29 @@ _INTERPOLATED_NAMES = {
 
 
 def array_name(name: str, ranges: str) -> str:
-    """Name of the array of a quantity: between bins, where that is asked for and there is one."""
+    """Return the array of a quantity: the interpolated one, if it is requested and exists."""
     return _INTERPOLATED_NAMES.get(name, name) if ranges == INTERPOLATED else name
 
 
 CATEGORICAL_QUANTITIES = ("beam", "surface", "flags")
-"""Quantities whose values are names rather than amounts."""
+"""Quantities whose values are categories, not amounts."""
 
 SIGNED_QUANTITIES = ("radial_velocity", "beam_radial_velocity", "true_radial_velocity")
-"""Velocities, whose sign is shown."""
+"""Velocities, shown with a scale that distinguishes both signs."""
 
 DECIBEL_QUANTITIES = ("snr", "snr_up")
-"""Ratios of powers, which are shown in decibels."""
+"""Power ratios, shown in decibels."""
 
 LOG_QUANTITIES = ("pfa_up", "pfa_down")
-"""Quantities that go over orders of magnitude, and are above 0."""
+"""Positive quantities that span orders of magnitude, shown on a logarithmic scale."""
 
 POINT_KINDS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Flags of which a point has exactly one."""
+"""Bits of the flags of which every point has exactly one."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of each shot or of each point."""
+    """Description of a quantity that each shot, or each point, has."""
 
     long_name: str
     units: str
@@ -98,11 +98,11 @@ def _list_quantities() -> dict[str, Quantity]:
 
 
 QUANTITY_BY_NAME = _list_quantities()
-"""Every quantity by its name."""
+"""All quantities of shots and points, by name."""
 
 
 def quantity_label(name: str) -> str:
-    """Return a quantity in words with the units in which it is shown."""
+    """Return the label of a quantity, with the units in which it is shown."""
     quantity = QUANTITY_BY_NAME[name]
     return labels.axis_label(
         quantity.long_name, "dB" if name in DECIBEL_QUANTITIES else quantity.units
@@ -110,7 +110,7 @@ def quantity_label(name: str) -> str:
 
 
 def to_shown_units(name: str, values: np.ndarray) -> np.ndarray:
-    """Values as they are shown: decibels of ratios, and of flags which kind of point they say."""
+    """Return values as they are shown: power ratios in dB, flags as indices of the point's kind."""
     values = np.asarray(values)
     if name == "flags":
         return np.asarray(point_kinds(values.astype(int)), float)
@@ -121,7 +121,7 @@ def to_shown_units(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def point_kinds(flags: np.ndarray) -> np.ndarray:
-    """Index of each point's kind in KINDS, from its flags; -1 where there is no point."""
+    """Return the index in `POINT_KINDS` of each point's kind, by its flags; -1 without a point."""
     kind_indices = np.full(np.shape(flags), -1)
     for i, bit in enumerate(POINT_KINDS.values()):
         kind_indices[(flags & bit) > 0] = i
@@ -138,7 +138,7 @@ UNLIMITED: ValueLimits = (-np.inf, np.inf)
 
 
 def is_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> np.ndarray:
-    """Mask of the rows in which all quantities that have limits lie within them; nan does not."""
+    """Return a mask of the rows in which all limited quantities are within limits; nan is not."""
     masks = [
         (column_arrays[n] >= low) & (column_arrays[n] <= high) for n, (low, high) in limits.items()
     ]
@@ -147,7 +147,10 @@ def is_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) ->
 
 @dataclass(frozen=True)
 class Recording:
-    """Shots and points of one scanner, at one place along the axes; chunks of its flags' folder."""
+    """Shots and points of one scanner, at one position along the study's axes.
+
+    ``flags_chunk_folder`` is the folder of the chunks of its flags; None in a packed store.
+    """
 
     scanner: str
     dataset: xr.Dataset
@@ -159,16 +162,16 @@ class Recording:
         return int(self.dataset.sizes["shot"])
 
     def shot_slices(self, time_limits: ValueLimits = UNLIMITED) -> Iterator[slice]:
-        """Ranges of shots, without those that are not computed or lie outside of limits."""
+        """Yield slices of shots; skip slices that are not computed or outside the time limits."""
         for shot_slice in read_slices(self.dataset["flags"], "shot"):
             if is_within({"time": self.read("time", shot_slice)}, {"time": time_limits}).any():
                 yield shot_slice
 
     def computed_shots(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
-        """Mask (k,) of the shots of a range of which the points of a draw are computed.
+        """Return a mask (k,) of the shots of a slice whose points are computed for a draw.
 
-        Geometry is stored with a study's first place and draw, and no point looks like none
-        found: only the chunk tells.
+        Geometry is stored with the first axis position and draw. Points that are not computed look
+        like shots without a point, so only the existence of the chunk tells the difference.
         """
         has_geometry = np.isfinite(self.read("time", shot_slice))
         if self.flags_chunk_folder is None:
@@ -191,17 +194,17 @@ class Recording:
         return has_geometry & np.array(is_chunk_stored)[chunk_of_shot]
 
     def read(self, name: str, shot_slice: slice, draw: int | None = None) -> np.ndarray:
-        """Return an array's values over a range of shots, of one draw if it has any."""
+        """Return an array's values over a slice of shots, for one draw if it has draws."""
         array = self.dataset[name].isel(shot=shot_slice)
         return np.asarray((array if draw is None else array.isel(draw=draw)).values)
 
     def point_columns(
         self, names: Sequence[str], shot_slice: slice, draw: int = 0, ranges: str = QUANTISED
     ) -> ColumnArrays:
-        """Quantities of every point of a range of shots, (m,) each, in order.
+        """Return quantities of every point of a slice of shots, (m,) each, in order.
 
-        Names are those of :data:`QUANTITY_BY_NAME`, ``return_number``, and ``returns`` (points of
-        the same shot).
+        Names are those of :data:`QUANTITY_BY_NAME`, ``return_number``, and ``returns`` (number of
+        points of the same shot).
         """
         has_point = self.read("flags", shot_slice, draw) > 0
         shot_index, return_number = np.nonzero(has_point)
@@ -234,7 +237,10 @@ class Recording:
         ranges: str = QUANTISED,
         time_limits: ValueLimits | None = None,
     ) -> ThinnedRows:
-        """Quantities of every point, or of every computed shot if all are a shot's; thinned."""
+        """Return quantities of every point, or of every computed shot, thinned to ``rows_max``.
+
+        Rows are shots if all quantities belong to shots.
+        """
         is_per_point = any(QUANTITY_BY_NAME[name].is_per_point for name in names)
         limits = {"time": time_limits} if time_limits else {}
         thinned = ThinnedRows(rows_max)
@@ -259,7 +265,7 @@ class Recording:
         draw: int,
         ranges: str,
     ) -> np.ndarray:
-        """World positions of points, (m, 3)."""
+        """Return world positions of points (m, 3) [m], by quantised or interpolated ranges."""
         position = self.read("position", shot_slice, draw)[has_point]
         if ranges == QUANTISED:
             range_change = self.read("range", shot_slice, draw) - self.read(
@@ -273,7 +279,7 @@ class Recording:
         return position
 
     def shot_values(self, name: str, shot_slice: slice) -> np.ndarray:
-        """Return a quantity of every shot of a range, (k,)."""
+        """Return a quantity of every shot of a slice, (k,)."""
         if name == "shot":
             return np.arange(shot_slice.start, shot_slice.stop)
         if name == "altitude":
@@ -285,7 +291,7 @@ class Recording:
         return self.read(name, shot_slice)
 
     def aim_points(self, shot_slice: slice) -> np.ndarray:
-        """World positions that beams truly point at, (k, 3); nan where a beam meets nothing."""
+        """Return the points where beam axes meet the scene, (k, 3) [m]; nan where they miss it."""
         beam_range = self.read("beam_range", shot_slice)
         beam_range = np.where(np.isfinite(beam_range), beam_range, np.nan)[:, None]
         return self.read("platform_position", shot_slice) + beam_range * self.read(
@@ -294,9 +300,9 @@ class Recording:
 
 
 def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
-    """Return the number of the first shot with true points of two surfaces in a draw.
+    """Return the number of the first shot that has true points of two surfaces in a draw.
 
-    Else the first with two groups of bins above the threshold; or None.
+    If there is none, return the first shot with two groups of bins above the threshold, or None.
     """
     fallback_shot = None
     for shot_slice in recording.shot_slices():
@@ -318,7 +324,7 @@ def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
 
 
 def select_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> ColumnArrays:
-    """Rows of a table that lie within limits."""
+    """Return the rows of a table that are within limits."""
     if not limits:
         return column_arrays
     is_inside = is_within(column_arrays, limits)
@@ -326,14 +332,14 @@ def select_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]
 
 
 class ThinnedRows:
-    """Rows of tables in order: all, then every second, every fourth, ... until few enough."""
+    """Rows of tables in order, thinned by powers of two to a largest number."""
 
     def __init__(self, rows_max: int) -> None:
         self.rows_max, self.step, self.n_total = rows_max, 1, 0
         self._tables: list[ColumnArrays] = []
 
     def append(self, column_arrays: ColumnArrays) -> None:
-        """Rows that follow."""
+        """Append rows of a table."""
         start = -self.n_total % self.step
         self.n_total += len(next(iter(column_arrays.values())))
         self._tables.append(
@@ -344,12 +350,12 @@ class ThinnedRows:
             self._tables = [{n: values[::2].copy() for n, values in self.to_columns().items()}]
 
     def describe_count(self, noun: str, qualifier: str = "") -> str:
-        """Return the number of all rows in words, and how many of them are kept."""
+        """Return the number of all rows in words, and the share that is kept."""
         kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
         return labels.counted(self.n_total, noun) + qualifier + kept_note
 
     def to_columns(self) -> ColumnArrays:
-        """Return the rows kept; empty where none were added."""
+        """Return the kept rows; empty if none were added."""
         if not self._tables:
             return {}
         return {n: np.concatenate([part[n] for part in self._tables]) for n in self._tables[0]}
@@ -357,9 +363,9 @@ class ThinnedRows:
 
 @dataclass(frozen=True)
 class AxisPosition:
-    """A place along the axes of a study: the number of the value along each, and words.
+    """Position along the axes of a study: the index along each axis, and a label.
 
-    Axes left open have other values that would do as well.
+    ``open_axes`` are axes along which other values match the request too.
     """
 
     axis_indices: dict[str, int]
@@ -367,7 +373,7 @@ class AxisPosition:
     open_axes: tuple[str, ...]
 
     def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
-        """Return the recording of a scanner there."""
+        """Return the recording of a scanner at this position."""
         group = tree.children[scanner].to_dataset(inherit=False)
         if PACKED_ATTRIBUTE in tree.attrs:
             return Recording(scanner, group.isel(self.axis_indices))
@@ -380,11 +386,10 @@ class AxisPosition:
 
 
 def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosition:
-    """Return the first place at which coordinates have the values asked for.
+    """Return the first position at which coordinates have the requested values.
 
-    Values are written as in a spec, one or several of each coordinate; of an axis with a name
-    of its own, the number along it. SpecError tells of all that are no coordinate or value of
-    it.
+    Values are written as in a spec, one or several for each coordinate. For an axis with a name of
+    its own, the value is the index along it. SpecError lists all unknown coordinates and values.
     """
     allowed_by_axis = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
     mistakes = []
@@ -405,7 +410,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
-    """Return the place at some numbers along the axes."""
+    """Return the position with the given indices along the axes."""
     axis_indices = {
         axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
     }
@@ -415,7 +420,10 @@ def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosit
 def _match_axis_values(
     spec: SceneSpec, name: str, wanted_values: list[object]
 ) -> tuple[str, np.ndarray, str]:
-    """Return the axis of a coordinate, which of its values are asked for, and them in words."""
+    """Return the axis of a coordinate, a mask of the requested values, and the available values.
+
+    Raise QuantityError if no axis has the coordinate.
+    """
     for axis in spec.axes:
         for axis_parameter in axis.parameters:
             if name == axis_parameter.coordinate:
@@ -463,10 +471,10 @@ def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> st
 
 
 CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2000
-"""Most points, dropouts and places of the path in a picture; more is thinned."""
+"""Largest numbers of points, dropouts and path positions in a picture; more are thinned."""
 
 BOX_MARGIN_FRACTION = 0.04
-"""Room around the points, as a share of the longest side of the box that holds them."""
+"""Margin around the points, as a fraction of the longest side of their bounding box."""
 
 CoordinateBox = dict[str, tuple[float, float]]
 """Lowest and highest value of x, y and z [m]."""
@@ -474,10 +482,10 @@ CoordinateBox = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of a picture, and what else is in it.
+    """Points of a picture, with the flight path and dropouts.
 
-    Of the rows within the limits, false points `outside` of the box of the picture [m] are left
-    out. Lost are shots without a point, and dropouts what they aimed at.
+    Dropouts are the aim points of shots without a point. ``n_outside`` is the number of false
+    points that are left out because they lie outside the ``box`` of the picture [m].
     """
 
     points: ColumnArrays
@@ -489,7 +497,7 @@ class PointCloud:
 
     @property
     def dropouts(self) -> ColumnArrays:
-        """Places that shots without a point aimed at; empty where none were looked for."""
+        """Aim points of shots without a point; empty if they were not requested."""
         return self.thinned_dropouts.to_columns()
 
     @property
@@ -499,7 +507,7 @@ class PointCloud:
 
     @property
     def remarks(self) -> list[str]:
-        """Numbers of points, dropouts and false points outside, and how many of them are shown."""
+        """Remarks on the numbers of points, dropouts and omitted false points."""
         count_texts = [self.thinned_points.describe_count("point")]
         if self.dropouts:
             count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
@@ -521,7 +529,10 @@ def gather_cloud(
     with_path: bool = False,
     points_max: int = CLOUD_POINTS_MAX,
 ) -> PointCloud | None:
-    """Points within limits; none where there is none."""
+    """Gather the points within limits; return None if there are none.
+
+    ``crops``: limits of quantities.
+    """
     crops = dict(crops or {})
     coordinate_crops = {name: crop for name, crop in crops.items() if name in WORLD_AXES}
     kept_names = list(dict.fromkeys([*WORLD_AXES, "flags", *names]))
@@ -575,7 +586,7 @@ def _bounding_box(
     path_columns: ColumnArrays,
     coordinate_crops: Mapping[str, ValueLimits],
 ) -> CoordinateBox:
-    """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
+    """Return the box around true points, dropouts and the path, clipped to the requested limits."""
     is_true = (point_columns["flags"] & TRUE_FLAG) > 0
     box: CoordinateBox = {}
     for axis in WORLD_AXES:
@@ -592,7 +603,7 @@ def _bounding_box(
 def read_eyepoints(
     store_path: Location, scanner_dataset: xr.Dataset, shot_indices: np.ndarray
 ) -> Eyepoints:
-    """Eyepoints of some shots that a scanner's clouds in a store were made of."""
+    """Read the eyepoints of shots from which a scanner's point cloud was computed."""
     eyepoints_store = eyepoints_path(store_path, str(scanner_dataset.attrs["geometry_id"]))
     if not eyepoints_store.exists():
         raise NotAStoreError(
