@@ -88,10 +88,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     ----------
     **options
         Options of `numba.njit`, and `borrows`. `borrows=True` declares that the kernel neither
-        creates
-        nor returns arrays. The kernel then skips reference counting of the arrays in its arguments.
-        Counting takes most of the time of a short kernel that receives records of arrays. Creating
-        or returning an array in such a kernel is a compilation error.
+        creates nor returns arrays. The kernel then skips reference counting of the arrays in its
+        arguments. Counting takes most of the time of a short kernel that receives records of
+        arrays. Creating or returning an array in such a kernel is a compilation error.
 
     Returns
     -------

@@ -70,7 +70,7 @@ Otherwise the largest error counts.
 
 @dataclass(frozen=True)
 class MeasuredSetting:
-    """Measured times and errors of one accuracy setting."""
+    """Measured times and errors of one accuracy setting, relative to the reference setting."""
 
     name: str
     kind: str
@@ -100,7 +100,7 @@ class MeasuredSetting:
 
     @property
     def is_complete(self) -> bool:
-        """True unless the setting lacks leakage, and leakage is its largest error."""
+        """False if the setting is the closed form, and its missing leakage is its largest error."""
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
         )

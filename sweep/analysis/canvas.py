@@ -216,7 +216,20 @@ def colour_map() -> Colormap:
 
 
 def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
-    """Return the edges (n + 1,) of adjacent cells with the given centres (n,)."""
+    """Return the edges of adjacent cells around their centres.
+
+    Parameters
+    ----------
+    centres
+        Positions of the cell centres, (n,), rising.
+    logarithmic
+        If true, edges are halfway between the logarithms of the centres.
+
+    Returns
+    -------
+    numpy.ndarray
+        Edges, (n + 1,). The outer edges are as far from their centres as the inner ones.
+    """
     if centres.size == 1:
         return centres[0] * np.array([0.9, 1.1]) if centres[0] else np.array([-0.5, 0.5])
     positions = np.log(centres) if logarithmic else centres.astype(float)

@@ -195,7 +195,24 @@ def is_log_spaced(values: np.ndarray) -> bool:
 
 
 def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) -> ColourScale:
-    """Return the colour scale of a variable: 0 to 1 for pd, else the extent of its values."""
+    """Return the colour scale of a variable.
+
+    Parameters
+    ----------
+    variable
+        Name of the variable. Probabilities of detection (``pd_...``) are always shown from 0 to 1.
+    label
+        Label of the scale, with units.
+    layers
+        Values of all maps with this scale.
+
+    Returns
+    -------
+    ColourScale
+        The extent of the finite values. It is logarithmic if all are at least 0, and the largest
+        exceeds 1000 times the median of the positive ones. It then starts at the first percentile
+        of the positive values, but not below 1e-12 of the largest.
+    """
     values = np.concatenate([layer.ravel() for layer in layers])
     finite_values = values[np.isfinite(values)]
     if variable.startswith("pd_") or not finite_values.size:
@@ -257,7 +274,22 @@ def surface_chart(
 ) -> Chart:
     """Return maps of a variable over two coordinates, a panel for each value of other coordinates.
 
-    Contours are drawn at ``levels`` if both coordinates are numeric.
+    Parameters
+    ----------
+    points
+        Points of the study.
+    x, y
+        Names of the coordinates along the axes.
+    variable
+        Name of the variable.
+    label
+        Label of the variable, with units.
+    size_limits
+        Largest numbers of panels, and of columns, rows and cells of the maps. Larger maps are
+        reduced to cells of adjacent points: their mean, and for probabilities and SNRs a second map
+        with the worst value.
+    levels
+        Values of the variable at which contours are drawn, if both coordinates are numeric.
     """
     parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
     planes = [_to_plane(part, variable, x, y) for _, part in parts]
@@ -387,9 +419,24 @@ def slice_chart(
     parts_max: int = 6,
     levels: Sequence[float] = (),
 ) -> Chart:
-    """Return lines of a variable along ``x``, one for each value of ``by``.
+    """Return lines of a variable along a coordinate.
 
-    Horizontal lines are drawn at ``levels``.
+    Parameters
+    ----------
+    points
+        Points of the study.
+    x
+        Name of the coordinate along the horizontal axis.
+    by
+        Name of the coordinate that has a line for each value; '' for none.
+    variable
+        Name of the variable.
+    label
+        Label of the variable, with units.
+    parts_max
+        Largest number of panels, one for each value of the remaining coordinates.
+    levels
+        Values at which horizontal lines are drawn.
     """
     line_coordinates = [by] if by else []
     parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
@@ -478,12 +525,23 @@ def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
 def lines_along(
     points_and_variables: Sequence[tuple[PointSelection, str]], x: str
 ) -> tuple[list[ChartLine], list[str]]:
-    """Read variables along a coordinate in one pass; also return remarks on how they are drawn.
+    """Read variables along a coordinate in one pass.
 
-    A line of many points is reduced to intervals: the line shows their means, and a band their
-    lowest to highest points. Otherwise the band is the interval of each point, if pd is drawn or
-    the dataset has ``.._low`` and ``.._high``. Along other dimensions the first selected index is
-    taken.
+    Parameters
+    ----------
+    points_and_variables
+        Points and name of the variable of each line.
+    x
+        Name of the coordinate. Along other dimensions the first selected index is taken.
+
+    Returns
+    -------
+    list of ChartLine
+        Lines in the order of the argument. A line of many points is reduced to intervals: the line
+        shows their means, and a band their lowest to highest points. Otherwise the band is the
+        interval of each point, if pd is drawn or the dataset has ``.._low`` and ``.._high``.
+    list of str
+        Remarks on reduction and bands.
     """
     lazy_arrays: list[list[Any]] = []
     reductions: list[tuple[SortedCoordinate, int, float, bool]] = []

@@ -31,7 +31,7 @@ VALUES_PER_SUM = 2**20
 
 @dataclass(frozen=True)
 class SortedCoordinate:
-    """Dimension of a figure: its indices in rising order of a coordinate's values."""
+    """Dimension of a figure: indices and values of a coordinate, in the order of its values."""
 
     dim: str
     indices: np.ndarray
@@ -185,9 +185,20 @@ class PointSelection:
     ) -> xr.DataArray:
         """Return a variable reduced to cells along some coordinates, lazily.
 
-        ``coordinates`` are pairs of a coordinate and its largest number of cells. ``statistic`` is
-        ``mean``, ``lowest`` or ``highest``. Along other dimensions the first selected index is
-        taken.
+        Parameters
+        ----------
+        variable
+            Name of the variable.
+        coordinates
+            Coordinates of the result, each with its largest number of cells. Along other dimensions
+            the first selected index is taken.
+        statistic
+            Statistic of a cell: ``mean``, ``lowest`` or ``highest``.
+
+        Returns
+        -------
+        xarray.DataArray
+            Floats over the dimensions of the coordinates, in their order; nan where not computed.
         """
         array = self.dataset[variable].isel(
             self.first_indices(*(coordinate for coordinate, _ in coordinates))

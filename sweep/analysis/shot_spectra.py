@@ -121,7 +121,19 @@ def simulate_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one shot at a flat target; with a seed, noise is drawn."""
+    """Simulate one shot at a flat target.
+
+    Parameters
+    ----------
+    parameters
+        SI values of all parameters, by dotted path.
+    effects
+        Names of the effects to simulate.
+    label
+        Label of the shot in figures and tables.
+    seed
+        Seed of the noise in the spectra; None for spectra without noise.
+    """
     ((_, prepared_shot),) = prepare_shots(parameters, effects)
     return simulate_prepared_shot(prepared_shot, parameters, label=label, seed=seed)
 
@@ -214,10 +226,24 @@ def _segment_spectrum(
 def draw_noise_spectrum(
     prepared_shot: shot_model.Shots, *, seed: int, segment: int, look: int = 0
 ) -> np.ndarray:
-    """Draw the noise spectrum of one look's windowed record [V].
+    """Draw the noise spectrum of one look's windowed record.
 
-    The spectrum is (N/2 + 1,) for a real and (N,) for a complex record. It is added to |X| of the
-    signal, which does not keep the phase between bins.
+    Parameters
+    ----------
+    prepared_shot
+        Shot whose noise variance, window and FFT size are used.
+    seed
+        Seed of the random numbers. Each segment and look has its own stream.
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    look
+        Index of the look.
+
+    Returns
+    -------
+    numpy.ndarray
+        Complex spectrum [V], (N/2 + 1,) for a real record and (N,) for a complex one. It is added
+        to |X| of the signal, which does not keep the phase between bins.
     """
     window_shape = prepared_shot.window
     spawn_key = (segment, look) if look else (segment,)
@@ -245,9 +271,29 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
 def range_or_velocity_at(
     shot: SimulatedShot, segment: SegmentSpectrum, frequency: np.ndarray
 ) -> np.ndarray:
-    """Return the range [m], or for the Doppler segment the velocity [m/s], at observed frequencies.
+    """Return the range or radial velocity that frequencies in a segment correspond to.
 
-    Frequencies are unfolded as the segment's beat frequency is.
+    Parameters
+    ----------
+    shot
+        Simulated shot.
+    segment
+        Segment of this shot.
+    frequency
+        Frequencies in the spectrum [Hz]. They are unfolded as the segment's beat frequency is.
+
+    Returns
+    -------
+    numpy.ndarray
+        Range [m] for a chirp, given the true radial velocity. Radial velocity [m/s] for a segment
+        of constant frequency.
+
+    Notes
+    -----
+    The unfolded frequency is f, the carrier f_c, and the Doppler ratio beta = 2 v / c. The slope of
+    the segment is s times the chirp rate S. Then
+
+        R = c (f_c beta - f) / (2 s S (1 + beta)) for a chirp, v = c f / (2 f_c) for s = 0.
     """
     prepared_shot = shot.prepared_shot
     sample_rate = float(prepared_shot.sample_rate[0])

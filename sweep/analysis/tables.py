@@ -238,8 +238,25 @@ def noise_only_reference(
 ) -> tuple[dict[str, Cell], float]:
     """Return false alarms of noise alone, in closed form and by the model without an echo.
 
-    The model has a target of reflectance 0. Return a partial record of a shot at a setting of the
-    instrument, and the model's pfa of a bin.
+    Parameters
+    ----------
+    spec
+        Spec of the study; its first point supplies all other parameters.
+    setting_parameters
+        SI values of the parameters that define a setting of the instrument, by dotted path.
+
+    Returns
+    -------
+    dict
+        Part of a record: `tnr`, `bins` (independent bins of a chirp), and the probability of a
+        false alarm in both chirps, as `closed_form` and as `noise_only`, by the model.
+    float
+        Model's probability of a false alarm in a bin.
+
+    Notes
+    -----
+    The closed form is the product of 1 - (1 - p)^N over both chirps, with the probability p in a
+    bin and the number N of independent bins. The model has a target of reflectance 0.
     """
     first_parameters = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first_parameters | setting_parameters | {"target.reflectance": 0.0}

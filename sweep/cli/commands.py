@@ -77,7 +77,7 @@ class _StandardError(logging.StreamHandler[Any]):
 
     @stream.setter
     def stream(self, value: Any) -> None:
-        """Ignore the stream that the base class keeps."""
+        """Ignore the stream that the base class assigns."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a log record, unless standard error is closed."""

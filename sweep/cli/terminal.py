@@ -44,8 +44,8 @@ MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
 SENTENCE_COLUMN_WIDTH_MIN, COLUMN_GAP, UNBROKEN_CELL_WIDTH_MAX = 14, 3, 36
 """Widths in a table [characters].
 
-They are the least width of a column of sentences, the gap between columns, and the width below
-which a cell is never broken in a row that is printed as a list.
+The first is the least width of a column of sentences, the second the gap between columns. Cells
+below the third width are never broken in a row that is printed as a list.
 """
 
 

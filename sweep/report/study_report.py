@@ -154,7 +154,7 @@ def _grid_report(store: Location) -> ReportPage:
 def _answer_section(
     spec: AnySpec, groups: Sequence[xr.Dataset], counted_unit: str, further_sentences: Sequence[str]
 ) -> PageSection:
-    """Return the first section: detection, false alarms, and if the tolerance is kept."""
+    """Return the first section: detection, false alarms, and compliance with the tolerance."""
     tolerance, pd_level = spec.accuracy.tolerance, detector_charts.PD_LEVEL
     limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
     lazy_counts = []

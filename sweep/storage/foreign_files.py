@@ -44,7 +44,7 @@ def is_litter(name: str) -> bool:
 
 
 def is_draft(name: str) -> bool:
-    """Tell whether a file is an unfinished draft: one that sweep had not finished writing."""
+    """Tell whether a file is a draft that sweep did not finish writing."""
     return bool(_DRAFT_NAME.fullmatch(name))
 
 

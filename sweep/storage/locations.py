@@ -486,8 +486,8 @@ def atomic_write(location: Location, content: bytes) -> None:
 def atomic_write_file(file_path: str, content: bytes, *, durable: bool = False) -> None:
     """Write a file on disk atomically, even if a directory has its name.
 
-    With ``durable``, the content is on the disk before the file has its name, even after a power
-    cut.
+    With ``durable``, the content is flushed to the disk before the draft is renamed, so that a
+    power cut can't leave an empty file.
     """
     draft_path = f"{file_path}.{uuid.uuid4().hex}{DRAFT_SUFFIX}"
     try:
@@ -543,7 +543,7 @@ PID_MAX = 2**31 - 1
 
 
 def process_start_id(pid: int) -> int:
-    """Return the start time of a process, which distinguishes it from earlier ones of its id.
+    """Return the start time of a process, which distinguishes it from others with the same id.
 
     The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
     other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and

@@ -36,7 +36,7 @@ ARRAY_FILE_BYTES_MAX = (1 << 31) + (1 << 25)
 _CHECKSUM_BYTES = 4
 _SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
 _EMPTY_INDEX_ENTRY = 2**64 - 1
-_ZSTD_HEADER_BYTES_MAX = 18  # of a zstd frame
+_ZSTD_HEADER_BYTES_MAX = 18  # largest header of a zstd frame
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ZSTD_CODEC = Zstd()
 
@@ -91,7 +91,7 @@ class ArrayFileLayout(NamedTuple):
         )
 
     def check_file(self, content: bytes, path_in_messages: str) -> None:
-        """Raise RefusedFileError if a chunk of a file would not decode to its declared size."""
+        """Raise RefusedFileError if a chunk of a file would not decode to its expected size."""
         for chunk in self._iter_chunks(content):
             self.check_chunk(chunk, path_in_messages)
 

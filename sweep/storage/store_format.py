@@ -125,7 +125,7 @@ class StoreError(PrintableError):
 
 
 class NotAStoreError(StoreError, ValueError):
-    """No store of a study exists at a path, or this program can't read it."""
+    """Error of a path without a store of a study, or with one that this program can't read."""
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
@@ -369,7 +369,8 @@ def _check_node(node_name: str, node: dict[str, Any]) -> None:
 def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, Any]:
     """Return the metadata that this program would write for an array of this shape and type.
 
-    The parts that may differ between arrays are taken from ``node`` and checked; ValueError.
+    The parts that may differ between arrays are taken from ``node``. Raise ValueError if they are
+    invalid.
     """
     data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
     if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_TYPE.get(data_type, ()):
@@ -449,7 +450,10 @@ def _check_dimensions(nodes: Mapping[str, Any]) -> None:
 
 
 def _check_journal_files(path: Location) -> None:
-    """Refuse a journal that contains links, which may lead out of it, or pipes, which never end."""
+    """Raise NotAStoreError if a journal contains links or special files.
+
+    A link may lead out of the store, and a pipe may never end.
+    """
     for name, problem in irregular_journal_files(path).items():
         raise NotAStoreError(f"{path}/{name} {problem}: remove it")
 
@@ -472,7 +476,7 @@ def irregular_journal_files(path: Location) -> dict[str, str]:
 
 
 class StoreReplacedError(PrintableError, ValueError):
-    """The store was extended, replaced or removed after it was opened."""
+    """Error of reading a store that was extended, replaced or removed after it was opened."""
 
 
 class StudyBoundLocalStore(SizeCheckedLocalStore):

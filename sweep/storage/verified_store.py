@@ -53,7 +53,7 @@ _EMPTY_INDEX_ENTRY = 2**64 - 1
 
 
 class DamagedChunkError(ValueError):
-    """A chunk of a store is missing or has changed since it was written."""
+    """Error of a chunk that is missing, or has changed since it was written."""
 
 
 def chunk_damage(content: bytes) -> str:
@@ -136,7 +136,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Return the number of chunks in the shard file of a name; 0 if its file is one chunk."""
+        """Return the capacity of a chunk's shard file [chunks]; 0 if the file is a single chunk."""
         name_match = CHUNK_NAME.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
@@ -240,7 +240,7 @@ class VerifiedStore(WrapperStore[Any]):
 
     @cached_property
     def _committed_blocks(self) -> frozenset[int]:
-        """Numbers of the blocks that were committed when the first chunk was missing."""
+        """Numbers of the blocks that were committed when the first missing chunk was requested."""
         points = read_receipt_totals(self._location, self._block_map.n_blocks).points_by_block
         return frozenset(np.flatnonzero(points).tolist())
 

@@ -30,9 +30,25 @@ It corresponds to about the smallest positive float.
 
 
 def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Return the normal deviate z of pd = Phi(z); for pd above 1/2 it is computed from the miss.
+    """Return the normal deviate z of a probability of detection, pd = Phi(z).
 
-    When the result is computed, ValueError is raised if pd and miss do not add to 1.
+    Parameters
+    ----------
+    pd
+        Probability of detection, 0..1.
+    miss
+        Probability of a miss, 1 - pd. It supplies the digits of pd above 1/2. By default it is
+        computed from pd.
+
+    Returns
+    -------
+    xarray.DataArray
+        Deviate z, clipped to +-38, lazy if `pd` is.
+
+    Raises
+    ------
+    ValueError
+        pd and miss do not add to 1. The error is raised when the result is computed.
     """
     miss_or_complement = 1 - pd if miss is None else miss
 
@@ -98,6 +114,11 @@ def limit(
     ValueError
         The coordinate or level does not exist, or the coordinate has one value only or a repeated
         one.
+
+    Notes
+    -----
+    Between the last value at the level and the next value below it, the normal deviate z, defined
+    by pd = Phi(z), is interpolated linearly.
     """
     level = parse_pd_level(pd)
     coord = find_coordinate(dataset, along)

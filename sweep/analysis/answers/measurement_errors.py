@@ -62,15 +62,28 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Lazy dataset [m]. `reported` is the noise-free range reported from whole bins, minus the
-        true range. `resolution` is the standard deviation caused by whole bins, averaged over
-        positions within a bin: a bin over sqrt(24), because two peaks share the error. `bound` is
-        the smallest standard deviation of an unbiased estimate. It is that of a single line with
-        the stored SNR in the three segments together (:mod:`sweep.model.detection.estimators`),
-        plus the contribution of developed speckle to detected echoes
-        (:mod:`sweep.model.sampling.speckle_wander`). Below the threshold, noise is mistaken for
-        signal, and no estimate comes near the bound. A study that draws whole spectra has instead
-        its stored `bias`, `rmse` and `bound`.
+        Lazy dataset [m]:
+
+        - `reported`: the noise-free range reported from whole bins, minus the true range;
+        - `resolution`: the standard deviation caused by whole bins, averaged over positions within
+          a bin;
+        - `bound`: the least standard deviation of an unbiased estimate, for a single line with the
+          stored SNR in all three segments together, plus in quadrature the contribution of
+          developed speckle to detected echoes.
+
+        A study that draws whole spectra has instead its stored `bias`, `rmse` and `bound`.
+
+    Notes
+    -----
+    A peak in a whole bin has a standard deviation of a bin over sqrt(12). The range is half the sum
+    of two peaks, which gives a bin over sqrt(24). The bound of a line is that of Rife and Boorstyn
+    [1]_ for each beat (:mod:`sweep.model.detection.estimators`), and speckle is described in
+    :mod:`sweep.model.sampling.speckle_wander`. Below the threshold, noise is mistaken for signal,
+    and no estimate comes near the bound.
+
+    References
+    ----------
+    .. [1] D. Rife and R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
     """
     return _error_dataset(dataset, "range")
 
@@ -78,7 +91,8 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
 def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
     """Return the error of the reported radial velocity, and the Cramer-Rao bound.
 
-    Parameters and results are those of :func:`range_error`, in m/s.
+    Result and notes are those of :func:`range_error`, in m/s. The velocity is half the difference
+    of two peaks.
     """
     return _error_dataset(dataset, "radial_velocity")
 
@@ -208,7 +222,12 @@ def _cramer_rao_bounds(
 def _bounds_of_group(
     snr: list[np.ndarray], parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Return the bounds of points that share architecture, waveform, window and record."""
+    """Return the bounds of points that share architecture, waveform, window and record.
+
+    The CNR of each segment follows from its stored SNR, without the scalloping loss and the loss of
+    a late echo. It gives the bound of the beat frequency, to which the laser's phase noise is added
+    in quadrature. The bounds of three beats are combined to those of range and velocity.
+    """
     fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
     record_parameters = {
         "fft_size": fft_size,
@@ -336,10 +355,19 @@ def _bounds_of_group(
 
 @lru_cache(maxsize=8)
 def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Return relative sum and width of a window's last n samples, for n = 0 to L, (L + 1,) each.
+    """Return relative sum and width of a window's last n samples.
 
-    Both are relative to those of all samples. The width is the standard deviation of time weighted
-    by the window. The main lobe's width is inversely proportional to it.
+    Parameters
+    ----------
+    taper
+        Window of L samples.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Sum and width for n = 0 to L, (L + 1,) each, relative to those of all samples. The width is
+        the standard deviation of time weighted by the window. The width of the main lobe is
+        inversely proportional to it.
     """
     samples, times = taper.samples()[::-1], np.arange(taper.length) / taper.length
     cumulative_sum, first_moment, second_moment = (

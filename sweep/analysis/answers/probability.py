@@ -173,7 +173,7 @@ def false_alarms_per_kilometre(
     Returns
     -------
     xarray.DataArray
-        Number per distance [1/km], lazy.
+        Number per distance [1/km], lazy: false alarms per second over the speed.
 
     Raises
     ------
@@ -223,10 +223,15 @@ def pfa_both_chirps_with_leakage(
     pfa_segment
         Probability of a false alarm by noise in the up-chirp.
     pfa_both_chirps
-        Probability of a false alarm by noise in both chirps, a product over the chirps. The
-        down-chirp's factor may differ, because the chirps' numbers of bins differ.
+        Probability of a false alarm by noise in both chirps.
     p_leakage_up, p_leakage_down
         Probability of an extra group by leakage in each chirp.
+
+    Notes
+    -----
+    Noise and leakage are independent, so a chirp has an extra group with probability p + l (1 - p).
+    The result is the product over both chirps. In the down-chirp, p is `pfa_both_chirps` over
+    `pfa_segment`, as the chirps may have different numbers of bins.
     """
     pfa_down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # 0 / 1 if pfa_segment is 0
     p_extra_up = pfa_segment + p_leakage_up * (1 - pfa_segment)
@@ -338,15 +343,24 @@ def roc(
     Returns
     -------
     xarray.Dataset
-        `pd`, with a further dimension `pfa_bin`; `curve_tnr`, the threshold-to-noise ratio for each
-        pfa_bin at each point; `simulated`, true if the point was simulated again; `half_width`,
-        that of pd's interval with the study's confidence, 0 if pd is exact.
+        Computed dataset with:
+
+        - `pd`, with a further dimension `pfa_bin`;
+        - `curve_tnr`: threshold-to-noise ratio for each pfa_bin at each point;
+        - `simulated`: true if the point was simulated again;
+        - `half_width`: half-width of pd's interval with the study's confidence; 0 if pd is exact.
 
     Raises
     ------
     ValueError
         There are too many points, a pfa is not between 0 and 1, the study draws whole spectra, or
         its looks vary.
+
+    Notes
+    -----
+    Without random effects, pd = Q_1(sqrt(2 SNR), b) and pfa = exp(-b^2 / 2), where SNR is that of
+    the strongest bin, b the threshold over the noise per quadrature, and Q_1 the Marcum function.
+    Points at which this does not reproduce the stored pd are simulated again at each threshold.
     """
     if grid_spec_of_dataset(dataset).draws.draws_whole_spectra:
         raise ValueError(

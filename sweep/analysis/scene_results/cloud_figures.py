@@ -207,7 +207,10 @@ class ObliqueView:
         return self.inches_per_unit * self._project(self.axes, positions)
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw a shaded relief, clipped to the box and without walls; return False."""
+        """Draw a shaded relief, clipped to the box and without walls.
+
+        Return False: the legend needs no entry for it.
+        """
         cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"])
         if cropped is None:
             return False
@@ -302,7 +305,7 @@ class AxisView:
     def draw_ground(self, height_map: HeightMap) -> bool:
         """Draw relief and contours from above, or the extent of heights from the side.
 
-        Return if the legend needs an entry for the ground.
+        Return True if the legend needs an entry for the ground.
         """
         cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"], nodes_max=480)
         if cropped is None:

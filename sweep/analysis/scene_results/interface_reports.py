@@ -141,10 +141,26 @@ def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
 
 
 def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArrays:
-    """Return the columns of reports (m,) made from columns of shots (n,), sorted by time.
+    """Return the reports of a unit's interface made from its shots.
 
-    ``shot_columns`` has ``time``, ``beam``, ``flags``, the values and standard errors of the first
-    return, and the truth along the beam's axis, ``beam_range`` and ``beam_radial_velocity``.
+    Parameters
+    ----------
+    shot_columns
+        Columns of n shots, sorted by time: ``time``, ``beam``, ``flags``, the values and standard
+        errors of the first return, and the truth along the beam's axis, ``beam_range`` and
+        ``beam_radial_velocity``.
+    interface
+        Rate, quanta, limits, latency and rule of validity.
+
+    Returns
+    -------
+    dict of numpy.ndarray
+        Columns of m reports, as listed in `REPORT_COLUMNS`.
+
+    Notes
+    -----
+    The variance of a report is that of the weighted mean of its shots, plus q^2 / 12 for a quantum
+    q.
     """
     is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED_FLAG == 0)
     report_index, report_periods = _assign_periods(shot_columns, interface.rate)

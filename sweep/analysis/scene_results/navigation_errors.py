@@ -131,7 +131,17 @@ def _append_length(components: np.ndarray) -> np.ndarray:
 def navigation_curves(
     named_recordings: Sequence[tuple[str, Recording]], *, quantity: str, n_bins: int
 ) -> list[ErrorCurve]:
-    """Return the error curves of scanners that navigate, all with the same altitude bins."""
+    """Return the error curves of scanners that navigate, all with the same altitude bins.
+
+    Parameters
+    ----------
+    named_recordings
+        Recordings with their names. Scanners without navigation are skipped.
+    quantity
+        ``velocity`` or ``altitude``.
+    n_bins
+        Number of bins between the lowest and the highest true altitude of all scanners.
+    """
     navigating = [
         (name, recording.dataset)
         for name, recording in named_recordings
@@ -203,7 +213,19 @@ def tally_errors(
 ) -> ErrorTally:
     """Return the tally of n solutions by altitude bin, computed in two passes for accuracy.
 
-    ``error`` and ``variance`` (the stated one) are (n, m); ``altitude_bin`` is (n,).
+    Parameters
+    ----------
+    error
+        Errors of the solutions, (n, m).
+    variance
+        Variances that the solutions state, (n, m).
+    is_available
+        Mask of the attempts that have a solution, (n,).
+    altitude_bin
+        Index of each solution's altitude bin, (n,). Indices outside 0 to ``n_bins`` - 1 do not
+        count.
+    n_bins
+        Number of bins.
     """
     is_in_range = (altitude_bin >= 0) & (altitude_bin < n_bins)
     attempts = np.bincount(altitude_bin[is_in_range], minlength=n_bins)

@@ -529,9 +529,29 @@ def gather_cloud(
     with_path: bool = False,
     points_max: int = CLOUD_POINTS_MAX,
 ) -> PointCloud | None:
-    """Gather the points within limits; return None if there are none.
+    """Gather the points of a recording within limits.
 
-    ``crops``: limits of quantities.
+    Parameters
+    ----------
+    recording
+        Recording of a scanner.
+    names
+        Quantities of the points, in addition to position and flags.
+    ranges
+        ``quantised`` or ``interpolated``.
+    draw
+        Number of the draw.
+    crops
+        Lowest and highest value of quantities; points outside are left out.
+    with_dropouts, with_path
+        If true, the aim points of shots without a point, and the flight path, are gathered too.
+    points_max
+        Largest number of points; more are thinned.
+
+    Returns
+    -------
+    PointCloud or None
+        None if no point is within the limits.
     """
     crops = dict(crops or {})
     coordinate_crops = {name: crop for name, crop in crops.items() if name in WORLD_AXES}
