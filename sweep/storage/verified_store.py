@@ -229,7 +229,7 @@ class VerifiedStore(WrapperStore[Any]):
         return chunk_damage(content.to_bytes())  # a chunk, a chunk of a shard, or a shard index
 
     def _should_exist(self, name: str) -> bool:
-        """Tell whether a chunk must exist: it was in the new store, or its block is committed."""
+        """Tell whether a chunk must exist: it was made with the store, or its block is done."""
         block_map = self._block_map
         if block_map.is_packed or name in block_map.template_objects:
             return True
