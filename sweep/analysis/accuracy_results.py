@@ -241,6 +241,7 @@ SHORT_SETTING_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak"
 """Columns of a setting in the terminal's shorter table."""
 
 CHEAPEST_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
+"""Columns of the table of the cheapest setting for each error."""
 
 STORING_ATTRIBUTE = "storing_seconds"
 """Attribute with the time of storing the study [s]; stores of earlier versions lack it."""
@@ -317,6 +318,7 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
 
 
 def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+    """Return the sentence on time and error of the spec as written, and on a faster setting."""
     (as_written,) = select_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
     cheapest_setting = cheapest_within_error(without_reference(settings), as_written.largest_error)
@@ -454,6 +456,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
 
 
 def _reference_sentence(attributes: dict) -> str:
+    """Return the sentence on the reference setting, and on its difference from the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ". It is not compared with the time domain."
@@ -607,6 +610,7 @@ def _short_name(setting: MeasuredSetting) -> str:
 
 
 def _set_axes(axes: Axes, error_min: float, error_max: float) -> None:
+    """Set logarithmic axes of time and error, with limits, labels and legend."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(max(NEGLIGIBLE_ERROR, error_min) / 2, max(2.5, 2 * error_max))

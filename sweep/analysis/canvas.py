@@ -30,6 +30,8 @@ from sweep.analysis.charts import (
 )
 
 DPI = 150
+"""Resolution of PNG files [dots per inch]."""
+
 COLOUR_MAP_NAME = "viridis"
 MISSING_COLOUR = "0.75"
 """Grey of missing values: nan, or a point that is not computed yet."""
@@ -47,6 +49,7 @@ LINE_COLOURS = (
 """Line colours: those of Okabe and Ito (2008), and a brown that red-blind readers distinguish."""
 
 DASH_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
+"""Dash styles of lines, in matplotlib's notation."""
 
 
 PICTURE_FORMATS = ("png", "pdf", "svg")
@@ -65,6 +68,7 @@ RC_PARAMS: dict[Any, Any] = {
     "path.simplify": True,
     "path.snap": True,
 }
+"""Settings of matplotlib for all pictures."""
 
 PNG_SOURCE_FIELD = "Source"
 """PNG metadata field that names the source of the picture."""
@@ -149,6 +153,7 @@ MARKED_POINTS_MAX = 40
 """Largest number of points of a line at which every point has a marker."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+"""Markers of points on lines, by style index."""
 
 MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INCHES = (
     (9.5, 4.4),
@@ -241,6 +246,7 @@ def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
 
 
 def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
+    """Draw the heat map of a panel, with contours and axes."""
     heat_map, mesh_edges = panel.heat_map, []
     assert heat_map is not None
     for axis_name, values, axis in (("x", heat_map.x, panel.x), ("y", heat_map.y, panel.y)):
@@ -371,6 +377,7 @@ def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draw the lines of a panel, with its axes and title."""
     has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
         _draw_line(axes, line, solid=has_stated or line.points_per_value > 1)

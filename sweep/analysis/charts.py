@@ -34,6 +34,7 @@ from sweep.analysis.selection import (
 )
 
 LINEAR, LOG, CATEGORY = "linear", "log", "category"
+"""Kinds of axes."""
 
 PROBABILITY_LIMITS = (-0.03, 1.03)
 """Limits of an axis that shows probabilities."""
@@ -146,11 +147,16 @@ SHEET_LIMITS = ChartSizeLimits(
 """Limits for a sheet: a map has no more cells than pixels, so that no cell is lost."""
 
 LINES_PER_PANEL_MAX = 8
+"""Largest number of lines in a panel; more are omitted."""
+
 LINE_INTERVALS = 500
 """Number of intervals to which a line of more than twice as many points is reduced."""
 
 _LOG_SCALE_DECADES_MIN = 3
+"""Least number of decades between median and largest value for a logarithmic colour scale."""
+
 _HARMFUL_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
+"""Prefixes of variables whose largest value is the worst."""
 
 
 @dataclass(frozen=True)

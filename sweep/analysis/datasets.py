@@ -37,6 +37,8 @@ from sweep.storage.store_format import (
 from sweep.storage.verified_store import open_verified_store
 
 BATCH_DIM = "batch"
+"""Dimension of the batches of draws, over which counts are summed."""
+
 VALUES_PER_READ = 2**20
 """Number of array values in a Dask chunk for reading.
 
@@ -51,6 +53,8 @@ COUNT_MISSING = -1
 """Value of a count in a block that is not computed yet."""
 
 GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
+"""Kinds of stores."""
+
 _DESCRIPTION_BY_KIND = {
     GRID_KIND: "a grid of points: sweep.open() opens it",
     SCENE_KIND: "a scene's point clouds: sweep.open_scene() opens it",

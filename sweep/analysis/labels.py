@@ -14,9 +14,16 @@ KILOMETRES_FROM = 1000.0
 """Median distance [m] above which distances are shown in km."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
+"""Symbols of units in labels, for units that are written otherwise in stores."""
+
 _UNITLESS = ("", "1")
+"""Units of pure numbers and of words."""
+
 _SI_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+"""SI prefixes by exponent of ten."""
+
 _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
+"""Units that take an SI prefix."""
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
+"""Statistics of the points in a cell."""
 
 VALUES_PER_SUM = 2**20
 """Number of values that are summed at once."""
@@ -293,6 +294,8 @@ PUBLISHED_CUTS = (
     (GRAZING_ANGLE_PATH, "85 deg"),
     (RANGE_PATH, "3500 m"),
 )
+"""Fixed parameter and value of each published cut."""
+
 MEAN_RANGE_MIN = "5 m"
 """Range below which points are excluded from means: the echo's own shot noise matters [T 4.2]."""
 

@@ -32,8 +32,10 @@ from sweep.spec.sections import parameter_rules
 from sweep.units import percent
 
 Parameters = Mapping[str, float | int | str]
+"""SI values of parameters by dotted path."""
 
 SEGMENT_NAMES = ("up-chirp", "Doppler", "down-chirp")
+"""Display names of the segments, in the order of their indices."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,7 @@ def _segment_spectrum(
     segment_index: int,
     seed: int | None,
 ) -> SegmentSpectrum:
+    """Return the spectrum of a segment with its detections; with a seed, noise is drawn."""
     signed_bins, signal_magnitude = (
         prepared_shot.all_signed_bins,
         full_segment_spectrum(prepared_shot, 0, segment_index),
@@ -540,6 +543,7 @@ def _noise_table(shot: SimulatedShot) -> PageTable:
 
 
 def _segment_table(shot: SimulatedShot) -> PageTable:
+    """Return a table of the segments: beat, peak, level, SNR, pd and number of groups."""
     columns = (
         "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
         "groups",
@@ -589,6 +593,7 @@ def _measurement_table(shot: SimulatedShot) -> PageTable:
 
 
 def _false_alarm_table(shot: SimulatedShot) -> PageTable:
+    """Return a table of the false-alarm and leakage probabilities of a shot."""
     label_by_variable = {
         "pfa_bin": "one bin, noise", "pfa_segment": "up-chirp segment, noise",
         "pfa_both_chirps": "both chirp segments, noise", "pfa_shot": "any segment, noise",
@@ -616,6 +621,7 @@ _DESCRIBED_PATHS = (
     "instrument.processing.window",
     *THRESHOLD_PATHS,
 )
+"""Paths of the parameters that a report lists."""
 
 
 def write_shot_report(

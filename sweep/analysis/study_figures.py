@@ -67,6 +67,7 @@ LONG_AXIS_VALUES_MIN = 8
 """Least number of values of an axis that can be a side of a surface."""
 
 DEFAULT_VARIABLES = ("pd_shot", "pd_doppler")
+"""Variables of the default figures of a grid."""
 
 
 @dataclass(frozen=True)
@@ -277,6 +278,7 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
 
 
 DEFAULT_CLOUD_COLOURS = ("range", "radial_velocity")
+"""Quantities by which the default figures colour a point cloud."""
 
 
 def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
@@ -383,6 +385,7 @@ def _picture_remarks(
 def _draw_cloud(
     results: SceneResults, figure_spec: CloudFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
+    """Return the sheet of a point cloud, or a message why there is none."""
     recording = _figure_recording(results, figure_spec, axis_position)
     crop_by_name = {name: getattr(figure_spec, name) for name in (*WORLD_AXES, "time")}
     cloud = gather_cloud(
@@ -417,6 +420,7 @@ def _draw_cloud(
 def _draw_scatter(
     results: SceneResults, figure_spec: ScatterFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
+    """Return the sheet of a scatter plot, or a message why there is none."""
     recording = _figure_recording(results, figure_spec, axis_position)
     thinned_rows = recording.thinned_rows(
         [figure_spec.x, figure_spec.y, figure_spec.colour],
@@ -445,6 +449,7 @@ def _draw_scatter(
 def _draw_shot(
     results: SceneResults, figure_spec: ShotSpectraFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
+    """Return the sheet of a shot's spectra, or a message why there is none."""
     recording = _figure_recording(results, figure_spec, axis_position)
     shot_choice = figure_spec.shot
     shot_number = (
@@ -482,6 +487,7 @@ def _draw_navigation(
     figure_spec: NavigationFigure | NavigationTable,
     axis_position: AxisPosition,
 ) -> canvas.Sheet | TablePage | str:
+    """Return the sheet or the table of navigation errors, or a message why there is none."""
     scanners = figure_spec.scanners or results.scanners
     named_recordings = [
         (scanner, axis_position.recording(results.tree, scanner)) for scanner in scanners

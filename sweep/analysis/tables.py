@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sweep.spec import TableFigure as TableSpec
 
 Cell = str | float | int
+"""Value of a table cell."""
 
 
 @dataclass(frozen=True)
@@ -428,6 +429,7 @@ _COMMON_NOTES = (
     "excess: noise variance above the one that sets the threshold, as a figure implies.",
     "  Nothing is tuned to the printed figures.",
 )
+"""Notes below all tables of false alarms."""
 
 
 def _record_table(

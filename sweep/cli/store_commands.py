@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.store_verification import Report
 
 EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
+"""Exit codes of verify for a damaged store, and of compare for different results."""
 
 #: Largest number of damaged objects that are listed for a store.
 LISTED_OBJECTS_MAX = 20
@@ -87,6 +88,7 @@ def status(store: Location) -> None:
 
 
 def _print_pending_replacement(store: Location) -> None:
+    """Print that a store is being extended or replaced, if so."""
     from sweep.storage.locations import resolve_links
     from sweep.tasks.engine.journal import EXTENDS_KEY, read_recipe
     from sweep.tasks.engine.progress import StoreError
@@ -175,6 +177,7 @@ def finalize(store: Location, output: Location | None) -> None:
 
 
 def _print_verify_report(report: Report) -> None:
+    """Print restored, damaged and foreign objects of a store, and its number of sound blocks."""
     store = shorten_path(report.store)
     for name in report.restored:
         click.echo(f"{store}: {name} put back")

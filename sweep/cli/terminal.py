@@ -201,6 +201,7 @@ def output_dir_option(help: str) -> Callable[..., Any]:
 def _allow_modules(
     context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]
 ) -> None:
+    """Allow studies to import the user's modules that --allow-code names."""
     if modules:
         from sweep.tasks.studies.user_functions import allow_modules
 
@@ -349,6 +350,7 @@ def _error_text(error: Exception) -> str:
 
 
 def _print_summary(store: Location) -> None:
+    """Print the table of results of a store, and its false alarms."""
     from sweep.tasks.studies import study_loading
 
     attributes, study = study_loading.read_study(store)
@@ -358,6 +360,7 @@ def _print_summary(store: Location) -> None:
 
 
 def _print_grid_summary(store: Location) -> None:
+    """Print the table of detection probabilities by part of a grid."""
     from sweep.tasks.studies.store_summary import DETECTED_PD_MIN, detection_summary
 
     part_heading, rows, block_share = detection_summary(store)
@@ -390,6 +393,7 @@ def _sampled_share_text(block_share: float) -> str:
 
 
 def _print_scene_summary(store: Location) -> None:
+    """Print the table of shots and points by scanner."""
     from sweep.tasks.studies.store_summary import scene_summary
 
     print_table(
@@ -623,6 +627,7 @@ def plan_rows(
 
 
 def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[str, str]]:
+    """Yield heading and text of the lines of a plan that only flights have."""
     from sweep.model.beamlet_counts import BEAMLETS_PATH
     from sweep.model.error_budget import ErrorBudget
     from sweep.tasks.studies.flight_coverage import sample_coverage
@@ -767,6 +772,7 @@ def print_effects_warnings(table: EffectsTable) -> None:
 
 
 def _effect_cells(row: EffectRow) -> list[str]:
+    """Return the row of an effect in the table of effects."""
     cost, mode_text = row.time_fraction, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + mode_text,

@@ -62,6 +62,7 @@ ROC_DRAWS = 400
 """Number of draws for the ROC curve of a point with random effects."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
+"""Name of the probability that noise or leakage raises an extra group in both chirps."""
 
 _LABEL_BY_ALARM = {
     "pfa_bin": "noise, one bin",
@@ -208,6 +209,7 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
 
 
 def _point_label(profile: GridProfile, index: int) -> str:
+    """Return the main coordinate of a point in words."""
     if profile.coordinate is None:
         return ""
     value = profile.coordinate_axis.to_axis_units(profile.coordinate.values[index : index + 1])[0]
@@ -358,12 +360,16 @@ def false_alarm_chart(
 
 
 PD_LEVEL = 0.9
+"""Level of pd for the maximum range and the summary."""
 
 UNBROKEN_LABEL = "kept all the way"
+"""Label of the range up to which pd never falls below the level."""
+
 ANSWER_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit`, by the label of their choice."""
 
 LABEL_BY_END = {"low": "lower end", "high": "upper end"}
+"""Column names of the ends of a limit's interval."""
 
 MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {PD_LEVEL:g}"
 

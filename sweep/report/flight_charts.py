@@ -353,6 +353,7 @@ def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> d
 
 
 def _scene_layout() -> dict[str, Any]:
+    """Return plotly's layout of the three-dimensional view."""
     axis_style = {"showbackground": False, "showspikes": False, "nticks": 5}
     return plot_layout(
         scene={

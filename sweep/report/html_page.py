@@ -359,6 +359,7 @@ class TextItem:
 
 
 PageItem = Plot | HtmlTable | TextItem
+"""Item of a page's section."""
 
 
 @dataclass(frozen=True)

@@ -71,11 +71,13 @@ GRID_TABLE_VARIABLES = (
     "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
     "radial_velocity_bound", "beamlets", "n_draws", "effects_error",
 )  # fmt: skip
+"""Variables in the table of a grid's points."""
 
 CLOUD_TABLE_QUANTITIES = (
     "time", "beam", "x", "y", "z", "range", "radial_velocity", "snr", "pd", "true_range",
     "true_radial_velocity", "flags",
 )  # fmt: skip
+"""Quantities in the table of a point cloud."""
 
 
 def write_report(store: str | Location, file: str | Path) -> Path:
@@ -114,11 +116,13 @@ def write_report(store: str | Location, file: str | Path) -> Path:
 
 
 SectionItem = Chart | PageItem | None
+"""Item of a section before charts become plots; None is left out."""
 
 AnySpec = GridSpec | SceneSpec
 
 
 def _grid_report(store: Location) -> ReportPage:
+    """Return the report of a grid."""
     results = GridResults.from_store(store)
     dataset, spec = results.dataset, results.spec
     figure_items: list[SectionItem] = list(_figure_charts(results))
@@ -286,6 +290,7 @@ def _html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
 
 
 def _scene_report(store: Location) -> ReportPage:
+    """Return the report of a flight."""
     results = SceneResults.from_store(store)
     spec, attributes = results.spec, results.tree.attrs
     labelled_recordings, n_omitted = flight_charts.select_recordings(results)
@@ -373,6 +378,7 @@ def _grid_point_table(results: GridResults) -> HtmlTable | None:
 
 
 def _reduction_caption(n_rows: int, n_total: int) -> list[str]:
+    """Return the caption on how many of all points a table contains."""
     if n_rows == n_total:
         return [f"All {n_total:,} points."]
     return [
@@ -420,6 +426,7 @@ def _field_table(spec: AnySpec) -> HtmlTable:
 
 
 def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted path and value of every field of a nested mapping."""
     for name, value in mapping.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping) and value:

@@ -30,7 +30,10 @@ _JOURNAL_FILE_NAME = re.compile(
     r"(receipts|failures|sessions|template)\.jsonl|recipe\.json|partial|begun-\d+|"
     r"lock(\.guard|\.[0-9a-f]{32})?|clock-\d+-[0-9a-f]{8}"
 )
+"""Names of the files that sweep writes into a journal."""
+
 _DRAFT_NAME = re.compile(r".+\.[0-9a-f]{32}\.partial")
+"""Names of unfinished drafts."""
 
 
 def is_litter(name: str) -> bool:
@@ -84,6 +87,7 @@ def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
 def _iter_foreign_files(
     folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
 ) -> Iterator[str]:
+    """Yield foreign files and folders below a folder of a store."""
     with os.scandir(folder) as entries:
         for entry in entries:
             name, is_folder = prefix + entry.name, entry.is_dir(follow_symlinks=False)
@@ -109,6 +113,7 @@ def _iter_foreign_journal_files(folder: str) -> Iterator[str]:
 
 
 def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
+    """Yield foreign files and folders among the chunk files of an array."""
     with os.scandir(folder) as entries:
         for entry in entries:
             is_folder = entry.is_dir(follow_symlinks=False)

@@ -283,6 +283,7 @@ def _object_version(meta: Any) -> ObjectVersion:
 
 
 def _connect(bucket_url: str, retry_config: Any) -> Any:
+    """Return the client of a bucket, with credentials and endpoint from the environment."""
     from obstore.store import MemoryStore, from_url
 
     if bucket_url.startswith("memory:"):
@@ -508,6 +509,7 @@ def atomic_write_file(file_path: str, content: bytes, *, durable: bool = False) 
 
 
 def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
+    """Write a file that must not exist yet; with ``durable``, flush it to the disk."""
     descriptor = os.open(file_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         remaining = memoryview(content)
@@ -714,6 +716,7 @@ def store_identity(location: Location) -> tuple[int, ...] | None:
 
 
 def _recover_leftover(leftover: Path, leftover_match: re.Match[str]) -> None:
+    """Complete, restore or delete one leftover of a dead process."""
     path = leftover.with_name(leftover_match["name"])
     if leftover_match["state"] == "replaced":
         if not path.exists():
@@ -746,6 +749,7 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
 
 
 def _hidden_path(path: Path, state: str) -> Path:
+    """Return a unique hidden path next to ``path``, with a state and this process in its name."""
     process_tag = f"{os.getpid()}.{process_start_id(os.getpid())}"
     unique_tag = f"{socket.gethostname()}-{process_tag}-{uuid.uuid4().hex[:8]}"
     name = (

@@ -96,6 +96,7 @@ class ArrayFileLayout(NamedTuple):
             self.check_chunk(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
+        """Yield the chunks in a file; of numeric chunks in a shard only the header."""
         if not self.chunks_per_shard:
             yield content
             return

@@ -83,10 +83,12 @@ _ATTRIBUTES_BY_STORE_KIND = {
 """Required attributes of each kind of store, in addition to the common ones."""
 
 _COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
+"""Required attributes of every store."""
 
 _STUDY_ID = re.compile(r"[0-9a-f]{32}")
 
 _NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
+"""Types of the attributes that are not text."""
 
 _ARRAY_ATTRIBUTE_TYPES = {
     "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
@@ -105,6 +107,7 @@ MAP_GROUP = "scene_map"
 """Name of the group with the terrain map of a flight."""
 
 _VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+"""Valid names of groups, arrays and dimensions."""
 
 _CHECKSUM_CODEC = {"name": "crc32c"}
 _COMPRESSION_CODECS = [
@@ -118,6 +121,7 @@ _SHARD_INDEX_CONFIGURATION = {
     "index_codecs": [_LITTLE_ENDIAN_CODEC, _CHECKSUM_CODEC],
     "index_location": "end",
 }
+"""Configuration of the index of a shard."""
 
 
 class StoreError(PrintableError):
@@ -266,6 +270,7 @@ def _read_root_document(path: Location) -> dict[str, Any]:
 
 
 _NAMES_SHOWN_MAX = 3
+"""Largest number of file names in an error message."""
 
 
 def _first_names_text(path: Location) -> str:
@@ -495,6 +500,7 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
             self._check_same_study()
 
     def _check_same_study(self) -> None:
+        """Raise StoreReplacedError if the store at the path has another study id."""
         identity = store_identity(self.root)
         if identity is None or identity != self._last_identity:  # repaired or replaced
             if read_study_id(self.root) != self._study_id:
@@ -544,8 +550,11 @@ _LINE_END = b'"}\n'
 _RECEIPT_HEAD = re.compile(
     rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
 )
+"""Start of a receipt: block, and points and bytes, or its withdrawal."""
+
 _RECEIPT_TIME = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
 _RECEIPT_WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
+"""Host and process id of the worker in a receipt."""
 
 
 def encode_record(record: dict[str, Any]) -> bytes:
@@ -855,6 +864,7 @@ def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf
 def _add_receipt_time(
     totals: ReceiptTotals, line_body: bytes, points: int, receipt_time: float, since: float
 ) -> None:
+    """Add time, recent points and worker of a receipt to the totals, in place."""
     totals.first_time, totals.last_time = (
         min(totals.first_time, receipt_time),
         max(totals.last_time, receipt_time),

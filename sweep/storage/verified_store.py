@@ -192,6 +192,7 @@ class VerifiedStore(WrapperStore[Any]):
             raise
 
     async def _get_verified(self, key: str, prototype: Any, byte_range: Any) -> Any:
+        """Return the bytes of a file; check a chunk, and read a damaged one a second time."""
         content = await self._fetch(key, prototype, byte_range)
         name = key.removeprefix(self._prefix).lstrip("/")
         if not CHUNK_NAME.fullmatch(name) or not (
@@ -245,6 +246,7 @@ class VerifiedStore(WrapperStore[Any]):
         return frozenset(np.flatnonzero(points).tolist())
 
     def _damage_message(self, name: str, damage: str) -> str:
+        """Return the message on a damaged chunk, with its block and the remedy."""
         block_map, location = self._block_map, self._location
         block = block_map.block_of_chunk(name)
         chunk_text = f"{location}: block {block}: {name}" if block >= 0 else f"{location}: {name}"

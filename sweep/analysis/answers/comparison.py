@@ -30,6 +30,7 @@ PD_ROUNDING_MAX = 1e-12
 _SIGNIFICANT_DIGITS = 12
 
 MIXED_KINDS_MESSAGE = "a grid of points and a flight have nothing to match: compare two of a kind"
+"""Error message for a comparison of a grid with a flight."""
 
 
 def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
@@ -206,6 +207,7 @@ COMPARED_STATISTICS = tuple(
     for name, output in SHOT_STATISTIC_VARIABLES.items()
     if output.dtype == "float64" and name not in ERROR_BOUND_VARIABLES
 )
+"""Statistics of a flight's shots that are compared."""
 
 
 def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
@@ -370,8 +372,10 @@ def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: boo
 
 
 DIFFERENCE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
+"""Column names of the table of differences."""
 
 OpenedStore = xr.Dataset | xr.DataTree
+"""Dataset of a grid, or tree of a flight."""
 
 TABULATED_VARIABLES = (
     *PD_OUTPUTS, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
@@ -379,6 +383,7 @@ TABULATED_VARIABLES = (
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
     "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_VARIABLE,
 )  # fmt: skip
+"""Variables in the table of differences, in its order."""
 
 
 def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
@@ -407,6 +412,7 @@ def difference_rows(differences: xr.Dataset) -> list[list[str]]:
 
 
 def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
+    """Return a variable's row: number and size of differences, agreement, and worst point."""
     array = differences[name]
     is_finite = np.isfinite(array.values)
     abs_difference = np.where(is_finite, np.abs(array.values), -1.0)

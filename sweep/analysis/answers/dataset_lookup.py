@@ -27,6 +27,7 @@ STUDY_ID = "study_id"
 JOIN_REMEDY = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
 )
+"""Part of error messages: how to join stores so that answers are per design."""
 
 _MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 

@@ -41,6 +41,8 @@ _PATH_BY_PARAMETER = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
+"""Paths of the needed instrument parameters, below `instrument`."""
+
 _RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
 """Names of random effects, whose draws do not change the footprint of an echo."""
 
@@ -76,14 +78,14 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
     Notes
     -----
     A peak in a whole bin has a standard deviation of a bin over sqrt(12). The range is half the sum
-    of two peaks, which gives a bin over sqrt(24). The bound of a line is that of Rife and Boorstyn
-    [1]_ for each beat (:mod:`sweep.model.detection.estimators`), and speckle is described in
-    :mod:`sweep.model.sampling.speckle_wander`. Below the threshold, noise is mistaken for signal,
-    and no estimate comes near the bound.
+    of two peaks, which gives a bin over sqrt(24). Below the threshold, noise is mistaken for
+    signal, and no estimate comes near the bound.
 
     References
     ----------
-    .. [1] D. Rife and R. Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974).
+    The bound of each beat is that of Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591 (1974), as
+    described in :mod:`sweep.model.detection.estimators`. The contribution of speckle is described
+    in :mod:`sweep.model.sampling.speckle_wander`.
     """
     return _error_dataset(dataset, "range")
 
@@ -98,6 +100,7 @@ def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
+    """Return stored error, resolution and bound of `range` or `radial_velocity`."""
     if f"{quantity}_rmse" in dataset:
         statistics = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(statistics).assign_attrs(dataset.attrs)

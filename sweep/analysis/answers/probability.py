@@ -32,6 +32,7 @@ from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
+"""Segments with a probability of detection, and the shot."""
 
 
 def variable_name(quantity: str, segment: str) -> str:
@@ -239,6 +240,7 @@ def pfa_both_chirps_with_leakage(
 
 
 SUMMARY_STATISTICS = ("mean", "least", "largest", "number")
+"""Statistics of a summary, in the order of its coordinate."""
 
 
 def summary(dataset: xr.Dataset) -> xr.Dataset:
@@ -311,6 +313,8 @@ CURVE_TNR = "curve_tnr"
 """Name of the TNR along a curve; `tnr` may be a coordinate of the study."""
 
 ROC_KEY_DOMAIN = "sweep.analysis.roc"
+"""Domain of the random-number keys of simulated ROC curves."""
+
 _RANDOM_EFFECT_FLAGS = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
 """Bit mask of the random effects."""
 
@@ -320,6 +324,7 @@ _DETECTING_SEGMENTS = {
     "down": ("down",),
     "shot": ("up", "down"),
 }
+"""Segments that must detect for a detection in each segment or in a shot."""
 
 
 def roc(

@@ -295,6 +295,7 @@ def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
 
 
 _SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
+"""Attributes that a join sums over its designs."""
 
 
 def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:

@@ -111,6 +111,7 @@ OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
 """Margins for ticks and labels: left, below, right and above [inches]."""
 
 _TRIAL_SIDE_INCHES = 10.0
+"""Side of the square sheet on which the projected box is measured [inches]."""
 
 
 class ObliqueView:
@@ -318,6 +319,7 @@ class AxisView:
         return self.axis_names[2] != "z"
 
     def _draw_relief(self, height_map: HeightMap) -> None:
+        """Draw the shaded relief from above, with labelled contours."""
         half_dx, half_dy = ((nodes[1] - nodes[0]) / 2 for nodes in (height_map.x, height_map.y))
         extent = (
             height_map.x[0] - half_dx,
@@ -346,6 +348,7 @@ class AxisView:
             self.axes.clabel(contours, fontsize=7, fmt="%g m")
 
     def _draw_profile(self, height_map: HeightMap) -> None:
+        """Fill the area between lowest and highest ground along the viewing axis."""
         coordinates, collapsed_axis = (
             (height_map.x, 0) if self.axis_names[0] == "x" else (height_map.y, 1)
         )

@@ -164,6 +164,8 @@ def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
 
 _VELOCITY = "velocity"
 _VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
+"""Stored variables of a point, by the name of the quantity in messages."""
+
 _NEEDED_VARIABLES = (
     "flags",
     "velocity",
@@ -181,6 +183,7 @@ _NEEDED_VARIABLES = (
     ),
     *(f"true_{q}" for q in _VARIABLE_BY_QUANTITY.values()),
 )
+"""Variables that are read from a store."""
 
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:

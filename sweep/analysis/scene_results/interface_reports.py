@@ -26,6 +26,8 @@ from sweep.spec.scene_sections import Interface
 from sweep.storage.locations import Location, atomic_path
 
 MEASURED_QUANTITIES = ("range", "radial_velocity")
+"""Quantities that a unit reports."""
+
 REPORT_COLUMNS = {
     "time": ("s", "time stamp: that of the measurement, and the latency"),
     "beam": ("1", "number of the beam"),
@@ -45,6 +47,8 @@ REPORT_COLUMNS = {
 """Units and description of each column of reports."""
 
 _TRUTH_VARIABLES = {"true_range": "beam_range", "true_radial_velocity": "beam_radial_velocity"}
+"""Stored variables with the true values, by column of reports."""
+
 _PERIOD_EDGE_FRACTION = 1e-6
 """Fraction of a period before its end within which a shot counts to the next one.
 
@@ -54,6 +58,7 @@ _REPORTS_PER_SHOT_MAX = 10
 """Largest number of reports per shot; a higher rate is refused, as most reports would be empty."""
 
 ColumnArrays = dict[str, np.ndarray]
+"""Columns of a table by name, all of equal length."""
 
 
 def reports(

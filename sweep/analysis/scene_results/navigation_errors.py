@@ -179,6 +179,7 @@ def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray |
 def _iter_tallies(
     dataset: xr.Dataset, quantity: str, altitude_edges: np.ndarray
 ) -> Iterator[ErrorTally]:
+    """Yield the tallies of a scanner's solutions, part by part."""
     status = dataset[f"{quantity}_status"]
     draws_per_chunk = chunk_length(status, "draw")
     draw_slices = read_slices(status, "draw", draws_per_chunk)
@@ -274,8 +275,11 @@ def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
 COMPONENTS = {VELOCITY: ("x", "y", "z"), ALTITUDE: ("",)}
+"""Names of the components of each quantity."""
+
 UNIT_BY_QUANTITY = {VELOCITY: "m/s", ALTITUDE: "m"}
 LENGTH_NAME = "vector"
+"""Name of the length of a vector, among its components."""
 
 ComponentStatistic = tuple[str, int]
 """Name of a statistic, and index of its component; the index m stands for the length."""
@@ -327,6 +331,7 @@ def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
 def _statistic_panel(
     curves: Sequence[ErrorCurve], quantity: str, statistic: str, component_index: int
 ) -> Panel:
+    """Return the panel of one statistic of a component, with a line for each curve."""
     component_names = COMPONENTS[quantity]
     component = (
         component_names[component_index] if component_index < len(component_names) else LENGTH_NAME

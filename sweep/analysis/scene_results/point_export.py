@@ -46,6 +46,8 @@ ground track, or of the x axis if the platform has no horizontal velocity.
 """
 
 POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
+"""Names of the columns, in the order of files."""
+
 UNIT_BY_COLUMN = {
     n: QUANTITY_BY_NAME[n].units
     for n in POINT_COLUMNS
@@ -137,10 +139,12 @@ class PointTable:
 
 
 Remarks = Sequence[str]
+"""Remarks that are written to a file, as far as its format allows."""
 
 _PLY_TYPE_BY_DTYPE = {
     "<f8": "double", "<i2": "short", "|u1": "uchar", "<i4": "int", "<u4": "uint",
 }  # fmt: skip
+"""PLY types of the columns' NumPy types."""
 
 
 def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
@@ -190,6 +194,7 @@ LAS_RETURN_NUMBER_MAX = 15
 """Largest coordinate in steps from the offset, and largest return number, of a LAS file."""
 
 _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
+"""Columns that point format 6 has fields for; the others become extra bytes."""
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
 """Quantisation step of scan angles in a LAS file [deg]."""
@@ -254,6 +259,7 @@ def _las_step(extent: float) -> float:
 
 
 def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type: ignore[no-untyped-def]
+    """Return rows as points of a LAS file."""
     import laspy
 
     points = laspy.ScaleAwarePointRecord.zeros(rows.size, header=header)

@@ -140,6 +140,7 @@ def _scale_ends(values: np.ndarray) -> tuple[float, float]:
 def _continuous_colours(
     quantity: str, values: np.ndarray, is_trusted: np.ndarray
 ) -> ContinuousColours:
+    """Return a continuous colour scale that spans the trusted values, without outliers."""
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values

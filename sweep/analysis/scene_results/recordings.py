@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 
 WORLD_AXES = ("x", "y", "z")
+"""Axes of world coordinates."""
 
 QUANTISED, INTERPOLATED = "quantised", "interpolated"
+"""Ranges and velocities of whole bins, or interpolated between bins."""
 
 _INTERPOLATED_NAMES = {
     f"{name}{error}": f"{name}_interpolated{error}"
@@ -76,6 +78,7 @@ class Quantity:
 
 
 def _list_quantities() -> dict[str, Quantity]:
+    """Return all quantities of shots and points, with their descriptions and units."""
     quantities = {}
     for table, is_per_point in (
         (SHOT_VARIABLES, False),
@@ -129,6 +132,7 @@ def point_kinds(flags: np.ndarray) -> np.ndarray:
 
 
 ColumnArrays = dict[str, np.ndarray]
+"""Columns of a table by name, all of equal length."""
 
 
 ValueLimits = tuple[float, ...]
@@ -458,6 +462,7 @@ def _match_axis_values(
 
 
 def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> str:
+    """Return the coordinates of a position in words, for axes with several values."""
     return ", ".join(
         labels.format_coordinate_value(
             axis_parameter.coordinate,
