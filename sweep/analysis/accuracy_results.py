@@ -1,4 +1,8 @@
-"""Results of `sweep accuracy`: comparison of settings by time and error, in tables and a figure."""
+"""Results of `sweep accuracy`: comparison of settings by time and error, in tables and a figure.
+
+The thesis's way is the method of [T], the thesis that :mod:`sweep.model` names; docs/accuracy.md
+describes it.
+"""
 
 from __future__ import annotations
 
@@ -62,9 +66,9 @@ MEDIAN_ROUNDS_MIN = 3
 """Least number of rounds for a median that one slow round does not change."""
 
 RANDOM_ERROR_QUANTILE = 0.95
-"""Quantile over the points that counts as a setting's error if errors are random.
+"""Quantile of the errors over the points that counts as the error of a setting with draws.
 
-Otherwise the largest error counts.
+Without draws the largest error counts.
 """
 
 
@@ -173,14 +177,14 @@ def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
 def cheapest_within_error(
     settings: Sequence[MeasuredSetting], error_max: float
 ) -> MeasuredSetting | None:
-    """Return the fastest setting with at most the given error, or None."""
+    """Return the fastest setting whose error is at most ``error_max``, or None."""
     error_limit = max(error_max, NEGLIGIBLE_ERROR)
     accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
     return min(accurate_settings, key=lambda s: s.best_seconds, default=None)
 
 
 class SettingComparison(NamedTuple):
-    """Comparison of an adaptive setting with another one (or None) of no larger error."""
+    """Adaptive setting, and another setting (or None) whose error is no larger than a limit."""
 
     adaptive: MeasuredSetting
     other: MeasuredSetting | None

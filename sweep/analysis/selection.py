@@ -297,7 +297,10 @@ PUBLISHED_CUTS = (
 """Fixed parameter and value of each published cut."""
 
 MEAN_RANGE_MIN = "5 m"
-"""Range below which points are excluded from means: the echo's own shot noise matters [T 4.2]."""
+"""Range below which points are excluded from means.
+
+At shorter ranges the echo's own shot noise matters [T 4.2].
+"""
 
 
 @dataclass(frozen=True)
@@ -374,9 +377,9 @@ def study_cuts(spec: GridSpec) -> list[Cut]:
 
 
 def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
-    """Return runs of a zipped axis in which one parameter is constant, in order.
+    """Return the constant parameter and its value for each run of a zipped axis, in order.
 
-    Each run is the constant parameter with its value.
+    In a run one of range and grazing angle is constant, while the other varies.
     """
     axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
     runs: list[tuple[AxisParameter, object]] = []

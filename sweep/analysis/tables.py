@@ -1,4 +1,7 @@
-"""Tables as text and CSV: of any variable, and of false alarms in the form of the thesis."""
+"""Tables as text and CSV: of any variable, and of false alarms in the form of the thesis.
+
+[T] is the thesis that :mod:`sweep.model` names.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +110,11 @@ def _is_numeric(cell: Cell) -> bool:
 def mean_table_page(
     points: PointSelection, spec: GridSpec, table_spec: TableSpec, units: str, title: str
 ) -> TablePage:
-    """Return the mean and median of a variable for each row and column coordinate value."""
+    """Return a page with mean and median of a variable, by the values of two coordinates.
+
+    ``table_spec`` names the coordinates of rows and columns, a selection, and published values to
+    compare with.
+    """
     points = select_where(points, spec, table_spec.where)
     if table_spec.minimum_range:
         points = select_beyond(points, spec, f"{table_spec.minimum_range!r} m", inclusive=True)
@@ -195,7 +202,7 @@ def _cross_table(
 
 
 def outputs_page(dataset: xr.Dataset) -> TablePage:
-    """Return a table of all variables of a study with a single point."""
+    """Return a page with all variables of a study of a single point."""
     records: list[dict[str, Cell]] = [
         {
             "variable": str(name),
@@ -215,9 +222,10 @@ TABLE_ROWS_MAX = 100
 
 
 def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
-    """Return mean and median of the leakage probabilities of each group of points.
+    """Return the leakage of each group of points, as part of a record.
 
-    They are for the up- and down-chirp, and for noise or leakage in both chirps.
+    The record has mean and median of the leakage probabilities of the up- and down-chirp, and of
+    the probability that noise or leakage raises an extra group in both.
     """
     dataset = groups[0].dataset
     dataset_with_shot = dataset.assign(
@@ -365,7 +373,11 @@ _THRESHOLD_COLUMNS = {
 def false_alarm_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Return the form of tables 4.3 to 4.5 [T]: false alarms of a shot by value of a coordinate."""
+    """Return a page with the false alarms of a shot for each value of a coordinate.
+
+    It has the form of tables 4.3 to 4.5 of [T]. ``printed`` are the published values, which are
+    compared with the study's.
+    """
     records = false_alarm_records(points, spec, by=by, printed=printed)
     has_printed = any(record["printed"] == record["printed"] for record in records)
     page_tables = [
@@ -392,7 +404,11 @@ def false_alarm_page(
 def threshold_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Return the form of table 4.2 [T]: false alarms of a bin for each threshold."""
+    """Return a page with the false alarms of a bin for each threshold.
+
+    It has the form of table 4.2 of [T]. ``printed`` are the published values, which are compared
+    with the study's.
+    """
     records: list[dict[str, Cell]] = []
     setting_parts = split_by_setting(points, spec, by)
     pfa_statistics = compute_statistics(

@@ -188,7 +188,10 @@ class ObjectPath:
             self.client.put(self.key, content)
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Delete the object; a missing object is never an error, whatever ``missing_ok`` is."""
+        """Delete the object, or do nothing if it does not exist.
+
+        ``missing_ok`` has no effect; `pathlib.Path` has it too.
+        """
         with translate_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)
 
@@ -236,7 +239,7 @@ class ObjectPath:
         return None
 
     def refuse_cut(self, content: bytes) -> None:
-        """Raise ObjectStoreError if a response with this content is a truncated object.
+        """Raise ObjectStoreError if a response's content is shorter than the object.
 
         A proxy may send a truncated body with a matching content length, so the client can't
         notice.
@@ -697,10 +700,10 @@ def recover_interrupted_replace(location: Location) -> None:
 
 
 def store_identity(location: Location) -> tuple[int, ...] | None:
-    """Return the identity of the store at a location; no other store has it at any time.
+    """Return an identity of the store at a location that no other store ever has.
 
-    The fields are those of the `stat` of its root document. Return None in an object store, or if
-    the document can't be opened.
+    It consists of device, inode, size and times of the store's root document. Return None in an
+    object store, or if the document can't be opened.
     """
     if not isinstance(location, Path):
         return None

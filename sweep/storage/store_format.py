@@ -172,7 +172,10 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
 
 
 def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
-    """Return the attributes of a store; raise NotAStoreError unless this version writes such."""
+    """Return the attributes of a store after checking them.
+
+    Raise NotAStoreError unless they are those of a store that this version writes.
+    """
     checked_attributes = _require_sweep_attributes(path, attributes)
     if (layout := checked_attributes.get("layout")) != LAYOUT_VERSION:
         raise NotAStoreError(

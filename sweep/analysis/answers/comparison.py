@@ -73,9 +73,9 @@ def compute_differences(
     *,
     bounded_variables: Sequence[str],
 ) -> xr.Dataset:
-    """Return the differences of variables at common points.
+    """Return the differences of variables, other minus ours, at common points.
 
-    For ``bounded_variables`` also return the allowed differences and the agreement.
+    For ``bounded_variables`` the result also has the allowed differences and the agreement.
     """
     matched_ours, matched_other = _match_points(ours, other)
     result = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
@@ -100,7 +100,7 @@ def compute_differences(
 
 
 def title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
-    """Return the title of a study, with the first digits of its id."""
+    """Return the title of a study, followed by the first eight digits of its id."""
     return (
         f"{opened_store.attrs.get('title', '')} ({str(opened_store.attrs.get('study_id', ''))[:8]})"
     )
@@ -387,7 +387,10 @@ TABULATED_VARIABLES = (
 
 
 def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
-    """Compute the differences that the table shows, by scanner; a grid has the name ''."""
+    """Compute the differences in the table of a comparison, by scanner.
+
+    The only group of a grid has the name ''.
+    """
     result = ours.sweep.compare(other)
     is_grid = isinstance(result, xr.Dataset)
     groups = (
@@ -465,7 +468,11 @@ def describe_common_shots(differences: xr.Dataset) -> str:
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
-    """Return ``same``, ``different`` or ``nothing``, and a sentence with this verdict."""
+    """Return the verdict of a comparison, and a sentence that states it.
+
+    The verdict is ``same`` or ``different``, by the probabilities of detection, or ``nothing`` if
+    no common point is computed.
+    """
     n_points, n_different, noun, count_note = 0, 0, "point", ""
     for differences in compared_groups:
         if "shot" in differences.dims:

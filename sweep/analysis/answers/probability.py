@@ -444,7 +444,7 @@ def _closed_form_pd(
 
 
 def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
-    """Return the study's threshold over the noise per quadrature."""
+    """Return the study's threshold over the noise per quadrature, at each point."""
     if looks.is_noncoherent:
         return xr.apply_ufunc(
             looks.threshold_ratio_from_log_pfa, np.log(10) * dataset["log10_pfa_bin"]

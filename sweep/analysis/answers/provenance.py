@@ -176,7 +176,7 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
 
 
 def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return for each value of a parameter's coordinate if the study has it, a bool array."""
+    """Return a mask of the values of a parameter's coordinate that the study has."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)

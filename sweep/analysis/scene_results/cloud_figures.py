@@ -115,7 +115,11 @@ _TRIAL_SIDE_INCHES = 10.0
 
 
 class ObliqueView:
-    """Oblique picture, with azimuth of the eye from x towards y, and its elevation [deg]."""
+    """Oblique picture of a point cloud, in orthographic projection.
+
+    ``azimuth`` is the direction of the eye, from x towards y, and ``elevation`` its angle above the
+    ground plane [deg].
+    """
 
     scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
 
@@ -242,9 +246,10 @@ AXIS_VIEW_WIDTH_MAX_INCHES, AXIS_VIEW_HEIGHT_MAX_INCHES, AXIS_VIEW_SIDE_MIN_INCH
 
 
 class AxisView:
-    """Picture along a world axis; `axis_names` are horizontal, vertical and viewing axis.
+    """Picture of a point cloud along a world axis.
 
-    `nearest_sign` is 1 if the eye is at the upper end of the viewing axis, and -1 at its lower end.
+    `axis_names` are horizontal, vertical and viewing axis. `nearest_sign` is 1 if the eye is at the
+    upper end of the viewing axis, and -1 at its lower end.
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {}

@@ -53,7 +53,7 @@ class ConsistencyResult(NamedTuple):
     scanner: str
     quantity: str
     error_ratio: float
-    """Largest ratio of an error quantile to that of normal errors of the stated size; ideally 1."""
+    """Quantile of the errors over that of normal errors of the stated size; ideally 1."""
     n_errors: int
     """Number of sampled errors."""
 
@@ -134,7 +134,10 @@ def inconsistency_messages(store: str | Location, scanner: str | None = None) ->
 
 
 def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Yield samples of a scanner's arrays in memory: a small one complete, else even intervals."""
+    """Yield samples of a scanner's arrays, loaded into memory.
+
+    A short flight is one sample, a long flight is sampled in evenly spaced intervals.
+    """
     n_shots, shots_per_cycle = group.sizes["shot"], int(group.attrs["shots_a_cycle"])
     axis_indices = {
         str(dim): np.unique(

@@ -310,7 +310,10 @@ def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
 
 
 def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
-    """Return the statistics of each row of panels: joint ones first, then those of components."""
+    """Return the statistics of each row of panels.
+
+    Availability and the error of the vector's length come first, then those of each component.
+    """
     n_components = len(COMPONENTS[quantity])
     component_indices = list(range(n_components))
     if n_components == 1:

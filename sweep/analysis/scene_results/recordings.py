@@ -48,7 +48,7 @@ _INTERPOLATED_NAMES = {
 
 
 def array_name(name: str, ranges: str) -> str:
-    """Return the array of a quantity: the interpolated one, if it is requested and exists."""
+    """Return the name of a quantity's array: the interpolated one, if requested and existing."""
     return _INTERPOLATED_NAMES.get(name, name) if ranges == INTERPOLATED else name
 
 
@@ -65,7 +65,7 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Positive quantities that span orders of magnitude, shown on a logarithmic scale."""
 
 POINT_KINDS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of the flags of which every point has exactly one."""
+"""Bits of the flags that tell the kind of a point; each point has exactly one of them."""
 
 
 @dataclass(frozen=True)
@@ -414,7 +414,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
-    """Return the position with the given indices along the axes."""
+    """Return the position with the given index along each axis."""
     axis_indices = {
         axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
     }
