@@ -91,6 +91,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         creates nor returns arrays. The kernel then skips reference counting of the arrays in its
         arguments. Counting takes most of the time of a short kernel that receives records of
         arrays. Creating or returning an array in such a kernel is a compilation error.
+        `forceinline=True`, numba's own, compiles a kernel into those that call it. A call copies
+        every array of its records to the stack, which takes most of the time of a loop over draws.
 
     Returns
     -------
@@ -109,6 +111,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     # Reference counting (NRT) has no public option in numba. A kernel without an explicit value
     # inherits that of the kernel that calls it.
     options["_nrt"] = not borrows
+    options.setdefault("forceinline", False)  # likewise
 
     def declare(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**(DEFAULT_NJIT_OPTIONS | options))(function)

@@ -1047,7 +1047,7 @@ def insert_peak(peak, peak_bins, peak_ratios, n_peaks):
     return n_peaks
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_leaked_peaks(
     address,
     point_and_segment,

@@ -1364,7 +1364,7 @@ def fill_detection_weights(
     weights /= math.sqrt(weighted_power)
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
     """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
     for g in range(speckle.n_bins.shape[0]):
@@ -1426,7 +1426,7 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
                     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
     """Pair the peaks of one point (i, draw) into returns, and judge each.
 
@@ -1492,7 +1492,7 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
         drawn_peaks.flags[i, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_segment_peaks(
     address,
     point_and_segment,
@@ -1726,7 +1726,7 @@ def list_noisy_leaked_peaks(
     return insert_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, n_peaks)
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_peak_bin(
     address,
     point_and_segment,
@@ -1819,7 +1819,7 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
     return magnitude * speckle.amplitudes[group, 0, segment, bin_index]
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def detect_in_speckle(
     address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
 ):
@@ -2000,7 +2000,7 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
         draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, scratch)
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def is_near_end(first_bin, n_bins, config):
     """Return true of adjacent bins so near to DC or Nyquist that the noise's quadratures differ."""
     n_near_bins = config.noise_pseudo_variance_ratio.size
@@ -2057,7 +2057,7 @@ def draw_three_bin_noise(address, first_index, interpolation, scratch):
     )
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_all_bins(
     address,
     point_and_segment,
