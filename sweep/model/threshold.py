@@ -16,8 +16,8 @@ power, over sigma of one record. The probabilities then refer to all looks toget
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
-from typing import Any
+from functools import lru_cache, reduce
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -108,23 +108,52 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
             segments = list(segment_order)
     if band_bins is not None:
         log_pfa = log_pfa + np.zeros(band_bins.shape[2:])
-    return solve_threshold_ratio(log_pfa, _log_pfa_law(parameters, segments)) / RAYLEIGH_DEVIATION
+    noise_bins = tuple(_noise_bins(parameters, segment) for segment in segments)
+    if band_bins is None and log_pfa.ndim == 0:
+        return _common_threshold_ratio(float(log_pfa), looks, noise_bins) / RAYLEIGH_DEVIATION
+    return solve_threshold_ratio(log_pfa, _log_pfa_law(looks, noise_bins)) / RAYLEIGH_DEVIATION
+
+
+class NoiseBins(NamedTuple):
+    """Bins of a segment in which noise raises alarms."""
+
+    n_bins: float | np.ndarray
+    """Number of the bins; (n,) if a band is searched, else one number for all points."""
+    neighbour_correlation: float
+    """Correlation of the noise of neighbouring bins; 0 of bins that count as independent."""
+
+    def alarm_equivalent_bins(self, threshold_ratio: np.ndarray, looks: Looks) -> np.ndarray:
+        """Return the number of independent bins that alarm as often as these."""
+        return bin_noise.alarm_equivalent_bins(
+            self.n_bins,
+            threshold_ratio=threshold_ratio,
+            correlation=self.neighbour_correlation,
+            looks=looks,
+        )
+
+
+@lru_cache(maxsize=64)
+def _common_threshold_ratio(
+    log_pfa: float, looks: Looks, noise_bins: tuple[NoiseBins, ...]
+) -> np.ndarray:
+    """Return the threshold over sigma of all points of a study that share their probability."""
+    return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_law(looks, noise_bins))
 
 
 def _log_pfa_law(
-    parameters: Mapping[str, Any], segments: Sequence[str]
+    looks: Looks, noise_bins: Sequence[NoiseBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from b to the log probability that noise raises an alarm in segments."""
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
-    bin_log_pfa = Looks.from_parameters(parameters).log_pfa
     return lambda threshold_ratio: reduce(
         log_either_probability,
         (
             log_at_least_one_probability(
-                bin_log_pfa(threshold_ratio), segment_alarm_bins(parameters, threshold_ratio, s)
+                looks.log_pfa(threshold_ratio),
+                of_segment.alarm_equivalent_bins(threshold_ratio, looks),
             )
-            for s in segments
+            for of_segment in noise_bins
         ),
     )
 
@@ -147,20 +176,24 @@ def segment_alarm_bins(
     --------
     sweep.model.preparation.Shots.alarm_equivalent_bins : The number less the bins of a detection.
     """
+    looks = Looks.from_parameters(parameters)
+    n_bins = _noise_bins(parameters, segment).alarm_equivalent_bins(threshold_ratio, looks)
+    return n_bins + np.zeros(np.shape(threshold_ratio))
+
+
+def _noise_bins(parameters: Mapping[str, Any], segment: str) -> NoiseBins:
+    """Return the bins of a segment in which noise raises alarms."""
     fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
-    counts_all_bins = str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"
     is_complex_record = str(parameters.get("instrument.receiver.record", "real")) == "complex"
-    counts_all_bins |= is_complex_record
+    counts_all_bins = is_complex_record or (
+        str(parameters[PROCESSING_PREFIX + "bins_counted"]) == "all"
+    )
     band_bins, segment_index = search_band_bins(parameters), SEGMENT_NAMES.index(segment)
     if str(parameters[PROCESSING_PREFIX + "noise_bins"]) == "independent":
-        if band_bins is not None:
-            n_searched = n_alarm_bins(band_bins, fft_size, 1, is_signed=is_complex_record)[
-                segment_index
-            ]
-            return n_searched + np.zeros(np.shape(threshold_ratio))
-        return np.full(
-            np.shape(threshold_ratio), float(fft_size if counts_all_bins else fft_size // 2)
-        )
+        if band_bins is None:
+            return NoiseBins(float(fft_size if counts_all_bins else fft_size // 2), 0.0)
+        n_searched = n_alarm_bins(band_bins, fft_size, 1, is_signed=is_complex_record)
+        return NoiseBins(n_searched[segment_index], 0.0)
     record_window = get_window(
         canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"])),
         int(np.max(record_length(parameters))),
@@ -173,10 +206,4 @@ def segment_alarm_bins(
         n_bins = n_alarm_bins(band_bins, fft_size, first_alarm_bin, is_signed=is_complex_record)[
             segment_index
         ]
-    correlation = bin_noise.neighbour_noise_correlation(record_window, fft_size)
-    return bin_noise.alarm_equivalent_bins(
-        n_bins,
-        threshold_ratio=threshold_ratio,
-        correlation=correlation,
-        looks=Looks.from_parameters(parameters),
-    )
+    return NoiseBins(n_bins, bin_noise.neighbour_noise_correlation(record_window, fft_size))
