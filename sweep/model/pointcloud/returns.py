@@ -857,8 +857,10 @@ def _add_drift_errors(
     )
     peaks = drawn_peaks.peaks.copy()
     offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
-    drift_errors = drift_error(offset, drift_bins.T[:, None, None], shots.window, shots.fft_size)
-    peaks[..., ERROR_COLUMN] = np.hypot(peaks[..., ERROR_COLUMN], drift_errors)
+    has_peak = np.isfinite(offset)  # few of the entries for returns are filled
+    drift_of_peak = np.broadcast_to(drift_bins.T[:, None, None], offset.shape)[has_peak]
+    drift_errors = drift_error(offset[has_peak], drift_of_peak, shots.window, shots.fft_size)
+    peaks[has_peak, ERROR_COLUMN] = np.hypot(peaks[has_peak, ERROR_COLUMN], drift_errors)
     return drawn_peaks._replace(peaks=peaks)
 
 
