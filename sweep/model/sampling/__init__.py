@@ -1,1 +1,1 @@
-"""Random draws: generators of numbers, random effects, noise and whole noisy spectra."""
+"""Random draws: random numbers, random effects, noise and full noisy spectra."""

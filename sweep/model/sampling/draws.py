@@ -1,17 +1,19 @@
-"""Random draws of shots: detections and false alarms counted, batch by batch.
+"""Random draws of shots: count detections and false alarms, batch by batch.
 
-Two ways that agree in the mean. ``probabilities`` is [T 3.3.2]'s: uniform numbers against pd and
-the probability of a false alarm (noise and leakage together). ``noise`` adds complex Gaussian
-noise to the bins of the echo, alike as window and padding make it, and looks. Over the other bins,
-which hold noise alone, the largest magnitude is drawn from the order statistic of as many
-independent ones as alarm as often. If effects are random, each draw has a spectrum and
-probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling.samplers`, which
-also says
-when to stop. Echoes in developed speckle fade by factors that the segments have partly in common,
-or, where any bin detects, by the lines of their footprint
-(:mod:`sweep.model.sampling.speckle_lines`).
+Two methods agree in the mean. ``probabilities`` is the method of [T 3.3.2]. It compares uniform
+random numbers with pd and with the probability of a false alarm by noise and leakage together.
+``noise`` adds complex Gaussian noise to the bins of the echo, in each look, correlated between bins
+as window and padding make it. The other bins hold noise alone. Their largest magnitude follows from
+the order statistic of an equivalent number of independent bins, which has the same probability of a
+false alarm.
 
-Every number is addressed by point, draw, cause and index (:mod:`sweep.model.sampling.philox`).
+If effects are random, each draw has a spectrum, probabilities and noise of its own
+(:mod:`sweep.model.sampling.samplers`, which also decides when to stop). Echoes in developed speckle
+fade by factors that are correlated between segments. If any bin may detect an echo, the factors
+follow from the lines of its footprint (:mod:`sweep.model.sampling.speckle_lines`).
+
+Every random number is addressed by point, draw, cause and index
+(:mod:`sweep.model.sampling.philox`).
 """
 
 import math
@@ -46,23 +48,24 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 PD_BOTH_CHIRPS = "pd_both_chirps"
-"""Probability of a detection in both chirps, beside the outputs where any two segments detect."""
+"""Name of the probability of a detection in both chirps. It is an additional output if any two
+segments detect a shot."""
 
 _DRAWS_PER_STEP = 256
-"""Draws of a row whose random numbers are made together."""
+"""Number of draws of a point whose random numbers are generated together."""
 
 
 class DrawRanges(NamedTuple):
-    """Spectra, (m,) each, of a run of draws."""
+    """Ranges of consecutive draws of m points or prepared spectra, (m,) each."""
 
     point_index: np.ndarray
-    """int64: the point whose counts they add to."""
+    """int64: index of the point to whose counts the draws are added."""
     keys: np.ndarray
-    """(m, 2) uint64: random key of that point."""
+    """(m, 2) uint64: random key of the point."""
     first_draw: np.ndarray
     """int64: number of the first draw."""
     end_draw: np.ndarray
-    """int64: number after the last."""
+    """int64: number after the last draw."""
 
 
 def count_by_probability(
@@ -71,10 +74,20 @@ def count_by_probability(
     outputs: Mapping[str, np.ndarray],
     counts: np.ndarray,
 ) -> None:
-    """Add the draws of some rows, held against their outputs, to the counts.
+    """Count detections and false alarms in draws that are compared with probabilities.
 
-    ``batch_edges`` (batches + 1,) are the numbers of draws between batches; the counts, int64, are
-    (names, points, batches) in the order of :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`.
+    Parameters
+    ----------
+    draw_ranges
+        Draws of m points.
+    batch_edges
+        (batches + 1,) int64: numbers of the draws at which batches begin, and the number after the
+        last draw.
+    outputs
+        Outputs (m,) of the points by name.
+    counts
+        (names, points, batches) int64, in the order of
+        :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     n_rows, probabilities = draw_ranges.point_index.size, _draw_probabilities(outputs)
     no_filter = np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0
@@ -104,7 +117,21 @@ def count_by_probability(
 def count_in_noise(
     draw_ranges: DrawRanges, batch_edges: np.ndarray, shots: Shots, counts: np.ndarray
 ) -> None:
-    """Count the draws of some rows in the noise of their shots."""
+    """Count detections and false alarms in draws of the noise of shots.
+
+    Parameters
+    ----------
+    draw_ranges
+        Draws of the m points of `shots`.
+    batch_edges
+        (batches + 1,) int64: numbers of the draws at which batches begin, and the number after the
+        last draw.
+    shots
+        Prepared shots of m points.
+    counts
+        (names, points, batches) int64, in the order of
+        :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
+    """
     threshold_and_noise = threshold_and_line_noise_ratios(shots)
     mixing = (
         np.empty((0, shots.size))
@@ -144,10 +171,23 @@ def count_in_noise(
 def make_echo_noise_filter(
     shots: Shots, spectra: "NoiselessSpectra", bins_min: int = 0
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Filter of the noise of an echo's bins, none where the largest alone detects; N or 0.
+    """Return the filter that makes the noise of an echo's bins from independent numbers.
 
-    It has ``bins_min`` bins where any detects, if that is more than there are. The last is N where
-    noise at DC and Nyquist is real.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    spectra
+        Noiseless spectra of the shots.
+    bins_min
+        Smallest number of bins of the filter if any bin detects an echo.
+
+    Returns
+    -------
+    tuple
+        Weights (bins, taps), first number (bins,) int64 of each bin, and FFT size N if the noise at
+        DC and Nyquist is real, else 0. The filter has no bins if only the largest bin of an echo
+        detects it.
     """
     n_echo_bins = (
         max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule[1] else 0
@@ -161,14 +201,15 @@ def make_echo_noise_filter(
 
 
 ROOT_BINS_MAX = 16
-"""Bins of which noise is made of as few numbers as there are bins."""
+"""Largest number of adjacent bins whose noise is made from one independent number for each bin."""
 
 
 def noise_covariance_root(filter_rule: tuple[np.ndarray, np.ndarray, int]) -> np.ndarray:
-    """Return the triangular matrix (k, k) that makes the noise of adjacent bins of k numbers.
+    """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
-    Of the filter of :func:`make_echo_noise_filter`, up to ROOT_BINS_MAX bins; away from DC and
-    Nyquist, where :func:`draw_bin_noise` says how bins are alike.
+    It is the Cholesky factor of the covariance under a filter of :func:`make_echo_noise_filter`,
+    for at most ROOT_BINS_MAX bins. It holds away from DC and Nyquist, where :func:`draw_bin_noise`
+    correlates bins.
     """
     weights, start, _ = filter_rule
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)
@@ -193,14 +234,20 @@ def noise_covariance_root(filter_rule: tuple[np.ndarray, np.ndarray, int]) -> np
 
 
 _REMAINDER_MIN = 1e-9
-"""Share of a bin's noise that its neighbours do not make, below which there is none."""
+"""Fraction of a bin's noise variance, unexplained by its neighbours, that is neglected below this.
+"""
 
 
 def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Probabilities of a false alarm, and of a detection without and with one in the up segment.
+    """Return probabilities by segment (up, Doppler, down) that uniform numbers are compared with.
 
-    By segment (up, Doppler, down), (3, 3, n); of a detection in the Doppler segment where not one
-    alone of the other two has a detection, and where one has, which decides if any two detect.
+    Returns
+    -------
+    ndarray (3, 3, n)
+        First index 0: probability of a false alarm. Index 1 and 2: probability of a detection
+        without and with a condition. For the down segment the condition is a detection in the up
+        segment. For the Doppler segment it is a detection in exactly one of the other two, which
+        then decides whether any two detect. The up segment has no condition.
     """
     pd_up, pd_down, pd_shot = (
         np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot")
@@ -241,9 +288,17 @@ def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> np.ndarray:
-    """Probabilities of a detection in the down segment, without and with one in up, (2, ...).
+    """Return the pd of the down segment given no detection, and given one, in the up segment.
 
-    From those of either segment and of both.
+    Parameters
+    ----------
+    pd_up, pd_down, pd_both
+        Probability of a detection in the up segment, in the down segment, and in both, (...).
+
+    Returns
+    -------
+    ndarray (2, ...)
+        (pd_down - pd_both) / (1 - pd_up), and pd_both / pd_up.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         without_up = np.where(
@@ -255,50 +310,57 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
 
 
 def threshold_and_line_noise_ratios(shots: Shots) -> np.ndarray:
-    """Threshold and noise under the lines, over the noise of any other bin, (2, n)."""
+    """Return threshold and noise under the lines, both over the noise of any other bin, (2, n)."""
     ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
     return np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
 
 
 ECHO_NOISE_FIRST_INDEX = 1 << 24
-"""Numbers of the noise of an echo's bins, from which they count apart from those of single bins."""
+"""Stream index of the first random number of the noise of an echo's bins. Smaller indices are used
+by bins that are drawn one by one."""
 
 
 class NoiselessSpectra(NamedTuple):
-    """Spectra without noise, by point and segment (m, 3), for noise to be added to."""
+    """Spectra without noise by point and segment, (m, 3), to which noise is added.
+
+    Bins of a segment are numbered from its ``first_bin``.
+    """
 
     first_bin: np.ndarray
-    """int64: first of the bins that hold signal, from which they are numbered."""
+    """int64: first bin that holds signal."""
     peak_index: np.ndarray
-    """int64: number of the largest."""
+    """int64: number of the bin with the largest magnitude."""
     peak_ratio: np.ndarray
-    """Its |X| / sigma; nan for a segment that does not exist."""
+    """Largest magnitude |X| / sigma; nan for a segment that does not exist."""
     has_real_noise: np.ndarray
-    """bool: whether noise is real there."""
+    """bool: True if the noise in the largest bin is real, as at DC and Nyquist."""
     bins_start: np.ndarray
-    """int64: where the segment's bins begin in the two that follow, from ``first_bin`` on."""
+    """int64: index of the segment's first bin in ``bin_ratios`` and ``is_echo``."""
     n_bins: np.ndarray
-    """int64: number of these."""
+    """int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
     bin_ratios: np.ndarray
-    """|X| / sigma of all bins."""
+    """(bins,): |X| / sigma of the bins of all segments."""
     is_echo: np.ndarray
-    """bool: whether they are of the echo."""
+    """(bins,) bool: True for bins of the echo."""
     n_noise_bins: np.ndarray
-    """Bins that count for false alarms and hold noise alone."""
+    """Equivalent number of independent bins that count for false alarms and hold noise alone."""
     leaked_slice: np.ndarray
-    """(m, 3, 2) int64: first of the bins below, and after the last; none without leakage."""
+    """(m, 3, 2) int64: index of the segment's first bin in the arrays of leaked signal, and the
+    index after the last; equal without leakage."""
     leaked_index: np.ndarray
-    """int64: numbers of bins of leaked signal, that may raise a false alarm by themselves."""
+    """(leaked,) int64: numbers of bins of leaked signal, which may raise a false alarm by
+    themselves."""
     leaked_ratio: np.ndarray
-    """|X| / sigma of them."""
+    """(leaked,): |X| / sigma of the bins of leaked signal."""
     exempt_neighbour_ratio: np.ndarray
-    """|X| / sigma of the bin next to each of them that is exempt from false alarms, 0 for none."""
+    """(leaked,): |X| / sigma of the neighbour of a bin of leaked signal that is exempt from false
+    alarms; 0 without one."""
     exempt_neighbour_side: np.ndarray
-    """int64: 1 where that bin is above, else -1."""
+    """(leaked,) int64: 1 if the exempt neighbour is above the bin, -1 if it is below."""
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
-        """No spectra, for what is drawn against probabilities."""
+        """Return spectra without bins, for draws that are compared with probabilities."""
         zeros, empty_slices = (
             np.zeros((n_points, 3), np.int64),
             np.zeros((n_points, 3, 2), np.int64),
@@ -322,12 +384,17 @@ class NoiselessSpectra(NamedTuple):
 def iter_noiseless_spectra(
     shots: Shots, point_indices: np.ndarray | None = None
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra]]:
-    """Yield points of some shots, all or those of ``point_indices``, and their spectra.
+    """Yield indices of points and their noiseless spectra, in parts that fit the memory.
 
-    As many at once as memory holds.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    point_indices
+        Points to include; by default all.
     """
     noise_sigma, has_real_ends = shots.bin_noise_sigma, shots.real_fft_size > 0
-    # Without leakage none but the peak is looked at.
+    # Without leakage only the peak is evaluated.
     negligible_ratio = (
         shots.negligible_signal_ratio + np.zeros(shots.size)
         if shots.includes_leakage
@@ -340,7 +407,7 @@ def iter_noiseless_spectra(
         n_bins, start, peak_index = (
             c.T.ravel() for c in (spans.n_bins, spans.span_start, spans.peak_index)
         )
-        span_of_bin = np.repeat(np.arange(n_bins.size), n_bins)  # of each bin, point by point
+        span_of_bin = np.repeat(np.arange(n_bins.size), n_bins)  # segment of each bin
         index_in_span = np.arange(span_of_bin.size) - (np.cumsum(n_bins) - n_bins)[span_of_bin]
         flat_index, point_of_bin = (
             start[span_of_bin] + index_in_span,
@@ -384,7 +451,7 @@ def iter_noiseless_spectra(
             exempt_neighbour_ratio=np.maximum(below, above)[is_leaked],
             exempt_neighbour_side=np.where(above >= below, 1, -1)[is_leaked],
         )
-        # In C order as those of `nothing`: numba compiles anew for each order.
+        # In C order as in `NoiselessSpectra.empty`: numba compiles anew for each order.
         yield spans.point_numbers, NoiselessSpectra(*map(np.ascontiguousarray, spectra))
 
 
@@ -402,22 +469,42 @@ def _count_draws(
     sidelobe_correlation,
     counts,
 ):
-    """Add the draws of each row to the counts.
+    """Add the detections and false alarms of each row's draws to the counts.
 
-    ``config``: whether in noise; filter of an echo's noise, as of :func:`make_echo_noise_filter`;
-    whether any two segments detect a shot. ``threshold_and_noise`` (2,
-    m): :func:`threshold_and_line_noise_ratios`; ``bin_threshold_table`` (7, m) the levels of bins
-    of which any detects
-    (:class:`sweep.model.detection.echo_detection.BinThreshold`). ``probabilities`` (3, 3, m): those
-    of a false alarm in
-    bins that are not looked at one by one, and, of no meaning in noise, of a detection without and
-    with one in the up segment. ``mixing`` (6, m):
-    :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`, or nothing.
-    ``pseudo_variance_and_lines``: rows (3, m) of the pseudo-variances near DC and Nyquist
-    (:class:`sweep.model.detection.pseudo_variance.SignalPseudoVariance`), these, and N/2; lines of
-    footprints in
-    developed speckle, and their middles (m, 3) [bins]. ``sidelobe_correlation``: that of
-    neighbours' noise in phase with the signal.
+    Parameters
+    ----------
+    draw_ranges
+        :class:`DrawRanges` of m rows.
+    batch_edges
+        (batches + 1,): numbers of the draws at which batches begin, and the number after the last
+        draw.
+    threshold_and_noise
+        (2, m): :func:`threshold_and_line_noise_ratios`.
+    bin_threshold_table
+        (7, m): :attr:`sweep.model.preparation.Shots.bin_threshold_table` of the rows, for echoes
+        that any bin may detect.
+    probabilities
+        (3, 3, m): probability of a false alarm in bins that are not evaluated one by one, and of a
+        detection without and with a condition (:func:`_draw_probabilities`). The last two are
+        unused if noise is drawn.
+    config
+        True if noise is drawn; the three parts of :func:`make_echo_noise_filter`; and (m,) bool,
+        True if any two segments detect a shot.
+    spectra
+        :class:`NoiselessSpectra` of the rows.
+    mixing
+        (6, m): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`;
+        (0, m) without speckle.
+    pseudo_variance_and_lines
+        Rows (3, m) of the pseudo-variance ratios near DC and Nyquist, these ratios
+        (:class:`sweep.model.detection.pseudo_variance.SignalPseudoVariance`), N/2, the
+        :class:`SpeckleLineGrid` of the footprints in developed speckle, and the mean positions (m,
+        3) of their lines [bins].
+    sidelobe_correlation
+        Correlation of the noise of neighbouring bins in phase with the signal.
+    counts
+        (names, points, batches) int64, in the order of
+        :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     in_noise, weights, start, real_ends, any_two = config
     noise_scratch = np.empty((4, weights.shape[0] + weights.shape[1]))
@@ -552,9 +639,9 @@ def _mark_leakage_alarms(
     random_words,
     has_alarm,
 ):
-    """Mark the draws in which bins of leaked signal, with their noise, raise a further group.
+    """Mark the draws in which bins of leaked signal, with their noise, raise a false alarm.
 
-    Bins that cross next to an echo whose outermost bin crosses are part of the echo.
+    Crossing bins that are adjacent to an echo whose outermost bin crosses belong to the echo.
 
     Parameters
     ----------
@@ -567,20 +654,20 @@ def _mark_leakage_alarms(
     threshold_ratio
         Threshold [sigma].
     sidelobe_correlation
-        Correlation of neighbours' noise in phase with the signal.
+        Correlation of the noise of neighbouring bins in phase with the signal.
     magnitude_factors
         (draws,): factors on magnitudes by speckle.
     random_words
-        Room for random numbers (4, draws).
+        (4, draws) uint64: scratch for random numbers.
     has_alarm
-        Result (draws,), bool: True where they do.
+        (draws,) bool: set to True in draws with a false alarm.
     """
     stream, n_draws = STREAM_NOISE[point_and_segment[1]], address[3]
     independent_part = math.sqrt(1.0 - sidelobe_correlation * sidelobe_correlation)
     zeros, joins_echo = np.zeros(n_draws), np.zeros(n_draws, np.bool_)
     begin, end = spectra.leaked_slice[point_and_segment]
-    # A group that begins beside an echo is the echo's to its end, and one that ends beside an echo
-    # from its begin: an alarm waits until its group ends.
+    # A group that begins or ends next to an echo belongs to the echo as a whole. So an alarm
+    # is pending until its group ends.
     is_pending, is_crossing = np.zeros(n_draws, np.bool_), np.empty(n_draws, np.bool_)
     for leaked_bin in range(begin, end):
         if (
@@ -631,7 +718,10 @@ def _mark_leakage_alarms(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_factors(key, draw, group, mixing):
-    """Factors of a draw on a group's magnitudes in the three segments; their mean square is 1."""
+    """Return the factors of a draw on a group's magnitudes in up, Doppler and down segment.
+
+    Their mean square is 1. The arguments are as in :func:`speckle_amplitudes`.
+    """
     up, doppler, down = speckle_amplitudes(key, draw, group, mixing)
     return (
         math.hypot(up[0], up[1]),
@@ -642,9 +732,24 @@ def speckle_factors(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_amplitudes(key, draw, group, mixing):
-    """Amplitudes of a draw of a group in the three segments, complex; their mean square is 1.
+    """Return the complex amplitudes of a group of bins in a draw, of mean square 1.
 
-    Three standard normal amplitudes of the stream, those of the group's number, mixed.
+    Parameters
+    ----------
+    key
+        Random key of the point, two uint64.
+    draw
+        Number of the draw.
+    group
+        Number of the group of bins.
+    mixing
+        (6,): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`.
+
+    Returns
+    -------
+    tuple
+        Real and imaginary part in the up, Doppler and down segment. They are mixtures of three
+        independent circular normal amplitudes of the group.
     """
     stream, root_half = philox.STREAM_SPECKLE, math.sqrt(0.5)
     a, b = philox.normal_pair(key[0], key[1], draw, stream, 3 * group)
@@ -673,9 +778,11 @@ def speckle_amplitudes(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_random_events(address, stream, probabilities, condition, random_words, is_marked):
-    """Mark the draws (key, first, number) in which something happens, by two probabilities.
+    """Mark the draws in which an event happens with a given probability.
 
-    The second is that of draws that are ``condition``. These may be the ones that are marked.
+    `address` holds key, first draw and number of draws. A draw has the second of the
+    `probabilities` if its `condition` is True, else the first. `condition` may be the same array as
+    `is_marked`.
     """
     philox.fill_words(
         address[:3],
@@ -692,7 +799,7 @@ def _mark_random_events(address, stream, probabilities, condition, random_words,
 
 @njit(cache=True, error_model="numpy")
 def _echo_end_indices(point_and_segment, spectra):
-    """First and last bin of an echo, from those of the spectrum; the last is -1 of none."""
+    """Return the numbers of the first and last bin of an echo; the last is -1 without an echo."""
     bins_start, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
     first_index, last_index = 0, n_bins - 1
     while first_index < n_bins and not spectra.is_echo[bins_start + first_index]:
@@ -704,11 +811,12 @@ def _echo_end_indices(point_and_segment, spectra):
 
 @njit(cache=True, error_model="numpy")
 def _draw_echo_amplitudes(address, column, spectra, pseudo_variance_and_lines, segment_factors):
-    """Draw amplitudes (3, draws, bins) of an echo's bins in developed speckle, of mean power 1.
+    """Draw complex amplitudes (3, draws, bins) of an echo's bins in developed speckle.
 
-    Those of the lines of its footprint; bins that no line reaches have that of the strongest bin.
-    ``segment_factors`` (3, draws) takes the size of the strongest bin's.
-    ``pseudo_variance_and_lines`` is the ``quadratures`` of :func:`_count_draws`.
+    The amplitudes have mean power 1 and follow from the lines of the footprint. Bins that no line
+    reaches have the amplitude of the strongest bin. ``segment_factors`` (3, draws) is set to the
+    magnitude of the strongest bin's amplitude. ``pseudo_variance_and_lines`` is as in
+    :func:`_count_draws`.
     """
     line_grid, line_centre = (
         pseudo_variance_and_lines[3],
@@ -780,9 +888,9 @@ def _mark_any_bin_crossings(
 ):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
 
-    ``bin_threshold`` are the :class:`sweep.model.detection.echo_detection.BinThreshold` of the
-    point. ``echo_amplitudes`` (draws,
-    bins): amplitudes of the echo's bins, of none if it does not fade. A pedestal fades as they do.
+    ``bin_threshold`` is the :class:`sweep.model.detection.echo_detection.BinThreshold` of the
+    point. ``echo_amplitudes`` (draws, bins) are the complex amplitudes of the echo's bins, with no
+    bins if the echo does not fade. The phase-noise pedestal fades with the echo's bins.
     """
     begin, n_bins = spectra.bins_start[point_and_segment], spectra.n_bins[point_and_segment]
     bin_ratios, is_echo = (
@@ -827,12 +935,26 @@ def _mark_any_bin_crossings(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch):
-    """Noise of adjacent bins over sigma, in phase with the signal and across, to rows 0 and 1.
+    """Draw the noise of adjacent bins over sigma, correlated as window and padding make it.
 
-    ``address``: key of the point, number of the draw, stream; independent numbers count from
-    ``first_index``. ``first_bin``, ``n_bins``: first bin, number of bins. ``filter_rule``:
-    :func:`make_echo_noise_filter`.
-    ``scratch`` (4, >= count + TAPS): result, and the independent numbers.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64), number of the draw, and stream.
+    first_index
+        Stream index of the first pair of independent numbers.
+    first_bin, n_bins
+        First bin and number of bins.
+    filter_rule
+        Result of :func:`make_echo_noise_filter`.
+    scratch
+        (4, >= n_bins + taps): rows 0 and 1 are set to the noise in phase with the signal and in
+        quadrature; rows 2 and 3 hold the independent numbers.
+
+    Notes
+    -----
+    At DC and Nyquist of a real record the noise is real, and bins on either side are complex
+    conjugates.
     """
     weights, start, real_fft_size = filter_rule
     n_taps = weights.shape[1]
@@ -850,7 +972,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch
         re, im = 0.0, 0.0
         for m in range(n_taps):
             j = start[k] + m - first_number
-            sign = -1.0 if is_symmetric and j < 0 else 1.0  # a real record's are conjugate
+            sign = -1.0 if is_symmetric and j < 0 else 1.0  # conjugate in a real record
             re += weights[k, m] * scratch[2, abs(j)]
             im += weights[k, m] * sign * scratch[3, abs(j)]
         i = n_bins - 1 - k if is_from_nyquist else k
@@ -859,10 +981,11 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise_by_root(address, first_index, n_bins, root, scratch):
-    """Noise of ``n_bins`` adjacent bins over sigma, to rows 0 and 1 of ``scratch`` (4, >= count).
+    """Draw the noise of ``n_bins`` adjacent bins over sigma, by a root of its covariance.
 
-    ``address`` and ``first_index`` are as of :func:`draw_bin_noise`, with an even number; ``root``
-    is :func:`noise_covariance_root`.
+    ``address`` and ``first_index``, which is even, are as in :func:`draw_bin_noise`. ``root`` is
+    the result of :func:`noise_covariance_root`. Rows 0 and 1 of ``scratch`` (4, >= n_bins) are set
+    to the noise in phase with the signal and in quadrature.
     """
     for k in range(0, n_bins, 2):
         words = philox.four_words(
@@ -883,9 +1006,9 @@ def draw_bin_noise_by_root(address, first_index, n_bins, root, scratch):
 def _mark_crossings(address, stream, pair_index, crossing, random_words, is_marked):
     """Mark the draws in which a bin, with its noise, reaches the threshold.
 
-    ``pair_index``: pair of the stream that the noise is. ``crossing``: |X| / sigma; the noise's
-    deviations
-    in its phase and across; the threshold, a power; factors on |X| in both, draw by draw.
+    ``pair_index`` is the stream index of the pair of numbers that make the noise. ``crossing``
+    holds |X| / sigma; the noise's deviations in phase and in quadrature; the square of the
+    threshold; and factors (draws,) on |X| in phase and in quadrature.
     """
     ratio, noise_deviation, threshold, along, across = crossing
     philox.fill_words(
@@ -903,9 +1026,16 @@ def _mark_crossings(address, stream, pair_index, crossing, random_words, is_mark
 
 @njit(cache=True, error_model="numpy")
 def largest_noise_magnitude(n_bins, probability, n_looks):
-    """|X| / sigma that the largest of so many bins of noise exceeds with the given probability.
+    """Return the |X| / sigma that the largest of n noise bins exceeds with a given probability.
 
-    The root of the mean power of some looks.
+    Parameters
+    ----------
+    n_bins
+        Equivalent number of independent bins.
+    probability
+        Probability, 0..1.
+    n_looks
+        Number of looks; |X| is then the root of their mean power.
     """
     if not n_bins > 0.0:
         return 0.0
@@ -917,7 +1047,10 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
 
 @njit(cache=True, error_model="numpy")
 def gamma_upper_quantile(order, probability):
-    """Return x of Q(n, x) = `probability`, which a Gamma variable of whole order exceeds."""
+    """Return the x that a Gamma variable exceeds with a probability: Q(n, x) = `probability`.
+
+    The order n is an integer; the scale is 1.
+    """
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
     for _ in range(60):
         x = 0.5 * (low + high)

@@ -1,39 +1,37 @@
-"""Complex spectra of a shot with noise in every bin, and what is found in them, draw by draw.
+"""Complex spectra of shots with noise in every bin, and their detections, draw by draw.
 
-Noise is drawn as the receiver makes it: white Gaussian in the record, which is windowed, padded and
-transformed. So bins are alike as far as window and padding make them, and DC and Nyquist are what
-they are. Every sample is addressed by point, draw, segment and place
+Noise is drawn as the receiver makes it: white Gaussian noise in the record, which is windowed,
+padded and transformed. So bins are correlated as window and padding make them, and noise at DC and
+Nyquist has its true law. Every sample is addressed by point, draw, segment and position
 (:mod:`sweep.model.sampling.philox`).
 
-A real record has bins 0..N/2. A complex one, of I and Q, has N: bin k stands at index k + N/2, and
-the last is a neighbour of the first. Indices that name an echo's bins may go on below 0 and beyond
-N - 1.
+A real record has bins 0..N/2. A complex record of I and Q has N bins: bin k has the index k + N/2,
+and the last bin is a neighbour of the first. Indices of an echo's bins may be below 0 or above N -
+1.
 
-The signal has the magnitudes that :func:`sweep.model.spectrum.segment_spectra.segment_spectrum`
-gives, with all
-effects. If beamlets add as powers these are root mean squares, and have no phases: the signal
-is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
-is what the spectrum is. In developed speckle the bins of an echo have the amplitudes that the lines
-of its footprint make in a draw (:mod:`sweep.model.sampling.speckle_lines`), and its leaked signal
-fades with
-the strongest of them. If a shot of a flight has several echoes, each has the phases of a tone of
-its own, and its own speckle.
-A phase common to all bins makes no difference to circular noise and is left out.
+The signal has the magnitudes of :func:`sweep.model.spectrum.segment_spectra.segment_spectrum`, with
+all effects. If beamlets add as powers, these magnitudes are root mean squares and have no phases.
+Each bin of the signal then has the phase of a lone tone at the same position. This is exact for
+footprints of less than a bin. In developed speckle the bins of an echo have the amplitudes that the
+lines of its footprint make in a draw (:mod:`sweep.model.sampling.speckle_lines`). Its leaked signal
+fades with the strongest of these bins. If a shot of a flight has several echoes, each has the
+phases of a separate tone, and separate speckle. A phase common to all bins makes no difference in
+circular noise and is omitted.
 
-The phase of a laser of Lorentzian line width walks randomly: of each draw a walk is taken, at every
-sample, and turns the signal's record (:func:`sweep.model.effects.line_width.phase_walk`).
+The phase of a laser of Lorentzian line width is a random walk. Each draw has a walk, with a step at
+every sample, which rotates the signal's record (:func:`sweep.model.effects.line_width.phase_walk`).
 
-In several looks (:mod:`sweep.model.detection.looks`) each record has its signal where the target
-has come to,
-its noise, its walk, and the speckle that all have, or its own. Flags are those of the mean of
-|X|^2, of enough records, or of the mean record; the frequency is the mean of the looks' estimates.
+In several looks (:mod:`sweep.model.detection.looks`) each record has noise and a phase walk of its
+own, and its signal follows the moving target. Speckle is common to all looks or separate. Bins are
+flagged by the mean of |X|^2, by votes of the records, or by the mean record. The frequency is the
+mean of the looks' estimates.
 
-A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
-|X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the one
-that is the strongest without noise and speckle); adjacent flagged bins form a group. A group
-outside the bins that the signal occupies is a false alarm. The estimator is given the spectrum and
-the largest bin of the detected group. If all segments are detected, their frequencies are resolved
-into range and radial velocity.
+A detector and an estimator of frequency process each segment's spectrum. The detector flags bins of
+|X|^2. A segment is detected if any bin that the signal occupies is flagged. With ``peak_bin`` only
+the bin counts that is strongest without noise and speckle. Adjacent flagged bins form a group. A
+group outside the bins that the signal occupies is a false alarm. The estimator receives the
+spectrum and the largest bin of the detected group. If all segments are detected, their frequencies
+are resolved into range and radial velocity.
 """
 
 import math
@@ -108,67 +106,78 @@ AVERAGED_VALUES = (
     "range_2",
     "radial_velocity_2",
 )
-"""Values that are averaged over draws; the last two are squares of bounds."""
+"""Names of values that are averaged over draws; the last two are squares of bounds."""
 
 
 class SpectrumMethods(NamedTuple):
-    """Detectors and estimators by name: those of the program, and any others."""
+    """Detectors and estimators by name; by default those of the package."""
 
     detectors: Mapping[str, Detector] = DETECTORS
     estimators: Mapping[str, Estimator] = ESTIMATORS
 
 
 class SegmentSignal(NamedTuple):
-    """A segment's spectrum without noise, and what is true of it."""
+    """Spectrum of a segment without noise, with the bins and the frequency of its echo."""
 
     spectrum: np.ndarray
     """(N/2 + 1,) complex [V]; of a complex record (N,)."""
     strongest_bin: int
-    """Index of the largest bin; of a real record 1..N/2 - 1 where noise is taken to be circular in
-    all."""
+    """Index of the largest bin. DC and Nyquist are excluded if noise is taken as circular in all
+    bins of a real record."""
     first_bin: int
-    """First of the bins that the signal occupies: those from the first to the last of half its
-    largest magnitude, and a main lobe's half-width to either side."""
+    """Index of the first bin that the signal occupies. The occupied bins reach from the first to
+    the last of half the largest magnitude, plus a main lobe's half-width on either side."""
     last_bin: int
-    """Last of them; below ``first_bin`` if there is no echo, or its largest bin is not searched."""
+    """Index of the last bin that the signal occupies; below ``first_bin`` if there is no echo, or
+    its largest bin is not searched."""
     frequency: float
-    """Place of a lone tone of these magnitudes about the largest bin [bins], with its sign."""
+    """Position [bins] of a lone tone with the magnitudes about the largest bin, with its sign."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
     segment: int
     """0 up, 1 Doppler, 2 down."""
     nearest_echo: np.ndarray | None = None
-    """Number of the echo that each bin is nearest to, int64; None where all are one."""
+    """(bins,) int64: number of the echo nearest to each bin; None if there is one echo."""
     echo_peaks: tuple[np.ndarray, np.ndarray] | None = None
-    """Strongest bin of each of several echoes, and the place of a lone tone about it, as indices.
-    """
+    """Index of the strongest bin of each of several echoes, and index (fractional) of a lone tone
+    about it; None if there is one echo."""
     echo_half_width: int = 0
-    """Bins on either side of such an echo that it occupies."""
+    """Bins on either side of the strongest bin that each of several echoes occupies."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Records of the speckle of each echo, none where lines spread over more than a bin; None where
-    they are not known yet."""
+    """Records of the speckle of each echo. Empty if lines spread over more than a bin or the echo
+    has no samples; None before :func:`add_footprint_records`."""
     record_scalings: tuple[np.ndarray, ...] = ()
-    """(bins,) complex of each: what makes factors on ``spectrum`` of the record's transform."""
+    """(bins,) complex for each echo: factors that turn the transform of a drawn record into factors
+    on ``spectrum``."""
     is_exempt: np.ndarray | None = None
-    """(bins,) bool: bins that raise no false alarm: ``first_bin`` to ``last_bin``, and those at
-    or above the threshold with their neighbours, as of
-    :func:`sweep.model.detection.echo_detection.mark_exempt_bins`."""
+    """(bins,) bool: bins that raise no false alarm. These are ``first_bin`` to ``last_bin``, and
+    bins at or above the threshold with their neighbours
+    (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`)."""
 
 
 def noiseless_signal(
     shots: Shots, point: int, segment: int, echo_bins: Sequence[int] | np.ndarray = (),
     fixed_threshold: float = math.inf,
 ) -> SegmentSignal:  # fmt: skip
-    """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down.
+    """Return the spectrum of a segment of a point without noise.
 
-    ``echo_bins``: strongest bins of the echoes of several surfaces, where there are several.
-    ``fixed_threshold``: fixed threshold [V], if there is one: bins that reach it raise no false
-    alarm.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    point
+        Index of the point.
+    segment
+        0 up, 1 Doppler, 2 down.
+    echo_bins
+        Indices of the strongest bins of the echoes, if several surfaces return one.
+    fixed_threshold
+        Fixed threshold [V] of the detector, if it has one; bins that reach it raise no false alarm.
     """
     magnitude = full_segment_spectrum(shots, point, segment)
     if (laser_timing := _laser_timing(shots, point))[
         "line_width"
-    ] > 0:  # as it is before its phase walks
+    ] > 0:  # magnitude before the phase walk, which draws apply
         echo_window = shots.window
         if shots.n_samples_before_echo is not None:
             echo_window = zero_first_samples(
@@ -179,7 +188,7 @@ def noiseless_signal(
         )[0][0]
         magnitude = magnitude / math.sqrt(line_power_fraction)
     window, last_index = shots.window, magnitude.size - 1
-    margin = 0 if shots.real_fft_size or shots.complex_record else 1  # at DC and Nyquist taken as 0
+    margin = 0 if shots.real_fft_size or shots.complex_record else 1  # omits DC and Nyquist
     strongest_bin = int(np.clip(np.argmax(magnitude), margin, last_index - margin))
     if not magnitude[strongest_bin] > 0:
         peak_position = float(strongest_bin - zero_frequency_index(shots))
@@ -204,14 +213,14 @@ def noiseless_signal(
     )
     lobe_half_width = math.ceil(main_lobe_half_width(window) * shots.fft_size / window.length)
     energy = (magnitude**2).sum()
-    if not shots.complex_record:  # and as much at negative frequencies
+    if not shots.complex_record:  # add the energy at negative frequencies
         energy = 2 * energy - magnitude[0] ** 2 - magnitude[-1] ** 2
     signal_power = energy / (
         shots.fft_size * max(float(shots.echo_window_energy(segment)[point]), 1e-300)
     )
     echo_margin = max(
         lobe_half_width, int(shots.bin_threshold_table[4, point])
-    )  # where its pedestal is above the noise
+    )  # bins where the echo's pedestal exceeds the noise
     first_bin, last_bin = (
         int(bins_above_half[0]) - echo_margin,
         int(bins_above_half[-1]) + echo_margin,
@@ -226,7 +235,7 @@ def noiseless_signal(
     phases = _tone_phases(peak_position, shots, first_sample)
     if (
         bins_above_half[-1] - bins_above_half[0] > lobe_half_width
-    ):  # wider than a tone: in step, as in one's main lobe
+    ):  # wider than a tone: phases step evenly, as in a main lobe
         bin_offset = np.arange(first_bin, last_bin + 1) - strongest_bin
         phases[(strongest_bin + bin_offset) % phases.size] = phases[strongest_bin] * np.exp(
             -1j * np.pi * bin_offset * ((window.length + first_sample) / shots.fft_size)
@@ -280,7 +289,11 @@ def _exempt_bin_mask(
     echo_bins: tuple[int, int],
     fixed_threshold: float,
 ) -> np.ndarray:
-    """Bins that raise no false alarm (bins,) bool; none of an echo that is not searched for."""
+    """Return the mask (bins,) bool of bins that raise no false alarm.
+
+    Without a searched echo no bin is exempt. `echo_bins` are the first and last bin that the signal
+    occupies.
+    """
     first_bin, last_bin = echo_bins
     is_exempt = np.zeros(magnitude.size, bool)
     if last_bin < first_bin:
@@ -301,21 +314,21 @@ def _exempt_bin_mask(
 
 
 def zero_frequency_index(shots: Shots) -> int:
-    """Index of the bin at frequency 0 in a spectrum."""
+    """Return the index of the bin at frequency 0 in a spectrum."""
     return int(shots.bin_indices(np.zeros((), int)))
 
 
 def unrolling_shift(shots: Shots, middle_index: int) -> int:
-    """Places by which :func:`unroll_bins` moves a bin."""
+    """Return the number of bins by which :func:`unroll_bins` moves a bin."""
     return 1 + shots.fft_size // 2 - middle_index if shots.complex_record else 0
 
 
 def unroll_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
-    """Values of bins (..., bins) without a seam near one of them.
+    """Return values of bins (..., bins) rotated so that a given bin is far from either end.
 
-    Those of a complex record are turned until index ``middle_index`` stands in the middle, with a 0
-    put
-    at either end as if it were DC and Nyquist of a real one. Those of a real one are as they are.
+    Values of a complex record are rotated until index ``middle_index`` is in the middle. A 0 is
+    added at either end, as if for DC and Nyquist of a real record. Values of a real record are
+    returned unchanged.
     """
     if not shots.complex_record:
         return values
@@ -324,7 +337,7 @@ def unroll_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarr
 
 
 def _tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
-    """Place of a lone tone whose largest bin is k, as an index."""
+    """Return the position, as a fractional index, of a lone tone with a given largest bin."""
     last_index = magnitude.size - 1
     if shots.complex_record:
         below, above = magnitude[peak_index - 1], magnitude[(peak_index + 1) % magnitude.size]
@@ -339,9 +352,9 @@ def _tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> floa
 
 
 def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray:
-    """Phase factors of a lone tone at a place, by index; 1 where it vanishes.
+    """Return phase factors (bins,) of a lone tone at a position, by index; 1 if the tone vanishes.
 
-    It begins with sample ``first_sample`` of the record.
+    The tone begins with sample ``first_sample`` of the record.
     """
     fft_size = shots.fft_size
     cycles = (position - zero_frequency_index(shots)) / fft_size
@@ -355,14 +368,14 @@ def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray
 
 
 def record_spectrum(shots: Shots, record: np.ndarray) -> np.ndarray:
-    """Spectrum of a windowed record (L,), which is padded."""
+    """Return the spectrum (bins,) of a windowed record (L,), padded to the FFT size."""
     if shots.complex_record:
         return np.asarray(fft.fftshift(fft.fft(record, shots.fft_size)))
     return np.asarray(fft.rfft(record, shots.fft_size))
 
 
 def _laser_timing(shots: Shots, point: int) -> dict[str, np.ndarray]:
-    """Width of the laser's line [Hz]; delay of the echo and length of the record [s]."""
+    """Return the laser's line width [Hz], the echo's delay [s] and the record's duration [s]."""
     return {
         "line_width": _value_at(shots.lorentzian_line_width, point),
         "delay": 2 * _value_at(shots.range, point) / SPEED_OF_LIGHT,
@@ -379,7 +392,21 @@ def draw_signal_spectra(
     key: np.ndarray,
     draws: np.ndarray,
 ) -> np.ndarray:
-    """Spectra (m or 1, bins) complex of the signal in some draws, without noise [V]."""
+    """Return complex spectra (m, bins) of the signal in m draws, without noise [V].
+
+    Without a phase walk all draws are equal, and there is one row.
+
+    Parameters
+    ----------
+    shots, point, segment
+        Prepared shots, index of the point, and segment.
+    signal
+        Signal of the segment.
+    key
+        (2,) uint64: random key of the point.
+    draws
+        (m,) int64: numbers of the draws.
+    """
     laser_timing, sample_rate = (
         _laser_timing(shots, point),
         float(_value_at(shots.sample_rate, point)),
@@ -404,7 +431,7 @@ def draw_signal_spectra(
             key[None], draw[None], STREAM_LASER_PHASE[segment],
             n_phase_walk_steps(delay=delay_samples, length=record_length),
         )  # fmt: skip
-        # |X| does not tell the phase that a record begins with, and their sum does.
+        # The initial phase of a record matters only if looks are added in amplitude.
         phase = phase_walk(
             to_normals_by_row(uniform_numbers)[0],
             variance_per_sample=phase_variance_per_sample,
@@ -421,19 +448,29 @@ def draw_signal_spectra(
 def draw_noise_spectra(
     shots: Shots, point: int, segment: int, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Noise (m, bins) complex of some draws of point i's segment, by their numbers [V]."""
+    """Return complex noise (m, bins) of a segment in m draws [V].
+
+    Parameters
+    ----------
+    shots, point, segment
+        Prepared shots, index of the point, and segment.
+    key
+        (2,) uint64: random key of the point.
+    draws
+        (m,) int64: numbers of the draws.
+    """
     record_length, stream = shots.window.length, STREAM_RECORD[segment]
     keys = np.broadcast_to(key, (draws.size, 2))
     n_numbers = 2 * record_length if shots.complex_record else record_length + record_length % 2
     record = to_normals_by_row(uniforms(keys, draws, stream, n_numbers))
-    if shots.complex_record:  # I and Q with half of the noise each
+    if shots.complex_record:  # I and Q, each with half of the noise variance
         record = (record[:, :record_length] + 1j * record[:, record_length:]) * math.sqrt(0.5)
     record = (
         record[:, :record_length]
         * math.sqrt(float(shots.noise_variance[point]))
         * cached_window_samples(shots.window)
     )
-    # A transform at a time: bits do not depend on how many there are.
+    # One transform at a time, so that bits do not depend on the number of draws.
     return np.array([record_spectrum(shots, noise_record) for noise_record in record])
 
 
@@ -447,10 +484,23 @@ def draw_bin_speckle(
     draws: np.ndarray,
     line_grid: SpeckleLineGrid | None = None,
 ) -> np.ndarray:
-    """Complex factors on the bins of point i's segment in some draws, (m, bins); 1 without speckle.
+    """Return complex factors (m, bins) of speckle on the bins of a segment; 1 without speckle.
 
-    The bins that an echo occupies have those of the lines of its footprint, its other bins the one
-    of its strongest bin.
+    The bins that an echo occupies have the factors of the lines of its footprint. Its other bins
+    have the factor of its strongest bin.
+
+    Parameters
+    ----------
+    shots, point, segment
+        Prepared shots, index of the point, and segment.
+    signal
+        Signal of the segment.
+    key
+        (2,) uint64: random key of the point.
+    draws
+        (m,) int64: numbers of the draws.
+    line_grid
+        Result of :func:`speckle_line_grid` for `shots`; computed if None.
     """
     if shots.line_gradients is None:
         return np.ones((1, 1))
@@ -461,7 +511,7 @@ def draw_bin_speckle(
         return _draw_speckle_from_records(shots, signal, key, draws)
     n_bins, zero_index = signal.spectrum.size, zero_frequency_index(shots)
     factors = np.empty((draws.size, n_bins), complex)
-    is_real_bin = np.zeros(n_bins, bool)  # one part is left, which has all of the power
+    is_real_bin = np.zeros(n_bins, bool)  # the real part alone has all of the power
     is_real_bin[[0, -1]] = shots.real_fft_size > 0
     echo_windows = [
         (signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin)
@@ -502,7 +552,7 @@ def draw_bin_speckle(
         bins = bins[has_speckle] % n_bins
         factors[:, bins] = amplitudes[:, has_speckle]
         if shots.real_fft_size and shots.speckle_table.ratio_row[segment, point] > 0:
-            # Their phases are those about the record's middle, as the noise's are.
+            # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0
                 if shots.n_samples_before_echo is None
@@ -524,7 +574,7 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return a signal of point i with the records of its echoes' speckle."""
+    """Return the signal of a point with the records of its echoes' speckle."""
     if shots.line_gradients is None:
         return signal
     segment, zero_index = signal.segment, zero_frequency_index(shots)
@@ -557,7 +607,7 @@ def add_footprint_records(
     scalings = []
     for record in records:
         power = record.mean_bin_power[bin_numbers % fft_size]
-        if not shots.complex_record:  # half of the line and of its image
+        if not shots.complex_record:  # half of the line's amplitude and of its image's
             power = 0.25 * (power + record.mean_bin_power[-bin_numbers % fft_size])
         scalings.append(conjugate_phase / np.sqrt(power))
     return signal._replace(footprint_records=records, record_scalings=tuple(scalings))
@@ -566,7 +616,7 @@ def add_footprint_records(
 def _draw_speckle_from_records(
     shots: Shots, signal: SegmentSignal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Draw the speckle of bins by the records of a footprint's lines, which all bins see."""
+    """Draw factors (m, bins) of speckle from the records of a footprint's lines."""
     assert signal.footprint_records is not None
     factors = np.empty((draws.size, signal.spectrum.size), complex)
     for echo_number, record in enumerate(signal.footprint_records):
@@ -584,9 +634,9 @@ def _draw_speckle_from_records(
 def iter_look_spectra(
     view: "SpectrumView", segment: int, draws: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Spectra (m, bins) complex of a segment in some draws, with noise [V], look by look.
+    """Yield complex spectra (m, bins) of a segment in m draws, with noise [V], look by look.
 
-    Of looks that are added in amplitude their mean alone.
+    For looks that are added in amplitude it yields their mean alone.
     """
     looks, look_sum = view.shots.looks, np.zeros(1, complex)
     for look, shots in enumerate(view.look_shots):
@@ -614,9 +664,10 @@ def _draw_look_speckle(
     draws: np.ndarray,
     signal: SegmentSignal,
 ) -> np.ndarray:
-    """Factors (m, bins) on a look's bins: of speckle common to all looks, its own, or a mixture.
+    """Return factors (m, bins) of speckle on the bins of a look.
 
-    Speckle that changes from look to look is a sum of independent ones.
+    Speckle is common to all looks, independent, or a mixture. Speckle that changes from look to
+    look is a sum of independent realisations.
     """
     draw_arguments: dict[str, Any] = {"key": view.key, "line_grid": view.line_grid}
     if shots.look_speckle is None:
@@ -627,7 +678,7 @@ def _draw_look_speckle(
             shots, view.point, segment, signal, draws=look_draws, **draw_arguments
         )
     root_row = shots.look_speckle.covariance_root(segment, view.point)[look]
-    # The mean power of the looks differs in the signal itself.
+    # The mean power of each look is already in its signal.
     root_row = root_row / np.sqrt((np.abs(root_row) ** 2).sum())
     return np.asarray(
         sum(
@@ -646,32 +697,31 @@ def _draw_look_speckle(
 
 
 class SpectrumView(NamedTuple):
-    """A shot, and how it is looked at."""
+    """Point of prepared shots, with the detector and the estimator of its spectra."""
 
     shots: Shots
     point: int
-    """Number of the shot."""
+    """Index of the point in ``shots``."""
     key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """By segment; None for one that does not exist."""
+    """Signal of each segment; None for a segment that does not exist."""
     look_shots: list[Shots]
-    """The shots as each look finds them."""
+    """Prepared shots at the time of each look."""
     setting: SpectrumSettings
     detect: Detector
     estimate: Estimator
     signal_cache: dict[tuple[int, int], SegmentSignal]
-    """Signals of looks that find the target elsewhere, by segment and look, as they are asked for.
-    """
+    """Computed signals of looks at which the target has moved, by segment and look."""
     echo_bins: np.ndarray | None = None
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
     line_grid: SpeckleLineGrid | None = None
-    """Lines of all shots' footprints in developed speckle."""
+    """Speckle lines of the footprints of all shots."""
     fixed_threshold: float = math.inf
-    """Fixed threshold [V], if the detector has one."""
+    """Fixed threshold of the detector [V]; infinite for other detectors."""
 
     def get_signal_in_look(self, segment: int, look: int) -> SegmentSignal:
-        """Return the signal of a segment as a look finds it."""
+        """Return the signal of a segment at the time of a look."""
         shots, signal = self.look_shots[look], self.signals[segment]
         if shots is self.shots and signal is not None:
             return signal
@@ -686,33 +736,52 @@ class SpectrumView(NamedTuple):
         return self.signal_cache[segment, look]
 
     def echo_indices(self, segment: int) -> np.ndarray:
-        """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
+        """Return indices of the echoes' strongest bins in a segment; empty if there is one echo."""
         bins = np.empty(0, np.int64) if self.echo_bins is None else self.echo_bins[segment]
         bins = bins[bins >= 0]
         return self.shots.bin_indices(bins)
 
 
 class SegmentDetections(NamedTuple):
-    """Detections, alarms and frequency of a segment in m draws, (m,) each."""
+    """Detections, false alarms and frequency of a segment in m draws, (m,) each."""
 
     is_detected: np.ndarray
     n_false_groups: np.ndarray
-    """Groups outside the signal."""
+    """int64: number of groups of flagged bins outside the signal."""
     n_false_bins: np.ndarray
-    """Bins in them."""
+    """int64: number of bins in these groups."""
     frequency: np.ndarray
-    """[bins], with signs of a complex record."""
+    """Estimated frequency [bins], signed for a complex record."""
     peak_offset: np.ndarray
-    """Place past the strongest bin [bins]."""
+    """Estimated position relative to the strongest bin [bins]."""
     peak_power: np.ndarray
-    """|X|^2 of the echo's strongest bin in the mean, and at least the threshold's [V^2]."""
+    """|X|^2 of the bin that is strongest without noise [V^2]. If the peak's bin has more power, the
+    smaller of that and the squared threshold is the least value."""
 
 
 def make_spectrum_view(
     shots: Shots, point: int, parameters: Parameters, key: np.ndarray, methods: SpectrumMethods,
     echo_bins: np.ndarray | None = None, line_grid: SpeckleLineGrid | None = None,
 ) -> SpectrumView:  # fmt: skip
-    """View of one of some shots, by the parameters p of its point, those of `DEFAULTS`."""
+    """Return the view of one point of prepared shots.
+
+    Parameters
+    ----------
+    shots, point
+        Prepared shots, and index of the point.
+    parameters
+        Parameters of the point by dotted path, including those of
+        :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`.
+    key
+        (2,) uint64: random key of the point.
+    methods
+        Detectors and estimators by name.
+    echo_bins
+        (3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none; None for one
+        echo.
+    line_grid
+        Result of :func:`speckle_line_grid` for `shots`; computed if None.
+    """
     training, rank = (
         int(parameters[DETECTOR_PREFIX + "training"]),
         int(parameters[DETECTOR_PREFIX + "rank"]),
@@ -727,7 +796,7 @@ def make_spectrum_view(
         threshold=float(shots.threshold[point]),
         training=training,
         guard=int(parameters[DETECTOR_PREFIX + "guard"]),
-        rank=rank or math.ceil(0.75 * training),  # 0 stands for three quarters
+        rank=rank or math.ceil(0.75 * training),  # 0: the default, three quarters
         pfa=float(parameters[DETECTOR_PREFIX + "pfa"]),
         complex_record=shots.complex_record,
     )
@@ -765,7 +834,7 @@ def make_spectrum_view(
 def flag_bins(
     spectra: Sequence[np.ndarray], view: SpectrumView, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean power of a segment's looks, and the bins that are flagged, (m, bins) each."""
+    """Return the mean power of a segment's looks, and the mask of flagged bins, (m, bins) each."""
     powers = [spectrum.real**2 + spectrum.imag**2 for spectrum in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
     if view.shots.looks.combine == COMBINE_BINARY:
@@ -780,7 +849,7 @@ def flag_bins(
 def estimate_positions(
     spectra: Sequence[np.ndarray], peak_bins: np.ndarray, view: SpectrumView
 ) -> np.ndarray:
-    """Places (m,) of peaks in a segment's spectra, by index: the mean of the looks' estimates."""
+    """Return positions (m,) of peaks as fractional indices: the mean of the looks' estimates."""
     positions = [view.estimate(spectrum, peak_bins, view.setting) for spectrum in spectra]
     return positions[0] if len(positions) == 1 else np.asarray(np.mean(positions, axis=0))
 
@@ -788,7 +857,17 @@ def estimate_positions(
 def detect_and_estimate(
     spectra: Sequence[np.ndarray], signal: SegmentSignal, view: SpectrumView
 ) -> SegmentDetections:
-    """Detect and estimate in spectra (m, bins) of a segment, of one or several looks."""
+    """Detect an echo and estimate its frequency in each draw of a segment.
+
+    Parameters
+    ----------
+    spectra
+        Complex spectra (m, bins) of each look [V].
+    signal
+        Signal of the segment without noise.
+    view
+        View of the point.
+    """
     power, flags = flag_bins(spectra, view, signal.segment)
     shots, shift = view.shots, unrolling_shift(view.shots, signal.strongest_bin)
     power, flags = (unroll_bins(shots, values, signal.strongest_bin) for values in (power, flags))
@@ -812,13 +891,13 @@ def detect_and_estimate(
     )
     flags[:, [0, -1]] = False  # DC and Nyquist
     flag_edges = np.diff(flags.astype(np.int8), axis=1)
-    draw_of_group, start = np.nonzero(flag_edges > 0)  # of each group of flagged bins
+    draw_of_group, start = np.nonzero(flag_edges > 0)  # draw and first bin of each group
     start, end = start + 1, np.nonzero(flag_edges < 0)[1] + 1
     assert signal.is_exempt is not None
     n_exempt_below = np.cumsum(
         np.pad(unroll_bins(shots, signal.is_exempt, signal.strongest_bin), (1, 0))
     )
-    is_false = n_exempt_below[start] == n_exempt_below[end]  # no bin of theirs is exempt
+    is_false = n_exempt_below[start] == n_exempt_below[end]  # groups without exempt bins
     is_false &= (start <= end_index - shots.first_searched_bin) & (end > shots.first_searched_bin)
     n_false_groups, n_false_bins = (
         np.bincount(draw_of_group[is_false], weights, len(power)).astype(np.int64)
@@ -832,7 +911,7 @@ def detect_and_estimate(
     search_first, search_end = np.ones((len(power), 1)), np.full((len(power), 1), end_index)
     search_first[draw_of_group[own], 0], search_end[draw_of_group[own], 0] = start[own], end[own]
     peak_index = np.where((search_first <= bins) & (bins < search_end), power, -1.0).argmax(axis=1)
-    # The largest of several bins would be brighter than a bin whose place wanders.
+    # The largest of several bins would be brighter than the bin of a wandering peak.
     capped_power = np.minimum(power[np.arange(len(power)), peak_index], view.setting.threshold**2)
     peak_power = np.maximum(power[:, strongest_index], capped_power)
     peak_bin = (peak_index - shift) % shots.fft_size if shots.complex_record else peak_index
@@ -844,9 +923,20 @@ def detect_and_estimate(
 
 
 def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count detections and alarms in some draws, and find values to be averaged over them.
+    """Count detections and false alarms in draws, and return values to be averaged over the draws.
 
-    By the names of DRAW_OUTPUTS and of VALUES, (names, m); nan where there is no value.
+    Parameters
+    ----------
+    view
+        View of the point.
+    draws
+        (m,) int64: numbers of the draws.
+
+    Returns
+    -------
+    tuple of ndarray
+        Counts (names, m) in the order of :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`, and values
+        (names, m) in the order of AVERAGED_VALUES; nan for a draw without a value.
     """
     zeros = np.zeros(draws.size, np.int64)
     detections = [SegmentDetections(zeros > 0, zeros, zeros, *np.zeros((3, draws.size)))] * 3
@@ -890,7 +980,7 @@ def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray,
     squared_bounds = np.square(_bounds_by_draw(view, is_detected)) + _wander_variances(
         view, detections, is_detected
     )
-    if view.shots.any_two:  # they differ by what is detected
+    if view.shots.any_two:  # bounds depend on the detected segments
         squared_bounds = np.where(is_resolved, squared_bounds, np.nan)
     errors = [
         np.where(is_resolved, error, np.nan)
@@ -902,7 +992,7 @@ def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray,
 
 
 def _bounds_by_draw(view: SpectrumView, is_detected: np.ndarray) -> np.ndarray:
-    """Bounds of range and velocity in draws (2, m) by the segments (3, m) that tell of them."""
+    """Return bounds of range and velocity in draws, (2, m), by the detected segments (3, m)."""
     bounds = np.empty((2, is_detected.shape[1]))
     bounds[...] = np.reshape(measurement_bound(view), (2, 1))
     if view.shots.any_two:
@@ -915,7 +1005,7 @@ def _bounds_by_draw(view: SpectrumView, is_detected: np.ndarray) -> np.ndarray:
 def _wander_variances(
     view: SpectrumView, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> np.ndarray:
-    """Mean square errors of range and velocity by speckle in draws, (2, m)."""
+    """Return mean square errors of range and velocity by speckle in draws, (2, m)."""
     shots, point, n_draws = view.shots, view.point, is_detected.shape[1]
     if shots.line_gradients is None:
         return np.zeros((2, n_draws))
@@ -944,10 +1034,20 @@ def _wander_variances(
 def measurement_bound(
     view: SpectrumView, is_used: Sequence[bool] | np.ndarray | None = None
 ) -> RangeVelocityDeviation:
-    """Bound of range and velocity that are resolved from the beats that are ``is_used``.
+    """Return the bound on the deviations of range and radial velocity from selected beats.
 
-    By default of up and down beat; where segments have slopes of their own, of all. Of
-    Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
+    Parameters
+    ----------
+    view
+        View of the point.
+    is_used
+        True for each segment whose beat is used; by default up and down, or all if the segments'
+        chirp slopes differ from the default.
+
+    Notes
+    -----
+    The bound on a beat's variance is the Cramer-Rao bound in white noise plus the variance by the
+    laser's phase noise. Looks count as independent measurements.
     """
     shots, point = view.shots, view.point
     sample_rate, root_n_looks, laser_timing = (
@@ -960,7 +1060,7 @@ def measurement_bound(
         record_lengths = np.maximum(record_lengths - shots.n_samples_before_echo[:, point], 2)
         laser_timing["duration"] = record_lengths[0] / np.asarray(sample_rate)
     laser_deviation = phase_noise_deviation(**laser_timing)
-    cnr_factor = 2 if shots.complex_record else 1  # as much noise has two samples for one
+    cnr_factor = 2 if shots.complex_record else 1  # two samples (I, Q) for the noise of one
     if is_used is None:
         is_used = (True, shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES, True)
     up, doppler, down = (
@@ -987,9 +1087,9 @@ def measurement_bound(
 def _measurement_errors(
     view: SpectrumView, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute reported less true range [m] and radial velocity [m/s], (m,) each.
+    """Return measured minus true range [m] and radial velocity [m/s], (m,) each.
 
-    By the segments (3, m) that are detected; up, Doppler and down beat are resolved as ever.
+    `is_detected` (3, m) are the segments that are detected in each draw.
     """
     shots, point = view.shots, view.point
     bin_width = view.setting.sample_rate / view.setting.fft_size
@@ -1009,7 +1109,7 @@ def _measurement_errors(
     measured_velocity = measured.radial_velocity * (
         1 + _value_at(shots.velocity_bias_fraction, point)
     )
-    range_walk = _value_at(shots.range_walk_time, point) * measured_velocity  # within the shot
+    range_walk = _value_at(shots.range_walk_time, point) * measured_velocity  # to the shot's start
     measured_range = measured.range + range_walk
     uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (
         shots.any_two & ~is_detected.all(axis=0)
@@ -1025,11 +1125,12 @@ def _measurement_errors(
 
 
 def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the carriers of a point in the up, Doppler and down segment [Hz]."""
     up, doppler, down = (_value_at(carrier, point) for carrier in shots.carriers)
     return up, doppler, down
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Point i of a column that may be one value for all."""
+    """Return the value of a point in a column, which may be one number for all points."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

@@ -1,12 +1,12 @@
 """Random numbers by address: Philox4x64-10 [Salmon et al., SC 2011], compiled.
 
-A draw is a function of the point (the key), the number of the draw, the physical cause (the
-stream) and an index within it. It does not depend on the order of work, the size of blocks
+A random number is a function of the point (the key), the number of the draw, the physical cause
+(the stream) and an index in the stream. It does not depend on the order of work, the size of blocks
 or the number of workers. The 256-bit counter is
 
     word 0: block of four outputs    word 1: 0    word 2: draw    word 3: stream
 
-and the function of (key, counter) is that of ``numpy.random.Philox``, bit for bit.
+The words are those of ``numpy.random.Philox`` for this key and counter, bit for bit.
 """
 
 import hashlib
@@ -16,8 +16,8 @@ import numpy as np
 
 from sweep.kernel_cache import high_word, njit
 
-# Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
-# part of every stored draw: add, never change.
+# Streams, one per physical cause; causes that act in each segment have three: up, Doppler, down.
+# Every stored draw depends on these numbers: add numbers, never change any.
 STREAM_DETECTION = (1, 3, 2)
 STREAM_FALSE_ALARM = (4, 6, 5)
 STREAM_NOISE = (7, 9, 8)
@@ -40,16 +40,17 @@ _WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
 _HALF_WORD = np.uint64(0xFFFFFFFF)
 
 FIRST_BLOCK_NUMBER, DRAW_INCREMENTS, BLOCK_INCREMENTS = np.int64(0), (1, 0), (0, 1)
-"""Arguments of :func:`fill_words`, which numba compiles anew for each number written in a call."""
+"""Arguments of :func:`fill_words` as constants: numba compiles anew for each literal in a call."""
 
 _SHIFT_32, _SHIFT_12 = np.uint64(32), np.uint64(12)
 
 
 @njit(cache=True)
 def _round(x0, x1, x2, x3, key0, key1):
-    """One of the ten rounds: high words of 128-bit products by halves of words.
+    """Return the counter after one of the ten rounds of Philox.
 
-    So several are computed at once, in vector registers, which have no such product.
+    High words of 128-bit products are computed from 32-bit halves, because vector registers lack
+    such a product. The processor then computes several counters at once.
     """
     low, high = x0 & _HALF_WORD, x0 >> _SHIFT_32
     middle = _LOW0 * high + (_LOW0 * low >> _SHIFT_32)
@@ -66,7 +67,7 @@ def _round(x0, x1, x2, x3, key0, key1):
 
 @njit(cache=True)
 def four_words(key0, key1, draw, stream, block):
-    """Four words of indices 4 block .. 4 block + 3, for the price of one."""
+    """Return the four random words (uint64) of indices 4 `block` to 4 `block` + 3 of a stream."""
     k0, k1 = np.uint64(key0), np.uint64(key1)
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
     for _ in range(10):
@@ -79,10 +80,27 @@ def four_words(key0, key1, draw, stream, block):
 
 @njit(cache=True)
 def fill_words(address, stream, block, increments, count, words):
-    """Words of `four_words` into the first columns of (4, >= number), in C order.
+    """Fill columns of an array with the words of :func:`four_words`.
 
-    From an address (key0, key1, draw) on, draw and block rise by the steps each time. All take one
-    round after the other, which the processor does for several at once: some six times as fast.
+    Parameters
+    ----------
+    address
+        Key (two uint64) and draw of the first column.
+    stream
+        Stream.
+    block
+        Block of the first column.
+    increments
+        Increments of draw and block from one column to the next.
+    count
+        Number of columns to fill.
+    words
+        (4, >= count) uint64, in C order; the result.
+
+    Notes
+    -----
+    All columns pass one round before any passes the next, which the processor vectorises: about six
+    times as fast.
     """
     k0, k1, draw = np.uint64(address[0]), np.uint64(address[1]), np.uint64(address[2])
     x0, x1, x2, x3 = words[0], words[1], words[2], words[3]
@@ -97,20 +115,20 @@ def fill_words(address, stream, block, increments, count, words):
 
 @njit(cache=True)
 def to_uniform(word):
-    """Uniform number in (0, 1) of a word, the centre of one of 2^52 equal cells.
+    """Return a uniform number in (0, 1) from a word: the centre of one of 2^52 equal cells.
 
-    By the upper 52 bits: with 53 the last centre would round to 1; so 0 and 1 are both impossible,
-    and u and 1-u, both exact, equally likely.
+    Only the upper 52 bits are used, because with 53 the last centre would round to 1. So 0 and 1
+    are impossible. u and 1 - u are both exact and equally likely.
     """
     return (np.float64(word >> _SHIFT_12) + 0.5) * 2.0**-52
 
 
 @njit(cache=True)
 def to_normals(word0, word1):
-    """Two independent standard normal numbers of two words, by Box and Muller's transform.
+    """Return two independent standard normal numbers from two words, by the Box-Muller transform.
 
-    As real and imaginary part, sigma times this pair is one bin's noise (sigma per quadrature).
-    Their magnitude reaches sqrt(2 ln 2^53) = 8.57 at most.
+    Sigma times the pair is one bin's noise, real and imaginary part (sigma per quadrature). The
+    magnitude of the pair is at most sqrt(2 ln 2^53) = 8.57.
     """
     radius, angle = math.sqrt(-2.0 * math.log(to_uniform(word0))), 2.0 * math.pi * to_uniform(word1)
     return radius * math.cos(angle), radius * math.sin(angle)
@@ -118,22 +136,34 @@ def to_normals(word0, word1):
 
 @njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
-    """Return uniform number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
+    """Return uniform number `index` of a stream in a draw, 2^-53 .. 1 - 2^-53.
 
-    A probability below 1.1e-16 can not be drawn by comparison.
+    So comparison with a uniform number cannot realise a probability below 1.1e-16.
     """
     return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
 
 
 @njit(cache=True)
 def normal_pair(key0, key1, draw, stream, index):
-    """Pair `index` of normal numbers: of the uniforms ``2 index`` and ``2 index + 1``."""
+    """Return pair `index` of normal numbers, made from uniforms ``2 index`` and ``2 index + 1``."""
     words = four_words(key0, key1, draw, stream, index >> 1)
     return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])
 
 
 def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np.ndarray:
-    """Return the first ``count`` of `uniform`, (m, number), in a draw (m,) of each key (m, 2)."""
+    """Return the first ``count`` uniform numbers of a stream in each of m draws, (m, count).
+
+    Parameters
+    ----------
+    keys
+        (m, 2) uint64: random key of each row.
+    draws
+        (m,) int64: number of the draw of each row.
+    stream
+        Stream.
+    count
+        Number of uniform numbers in a row.
+    """
     out = np.empty((draws.size, (count + 3) // 4 * 4))
     _fill_uniforms(np.ascontiguousarray(keys), np.asarray(draws, np.int64), stream, out)
     return out[:, :count]
@@ -141,7 +171,7 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
 
 @njit(cache=True, nogil=True)
 def _fill_uniforms(keys, draws, stream, out):
-    """Blocks of four uniforms, from the first on, in a draw of each key."""
+    """Fill rows of `out` with the uniform numbers of a stream, in blocks of four."""
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):
         address = keys[i, 0], keys[i, 1], draws[i]
@@ -152,11 +182,11 @@ def _fill_uniforms(keys, draws, stream, out):
 
 
 def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
-    """Independent standard normal numbers of as many uniforms, an even number in a row (m, k).
+    """Return independent standard normal numbers, (m, k) with even k, from as many uniform numbers.
 
-    Pair by pair those of `normal_pair`, but for a last bit.
+    Each pair is that of `normal_pair`, up to the last bit.
     """
-    # In one piece each: bits do not depend on how many rows there are.
+    # Contiguous copies, so that bits do not depend on the number of rows.
     first, second = (np.ascontiguousarray(uniform_numbers[:, lane::2]) for lane in range(2))
     radius, angle = np.sqrt(-2.0 * np.log(first)), 2.0 * np.pi * second
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(
@@ -165,11 +195,22 @@ def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
 
 
 def point_keys(parameter_rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:
-    """Philox keys (n, 2) of points, from what they are and not from where they stand in a grid.
+    """Return the Philox keys (n, 2) of points, which follow from their parameters alone.
 
-    BLAKE2b-128 of domain, seed and row (n, m): equal rows have equal keys, others different ones.
-    The domain tells what the rows mean (names and order of the columns, say), so that equal numbers
-    of different meaning give different keys.
+    Parameters
+    ----------
+    parameter_rows
+        (n, m): parameters of each point, without nan.
+    domain
+        Meaning of the rows, such as names and order of the columns, so that equal numbers of
+        different meaning give different keys.
+    seed
+        Seed, not negative.
+
+    Notes
+    -----
+    A key is the BLAKE2b-128 hash of domain, seed and row. Equal rows have equal keys and different
+    rows different ones, wherever a point is in a grid.
     """
     table = np.asarray(parameter_rows, dtype="<f8")
     if table.ndim != 2:

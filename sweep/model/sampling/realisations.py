@@ -1,14 +1,14 @@
-"""Random effects, draw by draw: each draw is a shot of its own, and what counts is their mean.
+"""Simulation of random effects by draws: each draw is a shot, and results are means over draws.
 
-Points times draws are laid out in a row, cut into parts that fit the memory, and each part is
-prepared as any other points are. Random effects turn its parameters before, and change its shots
-after, all the others. Over the noise every draw has closed forms (PHYSICS section 6), whose mean
-over the draws converges far faster than a count of detections would.
+All combinations of points and draws are laid out in a row and cut into batches that fit the memory.
+Each batch is prepared as any other points are. Random effects change its parameters before all
+other effects, and its shots after them. The probabilities of each draw over its noise are closed
+forms (docs/draws.md). Their mean over the draws converges far faster than the fraction of
+detections would.
 
 Every random number is addressed by point, draw and cause (:mod:`sweep.model.sampling.philox`), and
-sums run
-over a point's draws in their order. So the cut of draws into parts, and other points or effects,
-make no difference to a single bit.
+sums run over a point's draws in their order. So neither the cut into batches nor other points or
+effects change a single bit.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -32,23 +32,23 @@ from sweep.model.outputs import (
 from sweep.model.preparation import Parameters, Shots
 
 DRAWS_PER_BATCH = 4096
-"""Draws that are prepared at once, of all points together."""
+"""Largest number of draws that are prepared at once, over all points."""
 BEAMLETS_PER_BATCH = 1 << 19
-"""Beamlets of all these draws, of some 100 bytes each."""
+"""Largest number of beamlets in the draws that are prepared at once, about 100 bytes each."""
 
 
 class RealisedShots(NamedTuple):
-    """Some draws of some points, (m,) each, a point's draws in their order."""
+    """Prepared shots of m draws of points, (m,) each; the draws of a point are in order."""
 
     point_indices: np.ndarray
-    """int64: which point."""
+    """int64: index of the point."""
     draw_numbers: np.ndarray
     """int64: number of the draw."""
     shots: Shots
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Those of the effects, by name, that are simulated by draws."""
+    """Return the effects, of those with the given names, that are simulated by draws."""
     return tuple(effect for effect in select_effects(effects) if effect.is_random)
 
 
@@ -60,12 +60,24 @@ def iter_realisations(
     first_draw: int = 0,
     draws: int,
 ) -> Iterator[RealisedShots]:
-    """Shots of every draw of n points, with random `keys` (n, 2), on a flat plane.
+    """Yield prepared shots of every draw of n points on a flat plane, batch by batch.
 
-    Any part of the draws, from `first_draw` on, can be had alone.
+    Parameters
+    ----------
+    parameters
+        Parameters of the points by dotted path, (n,) or scalar.
+    effects
+        Names of the effects to simulate.
+    keys
+        (n, 2) uint64: random key of each point.
+    first_draw
+        Number of the first draw. Draws depend only on their number, so any range can be computed
+        alone.
+    draws
+        Number of draws of each point.
     """
     all_parameters = PARAMETER_DEFAULTS | dict(parameters)
-    # So that there are n points even where they differ in nothing.
+    # One parameter has n values, so that there are n points even if they differ in nothing.
     all_parameters["target.range"] = np.broadcast_to(all_parameters["target.range"], len(keys))
     for indices, category_parameters in split_with_beamlet_counts(
         all_parameters, effects, EFFECT_CATEGORY_PATHS
@@ -93,7 +105,7 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """One draw of each of some points of one category."""
+    """Return prepared shots of one draw of each point of a category, with all effects."""
     n_points, random = draw_keys.draw_numbers.size, random_effects(effects)
     for effect in random:
         if effect.perturb_parameters is not None:
@@ -109,15 +121,22 @@ def _realise_batch(
 
 
 def zero_standard_errors(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return standard errors where nothing is random: 0, but nan for outputs that are nan."""
+    """Return standard errors of points without random effects: 0, but nan if the output is nan."""
     return {name: 0.0 * outputs[name.removesuffix("_error")] for name in STANDARD_ERROR_OUTPUTS}
 
 
 class RunningMeans:
-    """Means of values over the draws of n points, added up draw after draw.
+    """Means of values over the draws of n points, accumulated draw by draw.
 
-    By default of the outputs. A draw in which a value is nan is no draw of that value. Logarithms
-    are those of the mean.
+    A draw in which a value is nan does not count for this value. For log10 outputs the mean is the
+    logarithm of the mean of the numbers.
+
+    Parameters
+    ----------
+    n_points
+        Number of points n.
+    names
+        Names of the values; by default those of the outputs of grids.
     """
 
     def __init__(self, n_points: int, names: Sequence[str] = tuple(GRID_OUTPUTS)) -> None:
@@ -126,10 +145,19 @@ class RunningMeans:
         self.n_values = np.zeros(shape, np.int64)
         self.mean = np.where(self._is_logarithm[:, None], -np.inf, np.zeros(shape))
         self.squared_deviations = np.zeros(shape)
-        """Sums of squares about the means."""
+        """(names, n): sums of squared deviations from the means; for logarithms the sum of the
+        numbers over the largest number."""
 
     def add(self, point_indices: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-        """Add draws, (m,) each, in the order of their numbers for each point."""
+        """Add the values of m draws; those of one point must be in the order of their numbers.
+
+        Parameters
+        ----------
+        point_indices
+            (m,): index of the point of each draw.
+        values
+            (m,) by name.
+        """
         rows = np.array([values[name] for name in self.names])
         add_to_running_means(
             point_indices,
@@ -143,9 +171,19 @@ class RunningMeans:
     def moments(
         self, names: Sequence[str], point_indices: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means, variances of a single draw (unbiased) and numbers of draws, (names, points) each.
+        """Return means, unbiased variances of a single draw, and numbers of draws.
 
-        Of outputs other than logarithms.
+        Parameters
+        ----------
+        names
+            Names of values that are not logarithms.
+        point_indices
+            Selected points.
+
+        Returns
+        -------
+        tuple of ndarray (names, points)
+            Mean, variance and number of draws.
         """
         rows = np.ix_(np.array([self.names.index(name) for name in names]), point_indices)
         n = self.n_values[rows]
@@ -157,12 +195,12 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return the sums that further draws are added to, besides means, (n, RUNNING_COLUMNS)."""
+        """Return the sums, besides the means, that further draws change: (n, N_RUNNING_SUMS)."""
         arrays = self.n_values, self.squared_deviations[KEEPS_SPREAD], self.mean[IS_LOGARITHM]
         return np.concatenate(arrays).T
 
     def resume(self, results: Mapping[str, np.ndarray]) -> None:
-        """Resume from earlier `results` and `running_sums`; zeros where nothing was drawn."""
+        """Resume from earlier `results` with `running_sums`; zeros for points without draws."""
         split_rows = np.cumsum([len(self.names), KEEPS_SPREAD.sum()])
         n_values, squared_deviations, largest_logarithms = np.split(
             results[RUNNING_SUMS].T, split_rows
@@ -174,24 +212,24 @@ class RunningMeans:
         self.mean[...] = np.where(n_values > 0, mean, self.mean)
 
     def state(self) -> np.ndarray:
-        """All that draws have come to, (3 * names, n); :meth:`restore_state` goes on from there."""
+        """Return the complete state, (3 * names, n), for :meth:`restore_state`."""
         return np.concatenate([self.n_values, self.mean, self.squared_deviations])
 
     def restore_state(self, state: np.ndarray) -> None:
-        """Go on from what :meth:`state` gave before."""
+        """Restore a state that :meth:`state` returned."""
         self.n_values[...], self.mean[...], self.squared_deviations[...] = np.split(state, 3)
 
     def standard_errors(self) -> np.ndarray:
-        """Compute standard errors of the means, (names, n)."""
+        """Return the standard errors of the means, (names, n)."""
         n = self.n_values
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.sqrt(self.squared_deviations / (n * (n - 1.0)))
 
     def results(self) -> dict[str, np.ndarray]:
-        """Return means by the names of OUTPUTS, standard errors by ERROR_OUTPUTS, (n,)."""
+        """Return means by name, and standard errors by names of STANDARD_ERROR_OUTPUTS, (n,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = self.mean + np.log10(self.squared_deviations / self.n_values)
-        # The running maximum of logarithms that are all -inf has nothing to add to it.
+        # If all logarithms are -inf, the sum relative to the largest is 0: keep -inf.
         logarithm = np.where(np.isneginf(self.mean), self.mean, logarithm)
         mean = np.where(self._is_logarithm[:, None], logarithm, self.mean)
         means = dict(zip(self.names, np.where(self.n_values > 0, mean, np.nan), strict=True))
@@ -203,11 +241,28 @@ class RunningMeans:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_to_running_means(point_indices, values, is_logarithm, n_values, mean, squared_deviations):
-    """Draws into running means and sums of squared deviations [Welford, Technometrics 4, 1962].
+    """Add values to running means and sums of squared deviations [1].
 
-    (names, m) values of points (m,), nan where a draw is none; what is infinite in one of them, as
-    bounds without an echo are, is so in the mean. For logarithms instead the largest, and the sum
-    of the numbers over its number.
+    Parameters
+    ----------
+    point_indices
+        (m,): index of the point of each column of `values`.
+    values
+        (names, m): values of draws; nan does not count. If a value is infinite, as a bound without
+        an echo is, so is the mean.
+    is_logarithm
+        (names,) bool: True for values that are log10 of a number.
+    n_values
+        (names, n) int64: number of values added so far; updated.
+    mean
+        (names, n): mean of the values, for logarithms the largest logarithm; updated.
+    squared_deviations
+        (names, n): sum of squared deviations from the mean, for logarithms the sum of the numbers
+        over the largest number; updated.
+
+    References
+    ----------
+    .. [1] B. P. Welford, Technometrics 4, 1962.
     """
     for k in range(values.shape[0]):
         for j in range(point_indices.size):

@@ -1,23 +1,22 @@
-"""Points sampled by draws: a fixed number of them, or as many as it takes to keep a promise.
+"""Sampling of points by draws: a fixed number, or as many as an error tolerance needs.
 
-Draws are held against probabilities, or noise is added to the bins that matter
-(:mod:`sweep.model.sampling.draws`), or a detector and an estimator look at whole spectra with noise
+Draws are compared with probabilities, or noise is added to the bins that matter
+(:mod:`sweep.model.sampling.draws`), or a detector and an estimator process full spectra with noise
 (:mod:`sweep.model.sampling.noisy_spectra`).
 
-The promise bounds the error of pd, each segment's and the shot's, with some confidence. The
-estimate of pd from draws depends on what is random. If effects are random, pd is the mean over
+The tolerance bounds the half-width of the confidence interval of pd, for each segment and the shot.
+The estimate of pd from draws depends on what is random. If effects are random, pd is the mean over
 draws of the conditional probabilities that each draw has over its noise. If noise alone is random
-and is drawn, it is the share of draws with a detection. If noise alone is random and draws are
+and is drawn, pd is the fraction of draws with a detection. If noise alone is random and draws are
 compared with known probabilities, pd is exact, and the counts sample it.
 
-Drawing until the promise is kept goes in rounds over all points that are still open. A test stops
-sooner, on the average, if the draws happen to vary little. This costs coverage and adds bias:
-:func:`stopping_checks` looks seldom enough for both to be small. ``benchmarks/stopping_rule.py``
-measures
-them. Looks come at the same numbers of draws for every point, and what a point has drawn depends on
-nothing but its own draws: other points, blocks and workers change no bit of it. A detector sees the
-draws of one point and segment together, in pieces that depend on the FFT size and on numbers of
-draws alone.
+Drawing until the tolerance is met goes in rounds over all points that do not meet it yet. A
+sequential test stops sooner, on average, if the draws happen to vary little. This reduces coverage
+and adds bias. :func:`stopping_checks` tests seldom enough to keep both small;
+``benchmarks/stopping_rule.py`` measures them. Tests come at the same numbers of draws for every
+point. The draws of a point depend on nothing but the point: other points, blocks and workers change
+no bit of the result. A detector processes the draws of one point and segment together, in parts
+that depend on the FFT size and on numbers of draws alone.
 """
 
 import math
@@ -60,17 +59,17 @@ from sweep.model.sampling.realisations import (
 )
 
 NOISE_DRAWS_PER_STEP = 1 << 16
-"""Draws of a point that are taken at once where nothing but noise is random."""
+"""Number of draws of a point in one step if nothing but noise is random."""
 RANDOM_EFFECT_DRAWS_PER_STEP_MIN = 16
-"""Draws of a point that are taken at once where random effects are simulated, at the least."""
+"""Smallest number of draws of a point in one step if random effects are simulated."""
 
 SPECTRUM_SAMPLES_PER_STEP = 1 << 18
-"""Samples of whole spectra that are held at once."""
+"""Largest number of samples of full spectra in one step."""
 
 FFT_SIZE_PATH = "instrument.processing.fft_size"
 
 SPECTRA_METHOD = "spectra"
-"""Way to draw beside :data:`sweep.model.sampling.draws.METHODS`."""
+"""Method of drawing that makes full spectra; the others are ``probabilities`` and ``noise``."""
 
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
@@ -78,20 +77,34 @@ PD_COUNT_ROWS = [
 
 
 class PriorDraws(NamedTuple):
-    """Draws of n points that were taken before: further ones are added to them, bit for bit."""
+    """Earlier draws of n points, to which further draws are added, bit for bit."""
 
     n_draws: np.ndarray
-    """(n,) int64: how many, 0 where there are none."""
+    """(n,) int64: number of draws of each point."""
     counts: np.ndarray
-    """(names, n, batches) int64: over the batches that are to be filled, as of DRAW_OUTPUTS."""
+    """(names, n, batches) int64: counts in the batches of the result, in the order of
+    DRAW_COUNT_OUTPUTS."""
     means: Mapping[str, np.ndarray]
-    """(n,) by the names of OUTPUTS, and RUNNING; for points with random effects."""
+    """(n,) by the names of outputs, and RUNNING_SUMS; used for points with random effects or full
+    spectra."""
 
 
 class Sampler(ABC):
-    """Sums over the draws of n points so far, to be continued; arguments of :func:`simulate_draws`.
+    """Sums over the draws of n points so far, to which further draws can be added.
 
-    ``batch_edges`` (batches + 1,) are numbers of draws between batches, from the first draw's on.
+    Parameters
+    ----------
+    parameters
+        Parameters of the points by dotted path, (n,) or scalar.
+    effects
+        Names of the effects to simulate.
+    keys
+        (n, 2) uint64: random key of each point.
+    batch_edges
+        (batches + 1,) int64: numbers of the draws at which batches begin, and the number after the
+        last draw.
+    prior_draws
+        Earlier draws, from the first of `batch_edges` on.
     """
 
     def __init__(
@@ -108,10 +121,10 @@ class Sampler(ABC):
 
     @abstractmethod
     def draws_per_step(self, n_points: int) -> int:
-        """Draws of each of so many points that one `draw` is for: a few seconds at the most."""
+        """Return the number of draws of each of `n_points` points in a step of a few seconds."""
 
     def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
-        """Draw some points, of which there are equally many draws, so many times more."""
+        """Add `n_draws` draws to points that have equal numbers of draws."""
         first_draw = self.batch_edges[0] + self.n_draws[point_indices[0]]
         counts = np.zeros(
             (len(DRAW_COUNT_OUTPUTS), point_indices.size, self.batch_edges.size - 1), np.int64
@@ -128,28 +141,28 @@ class Sampler(ABC):
 
     @abstractmethod
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Half-widths (4, points) of pd at the confidence of `error_budget`.
+        """Return half-widths of pd at the confidence of `error_budget`, (4, points).
 
-        By the names of PROMISED; nan where there is none.
+        Rows are in the order of PD_OUTPUTS; nan for a segment that does not exist.
         """
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, errors and accuracy, (n,) each, and the sums for further draws."""
+        """Return outputs, errors and half-widths, (n,) each, and the sums for further draws."""
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
-        """Parameters of some of the points."""
+        """Return the parameters of selected points."""
         return {
             path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
             for path, v in self.parameters.items()
         }
 
     def n_detected(self) -> np.ndarray:
-        """Draws with a detection, (4, n), by the names of PROMISED."""
+        """Return the numbers of draws with a detection, (4, n), in the order of PD_OUTPUTS."""
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Half-widths of the shares of draws with a detection."""
+        """Return half-widths (4, points) of the fractions of draws with a detection."""
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
         interval = COUNT_INTERVALS[error_budget.interval](
@@ -158,13 +171,13 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Compute the excess of the worst half-width over the tolerance; 0 where there is none."""
+        """Return the excess (points,) of the largest half-width over the tolerance, at least 0."""
         widths = self.half_widths(point_indices, error_budget)
         excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
 
     def accuracy_outputs(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """(n,) by the names of ACCURACY_OUTPUTS."""
+        """Return numbers of draws, half-widths and excess (n,) by the names of ACCURACY_OUTPUTS."""
         point_indices = np.arange(self.n_draws.size)
         widths = zip(PD_OUTPUTS, self.half_widths(point_indices, error_budget), strict=True)
         return {
@@ -175,14 +188,15 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Not to stop before all is drawn."""
+    """Return False: continue until all draws are made."""
     return False
 
 
 def stopping_checks(batch_size: int, draws_max: int) -> Iterator[int]:
-    """Numbers of draws, rising to `draws_max`, after which half-widths are looked at.
+    """Yield the numbers of draws, rising to `draws_max`, at which half-widths are tested.
 
-    After each of the first batches, then after a quarter as many again, in whole batches.
+    Tests come after each of the first batches, later each time the number of draws has grown by a
+    quarter, rounded to whole batches.
     """
     n_batches = 1
     while n_batches * batch_size < draws_max:
@@ -206,21 +220,43 @@ def simulate_draws(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> dict[str, np.ndarray]:
-    """Simulate draws with all effects: outputs, their errors, and counts of draws.
+    """Simulate draws with all effects and return outputs, their errors, and counts of draws.
 
-    The result has the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS
-    of :mod:`sweep.model.outputs`, (n,), and those of DRAW_OUTPUTS, (n, batches). With random
-    effects or whole spectra it also has RUNNING, (n, columns), and outputs are means over the draws
-    that are counted.
+    Parameters
+    ----------
+    parameters, effects
+        Parameters by dotted path and names of effects, as for
+        :func:`sweep.model.evaluation.evaluate`.
+    keys
+        (n, 2) uint64: random key of each point.
+    method
+        ``probabilities``, ``noise`` or ``spectra``.
+    first_draw
+        Number of the first draw.
+    batch_sizes
+        Numbers of draws to count separately; each point then has their sum. Without them a point
+        has as many draws as `error_budget` needs, in one count.
+    batch
+        Number of draws of which a multiple is made between tests against `error_budget`.
+    limit
+        Largest number of draws of a point without `batch_sizes`.
+    error_budget
+        Tolerance and confidence.
+    methods
+        Detectors and estimators for ``spectra``.
+    prior_draws
+        Earlier draws from `first_draw` on, for the same tolerance or a looser one.
+    should_stop
+        Function that is called between steps. If it returns True, the result holds the draws so
+        far, at least those of one step. It can be continued by another call with `prior_draws`.
 
-    `parameters` and `effects` are as for :func:`sweep.model.evaluation.evaluate`, `keys` (n, 2)
-    random, `method` is ``probabilities``, ``noise`` or ``spectra``. A point has as many draws as
-    `batch_sizes` say. Without them (then all draws are one count) it has as many as `error_budget`
-    needs, which is checked at multiples of `batch` draws, but no more than `limit`. `prior_draws`
-    are
-    earlier draws, from `first_draw` on, for the same accuracy or a looser one. If `should_stop`,
-    called between draws, returns true, the result holds the draws taken so far, at least some: a
-    `prior_draws` from which another call continues.
+    Returns
+    -------
+    dict of str to ndarray
+        By names of :mod:`sweep.model.outputs`: (n,) those of GRID_OUTPUTS and
+        STANDARD_ERROR_OUTPUTS, or of SPECTRA_OUTPUTS, and of ACCURACY_OUTPUTS; those of
+        DRAW_COUNT_OUTPUTS, (n, batches) with `batch_sizes`, else (n,). With random effects or full
+        spectra there is RUNNING_SUMS (n, columns), and outputs are means over the draws.
     """
     batch_edges = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     sampler_arguments: dict[str, Any] = {
@@ -252,10 +288,21 @@ def draw_until_accurate(
     error_budget: ErrorBudget | None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> None:
-    """Draw points until the promise is kept of each, numbers to look at end, or told to stop.
+    """Draw points until each meets the tolerance, the last check is passed, or a stop is due.
 
-    One that has more draws than a look is at was looked at there before, or need not be. Without
-    an accuracy nothing is promised.
+    Parameters
+    ----------
+    sampler
+        Sampler; it is changed.
+    point_indices
+        Points to draw.
+    check_draws
+        Rising numbers of draws at which half-widths are tested. A point that already has more draws
+        is not tested at that number.
+    error_budget
+        Tolerance and confidence; None to draw up to the last of `check_draws` without a test.
+    should_stop
+        Function that is called between steps and returns True to stop.
     """
     has_drawn = False
     for check_at in check_draws:
@@ -280,7 +327,7 @@ def draw_until_accurate(
 
 
 class DetectionSampler(Sampler):
-    """Draws held against probabilities, or in noise, with or without random effects."""
+    """Sampler that compares draws with probabilities, or makes them in noise (``noise``)."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -296,7 +343,7 @@ class DetectionSampler(Sampler):
             self._running_means.resume(prior_draws.means)
 
     def draws_per_step(self, n_points: int) -> int:
-        """As of :class:`Sampler`."""
+        """Implement :meth:`Sampler.draws_per_step`."""
         return (
             NOISE_DRAWS_PER_STEP
             if self._running_means is None
@@ -306,7 +353,7 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """As of :class:`Sampler`: of random effects, draws are added to the means as well."""
+        """Implement :meth:`Sampler.count_draws`; draws of random effects also change the means."""
         point_parameters, keys = self.select_parameters(point_indices), self.keys[point_indices]
         if self._running_means is not None:
             for members, draw_numbers, shots in iter_realisations(
@@ -336,7 +383,7 @@ class DetectionSampler(Sampler):
             )
 
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """As of :class:`Sampler`."""
+        """Implement :meth:`Sampler.half_widths`."""
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
         if self._running_means is not None:
             mean, variance, n_draws = self._running_means.moments(PD_OUTPUTS, point_indices)
@@ -350,7 +397,7 @@ class DetectionSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """As of :class:`Sampler`."""
+        """Implement :meth:`Sampler.results`."""
         if self._running_means is None:
             outputs = self._outputs | zero_standard_errors(self._outputs)
         else:
@@ -361,7 +408,7 @@ class DetectionSampler(Sampler):
 
 
 class SpectraSampler(Sampler):
-    """Draws of whole spectra, looked at by detectors and estimators of given names."""
+    """Sampler whose draws are full spectra, processed by named detectors and estimators."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, methods: SpectrumMethods,
@@ -394,9 +441,10 @@ class SpectraSampler(Sampler):
                 self._statistic_means.restore_state(statistic_sums)
 
     def draws_per_step(self, n_points: int) -> int:
-        """Return the number of draws that one step takes of each of ``n_points`` points.
+        """Return the number of draws of each of ``n_points`` points in one step.
 
-        Whole ones, so that a detector sees the same draws together however they are cut.
+        It is a multiple of the draws that are processed together, so that a detector gets the same
+        draws together however the draws are cut into steps.
         """
         fft_sizes = np.unique(self.parameters[FFT_SIZE_PATH])
         return max(1, 4 // n_points) * math.lcm(
@@ -406,7 +454,7 @@ class SpectraSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """As of :class:`Sampler`: and values are added to running means."""
+        """Implement :meth:`Sampler.count_draws`, and add measured values to the running means."""
         for column, point in enumerate(point_indices):
             for view, draws in self._iter_views(int(point), int(first_draw), int(end_draw)):
                 batch_index = np.searchsorted(self.batch_edges, draws, "right") - 1
@@ -418,7 +466,7 @@ class SpectraSampler(Sampler):
     def _iter_views(
         self, point: int, first_draw: int, end_draw: int
     ) -> Iterator[tuple[SpectrumView, np.ndarray]]:
-        """Yield views of a point, with the numbers of the draws that each is for."""
+        """Yield views of a point, each with the numbers of its draws."""
         point_parameters = self.select_parameters(point)
         if self._shot_of_point:
             view = make_spectrum_view(
@@ -445,7 +493,7 @@ class SpectraSampler(Sampler):
                 yield view, np.array([draw_number])
 
     def _nan_where_missing(self) -> np.ndarray:
-        """0, but nan for a segment that is not there, (4, n), by the names of PROMISED."""
+        """Return 0, but nan for segments that do not exist, (4, n), in the order of PD_OUTPUTS."""
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(
             self.parameters.get(
@@ -460,14 +508,14 @@ class SpectraSampler(Sampler):
         return zero_or_nan
 
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """As of :class:`Sampler`."""
+        """Implement :meth:`Sampler.half_widths`."""
         return (
             self.count_half_widths(point_indices, error_budget)
             + self._nan_where_missing()[:, point_indices]
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """As of :class:`Sampler`."""
+        """Implement :meth:`Sampler.results`."""
         values, statistics = self._value_means, self._statistic_means.results()
         n, mean, squared_deviations, error = (
             dict(zip(AVERAGED_VALUES, part, strict=True))

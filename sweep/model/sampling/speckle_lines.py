@@ -1,38 +1,41 @@
-"""Developed speckle of a footprint, drawn: complex amplitudes of bins in the segments of a shot.
+"""Developed speckle of a footprint in draws: complex amplitudes of bins in the segments of a shot.
 
 The footprint is a grid of lines over the two coordinates of a Gaussian beam, in its standard
 deviations. A line at (y, x) has the weight a^2 of a Gaussian rule and a circular complex Gaussian
-amplitude z, which all segments of a shot see. In segment s it lies b_s . (y, x) bins off the middle
-of the echo, and its phase is t_s . (y, x) against the first segment, by equation (1) of
-:mod:`sweep.model.detection.speckle_correlation`. A bin k then has
+amplitude z, common to all segments of a shot. In segment s it is b_s . (y, x) bins off the middle
+of the echo. Its phase is t_s . (y, x) relative to the first segment, by equation (1) of
+:mod:`sweep.model.detection.speckle_correlation`. The amplitude of bin k is
 
     A_s,k = sum a z e^(i t_s . (y, x)) G(k - middle_s - b_s . (y, x))                            (1)
 
 with the window's transform G. Near DC and Nyquist of a real record the conjugate amplitudes of the
-lines' images add to it (:mod:`sweep.model.detection.pseudo_variance`): at DC the sum is real. Bins
-of all
-segments are jointly circular Gaussian, as sums of such numbers are. Their covariances are the
-Gaussian means that the rule integrates, so that the peak bins of two segments have the correlation
-mu of that module. Amplitudes are returned over their root mean squares: whoever draws gives a bin
-the mean power that the spectrum has there.
+lines' images are added (:mod:`sweep.model.detection.pseudo_variance`): at DC the sum is real. Sums
+of Gaussian numbers are Gaussian, so bins of all segments are jointly circular Gaussian. Their
+covariances are Gaussian means, which the rule integrates. So the peak bins of two segments have the
+correlation mu of that module. Amplitudes are returned over their root mean squares, and callers
+multiply them by the magnitudes of the noiseless spectrum.
 
-Places wander with speckle. If the footprint spreads over less than a bin, (1) is to first order in
-b the bin of a lone tone that lies
+Positions of peaks wander with speckle. If the footprint spreads over less than a bin, (1) is to
+first order in b the bin of a lone tone. This tone is off the middle by
 
     w_s = b_s . Re(Y_s / A_s),    Y_s = sum a z e^(i t_s . (y, x)) (y, x)                        (2)
 
-off the middle. A_s and Y_s are independent, as y and x have the mean 0. Of a peak with the power
-q^2 in units of its mean, noise included, of which the echo has the share v, w_s is normal:
+A_s and Y_s are independent, as y and x have the mean 0. Let the peak have the power q^2 in units of
+its mean, noise included, and let v be the fraction of the echo in that mean. Then w_s is normal:
 
     var w_s = |b_s|^2 v / (2 q^2)                                                                (3)
 
-This is the law of a ratio of two Gaussian numbers [Goodman, Speckle Phenomena in Optics, 2007,
-ch. 2; of angles in radar it is known as glint: Kanter, IEEE Trans. AES-13, 1977]. Without the
-threshold, which keeps q away from 0, it has no variance. :func:`wander_covariance` has the
+This is the law of a ratio of two Gaussian numbers [1]; of angles in radar it is known as glint [2].
+The threshold keeps q away from 0; without it w_s has no variance. :func:`wander_covariance` has the
 covariance of two segments.
 
-In footprints of half a bin and more the place is bounded by the bins that are looked at.
-:func:`position_error_moments` bounds it so where the strongest bin alone detects.
+In footprints of half a bin and more, the search limits the position of the peak.
+:func:`position_error_moments` applies such a limit if the strongest bin alone detects.
+
+References
+----------
+.. [1] Goodman, Speckle Phenomena in Optics, 2007, ch. 2.
+.. [2] Kanter, IEEE Trans. AES-13, 1977.
 """
 
 import math
@@ -65,24 +68,25 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 RULE_SIZES = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Numbers of nodes of the Gaussian rules: lines along one coordinate of the beam."""
+"""Numbers of nodes of the Gaussian rules, which are the numbers of lines along one coordinate of
+the beam."""
 
 _RULE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
-"""Largest phase per standard deviation of the beam [rad] that each rule of NODES integrates to
+"""Largest phase per standard deviation of the beam [rad] that each rule of RULE_SIZES integrates to
 1e-3."""
 
 _LINE_WEIGHT_MIN = 1e-6
-"""Power fraction below which a line is left out."""
+"""Power fraction below which a line is omitted."""
 
 GROUP_NUMBER_STRIDE = 1 << 24
-"""Random numbers reserved for a group: those of group g begin at (1 + g) FIRST_LINE."""
+"""Number of random numbers reserved for a group; those of group g begin at (1 + g) times this."""
 
 LOOK_DRAW_STRIDE = np.int64(1 << 48)
 """Offset in the draw number between successive looks, which makes their random numbers distinct."""
 
 
 class SpeckleLineGrid(NamedTuple):
-    """Grid of speckle lines of n points, as compiled code takes it."""
+    """Grid of speckle lines of n points, for compiled code."""
 
     line_shift: np.ndarray
     """(n, 3, 2): line shift per standard deviation of the beam [bins], positive towards higher
@@ -92,7 +96,7 @@ class SpeckleLineGrid(NamedTuple):
     rule_index: np.ndarray
     """(n, 2) int64: index into :data:`RULE_SIZES` for each coordinate."""
     peak_search_bins: np.ndarray
-    """(n,) int64: bins on either side of the strongest one in which the peak is searched."""
+    """(n,) int64: bins on either side of the strongest bin in which the peak is searched."""
     node: np.ndarray
     """(rules, nodes): nodes of the Gaussian rules [standard deviations], padded with 0."""
     weight: np.ndarray
@@ -104,14 +108,14 @@ class SpeckleLineGrid(NamedTuple):
     samples_per_bin: float
     """Samples of ``transform`` per bin of fs/N."""
     transform_reach_bins: float
-    """Distance from a line up to which bins receive light of it [bins of fs/N]."""
+    """Distance from a line up to which bins receive its light [bins of fs/N]."""
     nyquist_bin: int
-    """N/2 of a real record whose bins near DC and Nyquist see the conjugate images of lines,
+    """N/2 of a real record whose bins near DC and Nyquist contain the conjugate images of lines,
     else 0."""
 
     @classmethod
     def empty(cls) -> "SpeckleLineGrid":
-        """Return lines of no points."""
+        """Return a grid of no points."""
         no_gradients, no_indices = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
         no_table = np.zeros((0, 0))
         return cls(
@@ -129,7 +133,7 @@ class SpeckleLineGrid(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
-        """Select points by their indices."""
+        """Return the grid of the points with the given indices."""
         if not self.line_shift.shape[0]:
             return self
         return self._replace(
@@ -142,7 +146,7 @@ class SpeckleLineGrid(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _gaussian_rules() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of the Gaussian rules, (rules, nodes), padded with zeros."""
+    """Return nodes and weights of the Gaussian rules, (rules, nodes), padded with zeros."""
     node, weight = np.zeros((2, RULE_SIZES.size, RULE_SIZES[-1]))
     for row, n_nodes in enumerate(RULE_SIZES.tolist()):
         node[row, :n_nodes], weight[row, :n_nodes] = gaussian_rule(n_nodes)
@@ -150,7 +154,7 @@ def _gaussian_rules() -> tuple[np.ndarray, np.ndarray]:
 
 
 def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
-    """Prepare the speckle lines of shots; of no points if the shots have no developed speckle."""
+    """Return the speckle lines of shots; without points if the shots have no developed speckle."""
     gradients = shots.line_gradients
     transform = transform_table(shots.window)[1]
     node, weight = _gaussian_rules()
@@ -158,7 +162,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     line_shift, phase = np.zeros((2, n_points, 3, 2)) if gradients is None else gradients
     padding_factor = shots.fft_size / shots.window.length
     line_shift, phase = _rotate_to_steepest(line_shift, phase, padding_factor)
-    # Two bins' transforms together turn by 2 pi at the most for each bin of fs/L.
+    # The product of two bins' transforms turns by at most 2 pi for each bin of fs/L.
     phase_max = np.abs(phase[:, :, None] - phase[:, None]).max(axis=(1, 2))
     phase_max = phase_max + np.pi * np.abs(line_shift).max(axis=1) / padding_factor
     rule_index = np.searchsorted(_RULE_PHASE_MAX, phase_max)
@@ -185,9 +189,10 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
 def _rotate_to_steepest(
     line_shift: np.ndarray, phase: np.ndarray, padding_factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn the beam's two coordinates until shifts and phases grow most along the first.
+    """Rotate the beam's coordinates until shifts and phases grow most along the first.
 
-    The beam is round, so that the law is the same; few lines are then needed along the second.
+    The beam is round, so the probability law is unchanged. Few lines are then needed along the
+    second coordinate.
     """
     phase_slopes = np.concatenate(
         [phase - phase[:, :1], line_shift * (np.pi / padding_factor)], axis=1
@@ -230,20 +235,27 @@ def interpolate_transform(distance, grid):
 
 @njit(cache=True, error_model="numpy")
 def nearest_image_position(position, nyquist_bin):
-    """Place [bins] of the nearer image of a line of a real record, about DC or Nyquist."""
+    """Return the position [bins] of the nearest image of a line, about DC or Nyquist."""
     return -position if position < 0.5 * nyquist_bin else 2.0 * nyquist_bin - position
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
-    """Mean powers (3, bins) of bins by lines of a total power of 1, into ``mean_power``.
+    """Compute mean powers of bins by lines of total power 1, and return True if there are images.
 
-    ``echo_centre`` (3,) is the echo's middle in each segment, nan for none, and ``first_bin`` (3,)
-    the first
-    of the bins, in the same numbers. ``pseudo_variance`` takes the pseudo-variances over these
-    powers, which
-    images of lines make (:mod:`sweep.model.detection.pseudo_variance`). Returns true if there are
-    any.
+    Parameters
+    ----------
+    grid, point
+        Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
+    echo_centre
+        (3,): middle of the echo in each segment [bins]; nan for a segment without an echo.
+    first_bin
+        (3,): first of the bins in each segment.
+    mean_power
+        (3, bins): set to the mean powers.
+    pseudo_variance
+        (3, bins): set to the pseudo-variances over the mean powers, which images of lines cause
+        near DC and Nyquist (:mod:`sweep.model.detection.pseudo_variance`).
     """
     mean_power[:] = 0.0
     pseudo_variance[:] = 0.0
@@ -303,18 +315,20 @@ def draw_bin_amplitudes(
     address
         Key of the point (two uint64) and number of the draw.
     group
-        Number of the echo, which has random numbers of its own.
+        Number of the echo; each echo has its own random numbers.
     grid, point
-        Speckle lines (:class:`SpeckleLineGrid`), and the point.
+        Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
     echo_centre, first_bin
-        As of :func:`mean_bin_powers`.
+        Middle of the echo and first bin, as in :func:`mean_bin_powers`.
     mean_power
         (3, bins): result of :func:`mean_bin_powers` for the same bins.
+    amplitudes
+        (3, bins) complex; the result.
 
     Notes
     -----
-    Equation (1) of the module, over the root of ``mean_power``. All segments see the same
-    amplitudes z. Bins that no line reaches stay 0.
+    Amplitudes are equation (1) of the module over the root of ``mean_power``. All segments have the
+    same amplitudes z. Bins that no line reaches are 0.
     """
     amplitudes[:] = 0.0
     rule_first, rule_second = grid.rule_index[point]
@@ -372,30 +386,33 @@ def draw_bin_amplitudes(
 
 
 FACTORED_BINS_MAX = 48
-"""Bins of all segments together of which the covariance is factored; of more, lines are drawn."""
+"""Largest number of bins, over all segments, whose covariance is factored. For more bins, lines are
+drawn."""
 
 _RESIDUAL_POWER_MAX = 1e-8
-"""Share of a bin's mean power that a factor may leave out."""
+"""Fraction of a bin's mean power that a factor may omit."""
 
 
 @njit(cache=True, error_model="numpy")
 def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, factor):
-    """Factor the covariance of bins by :func:`draw_bin_amplitudes`, and return its rank.
+    """Factor the covariance of the bins of :func:`draw_bin_amplitudes`, and return its rank.
 
     Parameters
     ----------
+    grid, point
+        Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
     echo_centre, first_bin, mean_power
-        As of :func:`draw_bin_amplitudes`.
+        Middle of the echo, first bin and mean powers, as in :func:`draw_bin_amplitudes`.
     factor
-        (rows, 3, bins) complex, with as many rows as there are bins in all, for the result: the
-        amplitudes of the bins are sums of its first rows with independent circular Gaussian numbers
-        of mean power 2.
+        (rows, 3, bins) complex, with one row for each bin of all segments; the result. The
+        amplitudes of the bins are sums of its first rows, up to the rank, times independent
+        circular Gaussian numbers of mean power 2.
 
     Notes
     -----
-    Lines that lie close together make much the same amplitudes: of a footprint within a bin two or
-    three numbers tell those of nine bins. By Cholesky's factorisation with pivots, until no bin
-    lacks more than 1e-8 of its mean power.
+    Lines that are close together make nearly equal amplitudes. For a footprint within a bin, two or
+    three random numbers determine the amplitudes of nine bins. The factor follows from Cholesky's
+    factorisation with pivots, until no bin lacks more than 1e-8 of its mean power.
     """
     rule_first, rule_second = grid.rule_index[point]
     n_segments, n_bins = mean_power.shape
@@ -460,9 +477,10 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_factored_amplitudes(address, group, factor, rank, amplitudes):
-    """Draw amplitudes (3, bins) into ``amplitudes`` by the rows of :func:`factor_bin_covariance`.
+    """Draw amplitudes of bins into ``amplitudes`` (3, bins) from a factor of their covariance.
 
-    ``address`` and ``group`` are those of :func:`draw_bin_amplitudes`.
+    ``factor`` and ``rank`` are the results of :func:`factor_bin_covariance`. ``address`` and
+    ``group`` are as in :func:`draw_bin_amplitudes`.
     """
     amplitudes[:] = 0.0
     first_number = GROUP_NUMBER_STRIDE * (1 + group)
@@ -494,12 +512,14 @@ def draw_segment_amplitudes(
     draws: np.ndarray,
     group: int = 0,
 ) -> np.ndarray:
-    """Draw speckle amplitudes of mean power 1 in adjacent bins of one segment of point i.
+    """Draw speckle amplitudes of mean power 1 in adjacent bins of one segment of a point.
 
     Parameters
     ----------
+    grid, point
+        Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
     echo_centre
-        (3,): centre of the echo in the segment that is drawn [bins], nan in the other two.
+        (3,): middle of the echo in the segment that is drawn [bins], nan in the other two.
     first_and_count
         First bin, and number of bins.
     key
@@ -538,20 +558,21 @@ def draw_segment_amplitudes(
 
 
 RECORD_LINE_DEVIATION_MAX_BINS = 1.0
-"""Deviation of a footprint's lines [bins of fs/L] up to which :class:`FootprintRecord` is used."""
+"""Largest standard deviation of a footprint's lines [bins of fs/L] for which
+:class:`FootprintRecord` is used."""
 
 
 class FootprintRecord(NamedTuple):
     """Windowed record of a footprint's speckle lines: a lone tone at their middle times a series.
 
     The series is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) /
-    N)`` by Chebyshev polynomials in the number n of the sample.
+    N)``, in Chebyshev polynomials of the sample number n.
     """
 
     series_coefficients: np.ndarray
-    """(lines, k) complex: coefficients of the series by line, for z of 1."""
+    """(lines, k) complex: coefficients of the series by line, for an amplitude z of 1."""
     series_positions: np.ndarray
-    """(L,): samples' places in the series, -1 .. 1 over the samples that the echo has."""
+    """(L,): argument of the series at each sample, -1..1 over the samples that contain the echo."""
     windowed_tone: np.ndarray
     """(L,) complex: windowed record of the lone tone, of amplitude 1."""
     mean_bin_power: np.ndarray
@@ -568,19 +589,25 @@ class FootprintRecord(NamedTuple):
         first_sample: int,
         fft_size: int,
     ) -> "FootprintRecord":
-        """Prepare the record of point i in a segment.
+        """Prepare the record of a point in a segment.
 
         Parameters
         ----------
+        line_grid, point
+            Speckle lines, and the index of the point.
+        segment
+            0 up, 1 Doppler, 2 down.
         tone_position
             Frequency of the lone tone [bins].
         window, first_sample
             Window of the record, and the number of samples before the echo.
+        fft_size
+            FFT size N.
 
         Notes
         -----
-        The mean power of all bins is the transform of the window's autocorrelation times the mean
-        phasor of the lines, by the distance of two samples.
+        The mean powers of the bins are the transform of a product over lags. Its factors are the
+        window's autocorrelation and the mean phasor of the lines.
         """
         line_offsets, line_phases, line_weights = _line_offsets_phases_and_weights(
             line_grid, point, segment
@@ -601,7 +628,7 @@ class FootprintRecord(NamedTuple):
             )
         )
         series_coefficients = np.sqrt(0.5 * line_weights)[:, None] * series_coefficients
-        # Sums, not products of matrices, whose order depends on the number of threads.
+        # Sums in place of matrix products, whose order depends on the number of threads.
         series_coefficients = (series_coefficients[:, None] * series_matrix).sum(axis=2)
         windowed_tone = window_samples(window.name, length) * complex_exponentials(
             -tone_position / fft_size, length
@@ -632,7 +659,10 @@ class FootprintRecord(NamedTuple):
         )
 
     def draw_record(self, key: np.ndarray, draw_number: int, group: int) -> np.ndarray:
-        """Draw the record (L,) of a group's speckle from the numbers of its bins' amplitudes."""
+        """Draw the record (L,) of a group's speckle.
+
+        It uses the same random numbers as :func:`draw_bin_amplitudes`.
+        """
         line_amplitudes = np.empty(len(self.series_coefficients), complex)
         _draw_line_amplitudes(
             (key[0], key[1], np.int64(draw_number)),
@@ -649,13 +679,16 @@ class FootprintRecord(NamedTuple):
 
 
 _RELATIVE_POWER_MIN = 1e-14
-"""Mean power of a bin, over the largest, below which it is not known to float64."""
+"""Mean power of a bin, over the largest, below which float64 does not resolve it."""
 
 
 def _line_offsets_phases_and_weights(
     line_grid: SpeckleLineGrid, point: int, segment: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return offsets [bins], phases [rad] and weights of lines, in the order of draw_lines."""
+    """Return offsets [bins], phases [rad] and weights of lines, (lines,) each.
+
+    The order is that of :func:`draw_bin_amplitudes`.
+    """
     rule_first, rule_second = line_grid.rule_index[point]
     y, x = (
         line_grid.node[rule_index, : line_grid.nodes_in_rule[rule_index]]
@@ -674,7 +707,7 @@ def _line_offsets_phases_and_weights(
 
 @njit(cache=True, error_model="numpy")
 def _draw_line_amplitudes(address, first_number, amplitudes):
-    """Draw circular complex Gaussian numbers of mean power 2, of the stream of speckle."""
+    """Draw circular complex Gaussian numbers of mean power 2 from the stream of speckle."""
     for k in range(amplitudes.size):
         re, im = philox.normal_pair(
             address[0], address[1], address[2], philox.STREAM_SPECKLE, first_number + k
@@ -683,15 +716,15 @@ def _draw_line_amplitudes(address, first_number, amplitudes):
 
 
 def _chebyshev_degree(phase_max: float) -> int:
-    """Return the degree of a Chebyshev series that has exponentials up to a phase to 1e-7."""
+    """Return the degree at which a Chebyshev series of exp(i x), |x| <= phase, errs by 1e-7."""
     return 9 + math.ceil(1.5 * phase_max)
 
 
 @lru_cache(maxsize=64)
 def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (number,) of a Chebyshev series, and what makes its coefficients of values there.
+    """Return the nodes (k,) of a Chebyshev series, and the matrix (k, k) that fits one.
 
-    The matrix (number, number) has a row for each coefficient.
+    The matrix times values at the nodes gives the coefficients.
     """
     node_angles = np.pi * (np.arange(n_coefficients) + 0.5) / n_coefficients
     series_matrix = np.cos(np.arange(n_coefficients)[:, None] * node_angles) * (
@@ -702,12 +735,12 @@ def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.nda
 
 
 _SAMPLES_PER_BATCH = 128
-"""Samples that a series is evaluated at together, in vector registers."""
+"""Number of samples at which a series is evaluated together, in vector registers."""
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply_by_chebyshev_series(coefficients, positions, values):
-    """Multiply numbers in place by a Chebyshev series at places -1 .. 1 (Clenshaw's algorithm)."""
+    """Multiply values in place by a Chebyshev series at positions -1..1 (Clenshaw's algorithm)."""
     b1_re, b1_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
     b2_re, b2_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
     twice_positions = np.empty(_SAMPLES_PER_BATCH)
@@ -747,18 +780,18 @@ def wander_covariance(
     relative_power: np.ndarray,
     echo_fraction: np.ndarray,
 ) -> np.ndarray:
-    """Covariance [bins^2] of the places of two segments' peaks by speckle, of m peaks of points.
+    """Return the covariance [bins^2] of the positions of two segments' peaks by speckle, (m,).
 
     Parameters
     ----------
     gradients
-        Footprints of the m peaks.
+        Gradients of the lines of the footprints of the m peaks.
     pair
         Numbers of the two segments.
     relative_power
         (2, m): power q^2 of the two peaks in units of its mean, noise included.
     echo_fraction
-        (2, m): share of the echo in that mean.
+        (2, m): fraction v of the echo in that mean.
 
     Returns
     -------
@@ -767,16 +800,16 @@ def wander_covariance(
 
     Notes
     -----
-    With t the difference of the two turns and rho = exp(-t.t / 2) (v_1 v_2)^(1/2) the correlation
-    of the amplitudes A_1 and A_2, the means of Y_1 and Y_2 given both amplitudes are
+    Let t be the difference of the two phase gradients. The correlation of the amplitudes A_1 and
+    A_2 is rho = exp(-t.t / 2) (v_1 v_2)^(1/2). The means of Y_1 and Y_2 given both amplitudes are
 
         E[Y_1] = -i t rho k (A_2 - rho A_1),   E[Y_2] = i t rho k (A_1 - rho A_2),
         k = 1 / (1 - rho^2),
 
-    and what is left has the covariance rho (1 - k t t'). An instrument knows the amplitudes' sizes.
-    Given these their phases differ by an angle of von Mises' distribution of the concentration
-    K = 2 k rho q_1 q_2, with the means I_1(K) / I_0(K) of its cosine and I_1(K) / (K I_0(K)) of its
-    squared sine. Hence
+    and the remainders have the covariance rho (1 - k t t'). An instrument knows the magnitudes of
+    the amplitudes. Given these, their phases differ by an angle of von Mises' distribution with the
+    concentration K = 2 k rho q_1 q_2. The mean of its cosine is I_1(K) / I_0(K), and that of its
+    squared sine I_1(K) / (K I_0(K)). Hence the covariance is
 
         (b_1.t) (b_2.t) (rho k)^2 E[sin^2] + rho (b_1.b_2 - k (b_1.t) (b_2.t)) E[cos] / (2 q_1 q_2).
     """
@@ -787,7 +820,7 @@ def wander_covariance(
     rho = np.exp(-0.5 * squared_phase) * np.sqrt(echo_fraction[0] * echo_fraction[1])
     remainder = np.maximum(1 - rho * rho, 1e-12)
     magnitude_product = np.sqrt(relative_power[0] * relative_power[1])
-    # The ratio is that of its limits beyond, to float64.
+    # Beyond these limits the ratio equals its limits to float64.
     concentration = np.clip(2 * rho * magnitude_product / remainder, 1e-12, 1e7)
     mean_cosine = special.i1e(concentration) / special.i0e(concentration)
     phase_term = (
@@ -809,21 +842,21 @@ class SpecklePeaks(NamedTuple):
     offset: np.ndarray
     """Interpolated position, relative to the bin about which it was estimated [bins]."""
     folding_sign: np.ndarray
-    """-1 where the segment's bin falls as its beat rises (:func:`folding_signs`), else 1."""
+    """-1 if the segment's bin falls as its beat rises (:func:`folding_signs`), else 1."""
     relative_power: np.ndarray
     """Power q^2 of the peak bin over its mean, echo and noise."""
     echo_fraction: np.ndarray
-    """Fraction v of that mean that is echo, 0 .. 1."""
+    """Fraction v of the echo in the mean power of the peak bin, 0..1."""
 
 
 WANDER_MAX_BINS = 1.5
-"""Bound on the wander of a peak [bins] where only the strongest bin is tested (``peak_bin``)."""
+"""Bound on the wander of a peak [bins] if only the strongest bin is tested (``peak_bin``)."""
 
 
 SEGMENT_PAIRS_AND_SELF = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-"""All pairs of segments (0 up, 1 Doppler, 2 down), each segment with itself included."""
+"""All pairs of segments (0 up, 1 Doppler, 2 down), including each segment with itself."""
 CHIRP_PAIRS = (0, 0), (0, 2), (2, 2)
-"""Pairs among the up and the down segment alone."""
+"""Pairs of the up and down segment alone, including each segment with itself."""
 
 
 def position_error_moments(
@@ -832,32 +865,32 @@ def position_error_moments(
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_AND_SELF,
 ) -> np.ndarray:
-    """Return second moments E[e_i e_j] [bins^2] of the errors that speckle makes in peak positions.
+    """Return second moments E[e_i e_j] [bins^2] of the errors of peak positions by speckle.
 
     Parameters
     ----------
     gradients
         Gradients of the lines of the m echoes (:class:`LineGradients`).
     peaks
-        Their peaks, (m, 3).
+        Peaks of the m echoes, (m, 3).
     shots
-        Window, FFT size, rule of detection and looks.
+        Prepared shots, for window, FFT size, rule of detection and looks.
     pairs
         Pairs of segments (i, j) that are computed.
 
     Returns
     -------
     numpy.ndarray
-        (m, 3, 3) by segment, signed as the beats; 0 for pairs without both peaks, or not asked for.
+        (m, 3, 3) by segment, signed as the beats; 0 for pairs without both peaks, or not in
+        `pairs`.
 
     Notes
     -----
-    The sum of the wander, equation (3) and :func:`wander_covariance`, and of the errors by the
-    shape of the peak (:class:`PeakShapeErrors`). Re V has the mean b^2 and the variance b^4 (v /
-    q^2 +
-    v^2 / q^4), with the peak's power q^2 and its echo fraction v. Where only the strongest bin is
-    tested the wander's deviation is divided by sqrt(1 + variance / FARTHEST^2). The mean over L
-    looks of independent speckle has 1 / L of the variance.
+    An error is the sum of two parts: the wander, by equation (3) and :func:`wander_covariance`, and
+    the error by the shape of the peak (:class:`PeakShapeErrors`). Re V has the mean b^2 and the
+    variance b^4 (v / q^2 + v^2 / q^4), with the peak's power q^2 and its echo fraction v. If only
+    the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
+    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
     has_peak = np.isfinite(peaks.relative_power) & np.isfinite(peaks.offset)
@@ -907,17 +940,17 @@ def position_error_moments(
 
 
 _TEST_DISPLACEMENT_BINS = 0.05
-"""Test displacement [bins]: imaginary shift, and root of the variance, of the numerical
-derivatives."""
+"""Displacement for numerical derivatives [bins]: the imaginary shift, and the root of the variance.
+"""
 
 
 class PeakShapeErrors(NamedTuple):
-    """Position errors of peaks that speckle has deformed, to second order in the lines' spread."""
+    """Position errors of peaks deformed by speckle, to second order in the lines' spread."""
 
     imaginary_shift_error: np.ndarray
-    """Error [bins] by the imaginary part of the tone's complex shift, for its given variance."""
+    """Error [bins] by the imaginary part of the tone's complex shift, for the given variance."""
     error_per_variance: np.ndarray
-    """Error [bins] per bin^2 of Re V, V the complex variance of the lines."""
+    """Error [bins] per bin^2 of Re V, with the complex variance V of the lines."""
 
     @classmethod
     def from_offset(
@@ -925,13 +958,15 @@ class PeakShapeErrors(NamedTuple):
     ) -> "PeakShapeErrors":
         """Return the errors of tones ``offset`` [bins] from the strongest bin.
 
-        To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2), with the
-        complex shift s, whose real and imaginary parts each have the ``variance`` [bins^2], and
+        Notes
+        -----
+        To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2). The real
+        and imaginary part of the complex shift s each have the ``variance`` [bins^2], and
 
             V = sum a z b^2 y^2 / A - s^2.
 
-        The real part of s is the wander. Its imaginary part, and V, make the magnitudes of three
-        bins differ from those of any tone: the estimate errs in proportion to (Im s)^2 and to Re V.
+        The real part of s is the wander. Im s and V make the magnitudes of three bins differ from
+        those of any tone. The error of the estimate is proportional to (Im s)^2 and to Re V.
         """
         positions, error_per_square_shift, error_per_variance = _shape_error_table(
             shots.window, shots.fft_size
@@ -945,7 +980,7 @@ class PeakShapeErrors(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _shape_error_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate place 0 .. 1 [bins], error / (Im shift)^2 [1/bins] and error / Re V [1/bins]."""
+    """Tabulate positions 0..1 [bins], error / (Im s)^2 [1/bins] and error / Re V [1/bins]."""
     interpolation, tone = interpolator(window, fft_size), tone_spectrum(window, fft_size)
     positions = np.linspace(0.0, 1.0, 65)
     bins = np.array([[-1.0], [0.0], [1.0]]) - positions

@@ -1,4 +1,4 @@
-"""Errors of range and radial velocity because the places of peaks wander with speckle."""
+"""Errors of range and radial velocity because positions of peaks vary with speckle."""
 
 import numpy as np
 from scipy.special import exp1
@@ -8,21 +8,25 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling.speckle_lines import SpecklePeaks, folding_signs, position_error_moments
 
 NEGATIVE_LOG_PD_MAX = 700.0
-"""-ln of the least probability of detection that differs from 0."""
+"""-ln of the smallest probability of detection that differs from 0."""
 
 
 def wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
 ) -> np.ndarray:
-    """Mean square errors of range [m^2] and radial velocity [m^2/s^2] by speckle, (2, m).
+    """Return mean square errors of range [m^2] and radial velocity [m^2/s^2] by speckle, (2, m).
 
     Parameters
     ----------
+    shots
+        Prepared shots.
     point_indices
-        (m,): points of the shots that the peaks are of.
+        (m,): index of the shot of each set of peaks.
+    peaks
+        Peaks of the three segments, (m, 3).
     is_detected
-        (3, m): true for segments that are detected. The Doppler segment's beat is used if slopes
-        are not the default ones or any two segments detect a shot.
+        (3, m): True for segments that are detected. The Doppler segment's beat is used only if the
+        chirp slopes differ from the default or any two segments detect a shot.
     """
     if shots.line_gradients is None:
         return np.zeros((2, point_indices.size))
@@ -49,17 +53,27 @@ def wander_variance(
 
 
 def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
-    """Mean square errors as of :func:`wander_variance` over the echoes that are detected, (2, n).
+    """Return mean square errors by speckle, averaged over the detected echoes, (2, n).
 
     Parameters
     ----------
+    shots
+        Prepared shots of n points.
     pd, snr
-        (3, n): probability of detection and SNR of each segment; nan where there is none.
+        (3, n): probability of detection and SNR of each segment; nan for a segment that does not
+        exist.
+
+    Returns
+    -------
+    ndarray (2, n)
+        Mean square errors of range [m^2] and radial velocity [m^2/s^2], as of
+        :func:`wander_variance`.
 
     Notes
     -----
     The power q^2 of a detected peak, in units of its mean, is exponential beyond A = -ln pd. The
-    mean of 1 / q^2, with which the wander goes, is e^A E_1(A) with the exponential integral E_1.
+    mean square error is proportional to 1 / q^2. The mean of 1 / q^2 is e^A E_1(A) with the
+    exponential integral E_1.
     """
     is_present = np.isfinite(pd) & np.isfinite(snr) & (pd > 0)
     with np.errstate(divide="ignore"):
