@@ -1,4 +1,8 @@
-"""Groups of adjacent bins at or above the threshold in noiseless spectra (PHYSICS section 6)."""
+"""Groups of adjacent bins at or above the threshold in noiseless spectra.
+
+A group of a spectrum without noise is the echo of a surface, or a sidelobe of a strong echo. Draws
+add noise to the strongest bin of each group (:mod:`sweep.model.pointcloud.returns`).
+"""
 
 from typing import NamedTuple
 
@@ -15,45 +19,55 @@ from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 STRONGEST_ROW, FIRST_ROW, LAST_ROW = range(3)
-"""Bins of a group: the strongest, the first and the last."""
+"""Rows of a group's bins: the strongest, the first and the last."""
 
 
 class BinGroups(NamedTuple):
-    """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
+    """Groups of adjacent bins at or above the threshold in noiseless spectra, by point and segment.
 
-    Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
-    none. If no bin crosses the threshold the strongest is listed, as noise may lift it. Echoes that
-    are not searched for, or arrive after the record, have no group, but |X| of a strongest bin.
+    Segments are in the order up, Doppler, down. Each group is the echo of a surface, or a sidelobe
+    of a strong echo. Groups are listed strongest first. Elements without a group have bin -1 and
+    nan. If no bin reaches the threshold, the strongest bin is listed, because noise may lift it.
+    Echoes that are not searched for, or arrive after the record, have no group, but have the |X| of
+    a strongest bin.
     """
 
     strongest_bin: np.ndarray
-    """(n, 3, most) int64: strongest bin, 0..N/2; of a complex record any of its run."""
+    """(n, 3, groups) int64: strongest bin, 0..N/2; for a complex record periodic in N."""
     first_bin: np.ndarray
-    """(n, 3, most) int64: first bin of the group."""
+    """(n, 3, groups) int64: first bin of the group."""
     last_bin: np.ndarray
-    """(n, 3, most) int64: last bin of the group."""
+    """(n, 3, groups) int64: last bin of the group."""
     neighbour_magnitudes: np.ndarray
-    """(n, 3, most, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
+    """(n, 3, groups, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
     pd: np.ndarray
-    """(n, 3, most): probability of detection."""
+    """(n, 3, groups): probability of detection."""
     n_exempt: np.ndarray
-    """(n, 3): bins that cannot raise a false alarm."""
+    """(n, 3): number of bins that cannot raise a false alarm."""
     leakage: np.ndarray
-    """(n, 3): probability that leaked signal raises a further group, over noise alone."""
+    """(n, 3): probability that leaked signal raises an additional group, over noise alone."""
 
     @property
     def magnitude(self) -> np.ndarray:
-        """|X| of the strongest bin, (n, 3, most)."""
+        """|X| of the strongest bin [V, summed over the record], (n, 3, groups)."""
         return self.neighbour_magnitudes[..., 1]
 
 
 def list_bin_groups(
     shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True
 ) -> BinGroups:
-    """Find the ``groups_max`` strongest groups of each segment's spectrum without noise.
+    """Return the strongest groups of each segment's spectrum without noise.
 
-    ``every_bin`` as of :func:`sweep.model.evaluation.find`. Without ``with_leakage`` its
-    probability is 0.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    groups_max
+        Largest number of groups of a segment.
+    every_bin
+        True to sum leakage bin by bin where it could be an integral (:func:`iter_spans`).
+    with_leakage
+        False to skip the probability of leakage, which is then 0.
     """
     bin_rows, bin_groups = allocate_bin_groups(shots.size, groups_max)
     for spans in iter_spans(shots, bin_by_bin=every_bin, leakage=with_leakage, with_pd=False):
@@ -62,9 +76,10 @@ def list_bin_groups(
 
 
 def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, BinGroups]:
-    """Return no groups of ``n_points`` points, and the array of which their bins are parts.
+    """Return an array for bins of groups, and empty groups whose bins are views of it.
 
-    This is (3, points, 3, most), by BIN, FIRST and LAST.
+    The array is (3, points, 3, groups) int64, with the rows STRONGEST_ROW, FIRST_ROW and LAST_ROW
+    first.
     """
     bin_rows = np.full((3, n_points, 3, groups_max), -1, np.int64)
     return bin_rows, BinGroups(
@@ -80,9 +95,16 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, Bin
 def find_groups_in_spans(
     shots: Shots, spans: BinSpans, bin_rows: np.ndarray, bin_groups: BinGroups
 ) -> None:
-    """Find the groups of some points by the runs of their bins.
+    """Find the groups in the spans of bins of points, and write them into preallocated groups.
 
-    ``bin_rows`` and ``bin_groups``, those of :func:`allocate_bin_groups`, take them.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    spans
+        Spans of bins of some of the points.
+    bin_rows, bin_groups
+        Arrays of :func:`allocate_bin_groups` for all points; the result.
     """
     pd = bin_groups.pd
     nyquist_bin = 0 if shots.complex_record else shots.fft_size // 2
@@ -124,9 +146,9 @@ def find_groups_in_spans(
 
 
 def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of bins of runs, and |X|, with nothing but echoes where the largest is not searched.
+    """Return numbers of bins of spans, and |X|, without bins outside echoes that are not searched.
 
-    Sidelobes of what is not searched are no groups, and leak.
+    Sidelobes of an echo that is not searched are no groups, but leakage.
     """
     n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
     for s, j in np.argwhere(~spans.peak_is_searched):
@@ -149,12 +171,24 @@ def _fill_groups(
     neighbour_magnitudes,
     pd,
 ):
-    """Find the groups of every run, into arrays of the shapes of :class:`BinGroups`.
+    """Find the groups of every span, and write them into arrays with the shapes of BinGroups.
 
-    ``bin_arrays`` are |X| [V] of all runs, and whether bins are of echoes: other groups are leaked
-    signal.
-    ``config``: N/2, or 0 of complex records, :attr:`sweep.model.preparation.Shots.detection_rule`,
-    and :attr:`~sweep.model.preparation.Shots.speckle_table`.
+    Parameters
+    ----------
+    point_indices
+        (m,): index of each point.
+    spans
+        First bin, number of bins, index of the largest bin, and start in `bin_arrays`, (3, m) each.
+    bin_arrays
+        |X| [V] of the bins of all spans, and (bins,) bool, True for bins of echoes; other groups
+        are leaked signal.
+    bin_threshold_table
+        (7, n): :attr:`sweep.model.preparation.Shots.bin_threshold_table`.
+    config
+        N/2, or 0 of complex records; :attr:`sweep.model.preparation.Shots.detection_rule`; and
+        :attr:`~sweep.model.preparation.Shots.speckle_table`.
+    bin_rows, neighbour_magnitudes, pd
+        Results.
     """
     (first_bin, n_bins, peak_index, start), (nyquist_bin, rule, speckle_table) = spans, config
     magnitudes, is_echo_all = bin_arrays
@@ -202,7 +236,10 @@ def _fill_groups(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
-    """Magnitude k of a span from ``first_bin`` on; mirrored at DC and Nyquist, 0 past it."""
+    """Return the magnitude at an index of a span; mirrored at DC and Nyquist, 0 outside the span.
+
+    The span begins at ``first_bin``.
+    """
     if nyquist_bin > 0:
         bin_ = abs(first_bin + index)
         index = (2 * nyquist_bin - bin_ if bin_ > nyquist_bin else bin_) - first_bin
@@ -211,16 +248,17 @@ def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
-    """List the strongest groups of a run in bins (3, most), as indices; return their number.
+    """List the strongest groups of a span in `bin_rows`, and return their number.
 
-    Groups of bins that are not ``is_echo`` are leaked signal; of no size all may be echoes.
+    `bin_rows` (3, groups) holds indices in the span. Groups whose strongest bin is not ``is_echo``
+    are leaked signal, and omitted. If ``is_echo`` is empty, all groups may be echoes.
     """
     if not magnitude[peak_index] >= threshold:
         bin_rows[:, 0] = peak_index
         return 1
     groups_max, n_groups, k = bin_rows.shape[1], 0, 0
     while k < magnitude.size:
-        if not magnitude[k] >= threshold:  # true of nan too, which would end no loop
+        if not magnitude[k] >= threshold:  # also true for nan, which would loop forever
             k += 1
             continue
         strongest_index = first = k

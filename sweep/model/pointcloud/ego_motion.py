@@ -1,41 +1,46 @@
-"""Motion of the instrument within a shot, as far as it knows it, and the errors that are left.
+"""Motion of the instrument within a shot, as far as it is known, and the remaining errors.
 
-The beats of a shot tell range and radial velocity some milliseconds after its start, and tell them
-wrong while the closing speed grows. Let the segments start at t_i, with optical frequencies f_i and
-chirp rates r_i, and their records' middles lie t_c after. The beam sees scatterers that close at v
-and accelerate at a, and ground that comes nearer along it at u. To first order the beats are
+The beats of a shot give range and radial velocity some milliseconds after its start, with an error
+while the closing speed grows. Let the segments start at t_i, with optical frequencies f_i and chirp
+rates r_i. The middle of each record is t_c after its segment's start. The beam meets scatterers
+that close at v and accelerate at a, and ground whose range along the beam falls at u. To first
+order the beats are
 
     f_i (2/c) (v + a (t_i + t_c)) - r_i (2/c) (R - u t_i - (v + u) t_c - a (t_i^2 + ...) / 2)
 
-and the fit takes a = 0 and u = v. The rest of each beat,
+and the fit assumes a = 0 and u = v. The remainder of each beat,
 
     (2/c) f_i a (t_i + t_c)
     - (2/c) r_i [ (v - u) (t_i + t_c) - a (t_i^2 / 2 + 2 t_i t_c + 3/2 t_c^2) ],
 
-moves range and velocity by the same fit, which is linear. For Table 4.1 11 m/s^2 move the range by
-0.55 m, and so does a beam that turns by 20 deg/s, through a = V.d'.
+shifts range and velocity by the same fit, which is linear. For Table 4.1 an acceleration of 11
+m/s^2 shifts the range by 0.55 m. A beam that turns by 20 deg/s has the same effect, through a =
+V.d'.
 
-**Known motion.** By inertial sensors and its scanner it knows its velocity V, its
-acceleration V' and the rate d' at which the beam d turns: so it knows a = V'.d + V.d' for ground at
-rest. It takes the ground to be level (:func:`ego_motion`): then a beam that points down meets it at
-a range that falls by u = (V + R d').z / d.z. A beam that points nowhere near the ground is taken to
-meet a surface that faces it, along which nothing slides. Range and velocity are corrected for both.
+**Known motion.** Inertial sensors and the scanner give the instrument its velocity V, its
+acceleration V' and the rate d' at which the beam d turns. So it knows a = V'.d + V.d' for ground at
+rest. It assumes that the ground is level (:func:`ego_motion`). A beam that points down then meets
+the ground at a range that falls by u = (V + R d').z / d.z. A beam that does not point down is
+assumed to meet a surface that faces it, along which nothing slides. Range and velocity are
+corrected for both u and a.
 
-**Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor how
-that moves. Of both it has standard deviations beforehand (:class:`MotionPriors`), which the spec of
-a flight states; they are never taken from the scene. With W = V + R d' and a gradient g of level
-ground, du/dg = (W_z d_h - W_h d_z) / d_z^2; with a gradient of a surface that faces the beam,
-du/dg = -W_perp. A target's velocity w changes v - u by (z / d.z - d).w over level ground and by
-nothing on a surface that faces the beam, and a by -w.d'. The standard errors of range and velocity
-have these deviations, times what range and velocity change by slip and acceleration, in quadrature.
-If the truth is outside the priors, its errors are not stated: a run, a report and an export compare
-errors with standard errors, and say so (:mod:`sweep.analysis.scene_results.consistency`).
+**Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor the
+motion of this surface. It has prior standard deviations of both (:class:`MotionPriors`), which the
+spec of a flight states; they are never taken from the scene. With W = V + R d' and a gradient g of
+level ground, du/dg = (W_z d_h - W_h d_z) / d_z^2. With a gradient of a surface that faces the beam,
+du/dg = -W_perp. A target's velocity w changes v - u by (z / d.z - d).w over level ground, and not
+at all on a surface that faces the beam. It changes a by -w.d'. The standard errors of range and
+velocity include, in quadrature, these deviations times the derivatives of range and velocity with
+respect to slip and acceleration. If the truth is outside the priors, the stated errors do not cover
+it. A run, a report and an export compare errors with standard errors and warn in this case
+(:mod:`sweep.analysis.scene_results.consistency`).
 
-The slip v - u moves a range only because it is referred to the shot's start. Ground points of
-navigation are placed where the beam meets the ground as the beats tell its range, whatever its
-slope (:mod:`sweep.model.pointcloud.navigation`).
+The slip v - u shifts a range only because the range refers to the shot's start. Ground points of
+navigation are where the beam meets the ground at the range of the beats, whatever its slope
+(:mod:`sweep.model.pointcloud.navigation`).
 
-The angular acceleration is left out on both sides (:mod:`sweep.model.geometry.body_motion`).
+The angular acceleration is neglected in the truth and by the instrument
+(:mod:`sweep.model.geometry.body_motion`).
 """
 
 from __future__ import annotations
@@ -48,18 +53,19 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 DESCENT_SINE_MIN = 0.05
-"""Smallest sine of the depression angle at which a beam is taken to meet level ground."""
+"""Smallest sine of the depression angle at which a beam is assumed to meet level ground."""
 
 
 class MotionPriors(NamedTuple):
-    """Standard deviations of what an instrument does not know of the motion along its beams."""
+    """Standard deviations of the motion along its beams that an instrument does not know."""
 
     terrain_slope: float = 0.2
-    """Slope of the surface that a beam meets, against level ground or a surface that faces it."""
+    """Slope of the surface that a beam meets, relative to level ground or to a surface that faces
+    the beam."""
     target_speed: float = 0.0
-    """Each component of the velocity of what a beam meets [m/s]."""
+    """Each component of the velocity of the surface that a beam meets [m/s]."""
     target_acceleration: float = 0.0
-    """Acceleration of what a beam meets, along the beam [m/s^2]."""
+    """Acceleration, along the beam, of the surface that a beam meets [m/s^2]."""
 
 
 class EgoMotion(NamedTuple):
@@ -70,8 +76,8 @@ class EgoMotion(NamedTuple):
     acceleration: np.ndarray
     """Rate of change of the closing speed [m/s^2]."""
     slip: np.ndarray
-    """Slip at range 0: closing speed less the speed at which the range to level ground falls
-    [m/s]."""
+    """Slip at range 0 [m/s]: closing speed minus the speed at which the range to level ground
+    falls."""
     slip_per_range: np.ndarray
     """Derivative of the slip with respect to the range [1/s]."""
     slip_per_slope: np.ndarray
@@ -79,28 +85,28 @@ class EgoMotion(NamedTuple):
     slip_per_slope_per_range: np.ndarray
     """(n, 3): derivative of ``slip_per_slope`` with respect to the range [1/s]."""
     slip_per_target_speed: np.ndarray
-    """Standard deviation of the slip per standard deviation of a component of the target's
+    """Ratio of the standard deviation of the slip to that of one component of the target's
     velocity."""
     turn_rate: np.ndarray
     """Rate at which the beam turns [rad/s]."""
     priors: MotionPriors
-    """Standard deviations of what is not known."""
+    """Prior standard deviations of unknown motion."""
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the slip at ranges (n, ...) [m]: closing speed less range decrease [m/s]."""
+        """Return the slip at ranges (n, ...) [m]: closing speed minus range decrease [m/s]."""
         slip, per_range = (
             _align_with_ranges(v, distance) for v in (self.slip, self.slip_per_range)
         )
         return np.asarray(slip + per_range * distance)
 
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the known rate of decrease of ranges (n, ...) [m], closing less slip [m/s]."""
+        """Return the known speed [m/s] at which ranges (n, ...) [m] fall: closing less slip."""
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the slip at ranges (n, ...) [m] by the priors [m/s].
+        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m] by the priors.
 
-        sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_by_target^2 + slope^2)).
+        sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 + slope^2)).
         """
         slope_deviation, speed_deviation, _ = self.priors
         at_range_0, per_range = self.slip_per_slope, self.slip_per_slope_per_range
@@ -127,7 +133,7 @@ class EgoMotion(NamedTuple):
 
 
 def ego_motion(eyepoints: Eyepoints, priors: MotionPriors = MotionPriors()) -> EgoMotion:  # noqa: B008  # a tuple
-    """Compute the known motion along the commanded beams of n shots over level ground."""
+    """Return the known motion along the commanded beams of n shots over level ground."""
     return ego_motion_of_beams(
         eyepoints.direction, eyepoints.velocity, eyepoints.direction_rate,
         eyepoints.platform_acceleration, priors,
@@ -141,18 +147,18 @@ def ego_motion_of_beams(
     acceleration: np.ndarray,
     priors: MotionPriors,
 ) -> EgoMotion:
-    """Compute the known motion along n beams of a moving instrument over level ground.
+    """Return the known motion along n beams of a moving instrument over level ground.
 
     Parameters
     ----------
     direction
         (n, 3): unit vectors d of the beams.
     velocity, acceleration
-        (n, 3): of the instrument, V [m/s] and V' [m/s^2].
+        (n, 3): velocity V [m/s] and acceleration V' [m/s^2] of the instrument.
     direction_rate
         (n, 3): rate of change d' of the directions [1/s].
     priors
-        Standard deviations of what is not known.
+        Prior standard deviations of unknown motion.
 
     Notes
     -----
@@ -190,6 +196,7 @@ def _align_with_ranges(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 
 def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the scalar products (n,) of the rows of two arrays (n, 3)."""
     return np.asarray(
         first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]
     )

@@ -1,29 +1,29 @@
-"""Floor of errors: what an instrument gets wrong however strong the echo is.
+"""Floor of errors: errors of an instrument that do not depend on the strength of the echo.
 
-Five errors, normal with a mean of 0. With u a beam's direction, R and v_r the range and the radial
-velocity that it reports, v the instrument's velocity and v_perp the part of v across the beam:
+There are five errors, normal with a mean of 0. Let u be a beam's direction, R and v_r the reported
+range and radial velocity, v the instrument's velocity, and v_perp its component across the beam:
 
 ========== ============================= ================= ================== =================
 error      standard deviation            of the range      of the velocity    independent
 ========== ============================= ================= ================== =================
-clock      relative, of the sampling     R clock           v_r clock          none: common to
+clock      relative, of the sampling     R clock           v_r clock          no: common to
            clock                                                              all beams
-wavelength relative, as it is known                        v_r wavelength     none: common to
-                                                                              all beams
-pointing   of the known direction on                       |v_perp| pointing  from beam to beam
+wavelength relative, of the known                          v_r wavelength     no: common to
+           wavelength                                                         all beams
+pointing   of the known direction, on                      |v_perp| pointing  from beam to beam
            each of two axes [rad]
-vibration  of the instrument along the                     vibration          from shot to shot
-           beam [m/s]
+vibration  of the instrument's velocity                    vibration          from shot to shot
+           along the beam [m/s]
 range      of the range itself [m]       range noise                          from shot to shot
 noise
 ========== ============================= ================= ================== =================
 
-A range is that along the light's own way, however it is known to run; the point lies there along
-the direction that the beam is thought to have. Common errors are one number each of a draw; the
-pointing's, two of each beam and draw, which turn with the beam; vibration's and the range's, one of
-each shot and draw. Common errors scale the velocity's vector and the altitude, and add the outer
-product of the velocity, times their variance, to its covariance
-(:mod:`sweep.model.pointcloud.navigation`).
+The range is measured along the true path of the light, whatever the known direction is. A point is
+at this range along the known direction of the beam. Common errors are one random number in each
+draw. Pointing errors are two numbers for each beam and draw, and rotate with the beam. Vibration
+and range noise are one number each for each shot and draw. Common errors scale the velocity vector
+and the altitude. They add the outer product of the velocity, times their variance, to its
+covariance (:mod:`sweep.model.pointcloud.navigation`).
 """
 
 from __future__ import annotations
@@ -39,33 +39,33 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 KEY_DOMAIN = "sweep.error_floor"
-"""Domain of the keys of errors that shots have in common."""
+"""Domain of the random keys of errors that are common to shots."""
 
 INSTRUMENT_KEY_NUMBER = -1.0
-"""Number in the place of a beam's for errors that all beams share."""
+"""Number that replaces a beam number in the key of errors common to all beams."""
 
 
 class ErrorFloor(NamedTuple):
-    """Standard deviations of an instrument's errors; all 0 for an instrument without any.
+    """Standard deviations of an instrument's errors; all 0 for an instrument without errors.
 
-    >>> ErrorFloor(clock=0.03, wavelength=0.04).scale
+    >>> ErrorFloor(clock=0.03, wavelength=0.04).velocity_scale_error
     0.05
     """
 
     pointing: float = 0.0
-    """Of a beam's known direction, on each of two axes [rad]."""
+    """Standard deviation of a beam's known direction, on each of two axes [rad]."""
     clock: float = 0.0
-    """Of the sampling clock, relative."""
+    """Relative standard deviation of the sampling clock."""
     wavelength: float = 0.0
-    """Of the known wavelength, relative."""
+    """Relative standard deviation of the known wavelength."""
     vibration: float = 0.0
-    """Of the instrument's velocity along the beam [m/s]."""
+    """Standard deviation of the instrument's velocity along the beam [m/s]."""
     range_noise: float = 0.0
-    """Of ranges [m]."""
+    """Standard deviation of ranges [m]."""
 
     @property
     def velocity_scale_error(self) -> float:
-        """Relative standard deviation that all velocities share."""
+        """Relative standard deviation common to all velocities."""
         return float(np.hypot(self.clock, self.wavelength))
 
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
@@ -91,13 +91,25 @@ def apply_error_floor(
     seed: int,
     first_draw: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Points with the instrument's errors in their values, places and standard errors.
+    """Return points with the instrument's errors in values, positions and standard errors.
 
-    `points` are results of :func:`sweep.model.pointcloud.point_cloud.simulate_cloud`, of the n
-    shots of `eyepoints` and some
-    draws, from `first_draw` on; `keys` (n, 2) the random key of each shot; `seed` the study's, for
-    errors that shots share. New are range, radial velocity and their standard errors, by whole bins
-    and interpolated, the compensated velocity, and position. The truth stays.
+    Range, radial velocity and their standard errors change, both by whole bins and interpolated,
+    and the compensated velocity and position. The truth does not change.
+
+    Parameters
+    ----------
+    points
+        Results (n, draws, ...) of :func:`sweep.model.pointcloud.point_cloud.simulate_cloud`.
+    eyepoints
+        Geometry of the n shots.
+    error_floor
+        Standard deviations of the errors.
+    keys
+        (n, 2) uint64: random key of each shot.
+    seed
+        Seed of the study, for errors that shots share.
+    first_draw
+        Number of the first draw in `points`.
     """
     n, draws = points["flags"].shape[:2]
     draw_numbers = np.arange(first_draw, first_draw + draws)
@@ -152,7 +164,7 @@ def apply_error_floor(
 
 
 def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
-    """Two standard normal numbers of each beam in each draw, (beams, draws, 2)."""
+    """Return two standard normal numbers for each beam in each draw, (beams, draws, 2)."""
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0
     )
@@ -163,14 +175,16 @@ def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed:
 
 
 def _scalar_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Scalar products (..., 1) of vectors (..., 3), summed in the same order whatever the shape."""
+    """Return scalar products (..., 1) of vectors (..., 3), summed in the order of components."""
     return sum(first[..., k : k + 1] * second[..., k : k + 1] for k in range(3))  # type: ignore[return-value]
 
 
 def _transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) across each direction (n, 3), which turn steadily with it.
+    """Return two unit vectors (n, 3) across each direction (n, 3), which rotate steadily with it.
 
-    [Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017]
+    References
+    ----------
+    .. [1] Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017.
     """
     x, y, z = direction.T
     sign = np.copysign(1.0, z)

@@ -1,7 +1,7 @@
-"""Eyepoints: what each shot of a flight sees, before any radiometry.
+"""Eyepoints: geometry of each shot of a flight, before any radiometry.
 
 The geometry of a shot - range, incidence, surface and radial velocity at every beamlet - does not
-depend on laser power, receiver or processing. It is worked out once and serves any number of
+depend on laser power, receiver or processing. It is computed once and serves any number of
 radiometric studies [T 3.2].
 """
 
@@ -30,18 +30,19 @@ TARGET_HEIGHT_PATH = "atmosphere.target_height"
 SOLAR_IRRADIANCE_PATH = "target.solar_irradiance"
 
 RANGE_MIN = 1e-3
-"""Range [m] below which a surface is passed through: no light is focused or falls off so near.
+"""Range [m] below which rays pass through surfaces.
 
-An instrument in the plane of a wall, or standing on the ground, would see it at range 0, where the
-echo is infinite.
+A beam neither focuses nor falls off over so short a distance. An instrument in the plane of a wall,
+or standing on the ground, would otherwise see it at range 0, with an infinite echo.
 """
 
 _GRAZING_SINE_MIN = 0.01
-"""Sine of the grazing angle under which a surface is not taken to go on as a plane."""
+"""Lower bound on the sine of the grazing angle for the speed at which a range along a plane falls.
+"""
 
 
 class Eyepoints(NamedTuple):
-    """Geometry of n shots of b beamlets; SI, world frame."""
+    """Geometry of n shots of b beamlets, in SI units and the world frame."""
 
     time: np.ndarray
     """(n,): start of the measurement [s]."""
@@ -50,53 +51,59 @@ class Eyepoints(NamedTuple):
     cycle: np.ndarray
     """(n,) int64: number of the measurement cycle."""
     position: np.ndarray
-    """(n, 3): of the instrument [m]."""
+    """(n, 3): position of the instrument [m]."""
     velocity: np.ndarray
-    """(n, 3): of the instrument [m/s]."""
+    """(n, 3): velocity of the instrument [m/s]."""
     direction: np.ndarray
     """(n, 3): unit vector along the beam's axis, as commanded."""
     range: np.ndarray
-    """(n,): range R_0 of the reference beamlet [m]; inf where nothing is seen."""
+    """(n,): range R_0 of the reference beamlet [m]; inf for a shot that hits nothing."""
     offset: np.ndarray
-    """(n, b): R_b - R_0 [m]; nan for a beamlet that misses."""
+    """(n, b): range R_b - R_0 relative to the reference beamlet [m]; nan for a beamlet that misses.
+    """
     radial_velocity: np.ndarray
-    """(n,): of the reference beamlet [m/s], positive when closing; nan where nothing is seen."""
+    """(n,): radial velocity of the reference beamlet [m/s], positive when closing; nan for a shot
+    that hits nothing."""
     acceleration: np.ndarray
-    """(n,): rate at which that grows [m/s^2]; nan where nothing is seen."""
+    """(n,): rate at which the reference beamlet's radial velocity grows [m/s^2]; nan for a shot
+    that hits nothing."""
     approach_speed: np.ndarray
-    """(n,): speed at which its range falls [m/s]; nan where nothing is seen."""
+    """(n,): speed at which the reference beamlet's range falls [m/s]; nan for a shot that hits
+    nothing."""
     turn_rate: np.ndarray
-    """(n,): rate at which its direction turns [rad/s], by scanner and platform."""
+    """(n,): rate at which the reference beamlet's direction turns [rad/s], by scanner and platform.
+    """
     direction_rate: np.ndarray
     """(n, 3): rate of change of the direction, as commanded [1/s]."""
     platform_acceleration: np.ndarray
-    """(n, 3): of the instrument [m/s^2]."""
+    """(n, 3): acceleration of the instrument [m/s^2]."""
     velocity_offset: np.ndarray
-    """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
+    """(n, b): radial velocity relative to the reference beamlet's [m/s]; nan for a beamlet that
+    misses."""
     cos_incidence: np.ndarray
-    """(n, b): 0..1; nan for a miss."""
+    """(n, b): cosine of the angle of incidence, 0..1; nan for a beamlet that misses."""
     surface: np.ndarray
-    """(n, b) int16: -1 for a miss."""
+    """(n, b) int16: number of the surface that is hit; -1 for a beamlet that misses."""
     weight: np.ndarray
-    """(b,): power fractions; they sum to 1."""
+    """(b,): power fractions of the beamlets; they sum to 1."""
 
     @property
     def has_target(self) -> np.ndarray:
-        """Shots of which any beamlet hits something, (n,) bool."""
+        """True for shots of which any beamlet hits a surface, (n,) bool."""
         return np.isfinite(self.range)
 
     @property
     def reference_beamlet(self) -> np.ndarray:
-        """Reference beamlet, the first that hits anything, (n,)."""
+        """Index of the reference beamlet, the first that hits a surface, (n,)."""
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
     @property
     def platform_radial_velocity(self) -> np.ndarray:
-        """Velocity of the instrument along its beams, as commanded, (n,) [m/s]."""
+        """Velocity of the instrument along its commanded beams, (n,) [m/s]."""
         return _row_dot(self.velocity, self.direction)
 
     def select(self, selection: slice | np.ndarray) -> "Eyepoints":
-        """Return some of the shots, by a slice, indices or a mask; neighbours are not copied."""
+        """Return selected shots, by slice, indices or mask, without a copy of consecutive shots."""
         indices = np.arange(len(self.time))[selection]
         if indices.size and (np.diff(indices) == 1).all():
             selection = slice(indices[0], indices[-1] + 1)
@@ -117,19 +124,43 @@ def observe_eyepoints(
     bodies_rotate: bool = True,
     footprint_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
 ) -> Eyepoints:
-    """Eyepoints of shots by number (n,), from 0; any part of a flight can be had alone.
+    """Return the eyepoints of n shots of a flight, by ray casting.
 
-    `n_beamlets` and `pattern` are those of :func:`sweep.model.beamlets.place_beamlets`,
-    `body_motions` the motion
-    of each of the caster's bodies, None for one at rest. `footprint_angles` gives the footprint by
-    the range (n,) of the beam's axis, infinite where that hits nothing
-    (:func:`sweep.model.beam.footprint_angles`);
-    without it the beam is `beam_divergence` wide everywhere [rad, between 1/e^2 points].
+    Shots depend only on their number, so any part of a flight can be computed alone.
 
-    Surfaces nearer than `RANGE_MIN` are passed through. `jitter` turns the light of each shot, of
-    which the instrument knows nothing: position, velocity and `direction` stay those commanded.
-    Without `bodies_rotate` the surfaces of turning bodies stand still. An UnsupportedShot names the
-    first shot whose geometry is not finite.
+    Parameters
+    ----------
+    shot_numbers
+        (n,): numbers of the shots, from 0.
+    flight
+        Motion of the instrument.
+    scanner
+        Scan pattern.
+    caster
+        Ray caster of the scene.
+    beam_divergence
+        Full width of the beam without `footprint_angles` [rad, between 1/e^2 points].
+    n_beamlets, pattern
+        Number and pattern of beamlets (:func:`sweep.model.beamlets.place_beamlets`).
+    body_motions
+        Motion of each of the caster's bodies; None for a body at rest.
+    jitter
+        Random pointing of the light of each shot, unknown to the instrument: position, velocity and
+        `direction` of the result stay those commanded.
+    bodies_rotate
+        False if surfaces of rotating bodies have no velocity by the rotation.
+    footprint_angles
+        Function of the range (n,) of the beam's axis, infinite if the axis hits nothing. It returns
+        the footprint (:func:`sweep.model.beam.footprint_angles`).
+
+    Raises
+    ------
+    UnsupportedShotError
+        If the geometry of a shot is not finite; names the first such shot.
+
+    Notes
+    -----
+    Rays pass through surfaces nearer than `RANGE_MIN`.
     """
     shot_numbers = np.asarray(shot_numbers)
     shots = scanner.shots(shot_numbers)
@@ -144,7 +175,7 @@ def observe_eyepoints(
     make_rays = partial(beamlet_rays, attitude, shots.direction)
     if footprint_angles is None:
         light_directions = ray_directions = make_rays(across, along, beam_divergence / 4)
-    else:  # a ray along the axis tells how wide the footprint is
+    else:  # the range of the axis determines the width of the footprint
         zero_angle = np.zeros(1)
         axis_bundle = caster.cast_bundles(
             state.position,
@@ -200,7 +231,7 @@ def _require_finite(
     bundle: BundleHits,
     velocity: np.ndarray,
 ) -> None:
-    """Refuse shots whose geometry is not finite: no loop over their spectra would end."""
+    """Raise an error for shots with non-finite geometry, on which loops over spectra never end."""
     is_hit = bundle.is_hit
     for label, is_wrong in (
         ("position", ~np.isfinite(state.position).all(axis=1)),
@@ -226,15 +257,17 @@ def _radial_velocities(
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> np.ndarray:
-    """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b); nan: a miss.
+    """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b).
 
-    Rays find the places, and hold the directions of light there. A surface on a body that turns
-    moves with V + omega x (P - X) at the point P that is hit. A turn of the instrument about itself
-    moves no light: it shows in the lever arm's velocity.
+    The speed is nan for a beamlet that misses. Rays give the points that are hit, and the
+    directions of light there may differ from those of the rays. A surface on a rotating body at X
+    moves with V + omega x (P - X) at the point P that is hit. Rotation of the instrument about
+    itself does not shift the light's frequency. Rotation with a lever arm does, through the
+    instrument's velocity.
     """
     ray_directions, light_directions = rays_and_light
     closing_speed = light_directions[..., 0] * state.velocity[:, :1]
-    for k in (2, 1):  # the order that results have had, bit for bit
+    for k in (2, 1):  # fixed order of addition, for equal bits
         closing_speed += light_directions[..., k] * state.velocity[:, k, None]
     closing_speed[~bundle.is_hit] = np.nan
     for body, body_state in enumerate(body_states):
@@ -268,13 +301,13 @@ def _reference_beam_motion(
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute closing acceleration, range rate (falling) and turn rate of reference beams, (n,).
+    """Compute closing acceleration, approach speed and turn rate of reference beamlets, (n,) each.
 
-    V is the velocity of the instrument against the body that is hit, which turns by w and is
-    taken to extend to the instrument. The beam d sees the closing speed V.d, which grows by
-    V'.d + V.d'. It meets the surface, a plane of normal n there, at a range that falls by
-    (V + R (d' - w x d)).n / d.n. Bodies are taken to turn at steady rates. ``scanner_rate`` is the
-    scanner's part of d', (n, 3).
+    V is the velocity of the instrument relative to the body that is hit. The body rotates with w
+    and is extended to the instrument. The beam d has the closing speed V.d, which grows by V'.d +
+    V.d'. It meets the surface, a plane with normal n, at a range that falls by (V + R (d' - w x
+    d)).n / d.n. Bodies are assumed to rotate at steady rates. ``scanner_rate`` (n, 3) is the
+    scanner's part of d'.
     """
     rows, reference = np.arange(len(ray_directions)), np.maximum(bundle.reference_beamlet, 0)
     ray, body = ray_directions[rows, reference], bundle.body_index[rows, reference]
@@ -314,6 +347,7 @@ def _reference_beam_motion(
 
 
 def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the scalar products (n,) of the rows of two arrays (n, 3)."""
     return first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1] + first[:, 2] * second[:, 2]
 
 
@@ -323,7 +357,19 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare the shots of eyepoints that all see something."""
+    """Prepare the shots of eyepoints of which each hits a surface.
+
+    Parameters
+    ----------
+    eyepoints
+        Geometry of n shots.
+    parameters
+        Other parameters by dotted path, scalars.
+    surfaces
+        Materials by the surface numbers of `eyepoints`.
+    effects
+        Names of the effects to simulate.
+    """
     return prepare_ray_traced_shots(
         *parameters_and_ground_of_eyepoints(eyepoints, parameters, surfaces), effects
     )
@@ -332,10 +378,18 @@ def prepare_eyepoint_shots(
 def parameters_and_ground_of_eyepoints(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
 ) -> tuple[Parameters, RayTracedGround]:
-    """Parameters of shots, and their footprints; a beamlet that misses sends nothing back.
+    """Return parameters of shots, and their footprints; a beamlet that misses returns no light.
 
-    All n shots see something. Range, velocity, reflectance and law come from the eyepoints and the
-    surfaces that their numbers mean, all other parameters are given, as scalars.
+    Range, velocity, reflectance and reflectance law follow from the eyepoints and the surfaces.
+
+    Parameters
+    ----------
+    eyepoints
+        Geometry of n shots, of which each hits a surface.
+    parameters
+        Other parameters by dotted path, scalars.
+    surfaces
+        Materials by the surface numbers of `eyepoints`.
     """
     surface = eyepoints.surface
     is_hit = surface >= 0
@@ -375,7 +429,7 @@ def parameters_and_ground_of_eyepoints(
         BEAM_ELEVATION_PATH: -np.arcsin(direction_z),
         "target.reflectance": 1.0,
         TARGET_HEIGHT_PATH: parameters.get(TARGET_HEIGHT_PATH, 0.0) + height,
-        # The sun lights what the beam sees: its mean reflectance stands in the irradiance.
+        # The sun lights the same surfaces: the irradiance contains their mean reflectance.
         SOLAR_IRRADIANCE_PATH: np.asarray(parameters[SOLAR_IRRADIANCE_PATH])
         * sent_fraction.sum(axis=1),
     }

@@ -1,50 +1,50 @@
 """Velocity and altitude of each measurement cycle and draw, with their uncertainties.
 
-Each beam measures the platform's velocity along itself, ``v_r = u . v`` (closing is positive),
-and a point of the ground, ``R u``. Weighted least squares over the beams that returned gives the
-velocity; a plane through the ground points gives the altitude. Standard errors are those of
-single beams, uncorrelated; covariances follow by linear propagation.
+Each beam measures the platform's velocity along the beam, ``v_r = u . v`` (closing is positive),
+and a point of the ground, ``R u``. Weighted least squares over the beams with a return gives the
+velocity. A plane through the ground points gives the altitude. Standard errors are those of single
+beams, uncorrelated; covariances follow by linear propagation.
 
-The instrument does not know which of its points are true. Of each shot it takes the first, and
-strongest, that a Doppler peak confirms (:mod:`sweep.model.pointcloud.pairing`). False alarms that
-pass as
-confirmed, mispaired and misread points are used as if they were true; the test for one false beam
-is there to find them.
+The instrument does not know which of its points are true. For each shot it uses the first, and
+strongest, point that a Doppler peak confirms (:mod:`sweep.model.pointcloud.pairing`). False alarms
+that are confirmed, and mispaired and misread points, are used as if they were true. The test for
+one false beam may find them.
 
-The residuals of a solution may contradict the errors of its points: a chi-square that true errors
-exceed once in ten thousand, over unstated relief or with a false point. Its covariance is then that
-which the residuals tell, widened as Student's t is for so many degrees of freedom, so that 68 % of
-the errors are within it. The beams of one cycle tell no more: errors beyond two such deviations are
-more frequent than normal ones.
+The residuals of a solution may contradict the errors of its points: their chi-square exceeds the
+value that true errors exceed once in ten thousand. Causes are unstated relief, or a false point.
+The covariance is then estimated from the residuals and widened as Student's t is for the number of
+degrees of freedom, so that 68 % of the errors are within it. The beams of one cycle contain no more
+information: errors beyond two such deviations are more frequent than for a normal distribution.
 
-A point whose standard error is not a number is left out; one under a millionth of a bin counts as
-that, to which the interpolation itself is good.
+A point whose standard error is not finite is omitted. A standard error below a millionth of a bin
+counts as a millionth, which is the accuracy of the interpolation.
 
-The instrument is taken to know, from inertial sensors, how it is turned and how its place and
-velocity have changed within a cycle. So the altitude is that at the cycle's first shot, over the
-ground straight below it, and the velocity the mean over the cycle's shots, in the world's axes.
+The instrument knows, from inertial sensors, its attitude and the changes of its position and
+velocity within a cycle. So the altitude is that at the cycle's first shot, above the ground
+straight below it. The velocity is the mean over the cycle's shots, in the world's axes.
 
-The beats tell the range that the beam has some time after the shot's start: d range / d slip of a
-point (``range_per_slip``). A point's range is referred to the start by the speed u at which that of
-level ground falls (:mod:`sweep.model.pointcloud.ego_motion`). Here that is undone: the ground point
-is where
-the instrument, moved on by V t, sees it along the beam, turned on by d' t, at the range R - u t. It
-lies on the ground whatever the slope, and the error for an unknown slope is left out. The radial
-velocity depends on the slip a little, and is corrected by the slope of the plane. Its error for
-other slopes under the beams counts if `relief`, or the residuals, say that the ground is no plane.
+The beats give the range at some time after the shot's start, t = d range / d slip of a point
+(``range_per_slip``). A point's range is referred to the start by the speed u at which the range to
+level ground falls (:mod:`sweep.model.pointcloud.ego_motion`). Navigation undoes this. The ground
+point is at the range R - u t from the instrument, which has moved by V t, along the beam, which has
+turned by d' t. It is on the ground whatever the slope is, so the error for an unknown slope is
+omitted. The radial velocity depends slightly on the slip, and is corrected by the slope of the
+plane. Its error for other slopes under the beams counts if `relief`, or the residuals, show that
+the ground is no plane.
 
-Of pointing jitter it knows the standard deviation. To first order a beam thrown off by sigma in
-each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity.
-Here v_perp is the velocity across it (by a first solution without jitter). It adds sigma R
-tan(angle of incidence) to that of its range, on the plane of a first solution.
+The instrument knows the standard deviation sigma of its pointing jitter, in each of the two angles
+across a beam. To first order, jitter adds sigma |v_perp| to the standard error of the radial
+velocity. Here v_perp is the velocity across the beam, by a first solution without jitter. Jitter
+adds sigma R tan(angle of incidence) to the standard error of the range, on the plane of a first
+solution.
 
-Of the floor of its errors (:mod:`sweep.model.pointcloud.error_floor`) it knows the standard
-deviations too.
-Those of pointing and vibration are independent from beam to beam: they weigh, and they show in the
-residuals. Clock and wavelength scale all beams alike, which no residual shows. They are taken out
-of the weights. Of a relative error of s the solution's covariance has s^2 v v^T more, the
-altitude's variance s^2 h^2. The altitude is that of the points where pointing has put them, and its
-variance counts the pointing as it counts jitter.
+It also knows the standard deviations of the floor of its errors
+(:mod:`sweep.model.pointcloud.error_floor`). Those of pointing and vibration are independent from
+beam to beam: they enter the weights and show in the residuals. Clock and wavelength scale all beams
+by the same factor, which no residual shows, and are removed from the weights. A relative error s
+adds s^2 v v^T to the covariance of the velocity, and s^2 h^2 to the variance of the altitude. The
+altitude is that of the points at their reported positions, which include the pointing errors. Its
+variance includes the pointing as it includes jitter.
 """
 
 import math
@@ -65,62 +65,65 @@ from sweep.model.pointcloud.error_floor import NO_ERROR_FLOOR, ErrorFloor
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 
 BEAMS_PER_BATCH = 1 << 14
-"""Beams solved for at once: so many that what is made of them stays at hand."""
+"""Largest number of beams in a batch, so that intermediate arrays fit the cache."""
 
 GRAZING_SINE_MIN = 0.05
-"""A beam that grazes the ground at less than about 3 deg is weighted as if at that angle."""
+"""Lower bound on the sine of the grazing angle in the weights, about 3 deg."""
 
 _CONDITION_NUMBER_MAX = 1e6
-"""Condition number above which beams count as in a plane; covariances tell weak geometries."""
+"""Condition number above which beams count as coplanar; below it covariances show weak geometries.
+"""
 
 _INTERPOLATION_ERROR_MIN = 1e-6
-"""Least error of a place between bins, over that of a place by whole bins."""
+"""Smallest error of an interpolated position, over that of a position by whole bins."""
 
 _ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal error is below one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
-"""Relative error of numbers that are subtracted from each other."""
+"""Relative error of the difference of two float64 numbers."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
-"""Probability of larger residuals from which on they tell the errors, and not what is stated."""
+"""Probability of larger residuals below which the covariance follows from the residuals, and not
+from the stated errors."""
 
 STATUS_SOLVED = 0
-"""All valid beams are in the solution."""
+"""The solution uses all valid beams."""
 STATUS_EXCLUDED = 1
-"""All but one, which contradicts the others."""
+"""The solution uses all valid beams except one, which contradicts the others."""
 STATUS_WITHHELD = 2
-"""The beams contradict each other and it can not be told which one is false: no solution."""
+"""No solution: beams contradict each other, and the false one cannot be identified."""
 STATUS_UNDETERMINED = 3
-"""Too few beams, or too near to a plane: no solution."""
+"""No solution: beams are too few, or nearly coplanar."""
 
 ArraysByName = Mapping[str, np.ndarray]
 
 FitResult = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""First four fields of :class:`NavigationSolution`, of n cycles."""
+"""First four fields of a :class:`NavigationSolution` of n cycles."""
 
 
 class NavigationSolution(NamedTuple):
-    """Velocities in the frame of the directions, or altitudes; nan where not available."""
+    """Velocities in the frame of the directions, or altitudes; nan without a solution."""
 
     value: np.ndarray
-    """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above
-    the ground's plane along the vertical [m]."""
+    """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above the
+    ground's plane along the vertical [m]."""
     covariance: np.ndarray
-    """(..., 3, 3) [m^2/s^2] or (...,) [m^2]: of its error."""
+    """(..., 3, 3): covariance of the velocity's error [m^2/s^2]; or (...,): variance of the
+    altitude's error [m^2]."""
     chi_square: np.ndarray
-    """(...,): weighted sum of squared residuals; of all valid beams where withheld."""
+    """(...,): weighted sum of squared residuals; of all valid beams if the solution is withheld."""
     degrees_of_freedom: np.ndarray
-    """(...,) int64: observations beyond what the solution needs, the chi-square's expectation; 0
-    where undetermined."""
+    """(...,) int64: number of observations minus that of unknowns, the expectation of chi-square; 0
+    if undetermined."""
     is_used: np.ndarray
-    """(..., b) bool: beams in the solution."""
+    """(..., b) bool: True for beams in the solution."""
     status: np.ndarray
-    """(...,) int8: SOLVED, EXCLUDED, WITHHELD or UNDETERMINED."""
+    """(...,) int8: STATUS_SOLVED, STATUS_EXCLUDED, STATUS_WITHHELD or STATUS_UNDETERMINED."""
 
     @property
     def is_available(self) -> np.ndarray:
-        """(...,) bool: there is a solution."""
+        """(...,) bool: True if there is a solution."""
         return self.status <= STATUS_EXCLUDED
 
 
@@ -131,12 +134,24 @@ def solve_velocity(
     standard_error: np.ndarray,
     test_level: float | None = None,
 ) -> NavigationSolution:
-    """Velocity vector and covariance of each cycle of b beams.
+    """Solve for the velocity vector of each cycle of b beams, with its covariance.
 
-    Directions (..., b, 3) are unit vectors from the instrument. Velocities along them, positive
-    when closing and not finite for a beam that has not returned, and their errors are (..., b).
-    Leading dimensions broadcast. `test_level` is that of the test for one false beam, None for no
-    test: it needs five beams to find it; with four it withholds the solution.
+    Parameters
+    ----------
+    direction
+        (..., b, 3): unit vectors from the instrument.
+    radial_velocity
+        (..., b): velocities along the directions [m/s], positive when closing; not finite for a
+        beam without a return.
+    standard_error
+        (..., b): standard errors of the radial velocities [m/s].
+    test_level
+        Probability of a false positive of the test for one false beam; None for no test. With five
+        beams the test can identify a false beam; with four it withholds the solution.
+
+    Notes
+    -----
+    Leading dimensions broadcast.
     """
     u, closing_speed, error, leading_shape = _flatten_cycles(
         direction, radial_velocity, standard_error
@@ -176,17 +191,33 @@ def solve_altitude(
     relief: float = 0.0,
     test_level: float | None = None,
 ) -> NavigationSolution:
-    """Altitude above the plane through each cycle's ground points, and its variance.
+    """Solve for the altitude above the plane through each cycle's ground points, with its variance.
 
-    Arrays and `test_level` are as for :func:`solve_velocity`, z up. `offset` (..., b, 3) is the
-    place of the instrument when each beam fires, from that whose altitude is asked [m].
+    Parameters
+    ----------
+    direction
+        (..., b, 3): unit vectors from the instrument, z up.
+    range
+        (..., b): ranges along the directions [m]; not finite for a beam without a return.
+    standard_error
+        (..., b): standard errors of the ranges [m].
+    slope
+        Prior standard deviation of the ground's slope, whose mean is 0. It is weighed against the
+        points, whatever their number. 0 states level ground: two beams then check each other, and
+        three are enough to identify a false one.
+    offset
+        (..., b, 3): position of the instrument when each beam fires, relative to the position whose
+        altitude is solved for [m].
+    relief
+        Standard deviation of heights about the plane [m], which is added to the errors of range.
+        Without it real ground fails the test for a false beam.
+    test_level
+        Level of the test for one false beam, as in :func:`solve_velocity`.
 
-    The ground's slope, known beforehand to be 0 with the standard deviation `slope`, is weighed
-    against the points, whatever their number. 0 states level ground; then every second beam is a
-    check on the first, and three are enough to find a false one. `relief` is the standard deviation
-    of heights about the plane [m], which adds to the errors of range. Real ground fails the test
-    for a false beam without it. If the residuals tell that the ground is no plane, the variance
-    counts that the ground straight below is off the plane as the points are.
+    Notes
+    -----
+    If the residuals show that the ground is no plane, the variance assumes that the ground straight
+    below is as far off the plane as the points are.
     """
     ground_points, u, error, leading_shape = _ground_points(
         direction, range, standard_error, offset
@@ -232,10 +263,15 @@ def ground_gradient(
     offset: np.ndarray | None = None,
     relief: float = 0.0,
 ) -> np.ndarray:
-    """Gradient (..., 2) of the plane through the ground points of some beams of each cycle.
+    """Return the gradient (..., 2) of the plane through the ground points of each cycle.
 
-    Arguments are those of :func:`solve_altitude`, and `is_used` (..., b) the beams of its solution;
-    0 of a cycle that uses none.
+    Parameters
+    ----------
+    direction, range, standard_error, slope, offset, relief
+        Arguments of :func:`solve_altitude`.
+    is_used
+        (..., b) bool: beams whose points determine the plane, as of a solution. The gradient of a
+        cycle without any is 0.
     """
     ground_points, u, error, leading_shape = _ground_points(
         direction, range, standard_error, offset
@@ -256,9 +292,10 @@ def _ground_points(
     direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
     offset: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
-    """Ground points and directions (3, b, n), errors of range (b, n), and the shape n stands for.
+    """Return ground points and directions (3, b, n), range errors (b, n), and the leading shape.
 
-    Beams come first and cycles last: NumPy is fast along the last.
+    n is the product of the leading shape. Beams come first and cycles last, because NumPy is fast
+    along the last axis.
     """
     u, distance, error, leading_shape = _flatten_cycles(direction, distance, standard_error)
     ground_points = u * distance[..., None]
@@ -276,10 +313,10 @@ def _covariance_scale(
 ) -> np.ndarray:
     """Return the factor on the covariance of solutions whose residuals exceed the stated errors.
 
-    Residuals that true errors reach with :data:`_CONTRADICTION_PROBABILITY` or less tell their size
-    themselves: it
-    is the chi-square over the degrees of freedom that the residuals have, at least one. The error
-    over a deviation so estimated follows Student's t, whose central 68 % the scaled deviation has.
+    If true errors make such residuals with :data:`_CONTRADICTION_PROBABILITY` or less, the
+    residuals determine the size of the errors. The factor is then chi-square over the residuals'
+    degrees of freedom, at least one, times a factor of Student's t. The error over a deviation so
+    estimated follows Student's t, and the scaled deviation covers its central 68 %.
     """
     n_residual_degrees = np.maximum(residual_degrees, 1)
     scale = (
@@ -289,24 +326,24 @@ def _covariance_scale(
 
 
 def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
-    """Return true where residuals contradict the stated errors."""
+    """Return True for solutions whose residuals contradict the stated errors."""
     return (degrees_of_freedom > 0) & (
         chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
     )
 
 
 class _GroundPlane(NamedTuple):
-    """Plane through the ground points of n cycles; arrays (n,) unless said otherwise."""
+    """Plane through the ground points of n cycles; arrays are (n,) unless stated otherwise."""
 
     height: np.ndarray
-    """Height of the platform above it [m]."""
+    """Height of the platform above the plane [m]."""
     variance: np.ndarray
-    """Of that height [m^2]."""
+    """Variance of the height [m^2]."""
     chi_square: np.ndarray
     gradient: np.ndarray
-    """(2, n): along x and y."""
+    """(2, n): gradient along x and y."""
     n_fitted_slopes: np.ndarray
-    """Slopes that the points tell, and not what is known beforehand: 0 to 2 of them."""
+    """Effective number of slopes, 0..2, that the points determine, in contrast to the prior."""
     point_variance: np.ndarray
     """Harmonic mean of the variances of the points' heights, over the number of points [m^2]."""
 
@@ -315,11 +352,11 @@ def _fit_plane(
     ground_points: np.ndarray, directions: np.ndarray, errors: np.ndarray, is_used: np.ndarray,
     gradient: np.ndarray, slope: float, relief: float,
 ) -> _GroundPlane:  # fmt: skip
-    """Planes through n cycles' ground points, by weighted least squares.
+    """Fit planes to n cycles' ground points by weighted least squares.
 
-    The plane is z = -altitude + gradient . (x, y) with the platform at the zero. An error of range
-    moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``, so the weights
-    need a gradient beforehand. Points and beams are (3, b, n), gradients (2, n).
+    The plane is z = -altitude + gradient . (x, y) with the platform at the origin. An error of
+    range moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``. So the
+    weights need a gradient beforehand. Points and directions are (3, b, n), gradients (2, n).
     """
     n_beams, n_cycles = is_used.shape
     incidence_sine = gradient[0] * directions[0] + gradient[1] * directions[1] - directions[2]
@@ -327,7 +364,7 @@ def _fit_plane(
     weights = np.where(is_used, 1.0 / np.hypot(height_errors, relief), 0.0)
     weight_sum = np.asarray(
         sum(weights**2)
-    )  # one beam after the other: NumPy's order would go by n
+    )  # beam by beam, as NumPy's order of summation would depend on n
     weight_fractions = weights**2 / np.where(weight_sum > 0, weight_sum, 1.0)
     centroid = np.asarray(sum((ground_points * weight_fractions).swapaxes(0, 1)))
     weighted_offsets = weights * (ground_points - centroid[:, None])
@@ -358,7 +395,10 @@ def _fit_plane(
 def _flatten_cycles(
     direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Directions (n, b, 3), values and errors (n, b), and the shape that n stands for."""
+    """Return directions (n, b, 3), values and errors (n, b), and the leading shape.
+
+    n is the product of the leading shape.
+    """
     u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
     leading_shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape)
     u = np.broadcast_to(u, (*leading_shape, 3)).reshape(-1, leading_shape[-1], 3)
@@ -371,10 +411,22 @@ def _flatten_cycles(
 def _least_squares(
     design: np.ndarray, residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right singular vectors (n, m, m), squares of singular values and coordinates (n, m).
+    """Solve n linear least-squares problems by singular value decomposition.
 
-    The unknowns of problem i are ``turn[i] @ coordinate[i]``; `residual` (n, b) becomes what they
-    leave of itself by columns (n, b, m). Normal equations would square the condition number.
+    Normal equations would square the condition number.
+
+    Parameters
+    ----------
+    design
+        (n, b, m): design matrices.
+    residual
+        (n, b): observations; replaced by the residuals.
+
+    Returns
+    -------
+    tuple
+        Right singular vectors (n, m, m), squared singular values and coordinates (n, m). The
+        unknowns of problem i are ``right_vectors[i] @ coordinates[i]``.
     """
     n, b, m = design.shape
     padded_design = np.pad(design, ((0, 0), (0, max(m - b, 0)), (0, 0)))
@@ -382,9 +434,7 @@ def _least_squares(
     coordinates = np.empty((n, m))
     for k in range(m):
         left_vector = left_vectors[:, :b, k]
-        projection = np.asarray(
-            sum((left_vector * residual).T)
-        )  # one beam after the other, as above
+        projection = np.asarray(sum((left_vector * residual).T))  # beam by beam, as in _fit_plane
         residual -= projection[:, None] * left_vector
         coordinates[:, k] = projection / singular_values[:, k]
     return right_vectors.mT, singular_values**2, coordinates
@@ -396,16 +446,25 @@ def _solve_screened(
     test_level: float | None,
     leading_shape: tuple[int, ...],
 ) -> NavigationSolution:
-    """Solutions of n cycles of b beams, with a beam that contradicts the others left out.
+    """Solve n cycles of b beams, without a beam that contradicts the others.
 
-    A cycle is suspect where its chi-square is larger than it is with probability `test_level` when
-    all
-    beams are true. Then each beam is left out in turn: where exactly one such fit passes the same
-    test, that beam is false and that fit is the solution; else the solution is withheld. With one
-    degree of freedom every exclusion leaves an exact fit: a false alarm is noticed, never found.
+    A cycle is suspect if its chi-square is larger than true beams make it with probability
+    `test_level`. Each beam is then excluded in turn. If exactly one such fit passes the same test,
+    that beam is false and that fit is the solution. Otherwise the solution is withheld. With one
+    degree of freedom every exclusion leaves an exact fit: a contradiction is noticed, but the false
+    beam is never identified.
 
-    `fit_cycles` takes the cycles' index (k,) and a mask of beams (k, b); its chi-square is nan
-    without a solution. `is_valid` (n, b) beams have returned; n stands for `leading_shape`.
+    Parameters
+    ----------
+    fit_cycles
+        Function of the cycles' indices (k,) and a mask of beams (k, b); its chi-square is nan
+        without a solution.
+    is_valid
+        (n, b) bool: beams with a return.
+    test_level
+        Level of the test; None for no test.
+    leading_shape
+        Shape of the result, of n elements.
     """
     is_used, n_beams = is_valid.copy(), is_valid.shape[1]
     fitted = fit_cycles(np.arange(len(is_valid)), is_used)
@@ -448,14 +507,31 @@ def solve_navigation(
 ) -> dict[str, np.ndarray]:
     """Solve for the velocity and altitude of every cycle and draw.
 
-    `shot_arrays` and `point_arrays` are arrays of :data:`sweep.model.outputs.SHOT_VARIABLES` and
-    POINTS, cycle by cycle;
-    positions of points are used where the floor has an error of pointing. The ground's slope and
-    relief and the level are those of :func:`solve_altitude`, level None or 0 for no test.
-    `pointing_jitter` is the
-    standard deviation of each angle of the pointing [rad], and `error_floor` has those of the
-    instrument's other errors. `motion_priors` are those that the points' errors have. Numbers of
-    beams are 0 where there is no solution.
+    Parameters
+    ----------
+    shot_arrays
+        Arrays of :data:`sweep.model.outputs.SHOT_VARIABLES` by name, cycle by cycle.
+    point_arrays
+        Arrays of :data:`sweep.model.outputs.POINT_VARIABLES` by name, cycle by cycle. Positions are
+        used if `error_floor` has an error of pointing.
+    shots_per_cycle
+        Number of shots in a cycle.
+    ground_slope, relief
+        Slope and relief of the ground, as in :func:`solve_altitude`.
+    test_level
+        Level of the test for one false beam; None or 0 for no test.
+    pointing_jitter
+        Standard deviation of each angle of the pointing [rad].
+    error_floor
+        Standard deviations of the instrument's other errors.
+    motion_priors
+        Priors of unknown motion that the points' standard errors include.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Arrays of :data:`sweep.model.outputs.NAVIGATION_VARIABLES`. Numbers of beams are 0 without a
+        solution.
     """
     n, draws = point_arrays["flags"].shape[:2]
     cycles = n // shots_per_cycle
@@ -493,7 +569,7 @@ _POSE_VARIABLES = (
 
 
 class Poses(NamedTuple):
-    """Motion of shots' beams as the instrument knows it: fields (..., 3), in the world's axes."""
+    """Known motion of shots' beams, (..., 3) each, in the world's axes."""
 
     position: np.ndarray
     velocity: np.ndarray
@@ -503,7 +579,7 @@ class Poses(NamedTuple):
     acceleration: np.ndarray
 
     def by_cycle(self, beams_per_cycle: int) -> "Poses":
-        """Return poses (n / beams, beams, 3) of n shots."""
+        """Return the poses of n shots by cycle, (n / beams, beams, 3) each."""
         return Poses(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
 
@@ -514,11 +590,12 @@ def _select_beams(
     error_floor: ErrorFloor,
     known_motion: EgoMotion,
 ) -> dict[str, np.ndarray]:
-    """Values and errors of trusted points, (cycles, draws, each), nan without one; positions too.
+    """Return values and errors of one trusted point for each shot and draw, (cycles, draws, beams).
 
-    The errors are without what all beams have in common, and without that of an unknown slip, which
-    is ``radial_velocity_slip_error`` of the velocity. ``delay`` is the time from the shot's start
-    to that of the range [s], and ``range_then`` the range at that time.
+    Values are nan for shots without a trusted point. Errors exclude those common to all beams and
+    that by an unknown slip, which is ``radial_velocity_slip_error`` for the velocity. ``delay`` is
+    the time from the shot's start to that of the range [s], and ``range_then`` the range at that
+    time. ``position`` is included if pointing has an error.
     """
     flags = point_arrays["flags"][shot_slice]
     values_by_name: dict[str, np.ndarray] = {}
@@ -537,7 +614,7 @@ def _select_beams(
         slip_error = abs(per_slip) * known_motion.slip_standard_error(
             point_arrays["range_interpolated"][shot_slice]
         )
-        # The slip's error goes by the range, and so is known no better than the clock.
+        # The slip's error depends on the range, and so is known no better than the clock.
         error_min = 2 * math.sqrt(error_floor.clock + _ROUNDING_ERROR) * slip_error
         error = np.sqrt(np.maximum(error**2 - slip_error**2, error_min**2))
         if name == "range":
@@ -573,7 +650,7 @@ def _solve_cycles(
     poses: Poses, beams: dict[str, np.ndarray], test_arguments: dict, ground_arguments: dict,
     pointing_jitter: float, error_floor: ErrorFloor,
 ) -> list[tuple[str, str, NavigationSolution]]:  # fmt: skip
-    """Solutions of (cycles, draws) measurement cycles, with what they and their spread are."""
+    """Return velocities and altitudes of cycles and draws, each with names of value and spread."""
     positions, velocities, direction, direction_rates, _ = poses
     velocity_offset = np.einsum(
         "cbi,cbi->cb", direction, velocities - velocities.mean(axis=1, keepdims=True)
@@ -623,7 +700,7 @@ def _solve_cycles(
         altitude_solution = altitude_solution._replace(
             covariance=altitude_solution.covariance + common_variance
         )
-    # The ground straight below is off the plane, too.
+    # The ground straight below is also off the plane.
     altitude_solution = altitude_solution._replace(
         covariance=altitude_solution.covariance + ground_arguments["relief"] ** 2
     )
@@ -634,10 +711,11 @@ def _solve_cycles(
 
 
 def _slip_of_ground_gradient(poses: Poses, ranges: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Slip over a plane less that over level ground [m/s], (cycles, draws, each).
+    """Return the slip over a plane minus that over level ground [m/s], (cycles, draws, beams).
 
-    Ranges `ranges` (cycles, draws, each), gradients (cycles, draws, 2). With W = V + R d' and the
-    normal n of the plane it is W.z / d.z - W.n / d.n; 0 along beams that do not point down at both.
+    `ranges` are (cycles, draws, beams), gradients (cycles, draws, 2). With W = V + R d' and the
+    normal n of the plane the result is W.z / d.z - W.n / d.n. It is 0 for beams that do not point
+    down at both.
     """
     _, velocity, direction, direction_rates, _ = poses
     d = [direction[:, None, :, k] for k in range(3)]
@@ -658,7 +736,11 @@ def _add_pointing_errors(
     pointing_jitter: float,
     pointing: float,
 ) -> dict[str, np.ndarray]:
-    """Add the pointing's error to standard errors (cycles, draws, each); velocities have it."""
+    """Return standard errors (cycles, draws, beams) that include the errors of pointing.
+
+    Jitter is added to both errors. ``pointing`` is added to the range only, because the velocity's
+    error already includes it.
+    """
     closing_speed, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first_velocity = solve_velocity(
         direction=direction[:, None], radial_velocity=closing_speed, standard_error=error

@@ -1,35 +1,35 @@
-"""Up, Doppler and down peaks put together into returns, and returns judged against the truth.
+"""Pairing of up, Doppler and down peaks into returns, and their comparison with the truth.
 
-Each surface in a footprint leaves a peak in all three segments, and which belong together is not
-written on them. A pair of an up and a down peak has 16 readings (each of the three peaks as it
-stands or folded at Nyquist, half sum or half difference being the Doppler frequency). Each reading
-predicts a Doppler peak. A pair is *confirmed* by a peak within the tolerance of that prediction. Of
-all ways to pair up and down peaks one to one, that with the most confirmed pairs is taken, and
-among those the least sum of mismatches, a fold counting as
+Each surface in a footprint makes a peak in all three segments, but peaks do not show which of them
+belong together. A pair of an up and a down peak has 16 readings: each of the three peaks is folded
+at Nyquist or not, and the Doppler frequency is the half sum or the half difference. Each reading
+predicts a Doppler peak. A pair is *confirmed* by a peak within the tolerance of that prediction. Up
+and down peaks are paired one to one such that the number of confirmed pairs is largest. Among equal
+numbers the sum of mismatches is smallest, where a fold counts as
 :data:`sweep.model.waveform.FOLD_PENALTY_BINS` bins. A Doppler peak may confirm several pairs, as
-surfaces with a common velocity share theirs.
+surfaces with a common velocity share a Doppler peak.
 
-Up and down peaks that are left over are paired in the order in which they are listed (strongest
-first) and marked as unconfirmed. A Doppler peak that is nearer to one of their readings than a
-false one is, but once in a hundred times, still tells which to take. Else nothing does, and they
-take the reading that two beats have without a Doppler segment. PHYSICS section 2 leaves it open.
-Range and velocity are exchanged where that is wrong.
+The remaining up and down peaks are paired in their order, strongest first, and marked as
+unconfirmed. A Doppler peak may still select the reading of such a pair. It must be so near to the
+prediction that a false peak comes as near only once in a hundred cases. Otherwise the pair has the
+reading of two beats without a Doppler segment. If that reading is wrong, range and velocity are
+exchanged. [T] leaves the choice open (docs/physics.md, *Folding*).
 
-An up (or down) peak in which two surfaces coincide serves one return only.
+An up or down peak in which two surfaces coincide serves one return only.
 
-An instrument that accelerates closes at another speed in each segment. With the default slopes this
-cancels in the half sum, as the Doppler segment is in the middle; with others it does not, and the
-tolerance is wider by what the instrument knows of it.
+An instrument that accelerates has another closing speed in each segment. With the default slopes
+this cancels in the half sum, as the Doppler segment is in the middle. With other slopes it does not
+cancel, and the tolerance is wider by the known motion.
 
-Complex records keep their beats' signs: there is the one reading
+Complex records keep the signs of beats. Their only reading is
 :data:`sweep.model.waveform.SIGNED_READING`, and each surface's Doppler peak confirms it. Segments
-of other
-slopes are paired alike, by the Doppler beat that an up and a down beat predict; readings of a pair
-that is found are left to :func:`sweep.model.waveform.fit_range_velocity`.
+of other slopes are paired in the same way, by the Doppler beat that an up and a down beat predict.
+Their pairs are then evaluated by :func:`sweep.model.waveform.fit_range_velocity`.
 
-Without a Doppler segment nothing tells which peaks belong together, and none is unconfirmed: the
-strongest up peak goes with the strongest down peak, and so on, by the reading
-:data:`sweep.model.waveform.FAR_READING`, FAST or SIGNED.
+Without a Doppler segment no peak can confirm a pair, and no pair is marked as unconfirmed. The
+strongest up peak is paired with the strongest down peak, and so on. The reading is
+:data:`sweep.model.waveform.FAR_READING`, :data:`~sweep.model.waveform.FAST_READING` or
+:data:`~sweep.model.waveform.SIGNED_READING`.
 """
 
 import math
@@ -48,16 +48,16 @@ from sweep.model.waveform import (
 CONFIRMATION_TOLERANCE_BINS = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
 
-Rounding to bins moves the prediction and the Doppler peak by half a bin each, noise near the
-threshold as much again. A peak anywhere confirms one of the 16 readings at random with
-16 (2 TOLERANCE) / (N/2) or less: 1.5e-3 at N = 2^17.
+Rounding to bins moves the prediction and the Doppler peak by half a bin each. Noise near the
+threshold moves them by as much again. A peak at a random position confirms one of the 16 readings
+with a probability of at most 16 (2 tolerance) / (N/2): 1.5e-3 at N = 2^17.
 """
 
 CHANCE_MATCH_PROBABILITY = 0.01
-"""Probability with which a false Doppler peak is as near to a reading as one that tells which."""
+"""Probability that a false Doppler peak selects the reading of an unconfirmed pair."""
 
 _UNPAIRED_COST = 1e9
-"""Cost of an up peak without a down peak: more than any sum of mismatches."""
+"""Cost of an up peak without a down peak: larger than any sum of mismatches."""
 
 TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG, UNCONFIRMED_FLAG = (
     1,
@@ -75,18 +75,21 @@ FLAG_BITS = {
     "sidelobe": SIDELOBE_FLAG,
     "unconfirmed": UNCONFIRMED_FLAG,
 }
-"""Bits of a return's flags. Of the first five, which need the truth, exactly one is set:
+"""Bits of a return's flags. Exactly one of the first five is set, which require the truth.
 
-true: its peaks hold a common beamlet, whose range and velocity it reports to within their width;
-false alarm: one of its peaks is noise (or leaked signal lifted by noise); mispaired: its peaks
-are signal, of no common beamlet; misread: a common beamlet, but the wrong one of the readings;
-sidelobe: one of its peaks holds no beamlet's line. Unconfirmed, which the instrument knows: no
-Doppler peak within the tolerance.
+- true: all its peaks contain lines of one beamlet, whose range and velocity it reports to within
+  the width of the peaks;
+- false alarm: one of its peaks is noise, or leaked signal raised by noise;
+- mispaired: its peaks are signal, but contain lines of no common beamlet;
+- misread: all its peaks contain lines of one beamlet, but the reading is wrong;
+- sidelobe: one of its peaks contains no beamlet's line;
+- unconfirmed, which the instrument knows: no Doppler peak is within the tolerance.
 """
 
 
 FALSE_PEAK, NO_PEAK = -1, -2
-"""In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
+"""Values in place of the number of a peak's group: for a false peak; and for no Doppler peak or
+segment."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -101,15 +104,22 @@ def pair_peaks(
     tolerance,
     pairs,
 ):
-    """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
+    """Pair up and down peaks one to one, and return the numbers of confirmed and of all pairs.
 
-    Peaks are positions [bins], strongest first, with signs if ``down_beat_sign``; the rest as of
-    :func:`find_confirming_peak`. ``two_beat_reading`` is the reading of pairs that are not
-    confirmed. ``pairs`` (>=
-    min(ups, downs), 4) int64 takes the index of up, Doppler (-1 where unconfirmed) and down peak,
-    and the reading. Returns the numbers of confirmed pairs, and of all.
+    Parameters
+    ----------
+    up, doppler, down
+        Positions of the peaks [bins], strongest first; signed if `down_beat_sign` is not 0.
+    doppler_prediction, fft_size, down_beat_sign, tolerance
+        Arguments of :func:`find_confirming_peak`.
+    two_beat_reading
+        Reading of pairs that no Doppler peak confirms.
+    pairs
+        (>= min(ups, downs), 4) int64; the result. Columns are the index of the up peak, of the
+        Doppler peak (-1 if unconfirmed) and of the down peak, and the reading. Confirmed pairs come
+        first, in the order of the up peaks.
     """
-    if up.size == 1 and down.size == 1:  # the pair that most shots have
+    if up.size == 1 and down.size == 1:  # fast path for the most frequent case
         mismatch, doppler_index, reading = find_confirming_peak(
             up[0], doppler, down[0], doppler_prediction, fft_size, down_beat_sign, tolerance
         )
@@ -156,15 +166,30 @@ def pair_peaks(
 def find_confirming_peak(
     up, doppler, down, doppler_prediction, fft_size, down_beat_sign, tolerance
 ):
-    """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
+    """Find the Doppler peak and the reading that fit an up and a down peak best.
 
-    ``doppler_prediction`` (3,) is the share of up and of down beat in the Doppler segment's, and
-    what the
-    instrument's motion between the segments moves that by [bins], which adds to the tolerance.
-    ``down_beat_sign``, of complex records, is 1 where the down beat rises against the up beat as
-    the range
-    does, -1 where it falls; 0 of real records. Returns mismatch and penalties [bins], inf where
-    none comes within the tolerance; the Doppler peak and the reading, -1 for none.
+    Parameters
+    ----------
+    up, down
+        Positions of the up and down peak [bins].
+    doppler
+        (k,): positions of the Doppler peaks [bins].
+    doppler_prediction
+        (3,): coefficients of the up and down beat in the Doppler beat, and the change of that by
+        the instrument's motion between the segments [bins], which is added to the tolerance.
+    fft_size
+        FFT size N.
+    down_beat_sign
+        For complex records 1 if the down beat minus the up beat rises with the range, -1 if it
+        falls; 0 for real records.
+    tolerance
+        Largest mismatch [bins].
+
+    Returns
+    -------
+    tuple
+        Mismatch plus penalties for folds [bins], index of the Doppler peak, and reading; inf, -1,
+        -1 if no peak is within the tolerance.
     """
     least_cost, doppler_index, best_reading = np.inf, -1, -1
     tolerance += doppler_prediction[2]
@@ -204,9 +229,10 @@ def find_confirming_peak(
 
 @njit(cache=True, error_model="numpy")
 def _match_pairs(cost):
-    """Down peak of each up peak, or -1, and which are used: most pairs, then least cost.
+    """Return the down peak of each up peak, or -1, and the mask of down peaks that are used.
 
-    A search in depth over the pairs of finite cost, cut where it can't beat the best so far.
+    The solution has the most pairs, and among those the least cost. It is found by a depth-first
+    search over pairs of finite cost, which stops where it cannot be better than the best so far.
     """
     n_up, n_down = cost.shape
     best_down, current_down = np.full(n_up, -1), np.full(n_up, -1)
@@ -219,7 +245,7 @@ def _match_pairs(cost):
         j += 1
         while j < n_down and (is_down_used[j] or not math.isfinite(cost[depth, j])):
             j += 1
-        current_down[depth] = j  # without a partner where all are tried
+        current_down[depth] = j  # n_down: no partner, after all others were tried
         if j > n_down:
             current_down[depth] = -1
             depth -= 1
@@ -244,11 +270,21 @@ def _match_pairs(cost):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
-    """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
+    """Return the flag of a return, apart from its reading, and its nearest beamlet.
 
-    ``groups`` and ``positions`` (3,) are groups and positions [bins] of the peaks of the segments;
-    the rest as of :class:`sweep.model.pointcloud.returns.DrawInputs`, at one point. Beamlets of
-    amplitude 0 do not count.
+    Parameters
+    ----------
+    groups, positions
+        (3,): group and position [bins] of the peak in each segment.
+    group_bins, line_positions, beamlet_amplitude
+        Fields of :class:`sweep.model.pointcloud.returns.DrawInputs` for one point. Beamlets of
+        amplitude 0 do not count.
+
+    Returns
+    -------
+    tuple
+        TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG; and the beamlet nearest to the
+        peaks, of those whose lines are in all of them, or -1.
     """
     if groups[0] == FALSE_PEAK or groups[1] == FALSE_PEAK or groups[2] == FALSE_PEAK:
         return FALSE_ALARM_FLAG, -1

@@ -1,12 +1,13 @@
-"""Point clouds: what an instrument reports of a flight's eyepoints, shot by shot and draw by draw.
+"""Point clouds: the reports of an instrument for a flight's eyepoints, by shot and draw.
 
-Every point comes with its position in the world, its standard errors and the truth: surface, range
-and radial velocity of the beamlet that it has seen, and flags that say what it is.
+Every point has a position in the world, standard errors and the truth: surface, range and radial
+velocity of the beamlet that it measures, and flags
+(:data:`sweep.model.pointcloud.pairing.FLAG_BITS`).
 
-A shot that sees nothing has noise alone in its record: its false alarms are the largest of all bins
-that are counted, drawn like those of any other shot, from the same addresses. A shot sees the air
-once: all its draws, and its probabilities, have the scintillation of its own key. Results of a shot
-do not depend on the shots and draws that are computed with it.
+A shot that hits nothing has noise alone in its record. Its false alarms are the largest of all bins
+that are counted, drawn like those of any other shot, from the same addresses. A shot has one state
+of the air: all its draws, and its probabilities, have the scintillation of the shot's key. Results
+of a shot do not depend on the shots and draws that are computed with it.
 """
 
 from collections.abc import Collection, Sequence
@@ -41,10 +42,10 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import STRONGEST_PEAK
 
 VALUES_PER_BATCH = 1 << 20
-"""Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
+"""Largest number of values, in addition to the result, that a batch of shots needs in memory."""
 
 _EMPTY_SHOT_RANGE = 1.0
-"""Range [m] of a shot that sees nothing. No light comes back from there."""
+"""Range [m] assumed for a shot that hits nothing. It returns no light."""
 
 
 def simulate_cloud(
@@ -63,19 +64,43 @@ def simulate_cloud(
     estimates_ray_error: bool = False,
     motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
-    """Statistics and points of n shots, whether they see anything or not.
+    """Compute statistics and points of n shots, with or without a target.
 
-    Arrays are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`, (n,), and
-    :data:`sweep.model.outputs.POINT_VARIABLES`, (n, draws, returns[, 3]). `keys` (n, 2) are random,
-    `method`
-    is ``probabilities``, ``noise`` or ``spectra``. `returns_max` is the number of groups that are
-    looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
-    `effects` and `effect_flags` are as of :func:`sweep.model.evaluation.prepare_ray_traced_shots`.
-    `estimates_ray_error` asks for
-    ``beamlets_error``, which needs powers that add and is else nan. ``surface``, ``true_range`` and
-    ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
-    error of a misread one shows. `motion_priors` are what the instrument knows beforehand of motion
-    that it does not measure; standard errors have it.
+    Parameters
+    ----------
+    eyepoints
+        Geometry of the n shots.
+    parameters
+        Other parameters by dotted path, scalars.
+    surfaces
+        Materials by the surface numbers of `eyepoints`.
+    keys
+        (n, 2) uint64: random key of each shot.
+    first_draw, draws
+        Number of the first draw, and number of draws.
+    method
+        ``probabilities``, ``noise`` or ``spectra``.
+    methods
+        Detectors and estimators for ``spectra``.
+    returns_max
+        Largest number of groups in a segment, and of points of a shot and draw; ``surfaces_seen``
+        is at most this.
+    effects, effect_flags
+        Names of effects, and bit masks, as for
+        :func:`sweep.model.evaluation.prepare_ray_traced_shots`.
+    estimates_ray_error
+        True to estimate ``beamlets_error``, for which powers must add; otherwise it is nan.
+    motion_priors
+        Prior standard deviations of motion that the instrument does not measure; standard errors
+        include them.
+
+    Returns
+    -------
+    dict of str to ndarray
+        :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`, (n,), and
+        :data:`sweep.model.outputs.POINT_VARIABLES`, (n, draws, returns[, 3]). ``surface``,
+        ``true_range`` and ``true_radial_velocity`` are those of the beamlet that a true or a
+        misread point measures, so that the error of a misread point shows.
     """
     n_shots = len(eyepoints.time)
     sizes = {"shot": n_shots, "draw": draws, "return_number": returns_max, "xyz": 3}
@@ -155,10 +180,10 @@ def _prepare_bin_groups(
     groups_max: int,
     effect_arguments: tuple[Collection[str], np.ndarray | None, np.ndarray],
 ) -> tuple[Shots, BeamletTable, BinGroups, list[tuple[np.ndarray, LeakageBins]] | None]:
-    """Return prepared shots, footprints, and groups in their spectra; no groups without a target.
+    """Return prepared shots, footprints, groups in the spectra, and bins of leaked signal.
 
-    And their leaked peaks, where these had to be listed and are few. `effect_arguments`: names of
-    effects, flags of each shot, and the shots' keys.
+    Shots without a target have no groups. Bins of leaked signal are None if they were not listed or
+    are many. `effect_arguments` are names of effects, flags of each shot, and the shots' keys.
     """
     (effects, effect_flags, keys), has_target = effect_arguments, eyepoints.has_target
     placed_eyepoints = eyepoints._replace(
@@ -199,7 +224,7 @@ def _prepare_bin_groups(
     if leaks_in_speckle and not finds_groups_with_leakage:
         known_leakage_bins = (
             [] if shots.circulator_leak_amplitude is None else None
-        )  # a line has a great many bins
+        )  # the leak of a circulator has too many bins to keep
         for indices, leakage_bins in iter_leakage_bins(
             shots, bin_groups, np.flatnonzero(has_target)
         ):
@@ -210,7 +235,7 @@ def _prepare_bin_groups(
 
 
 def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
-    """Probabilities before any draw, (n,) each."""
+    """Return probabilities of shots that do not depend on draws, (n,) by name."""
     pd_up, pd_doppler, pd_down = bin_groups.pd[:, :, 0].T
     pd_both = shots.joint_detection_probability(
         pd_up, pd_down, (bin_groups.magnitude[:, 0, 0], bin_groups.magnitude[:, 2, 0])
@@ -239,11 +264,11 @@ def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, n
 def _cloud_points(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
-    """Points and their truth, (n, draws, returns[, 3]) each."""
+    """Return points and their truth by name, (n, draws, returns[, 3])."""
     has_beamlet = shot_returns.beamlet >= 0
     shot = np.arange(len(has_beamlet))[:, None, None]
     shot_and_beamlet = shot, np.maximum(shot_returns.beamlet, 0)
-    if n_lines < eyepoints.weight.size:  # the footprint is left out: its one line is the axis's
+    if n_lines < eyepoints.weight.size:  # without a footprint the only line is the axis's
         shot_and_beamlet = (
             shot,
             np.broadcast_to(eyepoints.reference_beamlet[:, None, None], has_beamlet.shape),

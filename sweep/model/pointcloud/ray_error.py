@@ -1,30 +1,31 @@
-"""Error of too few rays: the change that more rays might make to probabilities and peaks.
+"""Error of too few rays: the change of probabilities and peaks that more rays might make.
 
-If powers add, the power of the bin that is detected is a mean over the beam, P = sum_b w_b g_b; g_b
-is its power if all light went where beamlet b goes. A hexagonal lattice of whole shells is exact
-for everything odd about the beam's axis and for squares of the places, and nearly exact for smooth
-ground. So g is made even, and its best polynomial is subtracted, of the second degree for few rays
-and the fourth for more. The rest tells how rough the ground is between the beamlets: the share of
-the beam about each beamlet is taken to be off by as much as it differs from its neighbours, each
-independently,
+If powers add, the power of the detected bin is a mean over the beam, P = sum_b w_b g_b. Here g_b is
+the power of the bin if all light went to beamlet b. A hexagonal lattice of whole shells is exact
+for all odd functions about the beam's axis and for squares of the positions, and nearly exact for
+smooth ground. So g is made even, and its best polynomial is subtracted, of degree 2 for few rays
+and 4 for more. The remainder r measures the roughness of the ground between the beamlets. The part
+of the beam about each beamlet is assumed to err, independently, by as much as it differs from its
+neighbours:
 
     (dP)^2 = sum w_a w_b (r_a - r_b)^2    over the pairs of neighbours.
 
-The lattice ends at a radius, and is stretched so that squares stay exact: its weights w_b are not
-the beam's density about the beamlets, u_b. With what lies beyond taken from the outermost shell,
-the power changes by
+The lattice ends at a radius, and is stretched so that squares remain exact. So its weights w_b are
+not the powers u_b of the beam about the beamlets. If the power outside the lattice is taken from
+the outermost shell, the power changes by
 
-    sum (u_b - w_b) g_b + (1 - sum u_b) mean of g in the outermost shell,
+    sum (u_b - w_b) g_b + (1 - sum u_b) mean of g in the outermost shell.
 
-0.5 % for 19 rays whose lines fill some bins, and less for more, whose lattices are wider. Its size
-is added to dP.
+This is 0.5 % for 19 rays whose lines fill some bins, and less for more rays, whose lattices are
+wider. Its magnitude is added to dP.
 
-Like the error itself dP falls about as one over the number of rays. It knows nothing of what no ray
-has hit, and takes smooth ground for rougher than it is, for 19 rays most of all. It was checked on
-shots off by more than 1e-6, powers adding, against 8,017 or 16,021 rays: 1,000 of each of scan
-pattern comparison, gale crater descent, forest scan and square high descent. It is below half of
-the error for one in a thousand of the forest's shots, whatever the number of rays, and for no
-others. Its median is 7 to 60 times the error for 19 rays, 2 to 10 from 61 on.
+Like the error itself, dP is about inversely proportional to the number of rays. It does not include
+objects that no ray has hit. It overestimates the roughness of smooth ground, most of all for 19
+rays. It was checked against 8,017 or 16,021 rays, on shots with errors above 1e-6 where powers add:
+1,000 shots of each of scan pattern comparison, gale crater descent, forest scan and square high
+descent. For one in a thousand of the forest's shots it is below half of the error, whatever the
+number of rays, and for no others. Its median is 7 to 60 times the error for 19 rays, and 2 to 10
+times from 61 rays on.
 """
 
 import math
@@ -41,57 +42,68 @@ from sweep.model.preparation import Shots
 from sweep.model.window import window_samples
 
 _CHIRP_SIGNS = 1.0, 0.0, -1.0
-"""Of the segments' chirps."""
+"""Signs of the chirp rates of the up, Doppler and down segment."""
 
 _LOBE_REACH_BINS, _LOBE_STEPS_PER_BIN, _WINDOW_SAMPLES = 4, 1024, 1024
-"""Bins of fs/L up to which a line's power is known, steps of each, samples of the window."""
+"""Table of a line's power: largest distance [bins of fs/L], steps per bin, samples of the window.
+"""
 
 _NEIGHBOUR_DISTANCE_RATIO = 1.3
-"""Largest distance between neighbours, over the nearest; the next but one are 1.7 away."""
+"""Largest distance of neighbours over that of the nearest; second neighbours are at 1.7."""
 
 _QUARTIC_RAYS_MIN = 37
-"""Rays from which on the polynomials are of the fourth degree, and leave enough to tell from."""
+"""Smallest number of rays for polynomials of degree 4, which then leave enough residuals."""
 
 _NO_CHANGE_SIGMA = 15.0
-"""Standard deviations from the threshold at which nothing changes: e^-112."""
+"""Distance from the threshold [standard deviations] beyond which no probability changes: e^-112."""
 
 _PROBABILITY_CHANGE_MIN = 1e-9
-"""Change of a probability that is not looked for."""
+"""Change of a probability below which the error of a shot is not computed."""
 
 
 class FoldedLattice(NamedTuple):
-    """A lattice of whole shells folded about its middle: h places, each with the one opposite."""
+    """Lattice of whole shells, folded about its centre: h positions, each with the opposite one."""
 
     beamlet: np.ndarray
-    """(h,) int64: beamlet."""
+    """(h,) int64: index of the beamlet."""
     opposite_beamlet: np.ndarray
-    """(h,) int64: the one opposite; the middle is its own."""
+    """(h,) int64: index of the opposite beamlet; for the central one its own."""
     inverse_weight: np.ndarray
-    """(h,): 1 over the power fraction of the two."""
+    """(h,): 1 over the power fraction of both beamlets."""
     polynomials: np.ndarray
-    """(k, h): even polynomials of the places, orthonormal by the power fractions."""
+    """(k, h): even polynomials of the positions, orthonormal under the power fractions."""
     weighted_polynomials: np.ndarray
-    """(k, h): these times the power fractions."""
+    """(k, h): polynomials times the power fractions."""
     density_change: np.ndarray
-    """(h,): change of the mean power per power of the two, by the beam's density about them."""
+    """(h,): change of the mean power per power of both beamlets, by the beam's density about them.
+    """
     neighbour_pairs: np.ndarray
-    """(m, 2) int64: places that are neighbours."""
+    """(m, 2) int64: pairs of positions that are neighbours."""
     pair_weight: np.ndarray
-    """(m,): sum of the products of their beamlets' power fractions, made larger for what the
-    polynomials have taken of the roughness too: k of h."""
+    """(m,): sum of the products of the beamlets' power fractions, times h / (h - k) for the
+    roughness that k polynomials remove."""
 
 
 def estimate_ray_error(
     shots: Shots, beamlet_table: BeamletTable, peak_bins: np.ndarray, magnitude: np.ndarray
 ) -> np.ndarray:
-    """Change that more rays may make, (n,), 0..1.
+    """Return the change that more rays may make, (n,), 0..1.
 
-    The larger of two errors: that of the probabilities of detection, summed over the segments, and
-    that of a peak's magnitude relative to itself, or to sigma where that is larger.
+    It is the larger of two errors. The first is that of the probabilities of detection, summed over
+    the segments. The second is that of a peak's magnitude, relative to the larger of the magnitude
+    and sigma.
 
-    Powers of the shots add. The footprints are what their rays have hit, a hexagonal lattice of
-    whole shells, all of it even where the effect of its spread on the lines is left out.
-    `peak_bins` and `magnitude` (n, 3) are each segment's peak, -1 or nan for none, and |X| there.
+    Parameters
+    ----------
+    shots
+        Prepared shots whose powers add.
+    beamlet_table
+        Footprints of the shots by ray casting: a hexagonal lattice of whole shells, even if the
+        effect of its spread on the lines is omitted.
+    peak_bins
+        (n, 3): bin of each segment's peak, -1 for none.
+    magnitude
+        (n, 3): |X| of each segment's peak, nan for none.
     """
     threshold, noise_sigma = shots.threshold, shots.line_noise_sigma
     pd_change, magnitude_change = np.zeros((2, shots.size))
@@ -100,8 +112,8 @@ def estimate_ray_error(
         has_peak = peak_bins[:, s] >= 0 if shots.has_segment[s] else np.zeros(shots.size, bool)
         a, b = magnitude[:, s] / noise_sigma, np.broadcast_to(threshold / noise_sigma, shots.size)
         a, b = a * shots.looks.amplitude_gain_max, shots.looks.equivalent_threshold_ratio(b)
-        # The down-chirp's lines lie as those of the up-chirp, and Doppler's closer together,
-        # which makes them smoother: one magnitude tells of all.
+        # Lines of the down-chirp are spread as those of the up-chirp. Those of the Doppler segment
+        # are closer together, which makes them smoother. So one magnitude stands for all.
         counts_magnitude = has_peak if s == 0 else has_peak & ~(peak_bins[:, 0] >= 0)
         is_relevant = (
             counts_magnitude & (_magnitude_change(a, 1.0) >= _PROBABILITY_CHANGE_MIN)
@@ -124,9 +136,10 @@ def estimate_ray_error(
 
 
 def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Most that Q_1(a, b) changes as a's square changes by a share of itself.
+    """Return an upper bound on the change of Q_1(a, b) by a relative change of a^2.
 
-    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the nearest to b that a comes.
+    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the a in this range that is nearest to
+    b.
     """
     distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
     bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
@@ -134,7 +147,7 @@ def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float)
 
 
 def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Change of a over itself, or 1 if that is larger, as its square changes by a share."""
+    """Return the change of a by a relative change of a^2: relative to a, or absolute if a < 1."""
     return np.asarray(0.5 * relative * np.minimum(a, 1.0))
 
 
@@ -145,7 +158,7 @@ def _bin_powers(
     indices: np.ndarray,
     bins: np.ndarray,
 ) -> np.ndarray:
-    """Powers, in one scale, that bins k (m,) of a segment have of some shots' lines, (m, b)."""
+    """Return powers (m, b) of beamlets' lines in a bin of m shots, up to a common factor."""
     segment = shots.waveform_segments[segment_index]
     columns = (
         shots.range - segment.range_decrease,
@@ -170,7 +183,7 @@ def _bin_powers(
         beamlet_table.relative_range_offset[row],
         beamlet_table.doppler_ratio_offset[row],
     )
-    # to the bin's precision: phases, which need far more, are none of a power's
+    # Precise to a fraction of a bin; phases would need far more, but powers have none.
     beamlet_range = axis_range * (1 + relative_range_offset)
     beat = carrier * (doppler_ratio + doppler_ratio_offset)
     beat -= (
@@ -207,8 +220,8 @@ def _bin_powers(
 
 @lru_cache(maxsize=16)
 def fold_lattice(n_beamlets: int) -> FoldedLattice:
-    """Fold the lattice of ``n_beamlets`` beamlets, whole shells of them."""
-    from scipy.spatial import cKDTree  # which takes longer to import than all else
+    """Return the folded lattice of ``n_beamlets`` beamlets in whole shells."""
+    from scipy.spatial import cKDTree  # slow to import
 
     offsets, weights = place_beamlets(n_beamlets)
     positions = offsets.T
@@ -224,7 +237,7 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
         np.where(opposite[representatives] == representatives, 1.0, 2.0) * weights[representatives]
     )
     neighbours = tree.query_pairs(neighbour_distance, output_type="ndarray")
-    neighbours = neighbours[np.lexsort(neighbours.T)]  # whatever order the tree has them in
+    neighbours = neighbours[np.lexsort(neighbours.T)]  # independent of the tree's order
     folded_pairs = np.sort(folded_index[neighbours], axis=1)
     pair_keys, key_index = np.unique(
         folded_pairs[:, 0] * n_beamlets + folded_pairs[:, 1], return_inverse=True
@@ -251,14 +264,14 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
 
 
 def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the beam's power in each beamlet's cell less its weight, (number,); sums to 0.
+    """Return the beam's power in each beamlet's cell minus its weight, (beamlets,); the sum is 0.
 
-    ``offsets`` (2, number) are in standard deviations of the beam; ``weight`` (number,) sums to 1.
-    The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius
-    share the power outside of all cells.
+    ``offsets`` (2, beamlets) are in standard deviations of the beam; ``weight`` (beamlets,) sums to
+    1. The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius share the
+    power outside of all cells.
     """
     squared_radius = (offsets**2).sum(axis=0)
-    # Weights are exp(-r^2 / 2) at the radius r before the lattice was stretched.
+    # Weights are exp(-r^2 / 2) at the radius r before the lattice is stretched.
     centre_index = int(np.argmin(squared_radius))
     stretch = squared_radius.max() / (-2 * np.log(weight.min() / weight[centre_index]))
     cell_factor = stretch * lattice_radius(weight.size) ** 2 / (2 * weight.size)  # over 2 pi
@@ -269,7 +282,7 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> np.ndarray:
-    """Even polynomials up to a degree, orthonormal, (k, h)."""
+    """Return even polynomials up to a degree, orthonormal under the weights, (k, h)."""
     x, y = offsets
     powers = [(total - k, k) for total in range(0, degree + 1, 2) for k in range(total + 1)]
     root = np.sqrt(weights)
@@ -279,20 +292,20 @@ def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> 
 
 @lru_cache(maxsize=32)
 def _main_lobe_table(window_name: str) -> np.ndarray:
-    """|W(y)|^2 over its peak's at even steps of y >= 0, of the length that makes no difference."""
+    """Return |W(y)|^2 over its peak's at even steps of y >= 0, for any length of the window."""
     w = window_samples(window_name, _WINDOW_SAMPLES)
     transform = np.abs(
         np.fft.rfft(w, _WINDOW_SAMPLES * _LOBE_STEPS_PER_BIN)[
             : _LOBE_REACH_BINS * _LOBE_STEPS_PER_BIN + 1
         ]
     )
-    transform[-1] = 0.0  # and nothing beyond
+    transform[-1] = 0.0  # zero beyond the table
     return np.asarray((transform / w.sum()) ** 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_power_errors(powers, lattice, relative_errors):
-    """Errors (m,) of sums of powers (m, b), over the sums, no more than 1: see the module."""
+    """Compute relative errors (m,), at most 1, of sums of powers (m, b): see the module."""
     (
         beamlet,
         opposite_beamlet,
@@ -313,7 +326,7 @@ def _fill_power_errors(powers, lattice, relative_errors):
             total_power += pair_power
             bias += density_change[f] * pair_power
             residual[f] = pair_power * inverse_weight[f]
-        for j in range(polynomials.shape[0]):  # orthonormal: one after the other is all at once
+        for j in range(polynomials.shape[0]):  # orthonormal, so one at a time suffices
             projection = 0.0
             for f in range(beamlet.size):
                 projection += weighted_polynomials[j, f] * residual[f]

@@ -1,20 +1,22 @@
-"""Returns of a flight's shots that a detector and an estimator find in whole spectra, draw by draw.
+"""Returns of a flight's shots from full spectra, by a detector and an estimator, draw by draw.
 
-Spectra are those of :mod:`sweep.model.sampling.noisy_spectra`, as grids have them: a shot is a
-point, with
-the echoes of all the surfaces that it sees. Flagged bins that are adjacent make a peak, placed by
-the estimator; the strongest of them are paired, judged and measured as all others of a flight
-(:mod:`sweep.model.pointcloud.returns`). A peak belongs to an echo whose bins it touches. These are
-the bins
-from the first to the last of half the echo's largest magnitude, and a main lobe's half-width to
-either side (by ``peak_bin`` the strongest alone). An echo has one peak, the strongest. All others
-are false, as many as there are, but those that touch bins of a signal at or above a fixed
-threshold, or their neighbours: closed forms exempt these from false alarms, too.
+Spectra are those of :mod:`sweep.model.sampling.noisy_spectra`, as for grids. A shot is a point,
+with the echoes of all surfaces in its footprint. Adjacent flagged bins make a peak, whose position
+the estimator gives. The strongest peaks are paired, judged and measured as all peaks of flights are
+(:mod:`sweep.model.pointcloud.returns`).
 
-A draw is looked at by itself, so that a user's function answers the same however draws are cut.
+A peak belongs to an echo if it shares a bin with the echo. The bins of an echo reach from the first
+to the last of half its largest magnitude, plus a main lobe's half-width on either side. With
+``peak_bin`` only the strongest bin counts. An echo has one peak, the strongest. All other peaks are
+false, without a limit on their number. Peaks are omitted if they contain a bin of signal at or
+above a fixed threshold, or a neighbour of such a bin. Closed forms exempt such bins from false
+alarms, too.
 
-Standard errors are those of three bins' interpolation, whatever the estimator, which an instrument
-does not know better; those of ``peak_bin`` count its rounding.
+Each draw is processed alone, so that a user's function returns the same values however draws are
+grouped.
+
+Standard errors are those of interpolation by three bins, whatever the estimator is, because an
+instrument has no better knowledge. Those of ``peak_bin`` include its rounding.
 """
 
 import math
@@ -65,10 +67,25 @@ def draw_spectra_returns(
     draws: int = 1,
     motion: EgoMotion | None = None,
 ) -> Returns:
-    """Draw returns from whole spectra, by the detector and estimator of these names.
+    """Draw returns from full spectra, by the detector and estimator that the parameters name.
 
-    `parameters` are scalars; :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`
-    stand for any not given.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    bin_groups
+        Groups in the noiseless spectra of the shots.
+    keys
+        (n, 2) uint64: random key of each shot.
+    parameters
+        Scalars by dotted path; missing ones have the values of
+        :data:`sweep.model.detection.estimators.SPECTRUM_METHOD_DEFAULTS`.
+    methods
+        Detectors and estimators by name.
+    first_draw, draws
+        Number of the first draw, and number of draws.
+    motion
+        Known motion of the instrument; None to correct nothing.
     """
     method_parameters, groups_max = (
         {**SPECTRUM_METHOD_DEFAULTS, **parameters},
@@ -162,9 +179,10 @@ def draw_spectra_returns(
 
 
 def _echo_bin_bounds(view: SpectrumView, segment: int, signal: SegmentSignal | None) -> np.ndarray:
-    """First and last bin (echoes, 2) of each echo in a segment, unrolled by :func:`unroll_bins`.
+    """Return the first and last bin (echoes, 2) of each echo in a segment.
 
-    The strongest of all stands in the middle of a complex record's bins.
+    Bins are those after :func:`unroll_bins`, with the strongest echo in the middle of a complex
+    record's bins.
     """
     echo_indices = view.echo_indices(segment)
     if signal is None or not echo_indices.size:
@@ -198,10 +216,26 @@ def list_flagged_peaks(
     view: SpectrumView,
     peaks_max: int,
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Power (bins,) of one draw of a segment, and the peaks in it, strongest first.
+    """List the peaks of flagged bins in one draw of a segment, strongest first.
 
-    Of each the strongest bin, and the echo whose bins it touches, or FALSE. ``spectra``: (1, bins)
-    each, of one or several looks; ``echo_bounds``: of :func:`_echo_bin_bounds`.
+    Parameters
+    ----------
+    spectra
+        Complex spectra (1, bins) of each look [V].
+    signal
+        Signal of the segment without noise.
+    echo_bounds
+        Result of :func:`_echo_bin_bounds`.
+    view
+        View of the shot.
+    peaks_max
+        Largest number of peaks.
+
+    Returns
+    -------
+    tuple
+        Power (bins,) of the draw; strongest bin (peaks,) of each peak; and number of its echo, or
+        FALSE_PEAK.
     """
     (all_power,), (flags,) = flag_bins(spectra, view, signal.segment)
     shots, shift = view.shots, unrolling_shift(view.shots, signal.strongest_bin)
@@ -210,7 +244,7 @@ def list_flagged_peaks(
     )
     end_index = power.size - 1
     if view.shots.real_fft_size and signal.last_bin >= signal.first_bin:  # an echo on DC or Nyquist
-        # No group holds these bins: where they are flagged, the next one stands for them.
+        # Groups exclude these bins: if one is flagged, flag its inner neighbour instead.
         for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
             if flags[end] and end in (signal.first_bin, signal.last_bin):
                 flags[inner_bin] = True
