@@ -170,6 +170,7 @@ def ego_motion_of_beams(
     direction_z = np.where(meets_ground, direction[:, 2], -1.0)
 
     def slip_gradient(vector: np.ndarray) -> np.ndarray:
+        """Return the derivative of W's part of the slip (n, 3) with respect to the gradient."""
         over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
         over_ground /= direction_z[:, None] ** 2
         for_facing_surface = vector - _row_dot(vector, direction)[:, None] * direction

@@ -80,6 +80,7 @@ class ErrorFloor(NamedTuple):
 
 
 NO_ERROR_FLOOR = ErrorFloor()
+"""Error floor of an instrument without errors."""
 
 
 def apply_error_floor(

@@ -27,7 +27,9 @@ from sweep.model.preparation import APPROACH_SPEED_PATH, Parameters, Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 TARGET_HEIGHT_PATH = "atmosphere.target_height"
+"""Path of the height of the target above the zero of atmospheric profiles [m]."""
 SOLAR_IRRADIANCE_PATH = "target.solar_irradiance"
+"""Path of the spectral irradiance of the sun on the target."""
 
 RANGE_MIN = 1e-3
 """Range [m] below which rays pass through surfaces.

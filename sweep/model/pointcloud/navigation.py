@@ -97,6 +97,7 @@ STATUS_UNDETERMINED = 3
 """No solution: beams are too few, or nearly coplanar."""
 
 ArraysByName = Mapping[str, np.ndarray]
+"""Arrays by the name of their variable."""
 
 FitResult = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """First four fields of a :class:`NavigationSolution` of n cycles."""
@@ -340,6 +341,7 @@ class _GroundPlane(NamedTuple):
     variance: np.ndarray
     """Variance of the height [m^2]."""
     chi_square: np.ndarray
+    """Weighted sum of squared residuals."""
     gradient: np.ndarray
     """(2, n): gradient along x and y."""
     n_fitted_slopes: np.ndarray
@@ -566,17 +568,22 @@ _POSE_VARIABLES = (
     "platform_position", "platform_velocity", "beam_direction", "beam_turning",
     "platform_acceleration",
 )  # fmt: skip
+"""Names of variables in the order of the fields of :class:`Poses`."""
 
 
 class Poses(NamedTuple):
     """Known motion of shots' beams, (..., 3) each, in the world's axes."""
 
     position: np.ndarray
+    """Position of the instrument [m]."""
     velocity: np.ndarray
+    """Velocity of the instrument [m/s]."""
     direction: np.ndarray
+    """Unit vector along the beam."""
     direction_rate: np.ndarray
     """Rate of change of the direction [1/s]."""
     acceleration: np.ndarray
+    """Acceleration of the instrument [m/s^2]."""
 
     def by_cycle(self, beams_per_cycle: int) -> "Poses":
         """Return the poses of n shots by cycle, (n / beams, beams, 3) each."""

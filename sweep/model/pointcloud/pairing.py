@@ -67,6 +67,7 @@ TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG, UNCONF
     16,
     32,
 )
+"""Bits of a return's flags, described at :data:`FLAG_BITS`."""
 FLAG_BITS = {
     "true": TRUE_FLAG,
     "false_alarm": FALSE_ALARM_FLAG,

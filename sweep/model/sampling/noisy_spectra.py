@@ -113,7 +113,9 @@ class SpectrumMethods(NamedTuple):
     """Detectors and estimators by name; by default those of the package."""
 
     detectors: Mapping[str, Detector] = DETECTORS
+    """Detectors by name."""
     estimators: Mapping[str, Estimator] = ESTIMATORS
+    """Estimators of frequency by name."""
 
 
 class SegmentSignal(NamedTuple):
@@ -700,6 +702,7 @@ class SpectrumView(NamedTuple):
     """Point of prepared shots, with the detector and the estimator of its spectra."""
 
     shots: Shots
+    """Prepared shots."""
     point: int
     """Index of the point in ``shots``."""
     key: np.ndarray
@@ -709,8 +712,11 @@ class SpectrumView(NamedTuple):
     look_shots: list[Shots]
     """Prepared shots at the time of each look."""
     setting: SpectrumSettings
+    """Settings of the spectra and of the detector."""
     detect: Detector
+    """Detector: a function of power |X|^2 (m, bins) that returns flags."""
     estimate: Estimator
+    """Estimator: a function of spectra (m, bins) and peak bins (m,) that returns positions (m,)."""
     signal_cache: dict[tuple[int, int], SegmentSignal]
     """Computed signals of looks at which the target has moved, by segment and look."""
     echo_bins: np.ndarray | None = None
@@ -746,6 +752,7 @@ class SegmentDetections(NamedTuple):
     """Detections, false alarms and frequency of a segment in m draws, (m,) each."""
 
     is_detected: np.ndarray
+    """bool: True if the detector flags a bin of the echo."""
     n_false_groups: np.ndarray
     """int64: number of groups of flagged bins outside the signal."""
     n_false_bins: np.ndarray

@@ -45,6 +45,7 @@ class RealisedShots(NamedTuple):
     draw_numbers: np.ndarray
     """int64: number of the draw."""
     shots: Shots
+    """Prepared shots of the m draws."""
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:

@@ -67,6 +67,7 @@ SPECTRUM_SAMPLES_PER_STEP = 1 << 18
 """Largest number of samples of full spectra in one step."""
 
 FFT_SIZE_PATH = "instrument.processing.fft_size"
+"""Path of the FFT size."""
 
 SPECTRA_METHOD = "spectra"
 """Method of drawing that makes full spectra; the others are ``probabilities`` and ``noise``."""
@@ -74,6 +75,7 @@ SPECTRA_METHOD = "spectra"
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
 ]
+"""Rows of the counts with the detections that PD_OUTPUTS are estimated from."""
 
 
 class PriorDraws(NamedTuple):

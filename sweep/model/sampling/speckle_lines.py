@@ -202,6 +202,7 @@ def _rotate_to_steepest(
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
 
     def rotate(vectors: np.ndarray) -> np.ndarray:
+        """Rotate vectors (n, 3, 2) by each point's angle."""
         first, second = vectors[..., 0], vectors[..., 1]
         return np.stack([cosine * first + sine * second, cosine * second - sine * first], axis=-1)
 
