@@ -1,37 +1,39 @@
-"""False peaks that leaked signal raises: in which bins, how often, and how large.
+"""False peaks by leaked signal: their bins, probabilities and magnitudes.
 
-Each bin of a segment outside the echoes raises a false peak for two reasons, which are drawn apart.
-Noise alone does so in all bins searched alike. Leaked signal of amplitude a (over the noise per
-quadrature sigma) raises bin k in further draws, with the probability that it adds to noise,
+Each bin of a segment outside the echoes raises a false peak for two reasons, which are drawn
+separately. Noise alone does so in all searched bins with equal probability. Leaked signal of
+amplitude a (over the noise per quadrature sigma) raises bin k in additional draws, with the
+probability that it adds to noise,
 
     c_k(z) = (Q_1(a_k, z) - e^(-z^2 / 2)) / (1 - e^(-z^2 / 2)),
 
-at the threshold z = b. The two together leave the bin below any level z with the probability
+at the threshold z = b. Both together leave the bin below any level z with the probability
 
     (1 - e^(-z^2 / 2)) (1 - c_k(z)) = 1 - Q_1(a_k, z)
 
-that Rice's law has for signal and noise. So a bin is found at its own place and as large as in
-drawn noise, and the probability of leakage of a segment is 1 - prod (1 - c_k(b)).
+of Rice's law for signal and noise. So positions and magnitudes of false peaks have the same law as
+in drawn noise. The probability of leakage of a segment is 1 - prod (1 - c_k(b)).
 
-Bins are independent. With the rates r_k = -ln(1 - c_k), the first bin in which a peak is raised is
-the one where the sum of rates exceeds a number from the exponential distribution. The search goes
-on from the next bin with another such number.
+Bins are independent. With the rates r_k = -ln(1 - c_k), the first raised bin is the one at which
+the sum of rates exceeds a random number of the exponential distribution. The search continues from
+the next bin with another such number.
 
-Bins that cross next to an echo whose outermost bin crosses are part of the echo, where peaks are
-drawn as in probabilities (:mod:`sweep.model.detection.added_crossings`).
+Crossing bins that are adjacent to an echo whose outermost bin crosses belong to the echo, both in
+probabilities and in draws of peaks (:mod:`sweep.model.detection.added_crossings`).
 
-An echo in developed speckle fades as a whole, and its leaked signal with it. A bin fades with the
+An echo in developed speckle fades as a whole, together with its leaked signal. A bin fades with the
 echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle. With
 the speckle's power u = e^t, of mean 1, and the sum R(u) of an echo's rates r(a_k sqrt(u)) it is
 
     P = int (1 - exp(-R(e^t))) e^(t - e^t) dt,
 
-by the trapezoidal rule, which converges exponentially as the integrand vanishes at both ends. Its
-nodes are a whole number of steps of the tabulated ln(a) apart. A bin's rates at all nodes are then
-one row of a table (:func:`_rates_by_phase`), and R is a weighted sum of rows, without a logarithm.
+by the trapezoidal rule, which converges exponentially as the integrand vanishes at both ends. The
+distance of its nodes is an integer number of steps of the tabulated ln(a). A bin's rates at all
+nodes are then one row of a table, and R is a weighted sum of rows, without a logarithm
+(:class:`SpeckleQuadrature`).
 
-A line of leaked light (:mod:`sweep.model.effects.circulator_leak`) raises peaks in its own bins, by
-the magnitudes that it has there at one of some phases.
+A line of leaked light (:mod:`sweep.model.effects.circulator_leak`) raises peaks in the bins of the
+line. The magnitudes there depend on the line's phase, which is one of N_PHASES.
 """
 
 import math
@@ -61,105 +63,121 @@ CERTAIN_MARGIN_SIGMA = 12.0
 """Amplitude above the threshold [sigma] from which a bin is certain to cross."""
 
 TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
-"""Lowest tabulated amplitude [sigma]; below it rates go as the amplitude squared."""
+"""Lowest tabulated amplitude [sigma]; below it rates are proportional to the amplitude squared."""
 
 LEAKAGE_MIN = 1e-9
 """Probability of leakage in a segment below which no leaked peaks are drawn."""
 
 LINE_RANDOM_OFFSET = 1 << 24
-"""First random number of the leaked light's line; lower ones belong to the echoes."""
+"""Index of the first random number of the line of leaked light; lower indices belong to the echoes.
+"""
 
 EDGE_RANDOM_OFFSET = 1 << 25
-"""Numbers of the random numbers of bins of an echo next to leaked signal, likewise."""
+"""Index of the first random number of the echo's bins next to leaked signal."""
 
 LINE_BATCH_POINTS = 4
-"""Points processed at a time if leaked light has a line, which bounds memory to 1e8 numbers."""
+"""Number of points processed at a time if leaked light has a line, which limits memory to 1e8
+numbers."""
 
 BISECTION_STEPS = 40
-"""Bisection steps for the magnitude of a raised peak; relative error 1e-11."""
+"""Number of bisection steps for the magnitude of a raised peak; relative error 1e-11."""
 
 LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
-"""Ends of the average over speckle in ln(power), whose mean power is 1."""
+"""Limits of the average over speckle in ln(power); the mean power is 1."""
 
 LOG_POWER_MIN_FAINT = -5.0
-"""Lower end where rates at mean power are FAINT_RATES or less in all, and below it go as power."""
+"""Lower limit for sums of rates up to FAINT_RATE_SUM_MAX at mean power, which are proportional to
+the power below it."""
 FAINT_RATE_SUM_MAX = 0.1
+"""Largest sum of rates at mean power for which the average begins at LOG_POWER_MIN_FAINT."""
 
 LOG_POWER_STEP_MAX = 0.25
 """Largest step of this average, which errs by 1e-8 of the mean for e^(2 t - e^t)."""
 
 JOINING_RATE_MIN = 1e-2
-"""Rate at the power e^(2 BRIGHT) of bins in a row below which the next one joins no echo."""
+"""Rate of adjacent bins, at the power e^(2 BRIGHT_LOG_AMPLITUDE), below which the next bin joins no
+echo."""
 BRIGHT_LOG_AMPLITUDE = math.log(4.0)
+"""ln(amplitude) of the bright speckle for which JOINING_RATE_MIN holds."""
 
 FAINT_LEAKAGE_MAX = 1e-5
-"""Probability of leakage up to which its mean over speckle is the sum of the means of its bins.
+"""Largest probability of leakage whose mean over speckle is computed as the sum of the means of its
+bins.
 
-Two bins then hardly ever cross together, nor a bin with the echo that it would join."""
+Two bins then hardly ever cross together, nor a bin together with the echo that it would join.
+"""
 
 MEAN_TABLE_STRIDE = 8
-"""Tabulated amplitudes from one to the next at which a bin's mean over speckle is integrated."""
+"""Number of tabulated amplitudes between those at which a bin's mean over speckle is integrated."""
 
 N_BOUND_POWERS = 5
-"""Speckle powers 1, 2, 4 .. at which bounds of the rates' sum are kept."""
+"""Number of speckle powers 1, 2, 4 .. at which upper bounds of the sum of rates are stored."""
 
 EDGE_LOG_POWER_STEP = 0.75
 """Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
 EDGE_LOG_POWER_DEPTH = 3.0
-"""-ln(power) below which this probability is taken to be that at it."""
+"""Largest -ln(power) at which that probability is computed; at lower powers it is assumed equal."""
 
 LOG_RATE_STEP_MAX = 0.5
-"""Largest step of ln(rate) between nodes: what crosses within fewer ones errs by more than 1e-7."""
+"""Largest step of ln(rate) between nodes; with larger steps the average errs by more than 1e-7."""
 
 
 class LeakageBins(NamedTuple):
-    """Bins in which leaked signal may raise false peaks, by point and segment (m, 3)."""
+    """Bins in which leaked signal may raise false peaks, by point and segment (m, 3).
+
+    A law is the table of rates for one threshold.
+    """
 
     bin_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of segments in ``bins``, ``log_amplitude``, ``group``."""
+    """(m, 3, 2) int64: begin and end of each segment in the arrays from ``bins`` to
+    ``exempt_neighbour_side``."""
     bins: np.ndarray
-    """int64: bins with leaked echo, numbered as the strongest bins of groups."""
+    """(bins,) int64: bins with signal leaked from an echo, numbered as the strongest bins of
+    groups."""
     log_amplitude: np.ndarray
-    """ln(|X| / sigma) in these bins."""
+    """(bins,): ln(|X| / sigma)."""
     group: np.ndarray
-    """int64: index of the group (echo) with which each bin fades."""
+    """(bins,) int64: index of the group (echo) with which each bin fades."""
     exempt_neighbour: np.ndarray
-    """|X| / sigma of the bin next to it that is exempt from false alarms, 0 for none."""
+    """(bins,): |X| / sigma of the neighbour that is exempt from false alarms; 0 without one."""
     exempt_neighbour_side: np.ndarray
-    """int64: 1 where that bin is above, else -1."""
+    """(bins,) int64: 1 if that neighbour is above the bin, -1 if below."""
     rate_sum: np.ndarray
-    """(m, 3): sum of the rates of these bins at mean speckle power, or somewhat more."""
+    """(m, 3): upper bound on the sum of the rates of these bins at mean speckle power."""
     rate_sum_bounds: np.ndarray
-    """(m, 3, OCTAVES): the same at speckle powers 1, 2, 4 .."""
+    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates at speckle powers 1, 2, 4 .."""
     mean_probability_sum: np.ndarray
-    """(m, 3): sum of the mean probabilities over speckle that these bins cross; nan if unknown."""
+    """(m, 3): sum of the probabilities, averaged over speckle, that these bins cross; nan if
+    unknown."""
     line_slice: np.ndarray
-    """(m, 3, 2) int64: each segment's begin and end in ``line_bins`` and ``line_log_amplitude``."""
+    """(m, 3, 2) int64: begin and end of each segment in ``line_bins`` and ``line_log_amplitude``.
+    """
     line_bins: np.ndarray
+    """(line bins,) int64: bins that the line of leaked light may raise."""
     line_log_amplitude: np.ndarray
-    """(PHASES, bins): ln(|X| / sigma) in these bins at each phase of the leaked light's line."""
+    """(N_PHASES, line bins): ln(|X| / sigma) at each phase of the line of leaked light."""
     line_rate_sum: np.ndarray
-    """(m, 3): largest over the phases of the sum of the rates of these bins."""
+    """(m, 3): sum of the rates of the line's bins, at the phase at which it is largest."""
     excluded_slice: np.ndarray
     """(m, 3, 2) int64: begin and end of each segment in ``excluded_bins``."""
     excluded_bins: np.ndarray
-    """int64: bins in which noise alone raises no peak."""
+    """(excluded,) int64: bins in which noise alone raises no peak."""
     threshold_index: np.ndarray
-    """(m,) int64: row of ``log_rates`` and ``log_amplitude_grid`` of each point."""
+    """(m,) int64: index of each point's law."""
     log_rates: np.ndarray
-    """(laws, RATES): ln(rate) at evenly spaced ln(amplitude)."""
+    """(laws, N_RATES): ln(rate) at evenly spaced ln(amplitude)."""
     log_amplitude_grid: np.ndarray
-    """(laws, 2): first of these ln(amplitude), and their step."""
+    """(laws, 2): first ln(amplitude) of ``log_rates``, and the step."""
     threshold_ratio: np.ndarray
-    """(laws,): threshold [sigma] of a record that detects as all looks do."""
+    """(laws,): threshold [sigma] of a single record that is equivalent to all looks."""
     amplitude_gain_max: float
-    """Factor on |X| / sigma with which that record has it."""
+    """Factor on |X| / sigma in that equivalent record."""
     sidelobe_correlation: float
-    """Correlation of neighbours' noise in phase with the signal."""
+    """Correlation of the noise of neighbouring bins in phase with the signal."""
 
     @classmethod
     def empty(cls, n_points: int) -> "LeakageBins":
-        """Return no bins at all, for ``n_points`` points."""
+        """Return no bins, for ``n_points`` points."""
         no_slices, no_bins, sum_shape = (
             np.zeros((n_points, 3, 2), np.int64),
             np.empty(0, np.int64),
@@ -190,7 +208,7 @@ class LeakageBins(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "LeakageBins":
-        """Bins of some points by their numbers, or a mask; lists of bins stay whole."""
+        """Return the bins of selected points, by indices or a mask, without a copy of bins."""
         by_point = (
             "bin_slice",
             "rate_sum",
@@ -211,16 +229,18 @@ class LeakageBins(NamedTuple):
 
 
 def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
-    """Return the indices of points whose probability of leakage exceeds SELDOM in any segment."""
+    """Return indices of points whose leakage exceeds LEAKAGE_MIN in any segment."""
     return np.flatnonzero((groups.leakage > LEAKAGE_MIN).any(axis=1))
 
 
 def fading_group_of_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> np.ndarray:
-    """Return the group with which each leaking bin fades, that of the nearest strongest bin.
+    """Return the group with which each bin of leaked signal fades.
 
-    ``points`` are the points of ``spectra``; distances of a complex record are around the circle.
+    It is the group whose strongest bin is nearest.
+
+    ``points`` are the indices of the points of ``spectra``. Bins of a complex record are periodic.
     """
     bins, batch_index, segment = _leaked_bins(spectra)
     group_bins = groups.strongest_bin[points[batch_index], segment]
@@ -233,9 +253,10 @@ def fading_group_of_bins(
 def bins_without_noise_peaks(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> LeakageBins:
-    """List bins whose noise is drawn with their signal; noise alone raises no peak there.
+    """List the bins of leaked signal, whose noise is drawn with the signal, as excluded bins.
 
-    No bin of the result raises leaked peaks; ``echo`` holds the group of each listed bin.
+    In excluded bins noise alone raises no further peak. The result raises no leaked peaks; its
+    ``group`` holds the group of each listed bin.
     """
     return LeakageBins.empty(points.size)._replace(
         group=fading_group_of_bins(shots, groups, points, spectra),
@@ -247,7 +268,7 @@ def bins_without_noise_peaks(
 def iter_leakage_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakageBins]]:
-    """Yield batches of ``points``: their indices, and the bins of their leaked signal."""
+    """Yield indices of points in batches, with the bins of their leaked signal."""
     if shots.circulator_leak_amplitude is None:
         for spans in _iter_leaking_spans(shots, points):
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
@@ -275,10 +296,11 @@ def iter_leakage_bins(
 def find_groups_and_leakage_bins(
     shots: Shots, groups_max: int
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
-    """Find groups of bins, and list the peaks that leak from them.
+    """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
 
-    Of echoes in developed speckle, which are searched for both at once. The probability of leakage
-    is its mean over speckle. A search band, or a line of leaked light, takes two searches.
+    The groups' probability of leakage is its mean over speckle. Shots with a search band or a line
+    of leaked light need two separate searches instead
+    (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
     """
     bin_rows, groups = allocate_bin_groups(shots.size, groups_max)
     leakage_bins_by_part = []
@@ -291,7 +313,7 @@ def find_groups_and_leakage_bins(
 
 
 def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[BinSpans]:
-    """Yield runs of all bins of points that may leak."""
+    """Yield spans of all bins of points that may leak."""
     magnitude_min = np.minimum(
         shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
     )
@@ -301,14 +323,14 @@ def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[Bin
 
 
 def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
-    """|X| / sigma from which bins of points may leak, (n,)."""
+    """Return the |X| / sigma from which bins of points may leak, (n,)."""
     return np.broadcast_to(
         shots.negligible_signal_ratio if shots.includes_leakage else np.inf, shots.size
     )
 
 
 def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> LeakageBins:
-    """List the bins of leaked signal in runs of points."""
+    """List the bins of leaked signal in spans of points."""
     first_bin, n_bins, peak_index, span_start = (
         np.ascontiguousarray(array)
         for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
@@ -368,25 +390,25 @@ def _fill_leakage_bins(
     exempt_neighbour,
     exempt_neighbour_side,
 ):
-    """List the bins of leaked signal in runs; return their number.
+    """List the bins of leaked signal in spans; return their number.
 
     Parameters
     ----------
     point_numbers
-        (m,): points of the runs.
+        (m,): indices of the points.
     first_bin, n_bins, peak_index, span_start, peak_is_searched
-        (3, m): first bin, number of bins, place of the largest, begin in ``magnitudes`` and
-        ``is_exempt``, and whether the largest is searched, by segment.
+        (3, m): first bin, number of bins, index of the largest bin, begin in ``magnitudes`` and
+        ``is_exempt``, and True if the largest bin is searched.
     magnitudes, is_exempt
-        |X| [V] of all bins, and whether they are of an echo.
+        |X| [V] of all bins, and True for bins of an echo.
     noise_sigma, signal_ratio_min
         (n,): noise per quadrature [V], and |X| / sigma from which bins of points may leak.
     group_bins
-        (n, 3, most): strongest bins of groups, -1 for none.
+        (n, 3, groups): strongest bins of groups, -1 for none.
     circle_bins
         Number of bins of a complex record, else 0.
     bin_slice, bins, log_amplitude, group, exempt_neighbour, exempt_neighbour_side
-        Results, as of :class:`LeakageBins`.
+        Results, as in :class:`LeakageBins`.
     """
     n_listed = 0
     for j in range(point_numbers.size):
@@ -432,7 +454,7 @@ def _fill_leakage_bins(
 
 
 def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins) -> LeakageBins:
-    """Complete listed bins of points by the law and the sums of their rates."""
+    """Return listed bins of points completed by the tables and sums of their rates."""
     point_threshold_ratio = np.broadcast_to(shots.threshold / shots.bin_noise_sigma, shots.size)[
         batch
     ]
@@ -459,21 +481,21 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
 
 
 class RateTables(NamedTuple):
-    """Tables of one threshold by ln(amplitude)."""
+    """Tables of rates for one threshold, by ln(amplitude)."""
 
     log_rates: np.ndarray
-    """(RATES,): ln(rate)."""
+    """(N_RATES,): ln(rate)."""
     log_amplitude_grid: np.ndarray
-    """(2,): first ln(amplitude), and their step."""
+    """(2,): first ln(amplitude), and the step."""
     linear_rates: np.ndarray
-    """(RATES,): rate."""
+    """(N_RATES,): rate."""
     mean_probabilities: np.ndarray
-    """(RATES,): mean probability over speckle that a bin crosses; of no size if not asked for."""
+    """(N_RATES,): mean probability over speckle that a bin crosses; empty without speckle."""
 
 
 @lru_cache(maxsize=64)
 def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> RateTables:
-    """Return the tables of a threshold [sigma]; means over speckle if an echo ``in_speckle``."""
+    """Return the tables of a threshold [sigma], with means over speckle if ``in_speckle``."""
     log_rates, log_amplitude_grid = _log_rates(looks, np.array([threshold_ratio]))
     mean_probabilities = np.empty(0)
     if in_speckle:
@@ -491,7 +513,10 @@ def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> R
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_mean_probabilities(log_rates, log_amplitude_grid, mean_probabilities):
-    """Fill in the mean over speckle of a bin's probability, at each MEAN_STEP th amplitude."""
+    """Compute the mean over speckle of a bin's probability to cross.
+
+    The amplitudes are each MEAN_TABLE_STRIDE-th of the table.
+    """
     quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
     rate_sums = np.empty(quadrature.weights.size)
     for k in range(mean_probabilities.size):
@@ -506,7 +531,7 @@ def _fill_mean_probabilities(log_rates, log_amplitude_grid, mean_probabilities):
 
 
 def _leaked_bins(spectra: NoiselessSpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return bin number, point (index into the batch) and segment of each bin of leaked signal."""
+    """Return bin number, point (index in the batch) and segment of each bin of leaked signal."""
     n_bins = np.diff(spectra.leaked_slice.reshape(-1, 2)).ravel()
     span = np.repeat(np.arange(n_bins.size), n_bins)
     return spectra.first_bin.ravel()[span] + spectra.leaked_index, span // 3, span % 3
@@ -517,11 +542,11 @@ def _mask_leaked_light(
 ) -> tuple[NoiselessSpectra, np.ndarray, LeakageBins]:
     """Remove bins that a line of leaked light masks, and return the bins that this line raises.
 
-    Returns the reduced spectra, ``group`` (as of :func:`fading_group_of_bins`) of the bins that are
-    left, and :class:`LeakageBins` with the fields ``line_*`` and ``barred_*`` alone filled in.
+    Returns the reduced spectra, ``group`` of the remaining bins (:func:`fading_group_of_bins`), and
+    :class:`LeakageBins` whose fields ``line_*`` and ``excluded_*`` alone are set.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
-    slices = np.zeros((3, batch.size, 3, 2), np.int64)  # of leaked, raised and masked bins
+    slices = np.zeros((3, batch.size, 3, 2), np.int64)  # slices of leaked, raised and masked bins
     raised_bins, masked_bins, line_amplitudes = [], [], [np.empty((N_PHASES, 0))]
     phase_factors = np.exp(1j * np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES)[:, None]
     slice_ends = np.zeros(3, np.int64)
@@ -573,9 +598,9 @@ def _mask_leaked_light(
 
 
 def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return different thresholds of points [sigma], and the number of each point's.
+    """Return the distinct thresholds [sigma], and the index of each point's threshold.
 
-    Thresholds within 1e-7 of each other, which those of a flight are, have one table of rates.
+    Thresholds within 1e-7 of each other, as in a flight, share one table of rates.
     """
     distinct_ratios, threshold_index = np.unique(np.round(threshold_ratio, 7), return_inverse=True)
     return distinct_ratios, threshold_index.ravel().astype(np.int64)
@@ -602,9 +627,9 @@ def _log_rates(looks: Looks, threshold_ratio: np.ndarray) -> tuple[np.ndarray, n
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
-    """Fill ``log_rates`` (m, RATES) and ``log_amplitude_grid`` (m, 2) for single looks.
+    """Compute ``log_rates`` (laws, N_RATES) and ``log_amplitude_grid`` (laws, 2) for single looks.
 
-    ``threshold_ratio`` (m,): threshold [sigma].
+    ``threshold_ratio`` (laws,) is the threshold [sigma].
     """
     for j in range(threshold_ratio.size):
         ratio = threshold_ratio[j]
@@ -624,10 +649,9 @@ def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
-    """Return the rate -ln(1 - c) of a bin.
+    """Return the rate -ln(1 - c) of a bin, by interpolation of ``log_rates``.
 
-    ``log_amplitude`` is ln(|X| / sigma); ``log_rates`` are logarithms, at the amplitudes of
-    ``log_amplitude_grid``.
+    ``log_amplitude`` is ln(|X| / sigma); ``log_rates`` are tabulated at ``log_amplitude_grid``.
     """
     table_position = (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1]
     if table_position <= 0.0:
@@ -640,9 +664,10 @@ def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
-    """Store the sums of rates in the fields of ``leakage_bins``, in place.
+    """Compute the sums of rates in the fields of ``leakage_bins``, in place.
 
-    ``linear_rates`` and ``mean_probabilities`` (laws, RATES) are those of :class:`RateTables`.
+    ``line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates`` and
+    ``mean_probabilities`` (laws, N_RATES) are those of :class:`RateTables`.
     """
     for k_power_or_phase in range(leakage_bins.line_log_amplitude.shape[0]):
         for k in range(leakage_bins.line_log_amplitude.shape[1]):
@@ -663,7 +688,7 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
                     1.0,
                     (leakage_bins.log_amplitude[k] - log_amplitude_grid[0]) / log_amplitude_grid[1],
                 )
-                if table_position < 0.0:  # rates go as the amplitude squared
+                if table_position < 0.0:  # rate proportional to the amplitude squared
                     power_fraction, table_position = (
                         math.exp(2.0 * (leakage_bins.log_amplitude[k] - log_amplitude_grid[0])),
                         0.0,
@@ -704,27 +729,29 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
 
 
 class SpeckleQuadrature(NamedTuple):
-    """Trapezoidal rule of the average over speckle, for one law of rates."""
+    """Trapezoidal rule of the average over speckle, for one table of rates."""
 
     node_stride: int
-    """Distance of nodes in steps of the tabulated ln(amplitude)."""
+    """Distance of nodes, in steps of the tabulated ln(amplitude)."""
     n_below_mean: int
     """Number of nodes whose power is less than 1."""
     weights: np.ndarray
-    """(nodes,): weights at the powers e^(2 stride step (i - below)), in rising order."""
+    """(nodes,): weight of node i, at the power e^(2 node_stride step (i - n_below_mean))."""
     interleaved_rates: np.ndarray
-    """(stride * columns,): rates at ln(amplitude), from ``n_below_mean`` strides under the table.
+    """(node_stride * columns,): rates at ln(amplitude), from ``n_below_mean`` strides below the
+    table on.
 
-    That with the number stride c + p is at p columns + c, so that the nodes of a bin are adjacent.
+    The rate with the number node_stride c + p is at index p columns + c, so that the nodes of a bin
+    are adjacent.
     """
 
 
 @njit(cache=True, error_model="numpy")
 def _make_speckle_quadrature(log_rates, log_amplitude_grid):
-    """Make the quadrature over speckle for one row of rates."""
+    """Return the quadrature over speckle for one table of rates."""
     log_amplitude_step, log_rate_step_max = log_amplitude_grid[1], 0.0
     for k in range(1, log_rates.size):
-        if log_rates[k] < 1.0:  # beyond, a bin crosses at almost any power
+        if log_rates[k] < 1.0:  # at higher rates a bin crosses at almost any power
             log_rate_step_max = max(log_rate_step_max, log_rates[k] - log_rates[k - 1])
     node_stride = max(
         int(
@@ -743,7 +770,7 @@ def _make_speckle_quadrature(log_rates, log_amplitude_grid):
     for i in range(weights.size):
         power = math.exp((i - n_below_mean) * log_power_step)
         weights[i] = log_power_step * power * math.exp(-power)
-    # A bin crosses at the faintest node too from ``below`` strides beyond the table.
+    # From `n_below_mean` strides beyond the table a bin crosses even at the faintest node.
     n_columns = 2 * n_below_mean + n_above_mean + log_rates.size // node_stride + 4
     interleaved_rates = np.empty(node_stride * n_columns)
     for k in range(interleaved_rates.size):
@@ -767,7 +794,7 @@ def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums
         1.0,
         (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1],
     )
-    if table_position < 0.0:  # rates go as the amplitude squared
+    if table_position < 0.0:  # rate proportional to the amplitude squared
         power_fraction, table_position = (
             math.exp(2.0 * (log_amplitude - log_amplitude_grid[0])),
             0.0,
@@ -819,10 +846,10 @@ def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_from_rate_sums(rate_sums, weights):
-    """Return the mean over speckle of 1 - exp(-R), of the sums of rates R at some last nodes.
+    """Return the mean over speckle of 1 - exp(-R), from the sums of rates R at the last nodes.
 
-    Terms below the first node go on as a geometric series: in proportion to the power where all
-    draws leak, and else to its square.
+    Terms below the first node continue as a geometric series. They are proportional to the power if
+    all draws leak, else to its square.
     """
     mean, lowest_term, next_term = 0.0, 0.0, 0.0
     for i in range(rate_sums.size - 1, -1, -1):
@@ -838,22 +865,24 @@ def _mean_leakage_from_rate_sums(rate_sums, weights):
 def _evaluate_joining_bins(
     bin_index, bin_slice, leakage_bins, threshold_index, quadrature, is_evaluated, joining_rates
 ):
-    """Evaluate a bin next to an echo, and further ones that may join the echo with it.
+    """Evaluate a bin next to an echo, and further bins that may join the echo with it.
 
     Parameters
     ----------
     bin_index
-        Index of the bin in ``leakage_bins.bin``.
+        Index of the bin in ``leakage_bins.bins``.
     bin_slice
-        First and last index + 1 of the segment's bins.
+        Begin and end of the segment's bins.
+    leakage_bins
+        :class:`LeakageBins` of the batch.
     threshold_index
-        Row of ``leakage_bins.rates``.
+        Index of the law in ``leakage_bins.log_rates``.
     quadrature
         :class:`SpeckleQuadrature` of this law.
     is_evaluated
-        True of bins that have been evaluated so.
+        (bins,) bool: True for bins that were evaluated before.
     joining_rates
-        Result: rates of a further group in these bins at some last nodes.
+        Result: rates, at the last nodes, of a group in these bins that does not join the echo.
 
     Returns
     -------
@@ -873,7 +902,7 @@ def _evaluate_joining_bins(
     ):
         bright_log_amplitude = (
             leakage_bins.log_amplitude[end_index - step] + BRIGHT_LOG_AMPLITUDE
-        )  # as long as the bins so far all cross
+        )  # amplitude in bright speckle
         if (
             abs(end_index - bin_index) > 1
             and _crossing_rate(bright_log_amplitude, log_rates, log_amplitude_grid)
@@ -942,7 +971,7 @@ def _crossing_probability(rate):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average_leakage(leakage_bins, leakage_probability):
-    """Fill ``leakage_probability`` (m, 3) with its mean over speckle and the line's phase.
+    """Compute the mean of the probability of leakage (m, 3) over speckle and the line's phase.
 
     Each echo fades independently.
     """
@@ -1075,6 +1104,8 @@ def draw_leaked_peaks(
         Threshold [sigma].
     n_looks
         Number of looks whose powers are averaged.
+    interpolation
+        Interpolator of the window, for the correlation of neighbours' noise.
     peak_bins, peak_ratios
         Results: bin and |X| / sigma of the peaks, strongest first. For averaged looks |X| is that
         of a single look of the same significance.
@@ -1161,17 +1192,31 @@ def _draw_raised_bins(
     peak_ratios,
     n_peaks,
 ):
-    """Draw which bins of a range are raised, and insert their peaks; adjacent bins make one peak.
+    """Draw the raised bins of a range, insert their peaks, and return the list's new length.
 
-    Peaks that join on to a bin of the echo that crosses are the echo's.
+    Adjacent raised bins make one peak. Peaks adjacent to a bin of the echo that crosses belong to
+    the echo. Bins are skipped by exponential random numbers, as the module describes.
 
-    Bins are skipped by exponential numbers, as the module says. ``first_random``: first random
-    number of
-    the segment's stream; ``group``, ``exempt_neighbour``: of no size of bins that do not fade and
-    join no echo; ``rate_sum``: bound of the sum of the rates of all bins in this draw;
-    ``threshold_looks_correlation``: threshold [sigma],
-    number of looks and correlation of neighbours' noise; ``peak_bins``, ``peak_ratios``,
-    ``n_peaks``: the list, as of :func:`insert_peak`. Returns its new length.
+    Parameters
+    ----------
+    address, segment
+        Key of the point (two uint64) and number of the draw; segment.
+    first_random
+        Index of the first random number of the segment's stream.
+    bin_slice, bins, log_amplitude
+        Begin and end of the range; bins; ln(|X| / sigma).
+    group, exempt_neighbour
+        Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
+    fading_factors
+        (groups,): factors on the echoes' magnitudes by speckle.
+    rate_sum
+        Upper bound on the sum of the rates of all bins in this draw.
+    log_rates, log_amplitude_grid
+        Table of rates.
+    threshold_looks_correlation
+        Threshold [sigma], number of looks, and correlation of neighbours' noise.
+    peak_bins, peak_ratios, n_peaks
+        List of peaks, as in :func:`insert_peak`.
     """
     (a, b, draw), stream, (threshold_ratio, n_looks, correlation) = (
         address,
@@ -1180,7 +1225,7 @@ def _draw_raised_bins(
     )
     remainder = math.sqrt(1.0 - correlation * correlation)
     probability = philox.uniform(a, b, draw, stream, first_random)
-    if probability > rate_sum:  # and so is -ln(1 - chance)
+    if probability > rate_sum:  # then -ln(1 - probability) is larger, too
         return n_peaks
     exponent_left = -math.log1p(-probability)
     if exponent_left > rate_sum:
@@ -1205,7 +1250,7 @@ def _draw_raised_bins(
         ) * _added_crossing_probability(signal, scaled_threshold)
         if (
             exempt_neighbour.size > 0 and exempt_neighbour[k] > 0.0
-        ):  # its noise is in step with that which raises this bin
+        ):  # its noise is correlated with that of this bin
             re, im = philox.normal_pair(a, b, draw, stream, EDGE_RANDOM_OFFSET + k - bin_slice[0])
             echo_bin_in_phase = exempt_neighbour[k] * fading_factor * root_looks + correlation * (
                 _raised_magnitude(signal, scaled_threshold, probability) - signal
@@ -1233,7 +1278,7 @@ def _draw_raised_bins(
 
 @njit(cache=True, error_model="numpy")
 def _added_crossing_probability(signal, threshold_ratio):
-    """Return c(z), the probability that signal lifts a bin to a level that noise alone misses."""
+    """Return c(z), the probability that signal raises a bin to a level that noise alone misses."""
     return marcum_q1_excess(signal, threshold_ratio) / -math.expm1(
         -0.5 * threshold_ratio * threshold_ratio
     )
@@ -1241,7 +1286,7 @@ def _added_crossing_probability(signal, threshold_ratio):
 
 @njit(cache=True, error_model="numpy")
 def _raised_magnitude(signal, threshold_ratio, probability):
-    """Find the magnitude z >= ``threshold_ratio`` [sigma] at which c(z) is ``probability``."""
+    """Return the magnitude z >= ``threshold_ratio`` [sigma] at which c(z) is ``probability``."""
     low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_MARGIN_SIGMA
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)

@@ -1,43 +1,44 @@
 """Returns of footprints with several surfaces, draw by draw.
 
 :func:`draw_returns` draws which groups of bins (:mod:`sweep.model.pointcloud.bin_groups`) are
-detected, adds false
-peaks, pairs the peaks (:mod:`sweep.model.pointcloud.pairing`) and reports range and radial
-velocity, by whole bins and interpolated between them.
+detected. It adds false peaks, pairs the peaks (:mod:`sweep.model.pointcloud.pairing`), and reports
+range and radial velocity, by whole bins and interpolated between bins.
 
-The two ways to draw are those of :mod:`sweep.model.sampling.draws`, with the same random numbers:
-the strongest group is detected in the very draws that are counted there, and so are false alarms of
-noise.
-Against ``probabilities`` peaks stay in their noiseless bins, and the interpolated position has a
-normal error of the standard error that is reported. ``noise`` is added to ``peak_bin`` and its two
-neighbours, so that another may be the largest, or to all bins of a group's echo.
+The two methods of drawing are those of :mod:`sweep.model.sampling.draws`, with the same random
+numbers. The strongest group is detected in exactly the draws that are counted there, and so are
+false alarms of noise. With ``probabilities`` peaks stay in their noiseless bins, and the
+interpolated position has a normal error of the reported standard error. ``noise`` is added to all
+bins of a group's echo, or, if only the strongest bin detects, to that bin and its two neighbours. A
+neighbour may then be the largest bin.
 
-Ranges and velocities are those at the shot's start, the instant of the truth. Range walk moves the
-interpolated range by v_r (T_w + 2 t_0), and motion between segments moves both. The velocity that
-is measured with them corrects both. Nothing in the beats tells of the acceleration, or of ground
-that slides under the beam: the instrument's own motion, where it is known, corrects the points for
-them as far as it can (:mod:`sweep.model.pointcloud.ego_motion`). Of segments with slopes other than
-1, 0 and
--1 a return is the fit of all its peaks.
+Ranges and velocities are those at the shot's start, as the truth is. Range walk shifts the
+interpolated range by v_r (T_w + 2 t_0), and motion between segments shifts range and velocity. The
+measured velocity corrects both. The beats contain no information on the acceleration, or on ground
+that slides under the beam. The instrument's known motion corrects the points for both
+(:mod:`sweep.model.pointcloud.ego_motion`). If segments have slopes other than 1, 0 and -1, a return
+is the fit of all its peaks.
 
 Echoes in developed speckle have the amplitudes that the lines of their footprint make in a draw, in
-the bins about a group's strongest of all three segments
-(:mod:`sweep.model.sampling.speckle_lines`). Their
-places wander with it. By either method noise is added, and the peak is what the bins then show. Of
-``noise`` the bins detect by themselves; against ``probabilities`` the strongest bin's amplitude is
-held against the level that it exceeds with the group's probability. All three segments are so drawn
-together, by the same law as grids' closed forms. Draws of grids have other speckle.
+the bins about a group's strongest bin of all three segments
+(:mod:`sweep.model.sampling.speckle_lines`). Their positions wander with the speckle. Both methods
+add noise to the bins, and the peak follows from the sum. With ``noise`` the bins detect by their
+magnitudes. With ``probabilities`` the strongest bin's amplitude is compared with the level that it
+exceeds with the group's probability. All three segments are drawn together, by the same law as
+grids' closed forms. Draws of grids have other speckle.
 
-Standard errors are those of noise and, in quadrature, what the lines in a group make by their
-spread (:func:`interpolation.spread_error`), or of echoes in developed speckle by their speckle
-(:func:`sweep.model.sampling.speckle_lines.position_error_moments`). That moves the beats of both
-chirps with the range where both see the same speckle, and velocities little.
+Standard errors are the root sum of squares of two errors. The first is that of noise. The second is
+that by the spread of the lines in a group
+(:func:`sweep.model.detection.sub_bin_interpolation.line_spread_error`), or, in developed speckle,
+by the speckle (:func:`sweep.model.sampling.speckle_lines.position_error_moments`). If both chirps
+have the same speckle, it shifts their beats as a change of range does, and hardly changes
+velocities.
 
-Of noise alone a segment and draw has one false peak at most, the largest, in any of the bins
-searched outside the listed groups, uniformly. False peaks of leaked signal lie in their own bins,
-the strongest of them where there are many: by their noise, or against probabilities by the bins'
-own (:mod:`sweep.model.pointcloud.leaked_peaks`). Groups beyond the ``most`` strongest are neither
-detected nor false alarms.
+Noise alone makes at most one false peak in a segment and draw, the largest. Its bin is any of the
+searched bins outside the listed groups, with equal probability. False peaks of leaked signal are in
+the bins of that signal; if there are many, only the strongest count. They are drawn by the noise of
+the bins, or with ``probabilities`` by the bins' probabilities
+(:mod:`sweep.model.pointcloud.leaked_peaks`). Groups beyond the strongest that are listed are
+neither detected nor false alarms.
 """
 
 import math
@@ -126,46 +127,55 @@ from sweep.model.sampling.speckle_lines import (
 from sweep.model.spectrum.search_restriction import as_columns, beamlet_line_positions
 
 BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
-"""Fields of a peak: bin; position between bins and its standard error by noise [bins]; |X| / sigma.
-"""
+"""Columns of a peak: bin; position between bins and its standard error by noise [bins]; |X| /
+sigma."""
 
 
 DRAWN_INDEPENDENT_BINS_MAX = 32.0
 """Largest number of independent bins of an echo in developed speckle that are drawn."""
 
 CORRELATED_LOOKS_MAX = 32
-"""Number of looks up to which speckle that they share in part is drawn; of more, one amplitude is
-held against the probability of detection."""
+"""Largest number of looks for which partly common speckle is drawn. For more looks one amplitude is
+compared with the probability of detection."""
 
 
 class Returns(NamedTuple):
-    """Up to ``most`` returns of each shot and draw, each (n, draws, most); nan where there is none.
+    """Returns of each shot and draw, (n, draws, returns); nan for elements without a return.
 
-    Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, a false
-    up peak last. Units are those of :data:`sweep.model.outputs.POINT_VARIABLES`. ``_interpolated``
-    goes with
-    peaks placed between bins; their errors are those of noise, with what the spread of the groups'
-    own lines adds. No suffix goes with whole bins; rounding (1/sqrt(12) bin) adds to their errors.
+    Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, and a
+    false up peak last. Units are those of :data:`sweep.model.outputs.POINT_VARIABLES`. Fields with
+    ``_interpolated`` follow from positions between bins. Their errors are those of noise and of the
+    spread of the groups' lines. Fields without it follow from whole bins, and their errors include
+    rounding, 1/sqrt(12) bin.
     """
 
     range: np.ndarray
+    """Range by whole bins [m]."""
     range_interpolated: np.ndarray
+    """Range by interpolated positions [m]."""
     radial_velocity: np.ndarray
+    """Radial velocity by whole bins [m/s]."""
     radial_velocity_interpolated: np.ndarray
+    """Radial velocity by interpolated positions [m/s]."""
     range_standard_error: np.ndarray
+    """Standard error of ``range`` [m]."""
     range_interpolated_standard_error: np.ndarray
+    """Standard error of ``range_interpolated`` [m]."""
     radial_velocity_standard_error: np.ndarray
+    """Standard error of ``radial_velocity`` [m/s]."""
     radial_velocity_interpolated_standard_error: np.ndarray
+    """Standard error of ``radial_velocity_interpolated`` [m/s]."""
     snr: np.ndarray
-    """Power of the weaker of up and down peak as found over the mean noise power of a bin."""
+    """Measured power of the weaker of up and down peak, over the mean noise power of a bin."""
     pd: np.ndarray
     """Probability that up and down peak are both detected; nan with a false peak."""
     flags: np.ndarray
-    """uint8: :data:`sweep.model.pointcloud.pairing.FLAG_BITS`; 0 where there is no return."""
+    """uint8: bits of :data:`sweep.model.pointcloud.pairing.FLAG_BITS`; 0 without a return."""
     beamlet: np.ndarray
-    """int32: beamlet that a true or misread return has seen, -1 otherwise."""
+    """int32: beamlet that a true or misread return measures, -1 otherwise."""
     group: np.ndarray
-    """(n, draws, most, 3) int8: number of the up, Doppler and down group; -1 none or false."""
+    """(n, draws, returns, 3) int8: index of the up, Doppler and down group; -1 for none or a false
+    peak."""
     range_per_slip: np.ndarray
     """Change of the interpolated range [m] for 1 m/s of slip."""
     radial_velocity_per_slip: np.ndarray
@@ -183,12 +193,24 @@ def draw_returns(
     motion: EgoMotion | None = None,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None = None,
 ) -> Returns:
-    """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
+    """Draw returns of n prepared shots from their groups of bins.
 
-    ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
-    ``motion`` is what the instrument knows of its own, by which it corrects range and velocity.
-    ``known_leakage_bins`` are the :func:`iter_leakage_bins` of all points that may leak, if they
-    are known already.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    bin_groups
+        Groups in the noiseless spectra of the shots.
+    keys
+        (n, 2) uint64: random key of each shot.
+    first_draw, draws
+        Number of the first draw, and number of draws; any range of draws can be computed alone.
+    method
+        ``probabilities`` or ``noise``.
+    motion
+        Known motion of the instrument, which corrects range and velocity; None to correct nothing.
+    known_leakage_bins
+        Results of :func:`iter_leakage_bins` for all points that may leak, if already computed.
     """
     in_noise = method == "noise"
     inputs, drawn_peaks = (
@@ -257,7 +279,7 @@ def draw_returns(
 
 
 _CIRCULAR_PSEUDO_VARIANCE_MAX = 1e-3
-"""Pseudo-variance of a bin's noise over its power below which its quadratures are alike."""
+"""Largest ratio of pseudo-variance to noise power for which a bin's noise counts as circular."""
 
 
 def _iter_spectra(
@@ -266,7 +288,7 @@ def _iter_spectra(
     in_noise: bool,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None,
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
-    """Yield some points at a time, with their spectra and the bins of their leaked signal."""
+    """Yield indices of points, with noiseless spectra and bins of leaked signal, in parts."""
     if in_noise:
         for indices, spectra in iter_noiseless_spectra(shots):
             yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
@@ -296,46 +318,49 @@ def _iter_spectra(
 
 
 class DrawConfig(NamedTuple):
-    """Way in which draws are taken."""
+    """Settings of drawing that are common to all points."""
 
     first_draw: int
+    """Number of the first draw."""
     in_noise: bool
+    """True if noise is drawn, False if draws are compared with probabilities."""
     adds_powers: bool
-    """Lines add as powers."""
+    """True if lines add as powers."""
     has_doppler: bool
-    """There is a Doppler segment."""
+    """True if there is a Doppler segment."""
     nyquist_bin: int
-    """N/2."""
+    """Half of the FFT size, N/2."""
     down_beat_sign: float
-    """Of a complex record, of bins -N/2 .. N/2 - 1: 1 where the down beat rises against the up beat
-    as the range does, else -1. 0 of a real one, of bins 1 .. N/2."""
+    """For a complex record, with bins -N/2..N/2 - 1: 1 if the down beat minus the up beat rises
+    with the range, else -1. 0 for a real record, with bins 1..N/2."""
     two_beat_reading: int
     """Reading of up and down peak without a Doppler segment."""
     real_fft_size: int
-    """N where noise at DC and Nyquist is real, else 0."""
+    """FFT size N if noise at DC and Nyquist is real, else 0."""
     lobe_half_width: int
-    """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
+    """Half-width of a main lobe [bins] if any bin of an echo detects it, else 0."""
     noise_filter: tuple[np.ndarray, np.ndarray, int]
-    """:func:`sweep.model.sampling.draws.make_echo_noise_filter`"""
+    """Result of :func:`sweep.model.sampling.draws.make_echo_noise_filter`."""
     noise_root: np.ndarray
-    """:func:`sweep.model.sampling.draws.noise_covariance_root` of it."""
+    """Result of :func:`sweep.model.sampling.draws.noise_covariance_root` for ``noise_filter``."""
     end_noise_filter: tuple[np.ndarray, np.ndarray, int]
-    """Filter likewise of bins from DC or Nyquist on; of no bins where no echo in developed speckle
-    lies near."""
+    """Filter, like ``noise_filter``, of bins from DC or Nyquist on; without bins if no echo in
+    developed speckle is near."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the noise, from DC or Nyquist on, as far
-    as the noise's quadratures differ; none where no echo in developed speckle lies near."""
+    """(bins,): pseudo-variance ratio of the noise, from DC or Nyquist on, up to the last bin whose
+    noise is not circular; empty if no echo in developed speckle is near."""
     n_looks: int
-    """Records whose powers are averaged."""
+    """Number of looks whose powers are averaged or that vote; 1 for looks added in amplitude."""
     has_independent_speckle: bool
-    """Each has its own speckle, or a mixture of its own."""
+    """True if looks have different speckle, independent or partly common."""
     votes_needed: int
-    """Of them that have to detect, 0 where their mean power does; -1 where they are held against
-    the probability, as more than MIXED_LOOKS_MAX share their speckle in part."""
+    """Number of looks that must detect; 0 if their mean power detects; -1 if one amplitude is
+    compared with the probability of detection, as more than CORRELATED_LOOKS_MAX looks have partly
+    common speckle."""
 
     @classmethod
     def from_shots(cls, shots: Shots, first_draw: int, in_noise: bool) -> "DrawConfig":
-        """Draw some shots from a draw on."""
+        """Return the settings for draws of shots, from the draw `first_draw` on."""
         two_beat_reading = (
             waveform.FAST_READING
             if shots.two_beat_assumption == waveform.FAST_TARGET
@@ -371,79 +396,80 @@ class DrawConfig(NamedTuple):
 
 
 class DrawInputs(NamedTuple):
-    """Knowledge of n points, by segment, before any draw."""
+    """Quantities of n points, by segment, that draws depend on."""
 
     group_bins: np.ndarray
-    """(n, 3, 3, most) int64: BIN, FIRST and LAST of the groups; -1 for none."""
+    """(n, 3, 3, groups) int64: STRONGEST_ROW, FIRST_ROW and LAST_ROW of the groups; -1 for none."""
     pd: np.ndarray
-    """(n, 3, most)"""
+    """(n, 3, groups): probability of detection."""
     group_magnitudes: np.ndarray
-    """(n, 3, most, 3): of the strongest bin and its neighbours [V]."""
+    """(n, 3, groups, 3): |X| [V] below, at and above the strongest bin."""
     line_deviation_bins: np.ndarray
-    """(n, 3, most): standard deviation [bins] of the lines in a group, weighted by power."""
+    """(n, 3, groups): standard deviation [bins] of the lines in a group, weighted by power."""
     line_positions: np.ndarray
-    """(n, 3, beamlets): place of each beamlet's line [bins, 0..N/2]; with signs, as near to the
-    strongest group as whole FFT lengths bring it."""
+    """(n, 3, beamlets): position of each beamlet's line [bins, 0..N/2]. For a complex record it is
+    signed, and shifted by multiples of N to be nearest to the strongest group."""
     beamlet_amplitude: np.ndarray
-    """(n, beamlets)"""
+    """(n, beamlets): relative amplitude of each beamlet."""
     noise_and_threshold: np.ndarray
-    """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
+    """(n, 3): sigma [V]; threshold over sigma; noise of bins that hold lines over sigma."""
     bin_threshold_table: np.ndarray
-    """(n, 7): of :class:`sweep.model.detection.echo_detection.BinThreshold` [V]."""
+    """(n, 7): transposed :attr:`sweep.model.preparation.Shots.bin_threshold_table`."""
     pfa_noise: np.ndarray
     """(n, 3): probability of a false alarm by noise alone."""
     doppler_prediction: np.ndarray
-    """(n, 3): as of :func:`sweep.model.pointcloud.pairing.find_confirming_peak`."""
+    """(n, 3): argument of :func:`sweep.model.pointcloud.pairing.find_confirming_peak`."""
     down_pd_given_up: np.ndarray
-    """(n, 2, most): probability of a group in the down segment, where the up segment's of the same
-    number is missed, or detected."""
+    """(n, 2, groups): pd of a group in the down segment, given that the up segment's group of the
+    same index is missed, or detected."""
     searched_range: np.ndarray
-    """(n, 3, 2) int64: first and last of the bins that false peaks may lie in."""
+    """(n, 3, 2) int64: first and last bin for false peaks."""
     line_grid: SpeckleLineGrid
-    """Lines of footprints in developed speckle, of n points; or of none."""
+    """Lines of footprints in developed speckle; of no points without speckle."""
     line_centre: np.ndarray
-    """(n, 3, most): middle of the lines in a group [bins]."""
+    """(n, 3, groups): mean position of the lines in a group [bins]."""
     echo_fraction: np.ndarray
-    """(n, 3, most): share of the echo in the mean power by which a group is detected."""
+    """(n, 3, groups): fraction of the echo in the mean power by which a group is detected."""
     wander_deviation: np.ndarray
-    """(n, 3, most): standard deviation of its place by speckle [bins], at |X| of one sigma; 0
-    without speckle."""
+    """(n, 3, groups): standard deviation of the group's position by speckle [bins] at |X| of one
+    sigma; 0 without speckle."""
     n_independent_bins: np.ndarray
-    """(n, 3, most): number of independent bins as which a group in developed speckle counts."""
+    """(n, 3, groups): equivalent number of independent bins of a group in developed speckle."""
     cholesky_factors: np.ndarray
-    """(n, 6): Cholesky factors of the segments' correlation, 0 without speckle."""
+    """(n, 6): Cholesky factors of the segments' correlation; 0 without speckle."""
     look_covariance_root: np.ndarray
-    """(n, 3, looks, sets) complex: speckles of the looks by independent ones, where looks share
-    them in part; of no sets otherwise."""
+    """(n, 3, looks, sets) complex: coefficients of independent sets of speckle in the speckle of
+    each look, for partly common speckle; otherwise without sets."""
 
     def select(self, indices: np.ndarray) -> "DrawInputs":
-        """Knowledge of some points by their numbers."""
+        """Return the quantities of points with the given indices."""
         return DrawInputs(
             *(v.select(indices) if isinstance(v, SpeckleLineGrid) else v[indices] for v in self)  # type: ignore[arg-type]
         )
 
 
 class DrawWorkspace(NamedTuple):
-    """Arrays that kernels write to within a draw, made once for all draws."""
+    """Arrays that kernels write to within a draw, allocated once for all draws."""
 
     noise_bins: np.ndarray
-    """(4, bins + TAPS): noise of an echo's bins, and what it is made of."""
+    """(4, bins + NOISE_FILTER_TAPS): noise of an echo's bins (rows 0 and 1), and independent
+    numbers."""
     bin_power: np.ndarray
     """(bins,): power of an echo's bins over sigma^2."""
     pedestal_power: np.ndarray
     """(bins,): power of the pedestal in an echo's bins, over that of noise."""
     all_echo: np.ndarray
-    """(bins,) bool: true."""
+    """(bins,) bool: True."""
     false_bins: np.ndarray
-    """(most + 1,) int64: bins of a segment's false peaks."""
+    """(groups + 1,) int64: bins of a segment's false peaks."""
     false_ratios: np.ndarray
-    """(most + 1,): their |X| / sigma."""
+    """(groups + 1,): |X| / sigma of a segment's false peaks."""
     peak_positions: np.ndarray
     """(3,): positions of a return's peaks [bins]."""
 
     @classmethod
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
-        """Make room for echoes of so many bins, and for ``groups_max`` groups of a segment."""
+        """Allocate arrays for echoes of `n_bins` bins, and for `groups_max` groups of a segment."""
         return cls(
             np.empty((4, n_bins + NOISE_FILTER_TAPS)),
             np.empty(n_bins),
@@ -456,20 +482,25 @@ class DrawWorkspace(NamedTuple):
 
 
 class DrawnPeaks(NamedTuple):
-    """Results of the draws of n points."""
+    """Paired peaks of the draws of n points."""
 
     peaks: np.ndarray
-    """(n, draws, most, 3, 4): up, Doppler and down peak of each return; nan for none."""
+    """(n, draws, returns, 3, 4): up, Doppler and down peak of each return, with the columns
+    BIN_COLUMN to RATIO_COLUMN; nan for none."""
     reading: np.ndarray
-    """(n, draws, most) int64: reading of the default slopes; -1 where there is no return."""
+    """(n, draws, returns) int64: reading of the peaks with the default slopes; -1 without a return.
+    """
     group: np.ndarray
-    """(n, draws, most, 3) int8: group of the up, Doppler and down peak, FALSE or ABSENT."""
+    """(n, draws, returns, 3) int8: group of the up, Doppler and down peak, FALSE_PEAK or NO_PEAK.
+    """
     flags: np.ndarray
+    """(n, draws, returns) uint8: bits of FLAG_BITS; 0 without a return."""
     beamlet: np.ndarray
+    """(n, draws, returns) int32: beamlet that a true or misread return measures, -1 otherwise."""
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
-        """No returns of shots with these groups."""
+        """Return arrays without returns, for shots with these groups."""
         n, _, groups_max = bin_groups.strongest_bin.shape
         return cls(
             np.full((n, draws, groups_max, 3, 4), np.nan),
@@ -483,9 +514,9 @@ class DrawnPeaks(NamedTuple):
 def make_draw_inputs(
     shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
 ) -> DrawInputs:
-    """Return what is known of shots and their groups before any draw.
+    """Return the quantities of shots and their groups that draws depend on.
 
-    ``motion`` is as of :func:`draw_returns`.
+    ``motion`` is the known motion, as in :func:`draw_returns`.
     """
     line_positions, beamlet_amplitude = (
         beamlet_line_positions(shots),
@@ -512,7 +543,7 @@ def make_draw_inputs(
     mean_offset = (weight * apart).sum(axis=-1) / total
     mean_square = (weight * apart**2).sum(axis=-1) / total
     line_deviation = np.sqrt(np.maximum(mean_square - mean_offset**2, 0.0))
-    if shots.segment_correlations is not None:  # drawn lines have it
+    if shots.segment_correlations is not None:  # drawn lines include their spread
         line_deviation *= 0.0
     return DrawInputs(
         group_bins,
@@ -539,7 +570,7 @@ def make_draw_inputs(
 
 
 def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
-    """Return what mixes the speckle of the three segments, as of Known."""
+    """Return ``cholesky_factors`` of :class:`DrawInputs`, (n, 6)."""
     if shots.segment_correlations is None:
         return np.zeros((shots.size, 6))
     cholesky_factors = np.broadcast_to(
@@ -549,7 +580,7 @@ def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
 
 
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
-    """Return what mixes the speckle of looks, as of Known."""
+    """Return ``look_covariance_root`` of :class:`DrawInputs`, (n, 3, looks, sets) complex."""
     n_looks = shots.looks.number
     if shots.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
         return np.zeros((shots.size, 3, 1, 0), complex)
@@ -559,10 +590,10 @@ def _look_covariance_roots(shots: Shots) -> np.ndarray:
 def _n_independent_bins(
     shots: Shots, bin_groups: BinGroups, has_noncircular_bins: np.ndarray
 ) -> np.ndarray:
-    """Return the number of independent bins as which each group counts, (n, 3, most).
+    """Return the equivalent number of independent bins of each group, (n, 3, groups).
 
-    That of :meth:`sweep.model.preparation.Shots.joint_detection_probability` for the chirps; 1 near
-    DC and Nyquist.
+    For the chirps it is that of :meth:`sweep.model.preparation.Shots.joint_detection_probability`;
+    near DC and Nyquist it is 1.
     """
     n_independent = np.ones(bin_groups.pd.shape)
     if shots.detection == "peak_bin":
@@ -583,7 +614,7 @@ def _n_independent_bins(
 def _speckle_draw_inputs(
     shots: Shots, bin_groups: BinGroups
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share of the echo in the power that detects a group, its wander, and number, as of Known."""
+    """Return ``echo_fraction``, ``wander_deviation`` and ``n_independent_bins`` of DrawInputs."""
     noise_sigma, line_sigma, threshold = (
         np.broadcast_to(v, shots.size)[:, None, None]
         for v in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
@@ -599,7 +630,7 @@ def _speckle_draw_inputs(
     )
     n_independent = _n_independent_bins(shots, bin_groups, has_noncircular_bins)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # As if one bin were detected as often: fading_together has the same share.
+        # Fraction for one bin of equal probability, as in `joint_pd_in_speckle`.
         single_bin_pd = -np.expm1(np.log1p(-bin_groups.pd) / n_independent)
         echo_fraction = (
             1
@@ -630,9 +661,9 @@ def _speckle_draw_inputs(
 def _doppler_prediction(
     shots: Shots, motion: EgoMotion | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share of the up and of the down beat in the Doppler segment's, which these two tell.
+    """Return the coefficients of up and down beat that predict the Doppler segment's beat.
 
-    And the bins by which that is off for the motion that the instrument knows.
+    The third value is the error of that prediction by the known motion [bins].
     """
     _, doppler, down = shots.chirp_slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.carriers)
@@ -650,10 +681,10 @@ def _doppler_prediction(
 
 
 def _searched_ranges(shots: Shots) -> np.ndarray:
-    """First and last bin searched for alarms, as of :class:`DrawInputs`.
+    """Return ``searched_range`` of :class:`DrawInputs`, (n, 3, 2).
 
-    Of a complex record 0..N - 1. Of a real one those whose noise is circular, which are all but a
-    few next to DC and Nyquist; 1..N/2 where noise is taken to be so in all.
+    For a complex record it is 0..N - 1. For a real record it contains the bins whose noise is
+    circular: all but a few next to DC and Nyquist, or 1..N/2 if noise is taken as circular in all.
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
     last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
@@ -670,19 +701,27 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
 
 
 class Measurements(NamedTuple):
-    """Range [m] and radial velocity [m/s] of returns by WHOLE and FINE peaks, (n, draws, most, 2).
+    """Range [m] and radial velocity [m/s] of returns, (n, draws, returns, 2).
 
-    And their standard errors by noise, and what half a bin of the chirps is worth, (n, 1, 1).
+    The last axis has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions between bins.
+    Errors are standard errors by noise. ``range_per_half_bin`` and ``velocity_per_half_bin`` (n, 1,
+    1) are the changes by half a bin of the chirps.
     """
 
     range: np.ndarray
+    """Range [m]."""
     radial_velocity: np.ndarray
+    """Radial velocity [m/s]."""
     range_error: np.ndarray
+    """Standard error of the range [m]."""
     velocity_error: np.ndarray
+    """Standard error of the radial velocity [m/s]."""
     range_per_half_bin: np.ndarray
+    """Change of the range by half a bin of the chirps [m]."""
     velocity_per_half_bin: np.ndarray
+    """Change of the radial velocity by half a bin of the chirps [m/s]."""
     range_bias: np.ndarray | float
-    """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
+    """Measured range minus that at the shot's start [m], (n, 1, 1)."""
 
 
 def measure_returns(
@@ -693,15 +732,26 @@ def measure_returns(
     *,
     from_three_bins: bool = True,
 ) -> Returns:
-    """Compute returns from pairs of peaks; flag those that misread their common beamlet.
+    """Compute returns from paired peaks, and flag those that misread their common beamlet.
 
-    ``motion`` is as of :func:`draw_returns`. ``from_three_bins``: places between bins are those of
-    :mod:`sweep.model.detection.sub_bin_interpolation`, and not another estimator's.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    inputs
+        Quantities of the shots that draws depend on.
+    drawn_peaks
+        Paired peaks of the draws.
+    motion
+        Known motion, as in :func:`draw_returns`.
+    from_three_bins
+        True if positions between bins are those of
+        :mod:`sweep.model.detection.sub_bin_interpolation`; False for another estimator's.
     """
     uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
     drawn_peaks = _add_drift_errors(shots, drawn_peaks, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
-    if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise
+    if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise alone
         drawn_peaks = _correct_late_echoes(shots, drawn_peaks, measure(shots, drawn_peaks, None))
     wander_covariance = _wander_covariance(shots, inputs, drawn_peaks)
     if wander_covariance is not None:
@@ -716,7 +766,7 @@ def measure_returns(
     ]
     tolerance_half_bins = 2 * (
         4 + np.where(drawn_peaks.group >= 0, group_widths, 0).sum(axis=-1)
-    )  # of half bins
+    )  # number of half bins
     range_offset, velocity_offset = (
         shots.relative_range_offset[shots.footprint_row],
         SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[shots.footprint_row],
@@ -747,7 +797,7 @@ def measure_returns(
         measurements.range[..., POSITION_COLUMN].copy(),
         measurements.radial_velocity[..., POSITION_COLUMN].copy(),
     )
-    if not uses_fit:  # what the ground came nearer by within the shot: the measured velocity tells
+    if not uses_fit:  # refer to the shot's start by the measured velocity
         measurements.radial_velocity[..., POSITION_COLUMN] *= 1 + as_columns(
             shots, shots.velocity_bias_fraction, 2
         )
@@ -762,7 +812,7 @@ def measure_returns(
         (measurements.range_error, measurements.velocity_error),
         uncorrected,
         strict=True,
-    ):  # whole bins stay uncorrected: their errors say so
+    ):  # values by whole bins stay uncorrected; add the correction to their errors
         errors[..., BIN_COLUMN] = np.hypot(
             errors[..., BIN_COLUMN], values[..., POSITION_COLUMN] - uncorrected_values
         )
@@ -787,9 +837,10 @@ def measure_returns(
 def _wander_covariance(
     shots: Shots, inputs: DrawInputs, drawn_peaks: DrawnPeaks
 ) -> np.ndarray | None:
-    """Mean products [bins^2] of the errors of each return's peaks by speckle.
+    """Return the mean products [bins^2] of the errors of each return's peaks by speckle.
 
-    (n, draws, most, 3, 3) by segment, signed as the beats; None of shots that do not fade.
+    They are (n, draws, returns, 3, 3) by segment, signed as the beats; None for shots without
+    speckle.
     """
     line_gradients = shots.line_gradients
     if line_gradients is None:
@@ -812,7 +863,7 @@ def _wander_covariance(
     ) ** 2
     mean_power = signal_power + 2 * (line_sigma / noise_sigma) ** 2
     offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
-    if shots.detection == "peak_bin":  # placed by the bins about that one
+    if shots.detection == "peak_bin":  # the position is relative to the group's strongest bin
         bin_shift = (
             peaks[..., BIN_COLUMN]
             - inputs.group_bins[point_column, segment, STRONGEST_ROW, group_index]
@@ -838,9 +889,9 @@ def _wander_covariance(
 def _add_drift_errors(
     shots: Shots, drawn_peaks: DrawnPeaks, motion: EgoMotion | None
 ) -> DrawnPeaks:
-    """Add to the peaks' errors what the drift of their lines within the record makes.
+    """Add the errors by the drift of lines within the record to the peaks' standard errors.
 
-    It is that by the motion that the instrument knows, if there is one.
+    The drift is that of the known motion, if given, else that of the shots.
     """
     if motion is not None:
         shots = replace(
@@ -865,15 +916,16 @@ def _add_drift_errors(
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
+"""Largest error of a position between bins [bins]."""
 
 
 def _correct_late_echoes(
     shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements
 ) -> DrawnPeaks:
-    """Correct places between bins for the samples that lack before the echo arrives.
+    """Correct positions between bins for the samples that are missing before the echo arrives.
 
-    The instrument knows them by the range that whole bins tell. No error is larger than half a bin,
-    as a place is always within one.
+    The instrument knows their number from the range by whole bins. No error exceeds half a bin,
+    because a position is always within one.
     """
     column = partial(as_columns, shots, n_trailing=2)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[..., BIN_COLUMN])
@@ -900,11 +952,11 @@ def _correct_late_echoes(
 def _apply_motion_correction(
     shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements, motion: EgoMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correct range and velocity between bins for the motion that the instrument knows, in place.
+    """Correct interpolated range and velocity for the known motion, in place.
 
-    The standard deviation of what it does not know goes into the standard errors
-    (:mod:`sweep.model.pointcloud.ego_motion`). Returns what range [s] and velocity change by 1 m/s
-    of slip.
+    The standard deviation of the unknown motion is added to the standard errors
+    (:mod:`sweep.model.pointcloud.ego_motion`). Returns the changes of range [s] and velocity by 1
+    m/s of slip.
     """
     per_acceleration, per_slip = _response_to_motion(shots, drawn_peaks)
     known_slip = motion.slip_at(measurements.range[..., POSITION_COLUMN])
@@ -933,10 +985,11 @@ def _apply_motion_correction(
 def _response_to_motion(
     shots: Shots, drawn_peaks: DrawnPeaks
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Range [m] and velocity [m/s] that beats gain by 1 m/s^2 of acceleration, and 1 m/s of slip.
+    """Return the changes of range [m] and velocity [m/s] by motion that the beats do not show.
 
-    The slip is the radial velocity less the speed at which the range falls. All broadcast with the
-    returns (n, draws, most).
+    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip. The slip is the
+    radial velocity minus the speed at which the range falls. All values broadcast with the returns
+    (n, draws, returns).
     """
     carriers, chirp_rates = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
@@ -966,7 +1019,7 @@ def _response_to_motion(
 
 
 def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Hz that beats (3, n) gain by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
+    """Return changes of the beats (3, n) [Hz] by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
     chirp_rates = shots.beat_coefficients[1]
     starts = np.array([np.broadcast_to(start, shots.size) for start in shots.segment_starts])
     middle_time = shots.record_middle_time
@@ -984,10 +1037,10 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 def _measure_by_reading(
     shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
 ) -> Measurements:
-    """Tell range and velocity at mid-chirp by each return's reading of its up and down peak.
+    """Measure range and velocity at mid-chirp by each return's reading of its up and down peak.
 
-    Speckle that both see moves their beats against each other with the range, and along with each
-    other with the velocity.
+    The errors of both peaks by common speckle are correlated. Their covariance reduces the variance
+    of the range, and adds to that of the velocity.
     """
     carrier, bandwidth, duration, sample_rate = (
         as_columns(shots, column, 3)
@@ -1023,7 +1076,7 @@ def _measure_by_reading(
         np.sqrt(np.stack([value + 1 / 6, value], axis=-1))
         for value in (range_variance, velocity_variance)
     )
-    # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
+    # Up and down beat give the range at the mean of their starts, plus a term by acceleration.
     up_start, down_start = (as_columns(shots, shots.segment_starts[s], 2) for s in (0, 2))
     range_bias = (carrier / chirp_rate)[..., 0] * as_columns(shots, shots.acceleration, 2)
     range_bias = 0.5 * (down_start - up_start) * range_bias
@@ -1042,7 +1095,7 @@ def _measure_by_reading(
 def _measure_by_fit(
     shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
 ) -> Measurements:
-    """Tell range and velocity at the shot's start by the fit of each return's peaks."""
+    """Measure range and velocity at the shot's start by the fit of each return's peaks."""
     shape = drawn_peaks.flags.shape
     point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
@@ -1052,7 +1105,7 @@ def _measure_by_fit(
     is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
 
     def bound_of(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
-        """Of errors [bins], (3, m), of points."""
+        """Return the deviations of range and velocity by errors of the beats [bins], (3, m)."""
         up, doppler, down = errors * bin_width[points]
         return range_velocity_deviation(
             up=up,
@@ -1112,7 +1165,7 @@ def _add_wander_covariance(
     weights: np.ndarray,
     point_index: np.ndarray,
 ) -> RangeVelocityDeviation:
-    """Add to deviations of fits what the covariances of their beats (m, 3, 3) [Hz^2] make."""
+    """Add the effect of covariances of beats (m, 3, 3) [Hz^2] to the deviations of fits."""
     carriers, chirp_rates = shots.beat_coefficients
     responses = []
     for unit in np.eye(3):
@@ -1125,7 +1178,7 @@ def _add_wander_covariance(
                 chirp_rates=chirp_rates[:, point_index],
             )
         )
-    response_by_beat = np.array(responses)  # by beat, range and velocity, return
+    response_by_beat = np.array(responses)  # (beat, range or velocity, return)
     widened = []
     for value, gains_by_beat in zip(deviations, response_by_beat.swapaxes(0, 1), strict=True):
         covariance_term = sum(
@@ -1141,7 +1194,7 @@ def _add_wander_covariance(
 def _draw_points(
     keys, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
 ):
-    """All draws of all points: peaks of the three segments, and which make returns."""
+    """Draw and pair the peaks of all segments, draws and points into returns."""
     n, draws, returns_max = drawn_peaks.flags.shape
     peaks, peak_groups = np.zeros((3, returns_max + 1, 4)), np.empty((3, returns_max + 1), np.int64)
     n_peaks, pairs = np.empty(3, np.int64), np.empty((returns_max + 1, 4), np.int64)
@@ -1181,28 +1234,28 @@ class GroupSpeckle(NamedTuple):
     """Bins of a point's groups by segment, and their speckle in a draw."""
 
     first_bin: np.ndarray
-    """(most, 3) int64: first bin."""
+    """(groups, 3) int64: first bin."""
     n_bins: np.ndarray
-    """(most, 3) int64: number of bins, 0 where a segment lacks the group."""
+    """(groups, 3) int64: number of bins; 0 if a segment lacks the group."""
     mean_power: np.ndarray
-    """(most, 3, bins): mean power by the lines of the footprint."""
+    """(groups, 3, bins): mean power by the lines of the footprint."""
     pseudo_variance_ratio: np.ndarray
-    """(most, 3, bins): pseudo-variance over that power."""
+    """(groups, 3, bins): pseudo-variance over the mean power."""
     rms_ratio: np.ndarray
-    """(most, 3, bins): root mean square of the echo's |X| / sigma."""
+    """(groups, 3, bins): root mean square of the echo's |X| / sigma."""
     amplitudes: np.ndarray
-    """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
-    the same."""
+    """(groups, looks, 3, bins): complex amplitudes of mean power 1; one look if all looks have the
+    same speckle."""
     factor_rank: np.ndarray
-    """(most,) int64: rows of ``factor`` of a group; 0 where its lines are drawn one by one."""
+    """(groups,) int64: number of rows of ``factor`` in use; 0 if lines are drawn one by one."""
     factor: np.ndarray
     """(groups, rows, 3, bins): factors of the bins' covariance."""
     independent_amplitudes: np.ndarray
-    """(sets, 3, bins): independent amplitudes, of which those of looks are mixed that share them in
-    part."""
+    """(sets, 3, bins): independent amplitudes, which are mixed into looks with partly common
+    speckle."""
     detection_weights: np.ndarray
-    """(most, 3, bins): weights of the bins in the amplitude, of mean power 1, that is held against
-    the probability of detection."""
+    """(groups, 3, bins): weights of the bins in the amplitude, of mean power 1, that is compared
+    with the probability of detection."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -1229,7 +1282,7 @@ def empty_group_speckle(groups_max):
 
 @njit(cache=True, error_model="numpy")
 def prepare_group_speckle(i, config, inputs, spectra):
-    """List the bins of a point's groups that are looked at, and their mean powers."""
+    """Return the bins of a point's groups that are evaluated, with their mean powers."""
     groups_max, n_bins_max = inputs.group_bins.shape[3], 0
     first_bin, n_bins = np.zeros((groups_max, 3), np.int64), np.zeros((groups_max, 3), np.int64)
     for g in range(groups_max):
@@ -1339,11 +1392,11 @@ def prepare_group_speckle(i, config, inputs, spectra):
 def fill_detection_weights(
     point, group_and_segment, config, inputs, first_bin, mean_power, factor_rank, factor, weights
 ):
-    """Set the detection weights (bins,) of a group and segment.
+    """Compute the detection weights (bins,) of a group and segment.
 
-    With ``peak_bin`` that is the amplitude of the strongest bin. If any bin detects, the amplitudes
-    of two segments have the correlation of those in the middle of the echo: the bins are weighted
-    as a lone line in the middle would fill them.
+    With ``peak_bin`` only the strongest bin has a weight. If any bin detects, the bins are weighted
+    as a lone line in the middle of the echo would fill them. The amplitudes of two segments then
+    have the same correlation as in the middle of the echo.
     """
     group, segment = group_and_segment
     weights[:] = 0.0
@@ -1368,7 +1421,7 @@ def fill_detection_weights(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
-    """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
+    """Draw the speckle of a point's groups, and the factors (groups, 3) on their magnitudes."""
     for g in range(speckle.n_bins.shape[0]):
         speckle_factors[g] = 1.0
         if speckle.n_bins[g].max() == 0:
@@ -1408,7 +1461,7 @@ def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
             for look in range(speckle.amplitudes.shape[1]):
                 own = speckle.amplitudes[g, look, s]
                 for k in range(speckle.n_bins[g, s]):
-                    if not speckle.mean_power[g, s, k] > 0.0:  # beyond all lines
+                    if not speckle.mean_power[g, s, k] > 0.0:  # no line reaches it
                         own[k] = own[strongest_index]
                 power_sum += own[strongest_index].real ** 2 + own[strongest_index].imag ** 2
             speckle_factors[g, s] = math.sqrt(power_sum / speckle.amplitudes.shape[1])
@@ -1416,7 +1469,7 @@ def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes):
-    """Mix independent amplitudes (sets, 3, bins) to those of looks (looks, 3, bins)."""
+    """Mix independent amplitudes (sets, 3, bins) into amplitudes of looks (looks, 3, bins)."""
     look_amplitudes[:] = 0.0
     for look in range(look_amplitudes.shape[0]):
         for s in range(3):
@@ -1430,9 +1483,22 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
-    """Pair the peaks of one point (i, draw) into returns, and judge each.
+    """Pair the peaks of one point and draw into returns, and judge each.
 
-    ``peak_lists``: peaks (3, most + 1, 4), their groups, and their number in each segment.
+    Parameters
+    ----------
+    point_and_draw
+        Index of the point, and index of the draw in `drawn_peaks`.
+    config, inputs
+        Settings, and quantities of the points.
+    peak_lists
+        Peaks (3, groups + 1, 4), their groups (3, groups + 1), and their numbers (3,).
+    pairs
+        (groups + 1, 4) int64: scratch for :func:`sweep.model.pointcloud.pairing.pair_peaks`.
+    workspace
+        Scratch.
+    drawn_peaks
+        Result.
     """
     (i, d), (peaks, peak_groups, n_peaks) = point_and_draw, peak_lists
     if config.has_doppler:
@@ -1468,9 +1534,9 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
         for s in range(3):
             if (
                 peak_group_row[s] >= 0 and inputs.line_grid.line_shift.shape[0] > 0
-            ):  # of the echo, not of its speckle
+            ):  # position of the echo, without its wander by speckle
                 positions[s] = inputs.line_centre[i, s, peak_group_row[s]]
-        for s in range(3):  # groups of complex records may lie whole FFT lengths from their peaks
+        for s in range(3):  # a complex record's groups may be multiples of N from their peaks
             if config.down_beat_sign != 0.0 and peak_group_row[s] >= 0:
                 bin_distance = (
                     inputs.group_bins[i, s, STRONGEST_ROW, peak_group_row[s]] - positions[s]
@@ -1481,7 +1547,7 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
                     * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
                 )
         peak_rows = drawn_peaks.peaks[i, d, r]
-        for f in range(4):  # slices would compile an error message of shapes
+        for f in range(4):  # slices would compile an error message about shapes
             peak_rows[0, f], peak_rows[2, f] = peaks[0, up_index, f], peaks[2, down_index, f]
             peak_rows[1, f] = peaks[1, doppler_index, f] if doppler_index >= 0 else np.nan
         flag, drawn_peaks.beamlet[i, d, r] = judge_return(
@@ -1510,14 +1576,28 @@ def draw_segment_peaks(
     peak_groups,
     is_up_detected,
 ):
-    """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
+    """Draw the peaks of a segment in a draw, and return their number.
 
-    ``address`` is the key of the point and the number of the draw, ``point_and_segment`` point and
-    segment.
-    ``speckle_factors`` (most, 3) are factors on the groups' magnitudes, by segment, and ``speckle``
-    has the
-    amplitudes of their bins. ``is_up_detected`` (most,) tells which groups are detected in the up
-    segment, which comes first.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64) and number of the draw.
+    point_and_segment
+        Point and segment.
+    config, inputs, spectra, leakage_bins
+        Settings, quantities of the points, noiseless spectra, and bins of leaked signal.
+    speckle_factors
+        (groups, 3): factors on the groups' magnitudes by speckle.
+    speckle
+        Speckle in the bins of the point's groups.
+    interpolation
+        Interpolator of the window.
+    workspace
+        Scratch.
+    peaks, peak_groups
+        Results: (groups + 1, 4) peaks, and (groups + 1,) their groups or FALSE_PEAK.
+    is_up_detected
+        (groups,) bool: groups detected in the up segment, which is drawn first and sets it.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
@@ -1585,7 +1665,7 @@ def draw_segment_peaks(
                 error = sub_bin_standard_error(
                     offset, ratio / line_noise_ratio, interpolation
                 ) / math.sqrt(config.n_looks)
-                # With the pedestal that is under the lines.
+                # Add the power of the pedestal under the lines.
                 ratio = math.sqrt(ratio * ratio + 2.0 * (line_noise_ratio * line_noise_ratio - 1.0))
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 position = group_bins[STRONGEST_ROW, g] + offset + error * normal
@@ -1690,9 +1770,9 @@ def list_noisy_leaked_peaks(
 ):
     """List the strongest peaks of bins of leaked signal with their noise; return their number.
 
-    Adjacent bins that cross make one peak, the largest, or are of the echo if they join on to a bin
-    of it that crosses. ``speckle_factors`` (most,): factors on the groups' magnitudes. Results are
-    bins, and |X| / sigma.
+    Adjacent bins that cross make one peak, in the largest bin. They belong to the echo if they are
+    adjacent to a crossing bin of the echo. ``speckle_factors`` (groups,) are factors on the groups'
+    magnitudes. ``bins`` and ``ratios``, the results, are the bins and |X| / sigma of the peaks.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
@@ -1741,7 +1821,7 @@ def draw_peak_bin(
     workspace,
     peak,
 ):
-    """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
+    """Test a group's strongest bin with its noise; return True and set the peak if it crosses."""
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
     strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
@@ -1766,7 +1846,7 @@ def draw_peak_bin(
     amplitude = speckled_amplitude(group_magnitudes[1] / noise_sigma, speckle, group, s, 1)
     if (amplitude.real + re) ** 2 + (amplitude.imag + im) ** 2 < threshold_ratio * threshold_ratio:
         return False
-    # Neighbours are exempt from false alarms, so their bins' own numbers are free.
+    # Neighbours are exempt from false alarms, so the random numbers of their bins are unused.
     re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
     re_above, im_above = philox.normal_pair(a, b, draw, stream, k + 1)
     re_below, im_below = re_below * line_noise_ratio, im_below * line_noise_ratio
@@ -1815,7 +1895,7 @@ def draw_peak_bin(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
-    """Complex amplitude of bin k of a group in a draw, of a mean square magnitude."""
+    """Return the complex amplitude of a group's bin in a draw, from its rms magnitude."""
     if speckle.n_bins[group, segment] == 0:
         return complex(magnitude, 0.0)
     return magnitude * speckle.amplitudes[group, 0, segment, bin_index]
@@ -1825,15 +1905,15 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 def detect_in_speckle(
     address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
 ):
-    """Draw a group in developed speckle: True, and its peak, where it is detected.
+    """Draw a group in developed speckle; return True and set its peak if it is detected.
 
-    Its amplitude, echo and noise, is normal, of the echo's share in the mean power. It is detected
-    where its power exceeds what it exceeds with the group's probability of detection. So segments
-    are detected together as two correlated Rayleigh magnitudes of their own probabilities are, by
+    The group's amplitude is a complex Gaussian number: echo plus noise, with ``echo_fraction`` of
+    the mean power in the echo. The group is detected if its power exceeds the level that is
+    exceeded with the group's probability of detection. So segments are detected together as two
+    correlated Rayleigh magnitudes with these probabilities, by
     :func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`. An echo that counts as several
-    independent bins
-    is detected by any of as many amplitudes, of which the drawn one is the first. Several looks
-    detect by their own powers.
+    independent bins is detected by any of as many amplitudes, the first of which is the drawn one.
+    Several looks detect by the powers of their strongest bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     _, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
@@ -1947,14 +2027,15 @@ def detect_in_speckle(
 
 
 _OTHER_BINS_RANDOM_OFFSET = 1 << 22
-"""Random numbers from which those of further independent bins of groups count, group by group."""
+"""Index of the first random number of further independent bins of groups, group by group."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_bin_pd):
-    """Return true where an independent bin of a group but its strongest one is detected.
+    """Return True if an independent bin of a group, other than its strongest bin, is detected.
 
-    ``single_bin_pd`` is the probability of a bin. The last of them is a part of one.
+    ``single_bin_pd`` is the probability of detection of one bin. The last of the bins is a fraction
+    of one.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     n_bins_left, echo_fraction = (
@@ -1983,12 +2064,21 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
-    """Noise of adjacent bins over sigma, to rows 0 and 1 of ``scratch`` (4, >= bins + TAPS).
+    """Draw the noise of adjacent bins over sigma into rows 0 and 1 of ``scratch``.
 
-    It has room for all bins of ``config.end_rule`` and TAPS where bins are near DC or Nyquist.
-
-    ``address``: key, draw, stream; independent numbers count from ``first_index``.
-    ``first_and_count``: the first bin, and their number.
+    Parameters
+    ----------
+    address
+        Key (two uint64), draw and stream.
+    first_index
+        Stream index of the first pair of independent numbers.
+    first_and_count
+        First bin, and number of bins.
+    config
+        Settings with the filters.
+    scratch
+        (4, >= bins + NOISE_FILTER_TAPS); for bins near DC or Nyquist with all bins of
+        ``config.end_noise_filter`` in place of `bins`.
     """
     first_bin, n_bins = first_and_count
     touches_end = config.real_fft_size > 0 and (
@@ -2004,7 +2094,7 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def is_near_end(first_bin, n_bins, config):
-    """Return true of adjacent bins so near to DC or Nyquist that the noise's quadratures differ."""
+    """Return True if any of adjacent bins has non-circular noise, near DC or Nyquist."""
     n_near_bins = config.noise_pseudo_variance_ratio.size
     return n_near_bins > 0 and (
         first_bin < n_near_bins or first_bin + n_bins - 1 > config.nyquist_bin - n_near_bins
@@ -2013,7 +2103,10 @@ def is_near_end(first_bin, n_bins, config):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
-    """Noise of :func:`draw_adjacent_noise` near DC or Nyquist, beyond which bins are conjugate."""
+    """Draw the noise of :func:`draw_adjacent_noise` near DC or Nyquist.
+
+    Bins beyond DC or Nyquist are complex conjugates of their mirror images.
+    """
     first_bin, n_bins = first_and_count
     last_bin = first_bin + n_bins - 1
     drawn_first, drawn_last = 0, max(last_bin, -first_bin)
@@ -2041,9 +2134,10 @@ def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_three_bin_noise(address, first_index, interpolation, scratch):
-    """Noise of three adjacent bins over sigma, to rows 0 and 1 of ``scratch``.
+    """Draw the noise of three adjacent bins over sigma into rows 0 and 1 of ``scratch``.
 
-    ``address``: key, draw, stream; independent numbers count from ``first_index``.
+    ``address`` holds key, draw and stream; the first pair of independent numbers has the index
+    ``first_index``.
     """
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
     a, b, draw, stream = address
@@ -2072,9 +2166,9 @@ def draw_all_bins(
     workspace,
     peak,
 ):
-    """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
+    """Test all bins of an echo with their noise; return True and set the peak if any crosses.
 
-    The peak is the largest of them.
+    The peak is the largest of these bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
@@ -2122,7 +2216,7 @@ def draw_all_bins(
             speckled_amplitude(span_ratios[first_index + k], speckle, group, s, k),
             1.0,
         )
-        if pedestal_power[k] > 0.0:  # fades as the lines do
+        if pedestal_power[k] > 0.0:  # the pedestal fades as the lines do
             power = pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, s, k)) ** 2
             noise_deviation = math.sqrt(1.0 + power)
         re, im = (
@@ -2149,9 +2243,10 @@ def draw_all_bins(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def store_peak(peak, bin_number, position, error, ratio, line_deviation, config, interpolation):
-    """Write a peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
+    """Write the columns of a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
 
-    A peak of a complex record wraps from N/2 to -N/2.
+    A peak of a complex record wraps from N/2 to -N/2. The error by the spread of lines
+    (`line_deviation`, [bins]) is added to the `error` by noise.
     """
     fft_size = 2 * config.nyquist_bin
     if config.down_beat_sign:
@@ -2176,15 +2271,15 @@ def draw_free_bin(
 ):
     """Draw a bin outside the groups, their neighbours and ``excluded_bins``, uniformly.
 
-    One of those from the first to the last of ``searched_range``; of a complex record, of N =
-    ``fft_size`` bins, as far round as they go on.
+    The bin is between the first and last of ``searched_range``, inclusive. Bins of a complex
+    record, of N = ``fft_size`` bins, are periodic.
     """
     first, last = searched_range
     n_groups = 0
     while n_groups < group_bins.shape[1] and group_bins[STRONGEST_ROW, n_groups] >= 0:
         n_groups += 1
     group_spans, n_free, span_end = np.empty((n_groups, 2), np.int64), last - first + 1, first
-    for g in range(n_groups):  # disjoint; in rising order
+    for g in range(n_groups):  # insert into disjoint spans in rising order
         wrap_shift = (
             (group_bins[STRONGEST_ROW, g] - first) // fft_size * fft_size if down_beat_sign else 0
         )
@@ -2202,7 +2297,7 @@ def draw_free_bin(
         group_spans[g, 1], n_free = span_end, n_free - (span_end - group_spans[g, 0])
     excluded_elsewhere = np.empty(
         excluded_bins.size, np.int64
-    )  # barred bins that are searched, and in no group
+    )  # excluded bins that are searched and in no group
     n_excluded = 0
     for k in range(excluded_bins.size):
         bin_number = (
@@ -2217,7 +2312,7 @@ def draw_free_bin(
     rank = int(uniform_number * max(n_free - n_excluded, 1))
     n_passed_before, bin_number = -1, first + rank
     n_passed = 0
-    while n_passed != n_passed_before:  # as many barred bins below it are passed over
+    while n_passed != n_passed_before:  # until no more excluded bins lie below
         n_passed_before, bin_number = n_passed, first + rank + n_passed
         for g in range(n_groups):
             if bin_number >= group_spans[g, 0]:
