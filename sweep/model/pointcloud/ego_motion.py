@@ -63,7 +63,7 @@ class MotionPriors(NamedTuple):
     """Slope of the surface that a beam meets, relative to level ground or to a surface that faces
     the beam."""
     target_speed: float = 0.0
-    """Each component of the velocity of the surface that a beam meets [m/s]."""
+    """Each component of the velocity [m/s] of the surface that a beam meets."""
     target_acceleration: float = 0.0
     """Acceleration, along the beam, of the surface that a beam meets [m/s^2]."""
 
@@ -170,7 +170,7 @@ def ego_motion_of_beams(
     direction_z = np.where(meets_ground, direction[:, 2], -1.0)
 
     def slip_gradient(vector: np.ndarray) -> np.ndarray:
-        """Return the derivative of W's part of the slip (n, 3) with respect to the gradient."""
+        """Return the derivative (n, 3) of the slip by the surface's gradient, for a part of W."""
         over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
         over_ground /= direction_z[:, None] ** 2
         for_facing_surface = vector - _row_dot(vector, direction)[:, None] * direction

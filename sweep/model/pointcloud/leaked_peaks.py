@@ -108,7 +108,7 @@ Two bins then hardly ever cross together, nor a bin together with the echo that 
 """
 
 MEAN_TABLE_STRIDE = 8
-"""Number of tabulated amplitudes between those at which a bin's mean over speckle is integrated."""
+"""Step, in tabulated amplitudes, between those at which a bin's mean over speckle is integrated."""
 
 N_BOUND_POWERS = 5
 """Number of speckle powers 1, 2, 4 .. at which upper bounds of the sum of rates are stored."""

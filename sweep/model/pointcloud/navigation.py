@@ -81,7 +81,7 @@ _ONE_SIGMA_PROBABILITY = 0.8413447460685429
 """Probability that a normal error is below one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
-"""Relative error of the difference of two float64 numbers."""
+"""Relative rounding error of numbers that are subtracted from each other."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
 """Probability of larger residuals below which the covariance follows from the residuals, and not

@@ -75,10 +75,10 @@ class FoldedLattice(NamedTuple):
     weighted_polynomials: np.ndarray
     """(k, h): polynomials times the power fractions."""
     density_change: np.ndarray
-    """(h,): change of the mean power per power of both beamlets, by the beam's density about them.
-    """
+    """(h,): relative change (u_b - w_b) / w_b from the weights to the beam's powers about the
+    beamlets."""
     neighbour_pairs: np.ndarray
-    """(m, 2) int64: pairs of positions that are neighbours."""
+    """(m, 2) int64: indices of neighbouring positions."""
     pair_weight: np.ndarray
     """(m,): sum of the products of the beamlets' power fractions, times h / (h - k) for the
     roughness that k polynomials remove."""

@@ -459,7 +459,7 @@ class DrawWorkspace(NamedTuple):
     pedestal_power: np.ndarray
     """(bins,): power of the pedestal in an echo's bins, over that of noise."""
     all_echo: np.ndarray
-    """(bins,) bool: True."""
+    """(bins,) bool: mask of an echo's bins, all True."""
     false_bins: np.ndarray
     """(groups + 1,) int64: bins of a segment's false peaks."""
     false_ratios: np.ndarray

@@ -208,8 +208,8 @@ def noise_covariance_root(filter_rule: tuple[np.ndarray, np.ndarray, int]) -> np
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
     It is the Cholesky factor of the covariance under a filter of :func:`make_echo_noise_filter`,
-    for at most ROOT_BINS_MAX bins. It holds away from DC and Nyquist, where :func:`draw_bin_noise`
-    correlates bins.
+    for at most ROOT_BINS_MAX bins. It is not valid at DC and Nyquist, for which
+    :func:`draw_bin_noise` is.
     """
     weights, start, _ = filter_rule
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)

@@ -122,7 +122,7 @@ class SegmentSignal(NamedTuple):
     """Spectrum of a segment without noise, with the bins and the frequency of its echo."""
 
     spectrum: np.ndarray
-    """(N/2 + 1,) complex [V]; of a complex record (N,)."""
+    """Spectrum without noise [V], complex: (N/2 + 1,), or (N,) for a complex record."""
     strongest_bin: int
     """Index of the largest bin. DC and Nyquist are excluded if noise is taken as circular in all
     bins of a real record."""
@@ -762,8 +762,8 @@ class SegmentDetections(NamedTuple):
     peak_offset: np.ndarray
     """Estimated position relative to the strongest bin [bins]."""
     peak_power: np.ndarray
-    """|X|^2 of the bin that is strongest without noise [V^2]. If the peak's bin has more power, the
-    smaller of that and the squared threshold is the least value."""
+    """|X|^2 [V^2] of the bin that is strongest without noise; at least the smaller of the peak's
+    power and the squared threshold."""
 
 
 def make_spectrum_view(

@@ -19,29 +19,29 @@ from sweep.kernel_cache import high_word, njit
 # Streams, one per physical cause; causes that act in each segment have three: up, Doppler, down.
 # Every stored draw depends on these numbers: add numbers, never change any.
 STREAM_DETECTION = (1, 3, 2)
-"""Detection, by comparison with a probability; by segment."""
+"""Streams of detections, by comparison with a probability; by segment."""
 STREAM_FALSE_ALARM = (4, 6, 5)
-"""False alarms of noise and position, by comparison with a probability; by segment."""
+"""Streams of false alarms of noise, compared with a probability, and of their bins; by segment."""
 STREAM_NOISE = (7, 9, 8)
-"""Noise of the bins near an echo; by segment."""
+"""Streams of the noise of the bins of an echo and of leaked signal; by segment."""
 STREAM_NOISE_MAXIMUM = (10, 12, 11)
-"""Largest bin of noise alone; by segment."""
+"""Streams of the largest magnitude in bins of noise alone, and of its bin; by segment."""
 STREAM_FOOTPRINT_PHASE = 13
-"""Phases of beamlets."""
+"""Stream of phases of beamlets."""
 STREAM_SPECKLE = 14
-"""Amplitudes of developed speckle."""
+"""Stream of amplitudes of developed speckle."""
 STREAM_POINTING_JITTER = 16
-"""Pointing jitter of the beam."""
+"""Stream of the pointing jitter of the beam."""
 STREAM_SCINTILLATION = 17
-"""Scintillation by turbulence."""
+"""Stream of scintillation by turbulence."""
 STREAM_RECORD = (18, 20, 19)
-"""Noise of the samples of a record; by segment."""
+"""Streams of the noise of the samples of a record; by segment."""
 STREAM_LASER_PHASE = (21, 23, 22)
-"""Random walk of the laser's phase; by segment."""
+"""Streams of the random walk of the laser's phase; by segment."""
 STREAM_ERROR_FLOOR = 24
-"""Errors of the instrument that do not depend on the echo."""
+"""Stream of errors of the instrument that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
-"""False peaks by leaked signal; by segment."""
+"""Streams of false peaks by leaked signal; by segment."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _M0, _M1 = (np.uint64(m) for m in _MULTIPLIERS)

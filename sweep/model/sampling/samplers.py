@@ -79,7 +79,7 @@ PD_COUNT_ROWS = [
 
 
 class PriorDraws(NamedTuple):
-    """Earlier draws of n points, to which further draws are added, bit for bit."""
+    """Earlier draws of n points. Further draws give the same bits as one run of all draws."""
 
     n_draws: np.ndarray
     """(n,) int64: number of draws of each point."""
