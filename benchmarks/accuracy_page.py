@@ -112,10 +112,9 @@ and samples the result at the bins. Three improvements are measured too:
 - `folded`: a way back to the bins alone, by an FFT of a sixteenth of the size, also with `real`;
 - `degree 9`: lines shared out among ten cells, which puts them at their exact place.
 
-All are compiled and transform many spectra at once (`sweep/tasks/accuracy/study_sample.py`). They
-compute
-neither leakage nor range walk. They share preparation and detection with the other settings. The
-closed form with the same beamlets and effects is measured too.
+All are compiled and transform many spectra at once (`sweep/model/spectrum/oversampled_grid.py`).
+They compute neither leakage nor range walk. They share preparation and detection with the other
+settings. The closed form with the same beamlets and effects is measured too.
 
 Adaptive settings have to meet two requirements, which the numbers below test:
 

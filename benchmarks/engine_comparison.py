@@ -171,8 +171,9 @@ def sweep_cluster_client(workers: int):
     """A client of workers that are started as `sweep run` does."""
     from sweep.tasks.engine.cluster_connection import connect_cluster
     from sweep.tasks.engine.session import RunOptions
+    from sweep.tasks.studies.workload import SpecWorkload
 
-    cluster_request = RunOptions(workers=workers).resolve_cluster(grid_spec(2500))
+    cluster_request = RunOptions(workers=workers).resolve_cluster(SpecWorkload(grid_spec(2500)))
     assert cluster_request is not None
     with connect_cluster(
         cluster_request, max_workers=workers, processes=True, say=lambda text: None

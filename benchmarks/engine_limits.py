@@ -93,9 +93,9 @@ def time_call(function):
 def measure_blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
     from sweep.storage.store_format import read_receipt_totals
-    from sweep.tasks.engine.blocks import ParameterBlockGrid
     from sweep.tasks.engine.journal import Journal, scan_complete_blocks
     from sweep.tasks.engine.worker import BlockQueue
+    from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
     axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip
@@ -205,7 +205,7 @@ def measure_throughput(client, seconds, measured_seconds):
     slots = sum(client.nthreads().values())
     queue, job = (
         dispatcher.BlockQueue(np.zeros(10**7, bool)),
-        TaskSettings("x", f"waiting {seconds}"),
+        TaskSettings("x", f"waiting {seconds}", None),
     )
     task_scheduler = dispatcher.TaskDispatcher(
         client, 0, job, queue, verify_receipt=lambda *_: True, say=print

@@ -24,8 +24,8 @@ from sweep.model.evaluation import evaluate_segments, prepare_shots
 from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import GridSpec, load
 from sweep.tasks.accuracy.settings import ADAPTIVE_KIND, AccuracySetting
-from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 SEEDS_BY_TOLERANCE = {0.1: 11, 0.01: 11, 0.001: 2}
 """Times that all points are drawn anew at a tolerance."""

@@ -16,8 +16,8 @@ from sweep.model.effects.catalogue import EFFECTS, pack_effect_flags, unpack_eff
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.planning import plan_effects
 from sweep.model.evaluation import PARAMETER_DEFAULTS
-from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
+from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")

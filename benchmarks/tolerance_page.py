@@ -45,7 +45,7 @@ from sweep.tasks.accuracy.study_sample import (
     Trial,
     merge_trials,
 )
-from sweep.tasks.engine.blocks import ParameterBlockGrid
+from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 POINTS, SEED, ROUNDS = 1000, 2017, 5
 POINTS_TIMED_TOGETHER = 4096

@@ -20,7 +20,8 @@ from sweep.spec import GridSpec, load
 from sweep.tasks import driver
 from sweep.tasks.engine import progress
 from sweep.tasks.engine.journal import StoreLock
-from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions, estimate_cpu_seconds
+from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions
+from sweep.tasks.studies.workload import SpecWorkload, estimate_cpu_seconds
 
 STUDY = """\
 title: A small study
@@ -673,10 +674,10 @@ def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(h
     spec = GridSpec.from_mapping(
         {**yaml.safe_load(STUDY), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
-    assert RunOptions().resolve_cluster(spec) is None
-    assert RunOptions(workers=2).resolve_cluster(spec).workers == (2, 2)
+    assert RunOptions().resolve_cluster(SpecWorkload(spec)) is None
+    assert RunOptions(workers=2).resolve_cluster(SpecWorkload(spec)).workers == (2, 2)
     spec = GridSpec.from_mapping({**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=here)
-    assert RunOptions().resolve_cluster(spec).workers == (3, 3)
+    assert RunOptions().resolve_cluster(SpecWorkload(spec)).workers == (3, 3)
 
 
 def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwise(here):
@@ -684,13 +685,16 @@ def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwis
     large["axes"]["target.range"]["number"] = 10**6
     little, large = (GridSpec.from_mapping(mapping, base=here) for mapping in (little, large))
     assert estimate_cpu_seconds(little) < SERIAL_CPU_SECONDS_MAX < estimate_cpu_seconds(large)
-    assert RunOptions().resolve_cluster(little) is None
-    assert RunOptions().resolve_cluster(large).kind == "local"
+    assert RunOptions().resolve_cluster(SpecWorkload(little)) is None
+    assert RunOptions().resolve_cluster(SpecWorkload(large)).kind == "local"
     for said in ({"workers": 1}, {"processes": False}, {"block_timeout": 9.0},
                  {"performance_report": "r.html"}, {"evaluate": print}):  # fmt: skip
-        assert RunOptions(**said).resolve_cluster(little).kind == "local"
-    assert RunOptions(scheduler="tcp://10.0.0.5:8786").resolve_cluster(little).kind == "scheduler"
-    assert RunOptions(scheduler="none").resolve_cluster(large) is None
+        assert RunOptions(**said).resolve_cluster(SpecWorkload(little)).kind == "local"
+    assert (
+        RunOptions(scheduler="tcp://10.0.0.5:8786").resolve_cluster(SpecWorkload(little)).kind
+        == "scheduler"
+    )
+    assert RunOptions(scheduler="none").resolve_cluster(SpecWorkload(large)) is None
 
 
 def test_a_study_is_extended_by_the_file_of_a_larger_one(ran):

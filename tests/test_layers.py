@@ -1,6 +1,7 @@
 """Rules of the architecture, checked by walking the imports of every module."""
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
 
@@ -52,6 +53,23 @@ MAY_IMPORT = {
     "__init__": {"tasks", "analysis", "spec"},
 }
 """Imports run one way; analysis and report read stores, however they were computed."""
+
+NOT_IN_THE_ENGINE = ("sweep.tasks.studies", "sweep.tasks.accuracy", "sweep.model", "sweep.scenes")
+"""Packages that `sweep/tasks/engine` imports nothing of: it computes the blocks of any study."""
+
+ENGINE_SPEC_MODULES = {
+    "sweep.spec.cluster_config",  # the file that describes a cluster
+    "sweep.spec.rules",
+    "sweep.spec.sections",  # `execution`: workers, threads, scheduler
+}
+"""Modules of the spec that the engine may import: what the user says of machines."""
+
+LIDAR_WORDS = re.compile(
+    r"(?<![a-z])(lidar|laser|beam|beamlet|chirp|doppler|speckle|shot|scanner|scene|eyepoint"
+    r"|telescope|footprint|spectr(um|a)|fft|radial_velocity|ray)s?(?![a-z])",
+    re.IGNORECASE,
+)
+"""Words of the field, which the engine knows none of."""
 
 NOT_IN_THE_MODEL = {
     "click",
@@ -110,6 +128,26 @@ def test_imports_run_one_way():
 def test_the_model_knows_no_framework():
     for path in (path for path in MODULES if _layer(path) == "model"):
         assert not {name.split(".")[0] for name in _imports(path)} & NOT_IN_THE_MODEL, path
+
+
+def _engine_modules() -> list[Path]:
+    return [path for path in MODULES if path.is_relative_to(PACKAGE / "tasks" / "engine")]
+
+
+def test_the_engine_imports_no_study_and_no_physics():
+    for path in _engine_modules():
+        imports = {name for name in _imports(path) if name.startswith("sweep.")}
+        assert not [name for name in imports if name.startswith(NOT_IN_THE_ENGINE)], path
+        spec_imports = {name for name in imports if f"{name}.".startswith("sweep.spec.")}
+        allowed = tuple(ENGINE_SPEC_MODULES)
+        assert not [name for name in spec_imports if not name.startswith(allowed)], path
+
+
+def test_the_engine_has_no_word_of_the_field():
+    assert len(_engine_modules()) > 10
+    for path in _engine_modules():
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            assert not LIDAR_WORDS.search(line), f"{path}:{number}: {line}"
 
 
 def test_no_import_cycle():

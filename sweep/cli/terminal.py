@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from sweep.spec import GridSpec, SceneSpec
-    from sweep.tasks.engine.session import Outcome
+    from sweep.tasks.driver import Outcome
     from sweep.tasks.studies.study_plan import EffectRow, EffectsTable, StudyPlan
 
 ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 86400.0
@@ -203,7 +203,7 @@ def _allow_modules(
 ) -> None:
     """Allow studies to import the user's modules that --allow-code names."""
     if modules:
-        from sweep.tasks.studies.user_functions import allow_modules
+        from sweep.tasks.engine.user_code import allow_modules
 
         allow_modules(modules)
 
@@ -590,6 +590,7 @@ def plan_rows(
     from sweep.tasks.engine.session import RunOptions
     from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
     from sweep.tasks.studies.study_plan import plan_study
+    from sweep.tasks.studies.workload import SpecWorkload
 
     if isinstance(spec, SceneSpec):
         refuse_flight_without_hits(spec)
@@ -610,7 +611,7 @@ def plan_rows(
     if not study_plan.scanners:
         yield "time a point", f"{1e6 * study_plan.seconds_per_point:.3g} us on one core"
     bound_text = "at most about" if getattr(spec.draws, "is_adaptive", False) else "about"
-    if RunOptions(workers=workers).resolve_cluster(spec) is None:
+    if RunOptions(workers=workers).resolve_cluster(SpecWorkload(spec)) is None:
         yield (
             "time",
             f"{bound_text} {duration_text(study_plan.cpu_seconds)}, at once, without workers",

@@ -1,4 +1,4 @@
-"""A study from its first block to its last, and its rays before: run, resume, extend."""
+"""Run, resume and extend a study: all its stages, from the options to the complete store."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from sweep.storage.locations import (
     staging_path_for,
 )
 from sweep.storage.store_format import read_attributes, read_study_id
-from sweep.tasks.engine.blocks import user_functions
+from sweep.tasks.engine import user_code
 from sweep.tasks.engine.journal import (
     EXTENDS_KEY,
     REPLACES_KEY,
@@ -49,13 +51,12 @@ from sweep.tasks.engine.progress import (
     raise_as_store_error,
     show_activity,
 )
-from sweep.tasks.engine.session import ComputeBackend, Outcome, RunOptions, Session
+from sweep.tasks.engine.session import ComputeBackend, RunOptions, Session, SessionOutcome
 from sweep.tasks.engine.study_store import (
     create_store,
     pending_replacement,
     refuse_damaged_template,
     refuse_foreign_files,
-    refuse_other_study,
     refuse_other_versions,
     refuse_to_replace,
     remove_store,
@@ -66,16 +67,37 @@ from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
 from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
-from sweep.tasks.studies.memory_limits import refuse_too_large_blocks, refuse_too_large_study
+from sweep.tasks.studies.memory_limits import (
+    refuse_too_large_blocks,
+    refuse_too_large_point,
+    refuse_too_large_study,
+)
 from sweep.tasks.studies.study_loading import (
     AnySpec,
     apply_changes,
     refuse_not_larger_study,
+    refuse_other_study,
     reusable_points_text,
 )
+from sweep.tasks.studies.user_function_names import user_functions, user_modules
+from sweep.tasks.studies.workload import SpecWorkload
 
-#: Seconds between looks at rays that another run casts.
+#: Interval at which a run checks whether another run has cast its rays [s].
 EYEPOINT_LOCK_POLL_SECONDS = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(SessionOutcome):
+    """Result of a run."""
+
+    rays: Mapping[str, int] = field(default_factory=dict)  # rays cast in this run, by scanner
+
+    @classmethod
+    def of_session(
+        cls, outcome: SessionOutcome, rays_by_scanner: Mapping[str, int] | None = None
+    ) -> Outcome:
+        """Return the outcome of a run: that of its last session, and the rays cast before it."""
+        return cls(**vars(outcome), rays=rays_by_scanner or {})
 
 
 def run(
@@ -91,12 +113,12 @@ def run(
     Parameters
     ----------
     spec, store
-        The study, and the path of the store to make: on disk, or `s3://bucket/key.zarr` (gs, az).
+        Study, and path of the store to create: on disk, or `s3://bucket/key.zarr` (gs, az).
     overwrite
-        Whether to put the new store in the place of one that is there, once it is complete.
+        Whether to replace an existing store, once the new one is complete.
     resume
-        Whether to go on where the store is there already, and holds this study; complete, it stays
-        as it is. So the same call serves a job each time that it is started.
+        Whether to continue if the store exists and holds this study. A complete store stays as it
+        is, so the same call serves a job each time that it is started.
     **options
         Where and how to compute, by the names of :class:`sweep.tasks.engine.session.RunOptions`:
         ``workers=4``, ``client=...``, ``progress=False`` and so on.
@@ -104,20 +126,23 @@ def run(
     Returns
     -------
     Outcome
-        Complete, or why not; `resume` goes on from there.
+        Numbers of points and blocks, and why the study is incomplete, if it is. `resume` continues
+        an incomplete study.
 
     Warns
     -----
     StudyWarning
-        Of what can be computed, but is hardly meant: a beam that its aperture can't make, a flight
-        that partly sees nothing, echoes after their record, effects switched off that matter.
+        If the study can be computed but is probably not meant: a beam that its aperture can't make,
+        a flight that partly sees nothing, echoes after their record, disabled effects that matter.
 
     Raises
     ------
-    StoreError, ClusterError, CodeError
-        Where a store, or one of another study, is in the way or can't be written; where no
-        scheduler or worker is to be had; where the study names a function that may not run
-        (:mod:`sweep.tasks.studies.user_functions`).
+    StoreError
+        If another store is at the path, or the path is not writable.
+    ClusterError
+        If no scheduler or worker is available.
+    CodeError
+        If the study names a function that may not run (:mod:`sweep.tasks.studies.user_functions`).
     """
     final_path, run_options = resolve_links(parse_location(store)), RunOptions.from_mapping(options)
     if overwrite and resume:
@@ -129,7 +154,7 @@ def run(
             pending_replacement(final_path) or final_path, make_progress(run_options.progress).say
         )
         return _resume(final_path, spec, run_options)
-    backend, study = ComputeBackend(run_options, spec), study_loading.make_study(spec, final_path)
+    backend, study = _make_backend(run_options, spec), study_loading.make_study(spec, final_path)
     if not overwrite:
         _refuse_existing_store(final_path, study)
     _check_memory(study, backend)
@@ -140,25 +165,25 @@ def run(
 
 
 def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any) -> Outcome:
-    """Compute what a store lacks; where it is being extended or replaced, what the new one lacks.
+    """Compute the missing blocks of a store, or of the store that is to extend or replace it.
 
     Parameters
     ----------
     store
-        Where a store is that `run` made.
+        Path of a store that `run` made.
     spec
-        The study that the store is expected to hold; without it, whatever it holds.
+        Study that the store must hold; by default any.
     **options
         As in `run`.
 
     Raises
     ------
     StoreError
-        Where the store is not sweep's, holds another study, was begun with other versions, is
-        damaged in what it held before there were results, or is being written by someone else.
-        Nothing is touched.
+        If the store is not sweep's, holds another study, was begun with other versions, is damaged
+        in objects older than its results, or is being written by another process. The store is not
+        changed.
     ClusterError
-        Where there is no scheduler or worker to be had.
+        If no scheduler or worker is available.
     """
     final_path, run_options = resolve_links(parse_location(store)), RunOptions.from_mapping(options)
     if spec is not None:
@@ -167,7 +192,7 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
 
 
 def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions) -> Outcome:
-    """As :func:`resume`, of a place that no link leads to."""
+    """Resume the store at a path without links, as :func:`resume`."""
     final_path = final_path_for(final_path) if isinstance(final_path, Path) else final_path
     working_path = pending_replacement(final_path) or final_path
     attributes, study = _read_resumable_study(working_path)
@@ -178,8 +203,8 @@ def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions)
     if spec is None:
         refuse_damaged_recipe(working_path)
     else:
-        study = study_loading.make_study(spec, working_path)  # it knows where its files are
-    backend = ComputeBackend(run_options, study.spec)
+        study = study_loading.make_study(spec, working_path)  # with the folder of the spec's files
+    backend = _make_backend(run_options, study.spec)
     if working_path == final_path:
         return _compute_missing(working_path, study, backend)
     source = read_recipe(working_path).get(EXTENDS_KEY)
@@ -202,36 +227,37 @@ def extend(
     overwrite: bool = False,
     **options: Any,
 ) -> Outcome:
-    """Turn a store into that of a larger study, and compute only what is new.
+    """Turn a store into that of a larger study, and compute only the new points.
 
     The larger study has further values on its axes, further axes, more draws or a tighter
-    tolerance. It is computed in the same folder and replaces the store when it is complete; its
+    tolerance. It is computed in the same folder and replaces the store when it is complete. Its
     bytes are those of the larger study run at once.
 
     Parameters
     ----------
     store
-        Where a store is that `run` made, complete or not. It is only read.
+        Path of a store that `run` made, complete or not. It is only read.
     spec
-        The larger study; by default what the store holds.
+        Larger study; by default the study in the store, with the changes.
     changes
-        What is different in it, by dotted path: ``{"axes.target.range": ["1 km", "2 km"]}``.
+        Changed fields by dotted path: ``{"axes.target.range": ["1 km", "2 km"]}``.
     to
-        Another place for the larger store: the old one then stays. Needed in an object store.
+        Path of the larger store, if the old one shall stay. Required in an object store.
     overwrite
-        Whether to begin anew where an extension was begun, or another store is in the place `to`.
+        Whether to restart an extension that was begun, or to replace another store at `to`.
     **options
         As in `run`.
 
     Returns
     -------
     Outcome
-        Complete, or why not; `extend` or `resume` goes on from there.
+        Numbers of points and blocks, and why the study is incomplete, if it is. `extend` or
+        `resume` continues an incomplete study.
 
     Raises
     ------
     StoreError, ClusterError
-        As in `run` and `resume`; where the study asked for is not a larger one.
+        As in `run` and `resume`, and if the study is not larger than the one in the store.
     """
     source_path, run_options = (
         resolve_links(parse_location(store)),
@@ -242,7 +268,7 @@ def extend(
     attributes, source_study = _read_resumable_study(source_path)
     target_spec = apply_changes(source_study.spec if spec is None else spec, changes or {})
     _check_user_functions(target_spec)
-    backend = ComputeBackend(run_options, target_spec)
+    backend = _make_backend(run_options, target_spec)
     _refuse_altered_store(source_path, attributes, source_study)
     if target_spec.id == attributes["study_id"]:
         backend.progress.say(f"nothing to extend: {source_path} holds this very study")
@@ -266,15 +292,22 @@ def extend(
     )
 
 
+def _make_backend(run_options: RunOptions, spec: AnySpec) -> ComputeBackend:
+    """Return the compute backend of a study; SpecError if one point exceeds its memory."""
+    backend = ComputeBackend(run_options, SpecWorkload(spec))
+    refuse_too_large_point(spec, backend.memory)
+    return backend
+
+
 def _check_memory(study: GridStudy | FlightStudy, backend: ComputeBackend) -> None:
-    """Refuse a study that is too large for what computes it, here or once that is reached."""
-    backend.study = study
+    """Raise a SpecError if a study exceeds the backend's memory, now or once it is connected."""
+    backend.check_memory = partial(refuse_too_large_study, study)
     with show_activity("building the scene", backend.progress):
         refuse_too_large_study(study, backend.memory)
 
 
 def _check_spec_type(spec: object) -> None:
-    """Refuse what is no study, such as the path of its file."""
+    """Raise a TypeError if an argument is no study, for example the path of its file."""
     if isinstance(spec, GridSpec | SceneSpec):
         return
     if isinstance(spec, str | os.PathLike):
@@ -303,8 +336,8 @@ def _read_resumable_study(
 def _refuse_altered_store(
     store_path: Location, attributes: dict[str, Any], study: GridStudy | FlightStudy
 ) -> None:
-    """Refuse a store of other versions, or one that is not as it was made."""
-    refuse_other_versions(store_path, attributes, reader="this machine")
+    """Raise a StoreError if a store has other versions, or if its template is damaged."""
+    refuse_other_versions(store_path, attributes, study.model_version, reader="this machine")
     if study.id != attributes["study_id"]:
         raise StoreError(
             f"{store_path} holds a spec with id {study.id} but says {attributes['study_id']}: "
@@ -314,7 +347,7 @@ def _refuse_altered_store(
 
 
 def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy) -> None:
-    """Refuse a place in which there is something, or for which something is under way."""
+    """Raise a StoreError if something is at a path, or is being prepared for it."""
     staging_path, remedy = (
         pending_replacement(store_path),
         f"{suggestion('resume', store_path)} goes on with it",
@@ -345,7 +378,10 @@ def _run_into(
     from_scratch: bool,
     source_path: Location | None = None,
 ) -> Outcome:
-    """Compute a study into its place, or beside a store whose place it takes when complete."""
+    """Compute a study into a path, or into a staging path if it is to replace a store there.
+
+    The staged store replaces the other one when it is complete.
+    """
     recover_interrupted_replace(final_path)
     working_path, recipe, durable = final_path, _recipe_facts(spec), backend.options.durable
     with ExitStack() as stack:
@@ -368,7 +404,7 @@ def _run_into(
         if already_exists and from_scratch:
             StoreLock(
                 working_path, backend.progress.say
-            ).release()  # refuses where someone writes to it
+            ).release()  # a BusyError if another process writes to it
         elif already_exists:
             stored_attributes, stored_study = _read_resumable_study(working_path)
             refuse_other_study(working_path, stored_attributes, stored_study.spec, spec)
@@ -385,9 +421,9 @@ def _run_into(
         def prepare() -> None:
             creates_store = from_scratch or not already_exists
             if creates_store and backend.uses_running_scheduler:
-                backend.connect()  # its workers' memory may be too small for the study
+                backend.connect()  # checks the memory of its workers before the store is created
             elif already_exists and from_scratch and not backend.is_serial:
-                backend.connect()  # what was begun goes when there are workers for what replaces it
+                backend.connect()  # without workers the unfinished store is not removed
             if creates_store:
                 create_store(
                     working_path,
@@ -410,7 +446,7 @@ def _run_into(
             if not already_exists:
                 remove_store(
                     working_path
-                )  # nothing was computed, and the next try should not meet it
+                )  # nothing was computed, so the next run starts with a free path
             raise
         if (
             outcome.complete
@@ -423,7 +459,7 @@ def _run_into(
 
 
 def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
-    """Put the complete store beside a place, which the caller has locked, into it."""
+    """Move the complete staged store to its final path, which the caller has locked."""
     staging_path = staging_path_for(final_path)
     with raise_as_store_error(f"{staging_path} can't take the place of {final_path}"):
         if durable:
@@ -431,25 +467,25 @@ def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
         replace_path(staging_path, final_path)
         remove_recipe_predecessors(
             final_path
-        )  # where it stands now it extends and replaces nothing
+        )  # the store at the final path no longer extends or replaces another
 
 
 def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy) -> bool:
-    """Tell whether all eyepoints of a study stored at a path were cast before, or are being so."""
+    """Return True if the eyepoint stores of all scanners exist, complete or not."""
     return isinstance(study, FlightStudy) and all(
         eyepoints_path(store_path, eyepoints.id).exists() for eyepoints in study.eyepoint_studies()
     )
 
 
 def _recipe_facts(spec: AnySpec) -> dict[str, str]:
-    """Places of a study's files, for the recipe of its store."""
+    """Return the folder of a study's files, for the recipe of its store."""
     return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
 def _check_user_functions(spec: AnySpec) -> None:
-    """Import and try the functions that a study names, if any; CodeError where one fails."""
+    """Import and test the functions that a study names, if any; CodeError if one fails."""
     if any(user_functions(spec)):
-        from sweep.tasks.studies.user_functions import check_user_functions
+        from sweep.tasks.studies.user_functions import check_user_functions  # the model's kernels
 
         check_user_functions(spec)
 
@@ -457,12 +493,13 @@ def _check_user_functions(spec: AnySpec) -> None:
 def _warn_of_changed_user_code(
     store_path: Location, spec: AnySpec, say: Callable[[str], None]
 ) -> None:
-    """Say which of the user's modules a store, or the one that it extends, was not begun with."""
-    if not any(user_functions(spec)):
+    """Name the user's modules that changed since a store, or the one it extends, was begun."""
+    modules = user_modules(spec)
+    if not modules:
         return
-    from sweep.tasks.studies.user_functions import module_digests
-
-    current_digests = module_digests(spec)
+    current_digests = {
+        name: digest for name, digest in user_code.module_digests(modules).items() if digest
+    }
     recipe = read_recipe(store_path)
     source_recipe = (
         read_recipe(parse_location(recipe[EXTENDS_KEY])) if EXTENDS_KEY in recipe else {}
@@ -486,33 +523,34 @@ def _compute_missing(
     backend: ComputeBackend,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    backend.max_workers, backend.study = study.n_blocks, study
+    backend.max_workers = study.n_blocks
+    backend.check_memory = partial(refuse_too_large_study, study)
     refuse_too_large_blocks(study, backend.memory)
     with (
         backend.interrupts,
         ExitStack() as stack,
         backend,
-    ):  # the lock goes when the workers are gone
+    ):  # the lock is released after the workers have ended
         prepare()
         lock = StoreLock(store_path, backend.progress.say)
         stack.callback(lock.release)
         _warn_of_changed_user_code(store_path, study.spec, backend.progress.say)
         session = Session(store_path, study, backend, lock)
         if isinstance(study, GridStudy):
-            return session.run()
+            return Outcome.of_session(session.run())
         write_recipe(store_path, **read_recipe(store_path) | _recipe_facts(study.spec))
         if _is_complete(store_path, study):
-            return session.run()
+            return Outcome.of_session(session.run())
         rays_by_scanner, stop_reason = _cast_missing_eyepoints(study, backend)
         if (
             any(rays_by_scanner.values()) and not stop_reason
-        ):  # progress begins anew, at none of the same shots
+        ):  # the next stage counts the same shots from zero
             backend.progress.say("all rays are cast; simulating shots")
-        return session.run(prior_stop_reason=stop_reason, rays_by_scanner=rays_by_scanner)
+        return Outcome.of_session(session.run(prior_stop_reason=stop_reason), rays_by_scanner)
 
 
 def _is_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Tell whether no block is missing, nor any of those eyepoints that are there."""
+    """Return True if all blocks are committed, and those of the eyepoint stores that exist."""
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()
     ) and all(
@@ -525,7 +563,10 @@ def _is_complete(store_path: Location, study: FlightStudy) -> bool:
 def _cast_missing_eyepoints(
     study: FlightStudy, backend: ComputeBackend
 ) -> tuple[dict[str, int], str]:
-    """Cast what is missing of a study's eyepoints; rays by scanner, and why any is missing."""
+    """Cast the missing eyepoints of a study.
+
+    Return the number of rays by scanner, and the reason for stopping early, or ''.
+    """
     rays_by_scanner: dict[str, int] = {}
     for eyepoints in study.eyepoint_studies():
         eyepoint_store_path, scanner = (
@@ -535,7 +576,7 @@ def _cast_missing_eyepoints(
         rays_by_scanner[scanner] = 0
         if _is_eyepoint_store_complete(eyepoint_store_path, eyepoints):
             continue
-        _check_memory(study, backend)  # a scene's mistakes are the user's, not a block's
+        _check_memory(study, backend)  # builds the scene: its errors are no failures of blocks
         with ExitStack() as stack:
             if not (lock := _acquire_eyepoint_lock(eyepoint_store_path, eyepoints, backend)):
                 del rays_by_scanner[scanner]
@@ -543,7 +584,7 @@ def _cast_missing_eyepoints(
             stack.callback(lock.release)
             if _is_eyepoint_store_complete(
                 eyepoint_store_path, eyepoints
-            ):  # another run has cast them meanwhile
+            ):  # cast by another run meanwhile
                 continue
             backend.progress.say(
                 f"casting {eyepoints.n_rays:,} rays through the scanner '{scanner}'"
@@ -560,7 +601,7 @@ def _cast_missing_eyepoints(
 
 
 def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: EyepointStudy) -> bool:
-    """Tell whether an eyepoint store is there with all of its blocks."""
+    """Return True if an eyepoint store exists with all of its blocks."""
     if is_free(eyepoint_store_path):
         return False
     attributes = read_attributes(eyepoint_store_path)
@@ -568,7 +609,9 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
         raise StoreError(
             f"{eyepoint_store_path} holds other eyepoints than its name says: remove it"
         )
-    refuse_other_versions(eyepoint_store_path, attributes, reader="this machine")
+    refuse_other_versions(
+        eyepoint_store_path, attributes, eyepoints.model_version, reader="this machine"
+    )
     refuse_damaged_template(eyepoint_store_path)
     return bool(read_recipe(eyepoint_store_path)) and bool(
         committed_blocks(eyepoint_store_path, eyepoints).all()
@@ -578,7 +621,10 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
 def _acquire_eyepoint_lock(
     eyepoint_store_path: Location, eyepoints: EyepointStudy, backend: ComputeBackend
 ) -> StoreLock | None:
-    """Lock an eyepoint store, made if need be, once no other run casts; None if interrupted."""
+    """Lock an eyepoint store, which is created if needed, after any other run has released it.
+
+    None if the run is interrupted meanwhile.
+    """
     has_announced_wait = False
     while not backend.interrupts.is_stopping:
         try:

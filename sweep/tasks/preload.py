@@ -1,4 +1,4 @@
-"""Start of a worker: leave signals to the client, go on without output, import the model early."""
+"""Start of a worker: ignore signals meant for the client, protect output, import the model."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from sweep.tasks.engine.text_streams import PatientStream, make_dask_logs_patien
 
 
 def dask_setup(worker: Any) -> None:
-    """Entry point that Dask calls in a starting worker."""
-    # A terminal sends Ctrl-C to every process of the group; the workers have blocks to finish.
+    """Set up a starting worker; called by Dask."""
+    # A terminal sends Ctrl-C to all processes of its group, but workers finish their blocks.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        # The same of one that is closed; a worker ends with its nanny.
+        # A closed terminal does the same with SIGHUP; a worker ends with its nanny.
         if HANGUP_SIGNAL is not None and getattr(worker, "nanny", None) is not None:
             signal.signal(HANGUP_SIGNAL, signal.SIG_IGN)
         make_dask_logs_patient()
-        # What a user's function prints would fail its block where nobody reads it any more, and
-        # hold it up where a terminal has stopped.
+        # Printing in a user's function would otherwise fail its block if nobody reads the output,
+        # and block it if a terminal has stopped.
         sys.stdout, sys.stderr = PatientStream(sys.stdout), PatientStream(sys.stderr)
         if get_address_host(worker.address) == get_address_host(worker.scheduler.address):
             # The driver compiles the same kernels, and says once that they can't be cached.

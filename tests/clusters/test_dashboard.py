@@ -15,6 +15,7 @@ from sweep.tasks.engine import cluster_connection as clusters
 from sweep.tasks.engine.deploy import local_ssh
 from sweep.tasks.engine.progress import ClusterError
 from sweep.tasks.engine.session import RunOptions
+from sweep.tasks.studies.workload import SpecWorkload
 
 PAGES = ("status", "info/main/workers.html", "json/counts.json", "metrics", "statics/", "health")
 """Pages of a scheduler or a worker of Dask."""
@@ -100,12 +101,15 @@ def test_schedulers_of_jobs_and_of_ssh_have_none_either():
 
 
 def test_a_run_asks_for_a_dashboard_by_an_option(tmp_path):
-    place = RunOptions(workers=1, dashboard=True).resolve_cluster(small_spec())
+    place = RunOptions(workers=1, dashboard=True).resolve_cluster(SpecWorkload(small_spec()))
     assert place.scheduler.dashboard == "8787"
-    assert RunOptions(dashboard=True).resolve_cluster(small_spec()).workers is None
-    assert RunOptions(workers=1).resolve_cluster(small_spec()).scheduler.dashboard == "none"
+    assert RunOptions(dashboard=True).resolve_cluster(SpecWorkload(small_spec())).workers is None
+    assert (
+        RunOptions(workers=1).resolve_cluster(SpecWorkload(small_spec())).scheduler.dashboard
+        == "none"
+    )
     given = {"kind": "local", "workers": 2, "scheduler": {"dashboard": "9000"}}
-    kept = RunOptions(cluster=given, dashboard=True).resolve_cluster(small_spec())
+    kept = RunOptions(cluster=given, dashboard=True).resolve_cluster(SpecWorkload(small_spec()))
     assert kept.scheduler.dashboard == "9000" and kept.workers == WorkerBounds(2, 2)
     for elsewhere in ("none", "tcp://10.0.0.5:8786"):
         with pytest.raises(ClusterError, match="leave out dashboard=True"):

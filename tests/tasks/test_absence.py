@@ -30,10 +30,10 @@ from sweep.tasks.engine import (
     session,
     study_store,
     worker,
+    worker_memory,
 )
 from sweep.tasks.engine.progress import ClusterError, Progress, StoreError
 from sweep.tasks.engine.worker import worker_address
-from sweep.tasks.studies import memory_limits
 from sweep.tasks.studies.grid_study import GridStudy
 
 
@@ -198,7 +198,7 @@ class Leaving:
     "error", [OSError("gone"), TimeoutError(), RuntimeError("IOLoop is closed"), CancelledError()]
 )
 def test_nothing_is_known_of_the_memory_of_workers_that_go(error):
-    assert memory_limits.worker_memory(Leaving(error), None).bytes_max == float("inf")
+    assert worker_memory.worker_memory(Leaving(error), None).bytes_max == float("inf")
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):
@@ -261,8 +261,8 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
     shutil.copytree(undisturbed, f"{path}-copy")
     unfit = sorted(two_workers.nthreads())[: 1 + all_unfit]
 
-    def study(path, study_id):
-        opened = worker._open_block_writer(path, study_id)
+    def study(path, study_id, read_study):
+        opened = worker._open_block_writer(path, study_id, read_study)
         return fault(path, opened) if worker_address() in unfit else opened
 
     def evaluate(study, block):
@@ -340,7 +340,7 @@ def test_what_is_no_scheduler_is_told_as_that(tmp_path):
 
 
 def test_an_only_worker_that_does_not_see_the_folder_is_named(tmp_path, monkeypatch):
-    def unseen(path, study_id):
+    def unseen(path, study_id, read_study):
         raise NotAStoreError(f"there is no store at {path}")
 
     monkeypatch.setattr(worker, "block_writer_of_store", unseen)

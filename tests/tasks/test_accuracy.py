@@ -346,7 +346,7 @@ def test_shots_are_timed_with_so_many_that_follow_round_the_end():
 @pytest.mark.parametrize("rays", [7, "auto"])
 def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     """Statistics of a trial against those of the flight's own machinery, more rays and all."""
-    from sweep.tasks.engine.blocks import SHOTS_PER_TILE
+    from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE
 
     spec = small_scene_spec(
         footprint={"beamlets": rays, "speckle": "none"}, accuracy={"tolerance": 1e-6}

@@ -14,7 +14,7 @@ from sweep.model.sampling import samplers
 from sweep.storage.locations import ObjectPath
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine import journal, progress, worker
-from sweep.tasks.engine.blocks import PartialResults, ReusedResults
+from sweep.tasks.engine.block_study import PartialResults, ReusedResults
 from sweep.tasks.engine.journal import Checkpoint
 from sweep.tasks.engine.progress import Progress, StoreError
 from sweep.tasks.studies.grid_study import GridStudy

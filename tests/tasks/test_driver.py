@@ -30,6 +30,7 @@ from sweep.tasks.engine.study_store import BlockWriter, StoredBlock
 from sweep.tasks.engine.worker import TaskSettings, run_blocks
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.study_loading import read_study
 
 
 def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
@@ -212,7 +213,9 @@ def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(t
         study_store.create_store(path, GridStudy(small_spec(seed=6)))
         return study.evaluate(block)
 
-    unfit = run_blocks(TaskSettings(str(path), old.id, replaced_meanwhile), [0]).worker_error
+    unfit = run_blocks(
+        TaskSettings(str(path), old.id, read_study, replaced_meanwhile), [0]
+    ).worker_error
     assert f"now holds study {small_spec(seed=6).id}, not {old.id}" in str(unfit)
     assert not list(path.glob("*/c/0/0/0"))
 

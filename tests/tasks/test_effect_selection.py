@@ -16,7 +16,6 @@ from sweep.model.effects.catalogue import (
     pack_effect_flags,
     unpack_effect_flags,
 )
-from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies.flight_study import _tile_runs
 from sweep.tasks.studies.grid_study import (
@@ -27,6 +26,7 @@ from sweep.tasks.studies.grid_study import (
     TileGrid,
     fit_tile_shape,
 )
+from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 from sweep.tasks.studies.study_loading import make_study
 from sweep.tasks.studies.study_plan import effects_table
 

@@ -16,8 +16,8 @@ from sweep.model.outputs import (
     RUNNING_SUMS,
     STANDARD_ERROR_OUTPUTS,
 )
-from sweep.tasks.engine.blocks import ParameterBlockGrid
 from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
+from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 from sweep.tasks.studies.store_summary import count_unsupported_points
 
 RANDOM = (*DEFAULT_EFFECTS, "speckle", "pointing_jitter")

@@ -7,7 +7,9 @@ from small_flights import small_scene_spec
 from small_studies import STUDY_MAPPING, small_spec
 
 from sweep.storage.locations import parse_location
-from sweep.tasks.engine.blocks import (
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.grid_study import canonical_point_rows
+from sweep.tasks.studies.parameter_grid import (
     DEFAULT_BLOCK_POINTS,
     DEFAULT_BLOCKS_MAX,
     ParameterBlockGrid,
@@ -15,8 +17,6 @@ from sweep.tasks.engine.blocks import (
     fit_block_shape,
     worst_cpu_seconds_per_point,
 )
-from sweep.tasks.studies.flight_study import FlightStudy
-from sweep.tasks.studies.grid_study import canonical_point_rows
 
 
 def points_of(grid: ParameterBlockGrid) -> np.ndarray:

@@ -8,6 +8,7 @@ from small_studies import small_spec
 
 from sweep.spec import SpecError
 from sweep.tasks import driver
+from sweep.tasks.engine import worker_memory
 from sweep.tasks.engine.study_store import create_store
 from sweep.tasks.studies import memory_limits
 from sweep.tasks.studies.study_loading import make_study
@@ -69,7 +70,7 @@ def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_pat
 @pytest.mark.parametrize("limits", [(), (0,), (None, 10**12)])
 def test_workers_without_a_limit_take_any_study(limits):
     memory_limits.refuse_too_large_point(
-        small_spec(axes=HUGE), memory_limits.worker_memory(ClientOf(*limits), None)
+        small_spec(axes=HUGE), worker_memory.worker_memory(ClientOf(*limits), None)
     )
 
 

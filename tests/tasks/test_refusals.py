@@ -129,7 +129,7 @@ def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monk
     assert file_digests(store) == before
 
 
-def refusing_on_workers(path, attributes, *, reader):
+def refusing_on_workers(path, attributes, model_version, *, reader):
     """As if the workers, and only they, had other software."""
     if reader.startswith("worker"):
         raise StoreError(f"other versions on the {reader}")

@@ -109,14 +109,16 @@ def test_workers_that_may_come_are_counted_so_that_their_coming_is_asked_for():
 
 
 def test_the_same_work_has_the_same_key_and_other_work_another():
-    job = TaskSettings("/store", "id")
-    assert task_key(job, [1, 2], False) == task_key(TaskSettings("/store", "id"), [1, 2], False)
+    job = TaskSettings("/store", "id", None)
+    assert task_key(job, [1, 2], False) == task_key(
+        TaskSettings("/store", "id", None), [1, 2], False
+    )
     others = [
         task_key(job, [1, 3], False),
         task_key(job, [1, 2], True),
         task_key(job, [1, 2], False, resend_count=1),
-        task_key(TaskSettings("/other", "id"), [1, 2], False),
-        task_key(TaskSettings("/store", "other"), [1, 2], False),
+        task_key(TaskSettings("/other", "id", None), [1, 2], False),
+        task_key(TaskSettings("/store", "other", None), [1, 2], False),
     ]
     assert len({task_key(job, [1, 2], False), *others}) == 6
 
@@ -132,7 +134,7 @@ def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_i
 
     blocks = BlockQueue(np.zeros(8, dtype=bool))
     scheduler = TaskDispatcher(
-        None, 0, TaskSettings("x.zarr", "0"), blocks, verify_receipt=None, say=None
+        None, 0, TaskSettings("x.zarr", "0", None), blocks, verify_receipt=None, say=None
     )
     scheduler._in_flight["lost"] = _InFlightTask([3, 4], {"lost": Lost()})
     scheduler._finished_futures.put(Lost())
@@ -167,7 +169,7 @@ def test_a_task_that_is_over_is_not_sent_again_before_its_answer_is_looked_at():
 
     client, blocks = Idle(), BlockQueue(np.zeros(8, dtype=bool))
     scheduler = TaskDispatcher(
-        client, 0, TaskSettings("x.zarr", "0"), blocks, verify_receipt=None, say=None
+        client, 0, TaskSettings("x.zarr", "0", None), blocks, verify_receipt=None, say=None
     )
     scheduler._slots.current_count()
     for block, over in ((4, True), (5, False)):

@@ -17,10 +17,12 @@ from small_studies import RecordingProgress, run_serially, small_spec
 
 import sweep
 from sweep.spec.axes import remove_fields_on_axes
+from sweep.tasks.engine import user_code
 from sweep.tasks.engine.progress import CodeError, TaskError
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies import user_functions
 from sweep.tasks.studies.study_plan import plan_study
+from sweep.tasks.studies.user_function_names import user_modules
 
 CODE = """
     import numpy as np
@@ -64,7 +66,7 @@ def mine(tmp_path, monkeypatch):
     name = f"mine_{tmp_path.name}".replace("-", "_")
     (tmp_path / f"{name}.py").write_text(textwrap.dedent(CODE))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(user_functions.ALLOWED_MODULES_VARIABLE, "")
+    monkeypatch.setenv(user_code.ALLOWED_MODULES_VARIABLE, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
     user_functions.checked_function.cache_clear()
     yield name
@@ -99,7 +101,7 @@ def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
         with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
             ask()
     assert not (tmp_path / "a.zarr").exists() and not runs(mine, tmp_path)
-    user_functions.allow_modules([mine])
+    user_code.allow_modules([mine])
     assert run_serially(spec, tmp_path / "a.zarr").complete
     assert run_serially(study(), tmp_path / "b.zarr").complete
     own, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
@@ -119,7 +121,7 @@ def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine,
     spec = flown(f"{mine}:detect", f"{mine}:estimate")
     with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
         run_serially(spec, tmp_path / "a.zarr")
-    user_functions.allow_modules([mine])
+    user_code.allow_modules([mine])
     assert run_serially(spec, tmp_path / "a.zarr").complete
     assert run_serially(flown("fixed", "peak_bin"), tmp_path / "b.zarr").complete
     own, built_in = (sweep.open_scene(tmp_path / f"{n}.zarr")["three"] for n in "ab")
@@ -130,9 +132,9 @@ def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine,
 
 
 def test_opening_a_store_runs_nothing(mine, tmp_path):
-    user_functions.allow_modules([mine])
+    user_code.allow_modules([mine])
     assert run_serially(study(f"{mine}:detect"), tmp_path / "a.zarr").complete
-    del os.environ[user_functions.ALLOWED_MODULES_VARIABLE], sys.modules[mine]
+    del os.environ[user_code.ALLOWED_MODULES_VARIABLE], sys.modules[mine]
     ran = runs(mine, tmp_path)
     sweep.open(tmp_path / "a.zarr")
     from sweep.tasks.studies.store_summary import status
@@ -148,7 +150,7 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
 
 @pytest.mark.parametrize("extended", [False, True])
 def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, tmp_path, extended):
-    user_functions.allow_modules([mine])
+    user_code.allow_modules([mine])
     store, larger = tmp_path / "a.zarr", {"target.range": ["500 m", "2250 m", "4 km", "5 km"]}
     assert run_serially(study(f"{mine}:detect"), store).complete
 
@@ -184,14 +186,14 @@ def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, t
     ],
 )  # fmt: skip
 def test_a_function_is_held_to_its_word_before_anything_runs(mine, tmp_path, role, function, words):
-    user_functions.allow_modules([mine])
+    user_code.allow_modules([mine])
     with pytest.raises(CodeError, match=words):
         run_serially(study(**{role: f"{mine}:{function}"}), tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr").exists()
 
 
 def test_a_module_that_is_not_there_is_named(mine, tmp_path):
-    user_functions.allow_modules(["no_such_module"])
+    user_code.allow_modules(["no_such_module"])
     with pytest.raises(CodeError, match=r"no module no_such_module on .*put no_such_module\.py"):
         user_functions.check_user_functions(study("no_such_module:f"))
 
@@ -243,23 +245,23 @@ def elsewhere(function, *arguments):
         input=pickle.dumps((function, arguments)),
         capture_output=True,
         check=False,
-        env=os.environ | {user_functions.ALLOWED_MODULES_VARIABLE: ""},
+        env=os.environ | {user_code.ALLOWED_MODULES_VARIABLE: ""},
     )
 
 
 def test_what_a_run_allows_its_workers_allow_too_if_they_have_the_same_file(mine, tmp_path):
     spec = study(f"{mine}:detect")
-    user_functions.allow_modules([mine])
-    ((module, digest),) = user_functions.allowed_module_digests(spec).items()
+    user_code.allow_modules([mine])
+    ((module, digest),) = user_code.module_digests(user_modules(spec)).items()
     assert module == mine and len(digest) == 32
     refused = elsewhere(user_functions.check_user_functions, spec)
     assert refused.returncode and b"its module is not allowed" in refused.stderr
-    assert elsewhere(user_functions.allow_same_module, module, digest).returncode == 0
+    assert elsewhere(user_code.allow_same_module, module, digest).returncode == 0
     (tmp_path / f"{mine}.py").write_text("detect = 3")
-    other = elsewhere(user_functions.allow_same_module, module, digest)
+    other = elsewhere(user_code.allow_same_module, module, digest)
     assert other.returncode and b"is not the same file on" in other.stderr
     (tmp_path / f"{mine}.py").unlink()
-    lost = elsewhere(user_functions.allow_same_module, module, digest)
+    lost = elsewhere(user_code.allow_same_module, module, digest)
     assert lost.returncode and f"put {mine}.py into the folder".encode() in lost.stderr
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from sweep.messages import option_name, option_text
+from sweep.model import VERSION
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.locations import Location, is_free, resolve_links
@@ -39,7 +40,8 @@ from sweep.tasks.accuracy.study_sample import (
     merge_trials,
 )
 from sweep.tasks.engine import study_store
-from sweep.tasks.engine.blocks import ArrayLayout, BlockStudy, cf_attributes
+from sweep.tasks.engine.block_study import BlockStudy
+from sweep.tasks.engine.blocks import ArrayLayout
 from sweep.tasks.engine.interrupts import InterruptHandler
 from sweep.tasks.engine.progress import (
     Progress,
@@ -48,6 +50,7 @@ from sweep.tasks.engine.progress import (
     make_progress,
     show_activity,
 )
+from sweep.tasks.studies.output_layouts import cf_attributes
 from sweep.tasks.studies.study_loading import ACCURACY_KIND, make_study
 
 SAMPLE_POINTS, TIME_LIMIT_SECONDS = 200, 60.0
@@ -452,6 +455,11 @@ class AccuracyTemplate:
     time_domain_beamlets: int  # of both, where their number is not the reference's; else 0
     stop_reason: str  # why the sample is not whole; empty where it is
     storing_seconds: float = math.nan  # time that storing takes [s]
+
+    @property
+    def model_version(self) -> str:
+        """Version of the model that was tried."""
+        return VERSION
 
     @property
     def id(self) -> str:

@@ -85,7 +85,7 @@ class AccuracySetting:
     """A setting of a study: values of fields of its spec by dotted path, as one would write them.
 
     ``thesis_grid_options`` has the options of
-    :func:`sweep.tasks.accuracy.study_sample.find_peaks_on_grid`, where that
+    :func:`sweep.model.spectrum.oversampled_grid.find_peaks_on_grid`, where that
     finds the peaks; ``rays_error_max`` is what a flight's rays may leave before there are more, 0
     where the spec says that.
     """

@@ -2,13 +2,6 @@
 
 Of a grid these are points spread over all axes, of a flight whole tiles of shots, as effects are
 planned in them.
-
-[T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
-frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
-16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
-follows, a product with the transform of the window's own, and the way back. The improvements
-`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
-walk, line width) are skipped, and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -16,21 +9,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from functools import cache, cached_property, lru_cache, partial
-from itertools import product, zip_longest
+from functools import cache, cached_property, partial
+from itertools import zip_longest
 from pathlib import Path
 from time import thread_time
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import fft
 from scipy.stats import qmc
 
-from sweep.kernel_cache import njit
 from sweep.model import evaluation, time_domain_truth
-from sweep.model import window as windows
-from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.effects.catalogue import (
     EFFECT_NAMES,
     EFFECTS,
@@ -41,23 +29,16 @@ from sweep.model.error_budget import ErrorBudget
 from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
 from sweep.model.pointcloud.ray_error import estimate_ray_error
 from sweep.model.preparation import Shots
-from sweep.model.spectrum.lines import (
-    BLOCK,
-    IM,
-    PLACE,
-    RE,
-    add_image_lines,
-    compute_lines,
-    fold_lines,
-)
+from sweep.model.spectrum.oversampled_grid import find_peaks_on_grid
 from sweep.model.waveform import SEGMENT_NAMES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Axis, GridSpec, SceneSpec
 from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting, AnySpec
-from sweep.tasks.engine.blocks import SHOTS_PER_TILE, ParameterBlockGrid, Results
+from sweep.tasks.engine.blocks import Results
 from sweep.tasks.studies.eyepoint_study import build_world
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_points
+from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterBlockGrid
 
 PeakFinder = Callable[[Shots], np.ndarray]
 """A way to the largest bins of each segment's spectrum, as :func:`sweep.model.evaluation.find`."""
@@ -637,229 +618,3 @@ def _shot_statistics(
     for name, values in outputs.items():
         all_outputs[name][hitting_shots] = values
     return all_outputs
-
-
-CELLS_PER_BIN = 16
-"""Cells of the grid in a bin of the FFT."""
-
-GRID_CELLS_MIN = 1 << 12
-"""Cells of the grid, where the footprint's lines leave enough room beside them."""
-
-CLEARANCE_BINS = 16
-"""Bins beside the lines that must be free of what comes round the grid's ends."""
-
-_SPECTRA_PER_TRANSFORM = 32
-"""Spectra that are transformed together: as many as the processor's cache holds."""
-
-
-def find_peaks_on_grid(
-    shots: Shots,
-    *,
-    degree: int = 0,
-    size: int = GRID_CELLS_MIN,
-    real: bool = False,
-    folded: bool = False,
-) -> np.ndarray:
-    """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.evaluation.find`.
-
-    A line is shared out by a polynomial of a ``degree`` of 0, to the nearest cell, or 9, among
-    ten. A grid has ``size`` cells at the least, a power of two, and more where a point's lines
-    spread farther. ``real`` transforms powers as real numbers; ``folded`` goes back to the bins
-    alone. There is no leakage.
-    """
-    peaks = np.full((3, 6, shots.size), np.nan)
-    point_table, n_cells_of_point, grid_options = (
-        shots.point_parameter_table(),
-        cells_per_point(shots, size),
-        (degree, real, folded),
-    )
-    first_bin_and_width = shots.fft_size // 2, 1.0 / shots.fft_size
-    segments = np.flatnonzero(shots.has_segment).tolist()
-    for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
-        members = np.flatnonzero(n_cells_of_point == cells)
-        for points in np.split(
-            members, range(_SPECTRA_PER_TRANSFORM, members.size, _SPECTRA_PER_TRANSFORM)
-        ):
-            first_bin, magnitude = grid_magnitudes(
-                shots, point_table, points, segment, cells, grid_options
-            )
-            peak_rows = np.empty((6, points.size))
-            bin_levels = shots.bin_threshold_table[:, points]
-            speckle = shots.speckle_table.select(segment, points)
-            detect_in_spectra(
-                magnitude,
-                first_bin,
-                first_bin_and_width,
-                shots.detection_rule,
-                bin_levels,
-                speckle,
-                peak_rows,
-            )
-            peak_rows[3] *= point_table[6, points]
-            peaks[segment][:, points] = peak_rows
-    return peaks
-
-
-def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
-    """Cells of each point's grid, (n,) int64: the lines in its middle, and room on both sides."""
-    beat_per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
-    carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.carriers])
-    offset_max = np.abs(shots.relative_range_offset).max(axis=1)[shots.footprint_row]
-    doppler_max = np.abs(shots.doppler_ratio_offset).max(axis=1)[shots.footprint_row]
-    line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
-    line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
-    cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
-    return np.maximum(cells_min, 2 ** cells_needed.astype(np.int64))
-
-
-def grid_magnitudes(
-    shots: Shots,
-    point_table: np.ndarray,
-    points: np.ndarray,
-    segment: int,
-    n_cells: int,
-    grid_options: tuple[int, bool, bool],
-) -> tuple[np.ndarray, np.ndarray]:
-    """First bin (m,) and |X| (m, cells / CELLS) of some points' spectra around their lines.
-
-    ``grid_options``: `degree`, `real` and `folded` of :func:`find_peaks_on_grid`.
-    """
-    degree, real, folded = grid_options
-    adds_powers, record_length = shots.adds_powers, shots.window.length
-    real = real and adds_powers
-    grid = np.zeros((points.size, n_cells), float if real else complex)
-    centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
-    _deposit_lines(
-        np.ascontiguousarray(point_table[:, points]),
-        shots.footprint_row[points],
-        shots.beamlet_table,
-        segment,
-        np.array([shots.fft_size, record_length, 0, 0, adds_powers, 0]),
-        shots.sums_images,
-        np.array(
-            [
-                1 / np.prod(np.delete(node - polynomial_nodes, node_number))
-                for node_number, node in enumerate(polynomial_nodes)
-            ]
-        ),
-        centre_bin,
-        grid.view(float).reshape(points.size, n_cells, -1),
-    )
-    window_transform = _window_transform(
-        shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, real
-    )
-    convolved = _convolve_with_window(grid, window_transform, real, folded)
-    # Rounding takes a sum of squares that is all but nothing below it.
-    magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if adds_powers else np.abs(convolved)
-    return centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude
-
-
-def _convolve_with_window(
-    grid: np.ndarray, window_transform: np.ndarray, real: bool, folded: bool
-) -> np.ndarray:
-    """Return the convolution of powers or amplitudes, (rows, cells), at every sixteenth cell."""
-    n_bins = grid.shape[1] // CELLS_PER_BIN
-    forward_transform, inverse_transform = (fft.rfft, fft.irfft) if real else (fft.fft, fft.ifft)
-    transform = forward_transform(grid, axis=1, overwrite_x=True)
-    transform *= window_transform
-    if not folded:
-        return np.asarray(
-            inverse_transform(transform, grid.shape[1], axis=1, overwrite_x=True)[
-                :, ::CELLS_PER_BIN
-            ]
-        )
-    if real:  # the upper half is the lower one's conjugate
-        upper_half = transform[:, :-1].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
-            :, :, : n_bins // 2 + 1
-        ]
-        lower_half = transform[:, 1:].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
-            :, :, : n_bins // 2 - 2 : -1
-        ]
-        transform = upper_half.sum(axis=1) + lower_half.sum(axis=1).conj()
-    else:
-        transform = transform.reshape(-1, CELLS_PER_BIN, n_bins).sum(axis=1)
-    return (
-        np.asarray(inverse_transform(transform, n_bins, axis=1, overwrite_x=True)) / CELLS_PER_BIN
-    )
-
-
-@lru_cache(maxsize=32)
-def _window_transform(
-    window_name: str, length: int, fft_size: int, n_cells: int, adds_powers: bool, real: bool
-) -> np.ndarray:
-    """Transform of the window's own, of mid-record, on a grid of cells; no closed form is used."""
-    cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
-    transform = fft.fft(windows.window_samples(window_name, length), CELLS_PER_BIN * fft_size)[
-        cell_offsets
-    ]
-    transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / CELLS_PER_BIN))
-    if adds_powers:
-        transform = np.abs(transform) ** 2
-    return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
-
-
-@njit(cache=True, error_model="numpy")
-def _deposit_lines(
-    point_table, footprint_row, footprint, segment, sizes, image, node_weights, centre_bin, grid
-):
-    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1).
-
-    They are seen at 0 .. N/2, and their images about DC or Nyquist, whichever is nearer.
-    """
-    n_beamlets, n_cells = footprint.shape[2], grid.shape[1]
-    n_lines = 2 * n_beamlets if image else n_beamlets
-    line_scratch, cell_weights = np.empty((BLOCK + 1, n_lines)), np.empty(node_weights.size)
-    lowest_cell, highest_cell = (
-        (-0.5, n_cells - 1.0) if node_weights.size == 1 else (5.0, n_cells - 6.0)
-    )
-    for point in range(footprint_row.size):
-        signed_centre_bin = compute_lines(
-            point_table[:, point].copy(),
-            segment,
-            footprint,
-            footprint_row[point],
-            sizes,
-            line_scratch,
-        )
-        centre_bin[point] = abs(signed_centre_bin)
-        if signed_centre_bin < 0:
-            for beamlet in range(n_beamlets):
-                line_scratch[PLACE, beamlet], line_scratch[IM, beamlet] = (
-                    -line_scratch[PLACE, beamlet],
-                    -line_scratch[IM, beamlet],
-                )
-        if image:
-            add_image_lines(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
-            fold_lines(line_scratch[:, n_beamlets:], n_beamlets, sizes)
-        for beamlet in range(n_beamlets):
-            for line in range(beamlet, n_lines, n_beamlets):
-                cell_position = n_cells // 2 + CELLS_PER_BIN * line_scratch[PLACE, line]
-                if lowest_cell < cell_position < highest_cell:
-                    _deposit_line(
-                        grid[point],
-                        cell_position,
-                        line_scratch[RE, line],
-                        line_scratch[IM, line],
-                        node_weights,
-                        cell_weights,
-                    )
-
-
-@njit(cache=True, error_model="numpy")
-def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
-    """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
-    first_cell = (
-        int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
-    )
-    offset, weight_sum = cell_position - first_cell, 0.0
-    for node in range(node_weights.size):
-        if offset == node or node_weights.size == 1:
-            cell_weights[:] = 0.0
-            cell_weights[node] = weight_sum = 1.0
-            break
-        cell_weights[node] = node_weights[node] / (offset - node)
-        weight_sum += cell_weights[node]
-    for node in range(node_weights.size):
-        cells[first_cell + node, 0] += re * cell_weights[node] / weight_sum
-        if cells.shape[1] > 1:
-            cells[first_cell + node, 1] += im * cell_weights[node] / weight_sum

@@ -1,4 +1,4 @@
-"""Clusters to compute blocks: one that is there, or workers that are started and ended here."""
+"""Connections to a cluster: one that runs already, or workers that are started and ended here."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from sweep.tasks.engine.text_streams import make_dask_logs_patient
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-#: Time in which a scheduler has to answer [s].
+#: Time in which a scheduler must respond [s].
 CONNECT_TIMEOUT = 15.0
 
 
 class ClusterConnection(NamedTuple):
-    """A cluster in use."""
+    """Connection to a cluster."""
 
     client: Client
-    expected_slots: int  # worker threads that it may come to have; 0 where that is unknown
-    restart_workers: Callable[[], object] = lambda: None  # starts workers in the place of lost ones
+    expected_slots: int  # largest number of worker threads; 0 if unknown
+    restart_workers: Callable[[], object] = lambda: None  # replaces lost workers
 
 
 def cpu_count() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     from dask.system import CPU_COUNT
 
     return int(CPU_COUNT)
@@ -51,10 +51,10 @@ def cpu_count() -> int:
 def connect_cluster(
     cluster: AnyClusterConfig, *, max_workers: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[ClusterConnection]:
-    """Connect a client to a cluster; one that is started here ends with it.
+    """Connect a client to a cluster; a cluster that is started here ends with the context.
 
-    No more workers are started than there can be tasks at once (`most`). ClusterError where no
-    scheduler answers or no worker starts.
+    At most `max_workers` workers are started, as further ones would be idle. ClusterError if no
+    scheduler responds or no worker starts.
     """
     from distributed import Client
 
@@ -89,48 +89,52 @@ def connect_cluster(
             yield ClusterConnection(
                 client, expected_slots, lambda: dask_cluster.scale(bounds.least)
             )
-        else:  # what is lost comes again by itself, or not at all
+        else:  # the cluster itself replaces lost workers, or can't
             yield ClusterConnection(client, expected_slots)
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
-    """Bounds of the number of workers, none of which shall have nothing to do."""
+    """Return the bounds of the number of workers, limited to `max_workers`."""
     requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
     return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
 
 
 def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
-    """Make a client that is not Dask's default: one that fails to connect would stay it."""
+    """Connect a client that is not Dask's default one; ClusterError if no scheduler responds.
+
+    A client that fails to connect would remain the default.
+    """
     from distributed import Client
 
     security = local_ssh.make_security(cluster)
-    # A client that fails to connect takes half a minute more to be closed.
+    # Checked first, as closing a client that failed to connect takes another half minute.
     with ThreadPoolExecutor(
         1
-    ) as executor:  # this thread may have a loop that runs, as a notebook's
+    ) as executor:  # this thread may have a running event loop, as in a notebook
         try:
             executor.submit(asyncio.run, _check_scheduler(address, security)).result()
         except (OSError, ValueError, ImportError) as error:
             raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
-        except Exception as error:  # whatever decoding of another protocol raises
+        except Exception as error:  # decoding of another protocol may raise anything
             raise ClusterError(
                 f"what answers at {address} is no Dask scheduler ({type(error).__name__})"
             ) from error
     try:
         return Client(address, timeout=CONNECT_TIMEOUT, security=security, set_as_default=False)
     except (OSError, ValueError) as error:
-        # Collected here, as one that goes while another is made waits for ever for that one's lock.
+        # Collected here: if it is collected while another client is made, it waits for the lock of
+        # that client for ever.
         traceback.clear_frames(error.__traceback__)
         gc.collect()
         raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
 
 
 async def _check_scheduler(address: str, security: Security | None) -> None:
-    """Ask a scheduler who it is; raises where none answers in time."""
+    """Ask a scheduler for its identity; an exception if none responds in time."""
     from distributed import Security, rpc
 
     connection_args = (security or Security()).get_connection_args("client")
-    async with asyncio.timeout(CONNECT_TIMEOUT + 1.0):  # the other one has words
+    async with asyncio.timeout(CONNECT_TIMEOUT + 1.0):  # the timeout of `rpc` has a message
         async with rpc(
             address, timeout=CONNECT_TIMEOUT, connection_args=connection_args
         ) as scheduler:
@@ -164,7 +168,7 @@ def _start_workers(
 def _keep_workers_in_bounds(
     dask_cluster: Any, cluster: AnyClusterConfig, bounds: WorkerBounds
 ) -> None:
-    """Keep the number of workers within bounds; that of jobs, which end, even if it is fixed."""
+    """Adapt the number of workers to the work within bounds, and replace batch jobs that end."""
     if isinstance(cluster, BatchClusterConfig):
         from sweep.tasks.engine.deploy import jobqueue
 
@@ -198,7 +202,7 @@ def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
 def write_performance_report(
     client: Client, report_path: Path, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """Write Dask's report of what a cluster does meanwhile; that it can't is no reason to fail."""
+    """Write Dask's report of the context's computations; a failure is only reported."""
     from distributed import performance_report
 
     report = performance_report(filename=str(report_path))
@@ -212,5 +216,5 @@ def write_performance_report(
             with client.as_current():
                 report.__exit__(None, None, None)
             say(f"performance report: {report_path}")
-        except Exception as error:  # the scheduler may be gone, and with it what it knew
+        except Exception as error:  # the scheduler may be gone, and its records with it
             say(f"no performance report: {error}")

@@ -1,7 +1,7 @@
-"""A rolling window of Dask tasks: never more in flight than keeps every worker busy.
+"""Dispatch of blocks as Dask tasks, of which a bounded number is in flight.
 
-A task writes its blocks itself and returns receipts, which the client takes and lets go at once: no
-result stays on a worker that its death could lose.
+A task writes its blocks itself and returns receipts, which the client fetches and releases at once.
+No result stays on a worker, so none is lost if the worker dies.
 """
 
 from __future__ import annotations
@@ -37,34 +37,35 @@ if TYPE_CHECKING:
     from dask.typing import Key
     from distributed import Client, Future
 
-#: Seconds that a task should take: long beside the 3-9 ms that one costs, short beside a study.
+#: Intended time of a task [s]: long compared with its overhead of 3-9 ms, short compared with a
+#: study.
 TARGET_TASK_SECONDS = 2.0
 BLOCKS_PER_TASK_MAX = 1000
 
-#: Tasks that a scheduler is given in a second: a third of what it can take. On more than 200
-#: worker threads tasks are longer for it.
+#: Largest rate of tasks [1/s], a third of what a scheduler can handle. With more than 200 worker
+#: threads tasks are longer to keep to it.
 TASKS_PER_SECOND_MAX = 100.0
 
-#: Seconds between looks at the workers that there are.
+#: Age at which the count of worker threads is updated [s].
 SLOT_COUNT_AGE_MAX = 2.0
 
-#: Seconds after which a worker that does not answer is silent; longer where its blocks are.
+#: Time without a response after which a worker is silent [s]; longer if its blocks take long.
 LEASE_SECONDS = 30.0
 
-#: Seconds in which a file server shows here what a worker has written: Linux's NFS keeps what it
-#: knows of a folder for as long.
+#: Largest time after which files that a worker has written are visible here [s]: NFS of Linux
+#: caches folders for as long.
 FILE_VISIBILITY_DELAY_MAX = 60.0
 
-#: Time without an answer after which a run is told to stall [s]; longer where tasks take longer.
+#: Time without a response after which a stall is reported [s]; longer if tasks take longer.
 STALL_SECONDS = 60.0
 
-#: Time in which the first answer of a run may be that late, as workers compile the model [s].
+#: Largest delay of the first response that is not a stall, as workers compile the model [s].
 COMPILATION_SECONDS_MAX = 600.0
 
-#: Times that a task should take after which a run is told to stall.
+#: Multiple of the expected time of a task after which a stall is reported.
 STALL_TASK_TIMES = 5.0
 
-#: Largest number of tasks, and of workers, that a summary of the state lists.
+#: Largest numbers of tasks and of workers that a summary of the state lists.
 TASKS_SHOWN_MAX, WORKERS_SHOWN_MAX = 5, 10
 
 SHARED_FOLDER_REMEDY = "workers have to see the store's folder, under the same path"
@@ -76,18 +77,21 @@ _logger = logging.getLogger("sweep.scheduler")
 
 @dataclass
 class ThroughputEstimator:
-    """Blocks that make a task of a sensible length, from the time of those that came back."""
+    """Estimator of the number of blocks per task, from the times of the blocks so far."""
 
     n_blocks: int = 0
     seconds: float = 0.0
 
     def update(self, task_result: TaskResult) -> None:
-        """Take in the measured times of an answer."""
+        """Add the times of a task's receipts."""
         self.n_blocks += len(task_result.receipts)
         self.seconds += sum(receipt.seconds for receipt in task_result.receipts)
 
     def blocks_per_task(self, n_blocks_left: int, n_slots: int) -> int:
-        """Blocks for the next task; fewer near the end, so that all workers end together."""
+        """Return the number of blocks for the next task.
+
+        Tasks become smaller near the end, so that all workers end together.
+        """
         if not self.n_blocks:
             return 1
         task_seconds = max(TARGET_TASK_SECONDS, n_slots / TASKS_PER_SECOND_MAX)
@@ -97,16 +101,16 @@ class ThroughputEstimator:
 
 @dataclass
 class WorkerSlots:
-    """Worker threads of a cluster, or those that may come, asked for anew every few seconds."""
+    """Number of worker threads of a cluster, updated every few seconds."""
 
     client: Client
     expected_slots: int = 0
     n_slots: int = 1
-    threads_by_worker: dict[str, int] = field(default_factory=dict)  # by address of the worker
+    threads_by_worker: dict[str, int] = field(default_factory=dict)  # by the worker's address
     counted_at: float = -1e9
 
     def current_count(self) -> int:
-        """Worker threads, at least 1."""
+        """Return the number of worker threads, at least 1."""
         if time.monotonic() - self.counted_at > SLOT_COUNT_AGE_MAX:
             self.threads_by_worker = dict(self.client.nthreads())
             self.n_slots = max(1, self.expected_slots, sum(self.threads_by_worker.values()))
@@ -116,21 +120,20 @@ class WorkerSlots:
 
 @dataclass(eq=False)
 class _InFlightTask:
-    """Blocks that are out: at one worker, and again at others where that one is silent."""
+    """Blocks that are sent to a worker, and to further workers if that one is silent."""
 
     blocks: list[int]
     futures: dict[Key, Future] = field(default_factory=dict)
-    last_sent_at: float = 0.0  # last
+    last_sent_at: float = 0.0  # by `time.monotonic` [s]
 
 
 class TaskDispatcher:
-    """Tasks in flight on a cluster.
+    """Sender of a study's blocks to the workers of a cluster.
 
-    A worker that can't open the store, can't write to it, or writes to another one is left out,
-    and its blocks go to the others. Blocks of a silent worker are computed by others too, once
-    these have nothing else to do; the first answer counts. ``seen`` tells whether what a
-    receipt is for is in the store here: by its size, or read and held to its digest, as the
-    first block of each worker is.
+    A worker that can't open the store, can't write to it, or writes to another one is excluded, and
+    its blocks go to the others. Blocks of a silent worker are also sent to others once these are
+    idle; the first result counts. ``verify_receipt`` tells whether the block of a receipt is in the
+    store as seen from here: by its size, or by its digest for the first block of each worker.
     """
 
     def __init__(
@@ -146,44 +149,44 @@ class TaskDispatcher:
         self._client, self._settings, self._block_queue = client, settings, block_queue
         self._verify_receipt, self._say = verify_receipt, say
         self._in_flight: dict[Key, _InFlightTask] = {}
-        self._superseded: dict[Key, Future] = {}  # out still, though another worker has answered
+        self._superseded: dict[Key, Future] = {}  # still running, but another worker has finished
         self._finished_futures: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._throughput, self._slots = ThroughputEstimator(), WorkerSlots(client, expected_slots)
         self._resend_counts: Counter[int] = (
             Counter()
-        )  # how often a task's first block was sent again
-        self._failing_worker: dict[int, str] = {}  # address of the worker by block
-        self._last_response: dict[str, float] = {}  # when a worker last answered
+        )  # number of times that a task was sent again, by its first block
+        self._failing_worker: dict[int, str] = {}  # address of the worker that failed, by block
+        self._last_response: dict[str, float] = {}  # time of the last response by worker
         self._duplicated_at = self._rechecked_at = time.monotonic()
         self._unverified_receipts: list[
             tuple[Receipt, str, float]
-        ] = []  # of which worker, looked for till when
+        ] = []  # receipt, address of its worker, and time until which its chunks may appear
         self._verified_workers: set[str] = (
             set()
-        )  # workers that have written to the store that is here
-        self._excluded_workers: dict[str, int] = {}  # workers that are left out, and their threads
-        self._last_progress_at = time.monotonic()  # when an answer last arrived
-        self._stall_patience = STALL_SECONDS  # time from then until the next word of it
-        self._has_reported_stall = False  # since then
+        )  # workers of which a block was found in the store, by its digest
+        self._excluded_workers: dict[str, int] = {}  # number of threads by excluded worker
+        self._last_progress_at = time.monotonic()  # time of the last response
+        self._stall_patience = STALL_SECONDS  # time after it until the next report [s]
+        self._has_reported_stall = False  # whether a stall was reported since the last response
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Answers as they arrive; an empty one every `IDLE_POLL_SECONDS` while none does.
+        """Yield results of tasks as they arrive; an empty one every `IDLE_POLL_SECONDS` meanwhile.
 
-        Once `is_stopping` says so nothing more is sent, and the iteration ends with what is
-        out, or at once where there is no worker to do it. SchedulerLostError where the scheduler
-        is gone; StoreError, OSError where no worker can write to the store.
+        Once `is_stopping` returns True no more tasks are sent. The iteration ends when those in
+        flight end, or at once if there is no worker. SchedulerLostError if the scheduler is gone;
+        StoreError or OSError if no worker can write to the store.
         """
         try:
             while True:
                 try:
                     self._submit_tasks(may_submit=not is_stopping())
-                except Exception as error:  # of a client that is closed, of any kind
+                except Exception as error:  # a closed client raises errors of any kind
                     self._check_connection()
                     if isinstance(error, OSError | CancelledError | RuntimeError):
                         raise SchedulerLostError(str(error)) from error
                     raise
                 if is_stopping() and not (self._in_flight and self._usable_workers()):
-                    return  # nothing that is out will ever come
+                    return  # no task in flight will end
                 if not (self._in_flight or self._unverified_receipts or self._all_workers_excluded):
                     return
                 task_result = self._next_result()
@@ -225,10 +228,10 @@ class TaskDispatcher:
         return "\n".join(lines)
 
     def _report_stall(self) -> None:
-        """Tell that nothing comes back, after ever longer times, and log what is out where."""
+        """Report that no result arrives, at increasing intervals, and log the state of the run."""
         if (
             not self._in_flight or not self._usable_workers()
-        ):  # that no worker is there is told by others
+        ):  # the session reports a lack of workers
             self._last_progress_at = time.monotonic()
         seconds_waited = time.monotonic() - self._last_progress_at
         if seconds_waited < self._stall_patience:
@@ -248,7 +251,7 @@ class TaskDispatcher:
         self._say(f"{stall_text}:\n{textwrap.indent(summary, '  ')}" if is_first else stall_text)
 
     def _usable_workers(self) -> list[str]:
-        """Workers that there are, but for those that are left out."""
+        """Return the addresses of connected workers that are not excluded."""
         return [
             worker
             for worker in self._slots.threads_by_worker
@@ -257,7 +260,7 @@ class TaskDispatcher:
 
     @property
     def _all_workers_excluded(self) -> bool:
-        """Tell whether all workers so far are left out, and others are still to come."""
+        """True if all workers so far are excluded, and further ones may still connect."""
         return bool(self._excluded_workers) and not self._usable_workers()
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
@@ -276,12 +279,15 @@ class TaskDispatcher:
             self._submit(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
 
     def _failed_block_in_flight(self) -> bool:
-        """Tell whether a block that failed before is out: two could blame each other's deed."""
+        """Return True if a block that failed before is in flight.
+
+        Two such blocks at once could each be blamed for the error of the other.
+        """
         failed = self._block_queue.failed
         return bool(failed) and any(task.blocks[0] in failed for task in self._in_flight.values())
 
     def _placement_kwargs(self, block: int) -> dict[str, Any]:
-        """Workers to send a block to: not where it failed before, if there is anywhere else."""
+        """Return arguments of `Client.submit` that keep a block off the worker where it failed."""
         failing_worker = self._failing_worker.get(block)
         others = [worker for worker in self._usable_workers() if worker != failing_worker]
         if failing_worker and others:
@@ -306,13 +312,13 @@ class TaskDispatcher:
         future.add_done_callback(self._finished_futures.put)
 
     def _duplicate_stragglers(self) -> None:
-        """Send what silent workers hold to others as well, where these have nothing to do."""
+        """Send the tasks of silent workers to idle workers as well."""
         now = time.monotonic()
         overdue = [
             task
             for task in set(self._in_flight.values())
             if now - task.last_sent_at > self._lease_seconds(task)
-            and not any(future.done() for future in task.futures.values())  # yet to be looked at
+            and not any(future.done() for future in task.futures.values())  # yet to be collected
         ]
         if not overdue:
             return
@@ -350,11 +356,11 @@ class TaskDispatcher:
             self._submit(task, workers=idle_workers)
 
     def _lease_seconds(self, task: _InFlightTask) -> float:
-        """Seconds after which a task may be sent again; longer each time."""
+        """Return the time after which a task may be sent again [s]; it doubles each time."""
         return max(LEASE_SECONDS, 5 * self._task_seconds(task)) * 2.0 ** (len(task.futures) - 1)
 
     def _task_seconds(self, task: _InFlightTask) -> float:
-        """Time that a task should take by the pace of those before [s]."""
+        """Return the expected time of a task, from the blocks so far [s]."""
         throughput = self._throughput
         return (
             len(task.blocks) * throughput.seconds / throughput.n_blocks
@@ -381,7 +387,7 @@ class TaskDispatcher:
         for key in task.futures:
             del self._in_flight[key]
         for key in takewhile(lambda key: key != future.key, task.futures):
-            self._superseded[key] = task.futures[key]  # so that its worker does not look idle
+            self._superseded[key] = task.futures[key]  # kept, so that its worker counts as busy
         task_result = _collect_task_result(future, task.blocks)
         self._last_response[task_result.worker_address] = self._last_progress_at = time.monotonic()
         self._throughput.update(task_result)
@@ -408,12 +414,15 @@ class TaskDispatcher:
         return task_result
 
     def _requeue(self, blocks: list[int]) -> None:
-        """Put blocks back that are begun, or to be sent again by no fault of theirs."""
+        """Put blocks back that are unfinished, or whose task was lost without their fault."""
         self._block_queue.requeue(blocks)
         self._resend_counts.update(blocks)
 
     def _verify_receipts(self, task_result: TaskResult) -> None:
-        """Leave the receipts of what is in the store here, which may show some seconds late."""
+        """Keep only receipts whose blocks are visible in the store; check the others again later.
+
+        A block that does not appear in time is sent again, and its worker is excluded.
+        """
         now = time.monotonic()
         pending = [
             (receipt, task_result.worker_address, now + FILE_VISIBILITY_DELAY_MAX)
@@ -434,7 +443,10 @@ class TaskDispatcher:
                 self._exclude_worker(worker, receipt.host, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
 
     def _exclude_worker(self, worker: str, host: str, error: Exception) -> None:
-        """Send nothing more to a worker; raise why where no other is left, or may come."""
+        """Send no more tasks to a worker. Raise the error if no other worker is left.
+
+        Workers that may still connect count as left.
+        """
         if worker in self._excluded_workers:
             return
         self._excluded_workers[worker] = self._slots.threads_by_worker.get(worker, 1)
@@ -442,7 +454,7 @@ class TaskDispatcher:
             self._all_workers_excluded
             and sum(self._excluded_workers.values()) >= self._slots.expected_slots
         ):
-            if isinstance(error, NotAStoreError):  # the driver has it
+            if isinstance(error, NotAStoreError):  # the driver itself sees the store
                 raise StoreError(
                     f"no worker is left: {worker} on {host}: {error}; {SHARED_FOLDER_REMEDY}"
                 )
@@ -455,16 +467,16 @@ class TaskDispatcher:
 
 
 def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
-    """Answer of a task that is over; an empty one where its worker died with it."""
+    """Return the result of a task that has ended; an empty one if its worker died with it."""
     error: BaseException | None = None
     if future.status == "finished":
         try:
             return future.result(timeout=LEASE_SECONDS)
         except TimeoutError:
-            pass  # lost, as below, and not computed again in that time
+            pass  # the result is lost, as below, and was not computed again in that time
         except (CancelledError, OSError) as connection_error:
             raise SchedulerLostError(str(connection_error)) from connection_error
-        except Exception as task_error:  # gone with its worker, computed again, and that failed
+        except Exception as task_error:  # lost with its worker, computed again, and then failed
             error = task_error
     elif future.status == "error":
         error = future.exception()
@@ -474,7 +486,7 @@ def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
 
 
 def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
-    """Answer of a task that raised or killed its workers: any of its blocks may be to blame."""
+    """Return the result of a task that raised or killed its workers: a failure of every block."""
     from distributed.scheduler import KilledWorker
 
     failures = [make_failure(block, error) for block in blocks]
@@ -491,7 +503,7 @@ def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
 def task_key(
     settings: TaskSettings, blocks: list[int], is_retry: bool, resend_count: int = 0
 ) -> str:
-    """Key of a task: the same work for the same store is the same task, whoever asks."""
+    """Return the Dask key of a task: equal for the same blocks of the same store in any process."""
     identity = repr(
         (settings.store_path, settings.study_id, blocks, is_retry, resend_count)
     ).encode()

@@ -22,28 +22,28 @@ from typing import Any
 from sweep.messages import EXIT_INCOMPLETE, STORE_PLACEHOLDER, is_run_as_command, suggestion
 from sweep.tasks.engine.progress import Progress
 
-#: Signals that end a run once its running blocks are done; the second one ends it at once.
+#: Signals that end a run after its running blocks; a second one ends it at once.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-#: Signal of a terminal that is closed, which comes several times; there is none on some systems.
+#: Signal of a closed terminal, which may arrive several times; None on systems without it.
 HANGUP_SIGNAL = getattr(signal, "SIGHUP", None)
 
-#: Time that the main thread has to take a signal [s].
+#: Time in which the main thread must handle a signal [s].
 REACTION_SECONDS_MAX = 2.0
 
-#: Time after SIGTERM that running blocks have to end [s]; batch systems mostly kill after 30 s.
+#: Time after SIGTERM in which running blocks must end [s]; batch systems mostly kill after 30 s.
 TERMINATION_SECONDS_MAX = 15.0
 
-#: Time between looks at whether it has taken one [s].
+#: Interval at which the watcher checks whether a signal was handled [s].
 HANDLED_POLL_SECONDS = 0.1
 
-#: Time that the last words of a process may take, as to a terminal that is stopped [s].
+#: Time limit of the last message of a process, for example to a stopped terminal [s].
 LAST_WORDS_SECONDS_MAX = 1.0
 
-#: Bytes of signals that are read at once.
+#: Largest number of signals that are read at once, one byte each.
 _SIGNAL_BYTES_MAX = 4096
 
-#: Byte that wakes the watcher, which is no signal.
+#: Byte that wakes the watcher and is no signal.
 _WAKE_BYTE = b"\0"
 
 
@@ -63,18 +63,16 @@ class InterruptHandler:
 
     def __init__(self, listener: Progress | None = None) -> None:
         self.is_stopping = False
-        self.is_computing = False  # workers start or blocks run: stopped, only these are lost
-        self._deadline: float | None = None  # time at which the process has to end
+        self.is_computing = False  # True while workers start or blocks run
+        self._deadline: float | None = None  # time at which the process must end
         self._listener = listener or Progress()
         self._previous_handlers: dict[signal.Signals, Any] = {}
         self._announce_lock = threading.Lock()
         self._is_announced = False
         self._is_over = threading.Event()
         self._watcher: threading.Thread | None = None
-        self._wakeup_receiver: socket.socket | None = (
-            None  # bytes of signals, until they are handled
-        )
-        self._wakeup_sender: socket.socket | None = None  # where the system puts them
+        self._wakeup_receiver: socket.socket | None = None  # receives the bytes of signals
+        self._wakeup_sender: socket.socket | None = None  # the system sends the bytes here
 
     def __enter__(self) -> InterruptHandler:
         if threading.current_thread() is threading.main_thread():
@@ -123,7 +121,7 @@ class InterruptHandler:
             with suppress(OSError):
                 self._wakeup_sender.send(_WAKE_BYTE)
 
-    # The watcher
+    # Methods of the watcher thread
 
     def _watch_signals(self) -> None:
         """Start the watcher thread, unless an event loop of the caller already receives signals."""
@@ -131,7 +129,7 @@ class InterruptHandler:
         receiver.setblocking(False)
         sender.setblocking(False)
         previous_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-        if previous_descriptor != -1:  # an event loop of the caller's waits for signals there
+        if previous_descriptor != -1:  # an event loop of the caller receives signals there
             signal.set_wakeup_fd(previous_descriptor)
             receiver.close()
             sender.close()
@@ -142,7 +140,7 @@ class InterruptHandler:
         self._watcher.start()
 
     def _watch(self, receiver: socket.socket) -> None:
-        selector = selectors.DefaultSelector()  # which takes descriptors above 1023, too
+        selector = selectors.DefaultSelector()  # also accepts descriptors above 1023
         selector.register(receiver, selectors.EVENT_READ)
         with selector:
             self._watch_receiver(receiver, selector)
@@ -206,7 +204,7 @@ class InterruptHandler:
             self._exit_process(EXIT_INCOMPLETE if is_run_as_command() else 128 + signal.SIGTERM)
         elif is_asked_again and is_run_as_command():
             self._exit_process(EXIT_INCOMPLETE)
-        elif is_asked_again:  # ending a program of the user's is not ours to do
+        elif is_asked_again:  # a program of the user's is not ended
             self._listener.say("compiled code runs: stopping as soon as it returns")
         else:
             self.print_stopping()

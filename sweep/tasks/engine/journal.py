@@ -1,17 +1,17 @@
-"""The journal of what is committed: one JSON line a block, written after its chunks.
+"""Journal of a store: logs of committed blocks, recipe, checkpoints and lock, in `.sweep`.
 
-A block is done when its receipt is in the log and its objects are in the store; what is not done is
-computed again, to the same bytes. The log is only appended to, by the one driver that holds the
-store's lock. A receipt whose chunks were later found damaged is withdrawn by a further line; a line
-that does not match its own digest counts for nothing.
+A block is done when its receipt, one JSON line, is in the log and its chunks are in the store. All
+other blocks are computed again, to the same bytes. Only the driver that holds the store's lock
+appends to the log. A further line withdraws a receipt whose chunks are found damaged. A line that
+does not match its digest is ignored.
 
-The recipe is what a store's own bytes do not say: where its study's files are, and which store it
-extends.
+The recipe records what the store's other files do not contain: the folder of the study's files, and
+the store that this one extends.
 
-Blocks that take long are computed in pieces. A worker draws for some seconds and saves what it has
-in a file of the journal, with a digest; whoever takes up the block next goes on from there.
+Blocks that take long are computed in pieces. A worker computes for some seconds and saves the
+results so far as a checkpoint, a file with a digest. The next worker continues from it.
 
-The lock says which driver writes to the store, and whether it still lives.
+The lock names the driver that writes to the store. Its heartbeat shows that this driver still runs.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from sweep.storage.store_format import (
     read_receipt_totals,
     verified_body,
 )
-from sweep.tasks.engine.blocks import BlockStudy, PartialResults, ReusedResults
+from sweep.tasks.engine.block_study import BlockStudy, PartialResults, ReusedResults
 from sweep.tasks.engine.progress import BusyError, StoreError, raise_as_store_error
 
 FAILURE_LOG = "failures.jsonl"
@@ -77,38 +77,38 @@ LOG_NAMES = (RECEIPTS_FILE, FAILURE_LOG, SESSION_LOG)
 
 RECIPE_FILE = "recipe.json"
 
-#: The place of the store that points are taken from, while this one is extended from it.
+#: Key of the path of the store that this one extends, and takes results from.
 EXTENDS_KEY = "extends"
 
-#: Digests of the modules of the user's that it was begun with.
+#: Key of the digests of the user's modules at the start of the first run.
 USER_CODE_KEY = "code"
 
-#: Id of the study whose store this one is to take the place of; empty where there is none.
+#: Key of the id of the study whose store this one will replace; its value is '' without one.
 REPLACES_KEY = "replaces"
 
-#: Folders on disk that are listed at once: on a file server each is mostly waiting.
+#: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
 LISTING_THREADS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
-    """Note of a worker on a block that it has written."""
+    """Record of a block that a worker has written."""
 
     block: int
     points: int
-    bytes: int  # as stored
-    digest: str  # of the bytes stored, `opening.digest`
-    seconds: float  # evaluating and writing
+    bytes: int  # size as stored
+    digest: str  # digest of the stored bytes, by `store_format.contents_digest`
+    seconds: float  # time of evaluating and writing [s]
     write_seconds: float
     host: str
     pid: int
     versions: dict[str, str]
-    taken: int = 0  # of its points, those that a smaller study's store had
+    taken: int = 0  # number of points taken from the store of a smaller study
 
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """Error of a block, and where it was met."""
+    """Record of a block's error, and of the process in which it occurred."""
 
     block: int
     error: str
@@ -118,10 +118,9 @@ class Failure:
 
 
 class Journal:
-    """Logs of a store, to append to; on opening, lines that are damaged or cut short are dropped.
+    """Writer of a store's logs. Opening removes damaged and incomplete lines.
 
-    The caller holds the store's lock. A receipt of a `durable` one is on the disk once
-    committed.
+    The caller holds the store's lock. If `durable`, a receipt is on the disk once it is committed.
     """
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
@@ -131,62 +130,65 @@ class Journal:
             log.remove_damaged_lines(lambda line: verified_body(line) is not None)
 
     def commit(self, *receipts: Receipt) -> None:
-        """Append receipts: their blocks are done; in an object store from the next `flush` on."""
+        """Append receipts, which marks their blocks as done.
+
+        In an object store they are done after the next `flush`.
+        """
         commit_time = round(time.time(), 3)
         self._append(
             RECEIPTS_FILE, *({**asdict(receipt), "time": commit_time} for receipt in receipts)
         )
 
     def withdraw(self, block: int, reason: str) -> None:
-        """Take back the receipt of a block: from here on it is to be computed again."""
+        """Withdraw the receipt of a block, so that the block is computed again."""
         self._append(
             RECEIPTS_FILE, {"block": block, "withdrawn": reason, "time": round(time.time(), 3)}
         )
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write what was gathered, if it is time to; True where nothing is left to write."""
+        """Write pending lines if it is time to, or if `force`. Return True if none is left."""
         is_flushed = [log.flush(force=force) for log in self._logs.values()]
         return all(is_flushed)
 
     def record_failure(self, failure: Failure) -> None:
-        """Append the error of a block that was given up."""
+        """Append the error of a block that is permanently failed."""
         self._append(FAILURE_LOG, asdict(failure))
 
     def record_run_event(self, event: str, **details: Any) -> None:
-        """Append what happened to a run: begun, ended, by whom and when; all else is written."""
+        """Append an event of the run, such as its begin or end, and write all pending lines."""
         utc = datetime.now(UTC).isoformat(timespec="seconds")
         self._append(SESSION_LOG, {"event": event, "time": time.time(), "utc": utc, **details})
         self.flush(force=True)
 
     def _append(self, log_name: str, *records: dict[str, Any]) -> None:
-        """Append lines, whole or not at all; OSError where they can't be written."""
+        """Append lines, all or none; OSError if they can't be written."""
         if records:
             self._logs[log_name].append(b"".join(map(encode_record, records)))
 
 
 def committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
-    """Digests of the blocks that were committed, (blocks,) of bytes, empty where there is none."""
+    """Return the digest of each block from its receipt, (blocks,) of bytes; empty without one."""
     digest_by_block = np.zeros(n_blocks, dtype="S32")
     for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
         if 0 <= record["block"] < n_blocks:
             digest_by_block[record["block"]] = record.get(
                 "digest", ""
-            )  # none in a line that withdraws
+            )  # a line that withdraws a receipt has no digest
     return digest_by_block
 
 
 def blocks_with_receipt(store_path: Location, study: BlockStudy) -> np.ndarray:
-    """Blocks with a receipt, (blocks,) bool, whose chunks need not be there."""
+    """Return a mask (blocks,) of blocks with a receipt, whether their chunks exist or not."""
     return read_receipt_totals(store_path, study.n_blocks).points_by_block > 0
 
 
 def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
-    """Blocks that are done, (blocks,) bool: with a receipt, and every object in the store."""
+    """Return a mask (blocks,) of done blocks: with a receipt, and all chunks in the store."""
     return scan_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
 
 
 def permanently_failed(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
-    """Last failure of each block that was given up and never done since."""
+    """Return the last failure of each block that failed for good and was not done since."""
     last_failures = {
         record["block"]: record for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG)
     }
@@ -197,19 +199,19 @@ def permanently_failed(store_path: Location, n_blocks: int) -> dict[int, dict[st
 
 
 def last_run_start(store_path: Location) -> float:
-    """Time at which the last run began [s since the epoch]; infinite where there was none."""
+    """Return the time at which the last run began [s since the epoch]; inf if there was none."""
     runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG)
     start_times = [run["time"] for run in runs if run.get("event") == "begun"]
     return float(start_times[-1]) if start_times else np.inf
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
-    """Put down where a study's files are, in one step."""
+    """Write the recipe in one step."""
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
 
 
 def read_recipe(store_path: Location) -> dict[str, Any]:
-    """Facts that were put down; empty where nothing was, or where it is damaged."""
+    """Return the recipe; empty if it is missing or damaged."""
     records = [
         record for _, record in iter_lines_and_records(store_path / JOURNAL_DIR / RECIPE_FILE)
     ]
@@ -217,7 +219,7 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
 
 
 def remove_recipe_predecessors(store_path: Path) -> None:
-    """Take away which store a study's extends and replaces."""
+    """Remove from the recipe which store this one extends, and which it replaces."""
     facts = read_recipe(store_path)
     for name in (EXTENDS_KEY, REPLACES_KEY):
         facts.pop(name, None)
@@ -228,7 +230,7 @@ def remove_recipe_predecessors(store_path: Path) -> None:
 
 
 def refuse_damaged_recipe(store_path: Location) -> None:
-    """Refuse a store that no longer says where the files of its study are."""
+    """Raise a StoreError if the recipe is damaged."""
     recipe_path = store_path / JOURNAL_DIR / RECIPE_FILE
     if any(record is None for _, record in iter_lines_and_records(recipe_path)):
         raise StoreError(
@@ -238,7 +240,10 @@ def refuse_damaged_recipe(store_path: Location) -> None:
 
 
 class ChunkScan:
-    """A look at the chunks of blocks that are marked, (blocks,) bool, begun as it is made."""
+    """Concurrent search for missing chunks of candidate blocks; begins on construction.
+
+    `candidates` is a mask (blocks,) of bool.
+    """
 
     def __init__(self, store_path: Location, study: BlockStudy, candidates: np.ndarray) -> None:
         self._candidates, self._is_stopped = candidates.copy(), False
@@ -248,7 +253,7 @@ class ChunkScan:
         self._executor = ThreadPoolExecutor(n_threads, thread_name_prefix="look")
 
         def blocks_lacking_chunk(array_name: str, owner_blocks: np.ndarray) -> np.ndarray:
-            """Blocks that lack their chunk of an array."""
+            """Return the candidate blocks whose chunk of an array is missing."""
             if self._is_stopped:
                 return np.empty(0, np.int64)
             is_present = existing_chunks(store_path / array_name / "c", owner_blocks.shape)
@@ -261,11 +266,14 @@ class ChunkScan:
         ]
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Tell whether the look is over, waited for no longer than that."""
+        """Wait for the scan, for at most `timeout` [s]. Return True if it has ended."""
         return not wait(self._array_scans, timeout).not_done
 
     def complete_blocks(self) -> np.ndarray:
-        """Blocks that lack nothing as far as was looked, (blocks,) bool; OSError if unreadable."""
+        """Return a mask (blocks,) of candidates without a missing chunk in arrays scanned so far.
+
+        OSError if the store can't be read.
+        """
         is_complete = self._candidates.copy()
         for scan in self._array_scans:
             if scan.done():
@@ -273,7 +281,7 @@ class ChunkScan:
         return is_complete
 
     def stop(self) -> None:
-        """Look no further."""
+        """Stop the scan."""
         self._is_stopped = True
         self._executor.shutdown(wait=False)
 
@@ -281,7 +289,7 @@ class ChunkScan:
 def scan_complete_blocks(
     store_path: Location, study: BlockStudy, candidates: np.ndarray
 ) -> np.ndarray:
-    """Blocks, among some, that have every object in the store, and bytes in it, (blocks,) bool."""
+    """Return a mask (blocks,) of the candidates of which every chunk exists and is not empty."""
     scan = ChunkScan(store_path, study, candidates)
     try:
         scan.wait()
@@ -291,7 +299,7 @@ def scan_complete_blocks(
 
 
 def existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
-    """Chunks of an array that are there and hold something, bool in the shape of its grid."""
+    """Return a mask, in the shape of an array's grid of chunks, of chunks that are not empty."""
     is_present = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
         for position, size in _iter_chunk_keys(folder, shape):
@@ -305,7 +313,7 @@ def existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _is_nonempty_file(status: os.stat_result) -> bool:
-    """Tell whether a path is a file with something in it, and no directory."""
+    """Return True for a regular file that is not empty."""
     return stat.S_ISREG(status.st_mode) and status.st_size > 0
 
 
@@ -326,9 +334,12 @@ def _iter_chunk_keys(
 def _mark_existing_chunks(
     folder_or_name: Path | str, is_present: np.ndarray, parent_descriptor: int | None = None
 ) -> None:
-    """Note the chunks in a folder and below, (positions,) bool; it is in an open one."""
+    """Mark the existing chunks below a folder in `is_present`, in the shape of the grid of chunks.
+
+    `parent_descriptor` is an open folder in which a folder is given by name.
+    """
     try:
-        # no links: what they lead to is no part of the store
+        # links are not followed: their targets are no part of the store
         descriptor = os.open(
             folder_or_name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=parent_descriptor
         )
@@ -348,24 +359,24 @@ def _mark_existing_chunks(
         os.close(descriptor)
 
 
-#: Beginning of the names of files in the journal, each of one block.
+#: Prefix of the names of checkpoints; the number of the block follows.
 CHECKPOINT_PREFIX = "begun-"
 
 
 class Checkpoint(NamedTuple):
-    """The saved part of a block."""
+    """Saved part of a block that is not complete."""
 
     results: ReusedResults = ReusedResults()
-    points: float = 0.0  # that this comes to; a point that is drawn in part counts in part
-    seconds: float = 0.0  # spent on it
+    points: float = 0.0  # number of points done; a point that is computed in part counts in part
+    seconds: float = 0.0  # time spent so far [s]
 
 
 def write_checkpoint(
     store_path: Location, study_id: str, block: int, checkpoint: Checkpoint
 ) -> None:
-    """Save what there is of a block, in the place of less; OSError where it can't be written."""
+    """Save a checkpoint, unless one with as many points exists; OSError if it can't be written."""
     if read_checkpoint(store_path, study_id, block).points >= checkpoint.points:
-        return  # another worker, that was thought to be lost, was quicker
+        return  # written by another worker, which was believed to be lost
     buffer = io.BytesIO()
     np.savez(buffer, **dict(_checkpoint_arrays(checkpoint.results)))
     content = buffer.getvalue()
@@ -380,7 +391,7 @@ def write_checkpoint(
 
 
 def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoint:
-    """Return the saved part of a block of a study."""
+    """Return the checkpoint of a block of a study; an empty one if none is usable."""
     try:
         file_content = read_object(
             store_path, f"{JOURNAL_DIR}/{CHECKPOINT_PREFIX}{block}", ARRAY_FILE_BYTES_MAX
@@ -398,7 +409,7 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
         for key, values in _iter_npz_arrays(content):
             part, _, name = key.partition("/")
             arrays_by_part[part][name] = values
-    except (ValueError, KeyError, zipfile.BadZipFile):  # a stranger's, with a digest of its own
+    except (ValueError, KeyError, zipfile.BadZipFile):  # not made by this program
         return Checkpoint()
     results = ReusedResults(
         **{
@@ -410,7 +421,7 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
 
 
 def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays that `numpy.savez` packed, by name; ValueError where they are of other sizes."""
+    """Yield the arrays of a `numpy.savez` archive by name; ValueError if a size is wrong."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED or member.file_size > len(content):
@@ -422,7 +433,7 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
                 (2, 0): np.lib.format.read_array_header_2_0,
             }[version]
             shape, _, dtype = read_header(member_file)
-            # before numpy makes room for what the header declares
+            # checked before numpy allocates what the header declares
             if math.prod(shape) * dtype.itemsize != member.file_size - member_file.tell():
                 raise ValueError("its header declares another size")
             member_file.seek(0)
@@ -430,7 +441,7 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
-    """Points that there are, in part, of blocks that are begun."""
+    """Return the number of points done in the checkpoint of each unfinished block."""
     block_names = [
         file.name.removeprefix(CHECKPOINT_PREFIX)
         for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}*")
@@ -446,7 +457,7 @@ def checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
 
 
 def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
-    """Remove what there is of a block, or of all."""
+    """Remove the checkpoint of one block, or of all blocks."""
     for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}{block}"):
         file.unlink(missing_ok=True)
 
@@ -469,21 +480,21 @@ def _content_digest(content: bytes) -> str:
 
 LOCK_FILE = "lock"
 
-#: Tries at a lock in an object store that others try for, too.
+#: Largest number of attempts to acquire a lock in an object store against other processes.
 LOCK_ATTEMPTS_MAX = 5
 
-#: Seconds between heartbeats, and how old one may be before a holder on another host is doubted.
+#: Time between heartbeats [s], and age beyond which a holder on another host may be dead [s].
 HEARTBEAT_INTERVAL = 10.0
 HEARTBEAT_AGE_MAX = 120.0
 
-#: Seconds for which the heartbeat of such a holder is watched before it is held for dead. Its age
-#: alone may come from a clock that was set; that it does not change can't.
+#: Time for which an old heartbeat is watched before its holder counts as dead [s]. A clock that was
+#: set can make a heartbeat look old, but can't stop it from changing.
 SILENCE_WATCH_SECONDS = 35.0
 
-#: Bytes of a lock at most.
+#: Largest size of a lock file [bytes].
 LOCK_BYTES_MAX = 1 << 16
 
-#: Errors of file systems that have no flock (Lustre without it, some NFS), or no hard links (FUSE,
+#: Errors of file systems without flock (Lustre without it, some NFS), or without hard links (FUSE,
 #: SMB, exFAT; a file system of several disks may say that the link leads to another one).
 FLOCK_UNSUPPORTED_ERRNOS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 HARD_LINK_UNSUPPORTED_ERRNOS = {
@@ -496,25 +507,25 @@ HARD_LINK_UNSUPPORTED_ERRNOS = {
 }
 
 _released_tokens: set[str] = set()
-"""Tokens of locks that this process has given up, which a store out of reach may not know."""
+"""Tokens of locks that this process has released; an unreachable store may still hold them."""
 
 _issued_warnings: set[str] = set()
-"""Kinds of warnings about locks that this process has given: a study may have many locks."""
+"""Kinds of lock warnings that this process has given; a study may have many locks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder:
-    """Holder of a lock."""
+    """Process that holds a lock."""
 
     host: str = "unknown"
     pid: int = 0
-    start: int = 0  # of the process, as `process_start_id` has it: a number is used again
+    start: int = 0  # `process_start_id` of the process, as process numbers are reused
     token: str = ""
-    machine: str = ""  # hosts of one name may be many, where a store is seen from everywhere
+    machine: str = ""  # boot id and namespace, as several hosts may have the same name
 
     @classmethod
     def of_this_process(cls) -> LockHolder:
-        """Return the running process, with a token of its own."""
+        """Return this process as a holder, with a new token."""
         pid = os.getpid()
         return cls(
             host=socket.gethostname(),
@@ -526,13 +537,13 @@ class LockHolder:
 
     @property
     def is_on_this_machine(self) -> bool:
-        """Tell whether its process is one of this machine, if it still runs."""
+        """True if the holder is a process of this machine, running or not."""
         return self.host == socket.gethostname() and self.machine in ("", _machine_id())
 
 
 @cache
 def _machine_id() -> str:
-    """Boot and namespace in which a process number has a meaning."""
+    """Return the boot and the namespace within which process numbers are unique; '' if unknown."""
     try:
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         return f"{boot_id} {os.readlink('/proc/self/ns/pid')}"
@@ -541,13 +552,13 @@ def _machine_id() -> str:
 
 
 def read_lock_holder(store_path: Location) -> LockHolder | None:
-    """Holder of the lock of a store, living or dead; None where nobody does."""
+    """Return the holder of a store's lock, alive or dead; None if the store is not locked."""
     holder_json = _lock_of_store(store_path).read_holder_json()
     return None if holder_json is None else _parse_lock_holder(holder_json)
 
 
 def _parse_lock_holder(holder_json: str) -> LockHolder:
-    """Holder that a lock names; one that is damaged, or of another version, as far as it does."""
+    """Return the holder from the JSON of a lock; damaged or unknown fields have their defaults."""
     try:
         record = parse_json(holder_json)
     except ValueError:
@@ -562,14 +573,14 @@ def _parse_lock_holder(holder_json: str) -> LockHolder:
 
 
 def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
-    """Tell whether the holder of a lock runs: its process here, its heartbeat elsewhere."""
+    """Return True if a holder runs: by its process on this machine, by its heartbeat elsewhere."""
     if (is_running := _is_running_here(holder)) is not None:
         return is_running
     return heartbeat_age(store_path) < HEARTBEAT_AGE_MAX
 
 
 def _is_running_here(holder: LockHolder) -> bool | None:
-    """Tell whether a holder of this machine runs; None of others, and where it can't be seen."""
+    """Return whether a holder of this machine runs; None if it is elsewhere or can't be seen."""
     if not (holder.is_on_this_machine and holder.start):
         return None
     current_start = process_start_id(holder.pid)
@@ -577,7 +588,7 @@ def _is_running_here(holder: LockHolder) -> bool | None:
 
 
 def heartbeat_age(store_path: Location) -> float:
-    """Age of a lock's last heartbeat [s], by the file system's clock; infinite without one."""
+    """Return the age of a lock's last heartbeat by the file system's clock [s]; inf without one."""
     lock_path = store_path / JOURNAL_DIR / LOCK_FILE
     probe = lock_path.with_name(f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     file_system_time: float | None = None
@@ -585,7 +596,7 @@ def heartbeat_age(store_path: Location) -> float:
         probe.write_bytes(b"clock")
         file_system_time = _modification_time(probe)
     except OSError:
-        pass  # a reader of a store that it can't write to
+        pass  # this process may only read the store
     finally:
         with suppress(OSError):
             probe.unlink()
@@ -607,21 +618,21 @@ def _modification_time(path: Location) -> float | None:
 
 
 class _FileLock:
-    """A lock as a file."""
+    """Lock as a file on disk."""
 
     def __init__(self, lock_path: Path) -> None:
         self._lock_path = lock_path
 
     def read_holder_json(self) -> str | None:
-        """Text of its holder; None where nobody holds it."""
+        """Return the JSON text of the holder; None if the lock is free."""
         return _read_lock_file(self._lock_path)
 
     def heartbeat_mark(self) -> object:
-        """Mark of the last heartbeat, another one after each."""
+        """Return a value that changes with every heartbeat; None if the lock is free."""
         try:
             descriptor = open_regular(
                 self._lock_path, follow_links=False
-            )  # opened: a file server is asked anew
+            )  # opening makes a file server return the current status
         except FileNotFoundError:
             return None
         try:
@@ -633,22 +644,26 @@ class _FileLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Take it, unless `check_holder`, asked while no other process judges, raises."""
+        """Acquire the lock for a holder, after removing that of a dead one.
+
+        `check_holder` raises if the present holder lives. On file systems with flock no other
+        process acquires the lock meanwhile. BusyError if another process was quicker.
+        """
         self._lock_path.parent.mkdir(exist_ok=True)
-        with self._acquisition_guard(say):  # one process at a time judges and takes
+        with self._acquisition_guard(say):  # one process at a time checks and acquires
             stale_json = self.read_holder_json()
             check_holder()
             self._remove_stale(stale_json)
             new_lock_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
             atomic_write(
                 new_lock_path, holder_json.encode()
-            )  # an empty lock, after a power cut, would look alive
+            )  # on the disk first: an empty lock after a power failure would count as alive
             try:
                 self._create_lock_file(new_lock_path, holder_json, say)
             except FileExistsError:
                 if (
                     self.read_holder_json() != holder_json
-                ):  # a file server may have done it, and lost its answer
+                ):  # a file server may have made the link, and lost its response
                     raise BusyError(
                         f"another process was quicker to lock {self._lock_path}"
                     ) from None
@@ -657,7 +672,7 @@ class _FileLock:
 
     @contextmanager
     def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Keep others from judging, where the file system has such locks."""
+        """Exclude other processes that acquire the lock, if the file system has flock."""
         guard_path = self._lock_path.with_name("lock.guard")
         open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         guard_descriptor = os.open(guard_path, open_flags, 0o666)
@@ -680,13 +695,13 @@ class _FileLock:
             os.close(guard_descriptor)
 
     def _remove_stale(self, stale_json: str | None) -> None:
-        """Take the lock of a dead holder away, and no other, where nothing keeps others out."""
+        """Remove the lock of a dead holder, and put back any other that is there by now."""
         if stale_json is None:
             return
         aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
         with suppress(FileNotFoundError):
             os.rename(self._lock_path, aside_path)
-            if _read_lock_file(aside_path) != stale_json:  # somebody was quicker
+            if _read_lock_file(aside_path) != stale_json:  # another process was quicker
                 try:
                     os.link(aside_path, self._lock_path)
                 except OSError:
@@ -697,9 +712,9 @@ class _FileLock:
     def _create_lock_file(
         self, new_lock_path: Path, holder_json: str, say: Callable[[str], None]
     ) -> None:
-        """Put the lock in its place; FileExistsError where somebody was quicker."""
+        """Move a new lock file into place; FileExistsError if another process was quicker."""
         try:
-            os.link(new_lock_path, self._lock_path)  # fails where somebody was quicker, on NFS too
+            os.link(new_lock_path, self._lock_path)  # fails if the lock exists, on NFS too
             return
         except OSError as error:
             if error.errno not in HARD_LINK_UNSUPPORTED_ERRNOS:
@@ -718,15 +733,15 @@ class _FileLock:
                 file.flush()
                 os.fsync(descriptor)
         except OSError:
-            self._lock_path.unlink(missing_ok=True)  # part of a lock would look alive
+            self._lock_path.unlink(missing_ok=True)  # an incomplete lock would count as alive
             raise
 
     def send_heartbeat(self) -> None:
-        """Say that the holder lives."""
+        """Update the heartbeat of the lock."""
         os.utime(self._lock_path)
 
     def release(self) -> None:
-        """Give it up."""
+        """Release the lock."""
         self._lock_path.unlink(missing_ok=True)
 
 
@@ -740,14 +755,14 @@ def _read_lock_file(lock_path: Path) -> str | None:
 
 
 def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
-    """Give the first warning of a kind in this process."""
+    """Give a warning, unless one of the same kind was given in this process."""
     if kind not in _issued_warnings:
         _issued_warnings.add(kind)
         say(f"warning: {warning}")
 
 
 class _ObjectLock:
-    """A lock as an object, changed by conditional puts: its holder, and a count of heartbeats."""
+    """Lock as an object, changed by conditional puts: its holder, and a count of heartbeats."""
 
     def __init__(self, lock_path: ObjectPath) -> None:
         self._lock_path = lock_path
@@ -755,14 +770,15 @@ class _ObjectLock:
         self._tag: ObjectVersion | None = None
 
     def read_holder_json(self) -> str | None:
-        """Text of its holder; None where nobody holds it."""
+        """Return the JSON text of the holder; None if the lock is free."""
         tagged = self._read_tagged()
         return _first_line(tagged[0]) if tagged and tagged[0] else None
 
     def _read_tagged(self) -> tuple[bytes, ObjectVersion] | None:
-        """Return the lock and its tag, read once more if cut; ObjectStoreError if cut twice.
+        """Return the content of the lock and its version, read once more if it is incomplete.
 
-        Part of a lock would look like a stranger's.
+        An incomplete lock would look like that of another process. ObjectStoreError if it is
+        incomplete twice.
         """
         for _ in range(2):
             tagged = self._lock_path.read_with_version()
@@ -773,17 +789,17 @@ class _ObjectLock:
         return tagged
 
     def heartbeat_mark(self) -> object:
-        """Mark of the last heartbeat, another one after each."""
+        """Return a value that changes with every heartbeat; None if there is no lock."""
         tagged = self._read_tagged()
         return tagged and tagged[0]
 
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Take it, unless `check_holder` raises."""
+        """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
         for _ in range(LOCK_ATTEMPTS_MAX):
             tagged = self._read_tagged()
-            if tagged and _first_line(tagged[0]) == holder_json:  # put, though its answer was lost
+            if tagged and _first_line(tagged[0]) == holder_json:  # put, but the response was lost
                 self._holder_json, self._tag = holder_json, tagged[1]
                 return
             check_holder()
@@ -796,16 +812,16 @@ class _ObjectLock:
         raise ObjectStoreError(11, "others are quicker to lock it: try again", str(self._lock_path))
 
     def send_heartbeat(self) -> None:
-        """Say that the holder lives."""
+        """Update the heartbeat of the lock."""
         self._replace_content(f"{self._holder_json}\n{self._n_heartbeats + 1}\n")
         self._n_heartbeats += 1
 
     def release(self) -> None:
-        """Give it up."""
+        """Release the lock."""
         self._replace_content("")
 
     def _replace_content(self, content: str) -> None:
-        """Put something in the place of what was last put; of what is there, where that is ours."""
+        """Replace the content of the lock, if this process still holds it."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
             tagged = self._read_tagged()
@@ -825,9 +841,9 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait until the last heartbeat of a holder elsewhere is old, or another one comes.
+    """Wait until the last heartbeat of a holder elsewhere is too old, or a new one arrives.
 
-    So a job that is started again on another node, soon after it was killed, need not be refused.
+    A job that is restarted on another node soon after it was killed thus need not be refused.
     """
     other_holder, heartbeat_mark = (
         read_lock_holder(store_path),
@@ -851,7 +867,7 @@ def _stays_silent(
     watch_seconds: float,
     say: Callable[[str], None],
 ) -> bool:
-    """Watch a lock for some time by this process's own clock; tell whether it stayed as it was."""
+    """Watch a lock for some time by this process's clock. Return True if it did not change."""
     holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
     say(
         f"waiting up to {watch_seconds:.0f} s to see whether {holder_text}, "
@@ -866,10 +882,10 @@ def _stays_silent(
 
 
 class StoreLock:
-    """A store's lock, held and kept alive until released.
+    """Lock of a store, acquired on construction and kept alive until released.
 
-    BusyError where a living driver holds it, StoreError where the store can't be written. ``say``
-    is told what a user should know: by default it warns.
+    BusyError if a living driver holds it, StoreError if the store can't be written. ``say`` gets
+    messages for the user; by default they are warnings.
     """
 
     def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
@@ -887,7 +903,10 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of a holder elsewhere; return what its lock was, if it is silent."""
+        """Watch the heartbeat of a holder elsewhere. Return the state of its lock if it is silent.
+
+        None if there is no such holder; BusyError if it lives.
+        """
         other_holder, heartbeat_mark = (
             read_lock_holder(self._store_path),
             self._lock.heartbeat_mark(),
@@ -935,9 +954,9 @@ class StoreLock:
                 if self.is_held():
                     self._lock.send_heartbeat()
             except FileNotFoundError:
-                pass  # the store was taken away
+                pass  # the store was removed
             except OSError as error:
-                with suppress(Warning):  # that is to be an error: the next heartbeat may succeed
+                with suppress(Warning):  # even if warnings raise, the next heartbeat may succeed
                     _warn_once(
                         self._say,
                         "heartbeat",
@@ -948,7 +967,7 @@ class StoreLock:
                     )
 
     def is_held(self) -> bool:
-        """Tell whether the lock is still this driver's."""
+        """Return True if this driver still holds the lock."""
         current_holder = read_lock_holder(self._store_path)
         return current_holder is not None and current_holder.token == self._own_holder.token
 
@@ -959,7 +978,7 @@ class StoreLock:
         self.release()
 
     def release(self) -> None:
-        """Give the lock up, if it is still ours."""
+        """Release the lock, if this driver still holds it."""
         self._is_released.set()
         self._heartbeat_thread.join()
         _released_tokens.add(self._own_holder.token)

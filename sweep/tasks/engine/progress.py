@@ -1,4 +1,4 @@
-"""Words to whoever runs a study: errors; a bar in a terminal, or plain lines."""
+"""Messages to the user of a run: errors, and progress as a bar in a terminal or as plain lines."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ from sweep.tasks.engine.text_streams import PatientStream, is_terminal
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-#: Seconds between lines without a terminal.
+#: Time between lines of progress without a terminal [s].
 LINE_INTERVAL = 30.0
 
-#: Times a second that a bar is drawn, each some ms of the driver's time.
+#: Rate at which a bar is drawn [Hz]; each time takes some ms of the driver.
 BAR_REFRESH_RATE = 4.0
 
-#: Columns of a terminal that has room for workers and bytes beside a bar.
+#: Width of a terminal from which a bar shows workers and bytes too [columns].
 WIDE_TERMINAL_COLUMNS = 100
 
-#: Seconds before anything is shown of what is mostly over by then.
+#: Time before an activity is shown [s]; most activities are over by then.
 ACTIVITY_SILENT_SECONDS = 2.0
 
 _logger = logging.getLogger("sweep")
 
 
 class TaskError(PrintableError):
-    """A study that can't be run as asked: the text says why and what to do."""
+    """Error of a study that can't be run as requested; the message has reason and remedy."""
 
 
 class BusyError(StoreError):
-    """A store that another process writes to."""
+    """Error of a store that another process writes to."""
 
 
 class ClusterError(TaskError):
-    """A scheduler or workers that can't be had."""
+    """Error of a scheduler or of workers that are not available."""
 
 
 class CodeError(TaskError):
-    """A function of the user's that may not run, can't be imported, or answers wrongly."""
+    """Error of a user's function that is not allowed, can't be imported, or fails."""
 
 
 class SchedulerLostError(Exception):
-    """A scheduler that went away with work still out; what was committed stays."""
+    """Error of a scheduler that is gone with tasks in flight; committed blocks are safe."""
 
 
 @contextmanager
 def raise_as_store_error(problem: str) -> Iterator[None]:
-    """Say what can't be done where the disk, or an object store, raises."""
+    """Raise errors of the disk or of an object store as a StoreError that begins with `problem`."""
     try:
         yield
     except RefusedFileError as error:
@@ -65,26 +65,29 @@ def raise_as_store_error(problem: str) -> Iterator[None]:
 
 
 class Progress:
-    """Listener to a run, told of how far it is; this one shows nothing."""
+    """Listener to the progress of a run. The methods of this class do nothing."""
 
     def begin(self, *, points: int, done: float, unit: str) -> None:
-        """Begin a run, with so many points of the study done already, some in part."""
+        """Begin a run of `points` points, `done` of which exist already, some in part.
+
+        `unit` names the points, in the plural.
+        """
 
     def advance(self, *, points: float, failed: int) -> None:
-        """Points that were computed and blocks that were given up; both 0 as time passes."""
+        """Add newly computed points and failed blocks; both are 0 if only time has passed."""
 
     def at_work(self, *, workers: int, stored: int) -> None:
-        """Workers that there are, and bytes that are stored; told before `advance`."""
+        """Update the number of workers and the size stored [bytes]; called before `advance`."""
 
     def say(self, text: str) -> None:
-        """Something to know, in words."""
+        """Show a message."""
 
     def end(self) -> None:
         """End the run."""
 
 
 def make_progress(progress: bool | Progress) -> Progress:
-    """Return the progress asked for: none, the one given, or a display on standard error."""
+    """Return a progress listener: the given one, none, or a display on standard error."""
     if progress is True:
         return ProgressBar() if is_terminal(sys.stderr) else ProgressLines()
     if progress is False:
@@ -93,7 +96,7 @@ def make_progress(progress: bool | Progress) -> Progress:
 
 
 class _GuardedListener(Progress):
-    """A listener of the user's, which is told nothing more once it has raised an error."""
+    """Wrapper of a user's listener, which is no longer called after its first error."""
 
     def __init__(self, listener: Progress) -> None:
         self._listener, self._has_failed = listener, False
@@ -128,7 +131,7 @@ class _GuardedListener(Progress):
 
 @contextmanager
 def show_activity(activity: str, progress: Progress | None = None) -> Iterator[None]:
-    """Say from the third second on that something goes on, or that kernels are compiled."""
+    """Show an activity, or the compilation of kernels, if it takes longer than two seconds."""
     from numba.core.event import install_recorder
 
     listener, start_time, is_over = (
@@ -168,7 +171,7 @@ def show_activity(activity: str, progress: Progress | None = None) -> Iterator[N
 
 
 class _CountingProgress(Progress):
-    """Progress that adds up what it is told."""
+    """Listener that adds up points and failures."""
 
     def __init__(self) -> None:
         self._n_points = self._n_failed = 0
@@ -192,7 +195,7 @@ class _CountingProgress(Progress):
         self._show()
 
     def _show(self, *, is_start: bool = False) -> None:
-        """Show how far it is."""
+        """Show the present state."""
 
     def at_work(self, *, workers: int, stored: int) -> None:
         from rich.filesize import decimal
@@ -202,14 +205,14 @@ class _CountingProgress(Progress):
 
     @property
     def _rate(self) -> float:
-        """Points a second of this run."""
+        """Points per second of this run."""
         return (self._points_done - self._points_before) / max(
             time.monotonic() - self._start_time, 1e-9
         )
 
     @property
     def _column_texts(self) -> dict[str, Any]:
-        """All of it in words, by the names of a bar's columns."""
+        """Texts of the present state, by the names of the columns of a bar."""
         return {
             "done": amount_text(self._points_done),
             "rate": f"{amount_text(self._rate)} {self._points_noun}/s" if self._rate > 0 else "",
@@ -219,7 +222,7 @@ class _CountingProgress(Progress):
 
 
 class ProgressLines(_CountingProgress):
-    """One line at the start, every 30 s and at the end, for logs."""
+    """Listener that prints one line at the start, every 30 s and at the end, for logs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -231,11 +234,11 @@ class ProgressLines(_CountingProgress):
             self.end()
 
     def say(self, text: str) -> None:
-        """Print a line of its own."""
+        """Print a message on a line."""
         print(escape_unprintable(text), file=self._stream, flush=True)
 
     def end(self) -> None:
-        """Say how far it is."""
+        """Print the present state."""
         self._printed_at = time.monotonic()
         done_text, rate_text, workers_text, failures_text = self._column_texts.values()
         seconds_left = (self._n_points - self._points_done) / self._rate if self._rate > 0 else 0.0
@@ -249,7 +252,7 @@ class ProgressLines(_CountingProgress):
 
 
 class ProgressBar(_CountingProgress):
-    """A bar with points, rate, time left, workers, bytes and failures, on standard error."""
+    """Bar with points, rate, time left, workers, bytes and failures, on standard error."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -260,7 +263,7 @@ class ProgressBar(_CountingProgress):
         self.console = Console(file=cast("IO[str]", PatientStream(sys.stderr)))
 
         def text_column(text: str) -> TextColumn:
-            return TextColumn(text, table_column=Column())  # folded where others would be cut
+            return TextColumn(text, table_column=Column())  # wrapped, not truncated
 
         workers_column = (
             [text_column("{task.fields[work]}")]
@@ -292,23 +295,26 @@ class ProgressBar(_CountingProgress):
             self._bar.update(self._task, completed=self._points_done, **self._column_texts)
 
     def say(self, text: str) -> None:
-        """Print a line above the bar."""
+        """Print a message above the bar."""
         self.console.print(escape_unprintable(text), markup=False, highlight=False, soft_wrap=True)
 
     def end(self) -> None:
-        """Leave the bar as it is."""
+        """Stop drawing the bar, and leave it on the screen."""
         self._bar.stop()
 
 
 def amount_text(points: float) -> str:
-    """Points in words: `4,500`, or `0.31` where one is drawn in part; a low rate in two digits."""
+    """Return a number of points as text: `4,500`, or two digits if below 10, as `0.31`.
+
+    Numbers below 10 are not whole if part of a point is done, or for a rate.
+    """
     if points >= 10 or abs(points - round(points)) < 1e-6:
         return f"{points:,.0f}"
     return f"{points:.2g}"
 
 
 def duration_text(seconds: float) -> str:
-    """Put a time into words: `0.3 s`, `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
+    """Return a time as text: `0.3 s`, `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
     if seconds < 0.95:
         return f"{max(seconds, 0.0):.1g} s"
     whole_seconds = int(seconds + 0.5)

@@ -1,19 +1,18 @@
-"""One run over what a store lacks: where to compute, answers committed, an outcome at its end."""
+"""One run over the missing blocks of a store: options, compute backend, commits and outcome."""
 
 from __future__ import annotations
 
 import gc
 import logging
-import math
 import os
 import re
 import socket
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Integral
 from pathlib import Path
@@ -22,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.messages import option_text
-from sweep.spec import GridSpec
 from sweep.spec.cluster_config import (
     DASHBOARD_PORT,
     NO_DASHBOARD,
@@ -40,13 +38,8 @@ from sweep.spec.rules import suggest_similar_name
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError, os_error_reason, write_remedy
 from sweep.storage.store_format import read_receipt_totals
-from sweep.tasks.engine import journal, study_store
-from sweep.tasks.engine.blocks import (
-    BlockEvaluator,
-    BlockStudy,
-    user_functions,
-    worst_cpu_seconds_per_point,
-)
+from sweep.tasks.engine import journal, study_store, user_code
+from sweep.tasks.engine.block_study import BlockEvaluator, BlockStudy, Workload
 from sweep.tasks.engine.interrupts import InterruptHandler
 from sweep.tasks.engine.journal import (
     ChunkScan,
@@ -74,42 +67,31 @@ from sweep.tasks.engine.worker import (
     TaskSettings,
     run_serial,
 )
-from sweep.tasks.studies.memory_limits import (
-    refuse_too_large_point,
-    refuse_too_large_study,
-    serial_worker_memory,
-    worker_memory,
-)
+from sweep.tasks.engine.worker_memory import WorkerMemory, serial_worker_memory, worker_memory
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from sweep.spec import SceneSpec
     from sweep.tasks.engine.cluster_connection import ClusterConnection
-    from sweep.tasks.studies.flight_study import FlightStudy
-    from sweep.tasks.studies.grid_study import GridStudy
 
-#: Scheduler "address" of the plain loop.
+#: Value of the option `scheduler` that selects serial computation in this process.
 SERIAL_SCHEDULER = "none"
 
-#: Work that is done here and at once, where nobody says otherwise [s of one core]: workers take
-#: some seconds to start.
+#: Largest estimated time of a study on one core that is computed serially by default [s]: workers
+#: take some seconds to start.
 SERIAL_CPU_SECONDS_MAX = 10.0
 
-#: Seconds of a core that a ray, and a draw of a shot, take at the most, about.
-CPU_SECONDS_PER_RAY, CPU_SECONDS_PER_SHOT = 5e-6, 4e-4
-
-#: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
+#: Number of failed blocks, without any success, after which a run stops.
 MAX_INITIAL_FAILURES = 20
 
-#: Seconds for which a run waits to see that what is committed is there; of more files it begins
-#: with what the log says, and looks on meanwhile.
+#: Time for which a run waits for the scan of existing chunks [s]. After that it trusts the log, and
+#: the scan goes on during the run.
 CHUNK_SCAN_TIMEOUT = 2.0
 
-#: Seconds without any worker after which that is said.
+#: Time without a worker after which a warning is given [s].
 NO_WORKER_WARNING_AFTER = 20.0
 
-#: Figures of receipts that a run adds up.
+#: Fields of receipts that a run adds up.
 RECEIPT_TOTALS = ("points", "taken", "bytes", "seconds", "write_seconds")
 
 _logger = logging.getLogger("sweep.session")
@@ -122,38 +104,38 @@ CHECKPOINT_LOST_MESSAGE = (
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Ways to compute a study; nothing of them shows in the results.
+    """Options of where and how to compute a study; they do not change the results.
 
     Parameters
     ----------
     client
-        Dask client to compute with; without one, `scheduler` and `workers` say what to use. By
-        default little work is done here, in a plain loop, and more of it by workers on all cores of
-        this machine.
+        Dask client to compute with. Without one, `scheduler` and `workers` select the backend. By
+        default little work is done serially in this process, and more of it by workers on all cores
+        of this machine.
     workers, processes
-        Workers to start on this machine, as processes or as threads.
+        Number of workers to start on this machine, and whether they are processes or threads.
     scheduler
-        Address of a Dask scheduler, or "none" for a plain loop in this process.
+        Address of a Dask scheduler, or "none" for serial computation in this process.
     cluster
-        The file that describes a cluster, or what such a file holds; `workers` fixes how many.
+        File that describes a cluster, or its content; `workers` sets the number of workers.
     progress
         True for a bar or lines on standard error, False for none, or a `Progress`.
     block_timeout
-        Seconds that a block may take; beyond, it is tried once more and then given up.
+        Time limit of a block [s]; a block that exceeds it twice counts as failed.
     durable
-        Whether blocks are on the disk, and not only with the operating system, once committed: a
-        power failure then loses none of them.
+        Whether blocks are on the disk once committed, and not only in the cache of the operating
+        system. A power failure then loses none of them.
     retry_failed
-        Whether to try blocks again that were given up, for their errors, in an earlier run.
+        Whether to compute blocks again that failed in an earlier run.
     performance_report
-        HTML file to put Dask's own account of the run into.
+        HTML file for Dask's report of the run.
     dashboard
         Whether the workers that are started have Dask's dashboard, on a port of this machine alone.
         It has no password: all users of this machine can see it.
     allow_code
-        Python modules whose detectors and estimators the study may run, here and on its workers.
+        Python modules whose detectors and estimators the study may call, here and on its workers.
     evaluate
-        What computes a block in place of the model, with the same results; for instrumenting.
+        Function that replaces the model in computing a block, with the same results; for tests.
     """
 
     client: Client | None = None
@@ -183,15 +165,13 @@ class RunOptions:
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
             raise TaskError(f"block_timeout must be a number of seconds above 0, not {timeout!r}")
         if self.allow_code:
-            from sweep.tasks.studies.user_functions import allow_modules
-
-            allow_modules(
+            user_code.allow_modules(
                 [self.allow_code] if isinstance(self.allow_code, str) else self.allow_code
             )
 
     @classmethod
     def from_mapping(cls, options: Mapping[str, Any]) -> RunOptions:
-        """Options by name; a TypeError with the nearest name for one that there isn't."""
+        """Return options by name; TypeError with the most similar name for an unknown one."""
         names = [field.name for field in fields(cls)]
         for name in options.keys() - set(names):
             raise TypeError(
@@ -199,11 +179,11 @@ class RunOptions:
             )
         return cls(**options)
 
-    def resolve_cluster(self, spec: GridSpec | SceneSpec) -> AnyClusterConfig | None:
-        """Return the cluster given here or by the spec's `execution`; None for a plain loop.
+    def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
+        """Return the cluster of the options, or of the spec's `execution`; None to run serially.
 
-        ClusterError where both a scheduler and a cluster are named, or workers that are not
-        ours to start.
+        ClusterError if both a scheduler and a cluster are named, or a number of workers for a
+        scheduler that runs already.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -216,14 +196,14 @@ class RunOptions:
                     else load_cluster_config(cluster)
                 )
             return self._with_dashboard(_with_worker_count(cluster, self.workers))
-        scheduler, execution = self.scheduler, spec.execution
+        scheduler, execution = self.scheduler, workload.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
         if scheduler == SERIAL_SCHEDULER and self.dashboard:
             raise ClusterError(
                 f"a plain loop has no dashboard: leave out {option_text('dashboard')}"
             )
-        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_serial(spec)):
+        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_serial(workload)):
             return None
         if scheduler is not None:
             if self.dashboard:
@@ -241,7 +221,7 @@ class RunOptions:
         )
 
     def _with_dashboard(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
-        """Give a cluster that is started here a dashboard, if one is asked for."""
+        """Enable the dashboard of a cluster that is started here, if one is asked for."""
         if not self.dashboard:
             return cluster
         if isinstance(cluster, ExistingSchedulerConfig | KubernetesClusterConfig):
@@ -254,8 +234,8 @@ class RunOptions:
         scheduler = cluster.scheduler.model_copy(update={"dashboard": str(DASHBOARD_PORT)})
         return cluster.model_copy(update={"scheduler": scheduler})
 
-    def _prefers_serial(self, spec: GridSpec | SceneSpec) -> bool:
-        """Tell whether nothing is said that takes workers, and the work takes none."""
+    def _prefers_serial(self, workload: Workload) -> bool:
+        """Return True if no option asks for workers, and the work is too little for them."""
         asks_for_workers = (
             self.workers or self.block_timeout or self.performance_report or self.evaluate
         )
@@ -263,23 +243,24 @@ class RunOptions:
             asks_for_workers
             or self.dashboard
             or not self.processes
-            or spec.execution != Execution()
+            or workload.execution != Execution()
         ):
             return False
-        return (
-            not any(user_functions(spec)) and estimate_cpu_seconds(spec) <= SERIAL_CPU_SECONDS_MAX
-        )
+        return not workload.user_modules and workload.cpu_seconds <= SERIAL_CPU_SECONDS_MAX
 
 
 def _is_address(address: object) -> bool:
-    """Tell whether a text is an address of a Dask scheduler, with or without a protocol."""
+    """Return True if a text is an address of a Dask scheduler, with or without a protocol."""
     return isinstance(address, str) and bool(
         re.fullmatch(r"(\w+://)?[^\s/:]\S*:\d+|inproc://.+", address)
     )
 
 
 def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyClusterConfig:
-    """Fix the number of workers of a cluster, if one is given and they are ours."""
+    """Set the number of workers of a cluster, if one is given.
+
+    ClusterError if the workers belong to a scheduler that runs already.
+    """
     if n_workers is None:
         return cluster
     if isinstance(cluster, ExistingSchedulerConfig):
@@ -289,53 +270,39 @@ def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyC
     return cluster.model_copy(update={"workers": WorkerBounds(n_workers, n_workers)})
 
 
-def estimate_cpu_seconds(spec: GridSpec | SceneSpec) -> float:
-    """Time of one core that a study takes, about [s]; infinite if rays follow a tolerance."""
-    n_axis_points = math.prod(int(axis.size) for axis in spec.axes)
-    if isinstance(spec, GridSpec):
-        return n_axis_points * worst_cpu_seconds_per_point(spec)
-    if spec.is_ray_number_set_by_tolerance:
-        return math.inf
-    n_shots = sum(
-        spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner) for scanner in spec.scanners
-    )
-    rays_per_shot = float(spec.parameters()["footprint.beamlets"])
-    return n_shots * (
-        rays_per_shot * CPU_SECONDS_PER_RAY
-        + n_axis_points * int(spec.draws.number) * CPU_SECONDS_PER_SHOT
-    )
-
-
 class ComputeBackend(ExitStack):
-    """A place in use: its workers serve one study after another, and end with it."""
+    """Context manager for the workers, or the process, that compute consecutive studies."""
 
-    def __init__(self, options: RunOptions, spec: GridSpec | SceneSpec) -> None:
+    def __init__(self, options: RunOptions, workload: Workload) -> None:
         super().__init__()
         self.options, self.progress = options, make_progress(options.progress)
         self.interrupts = InterruptHandler(self.progress)
-        self._cluster, self._spec = options.resolve_cluster(spec), spec
+        self._cluster, self._workload = options.resolve_cluster(workload), workload
         self.memory = (
             serial_worker_memory()
             if self.is_serial
             else worker_memory(options.client, self._cluster)
         )
-        refuse_too_large_point(spec, self.memory)
-        self.study: GridStudy | FlightStudy | None = None  # once it is known
-        self.max_workers = 1  # blocks of the study: more workers than that have nothing to do
+        self.check_memory: Callable[[WorkerMemory], None] = lambda memory: None
+        """Raises a SpecError if the study exceeds the memory of a worker; set by the caller."""
+        self.max_workers = 1  # number of blocks of the study, as further workers would be idle
         self._connection: ClusterConnection | None = None
 
     @property
     def is_serial(self) -> bool:
-        """Tell whether blocks are computed in a plain loop, without workers."""
+        """True if blocks are computed one after the other in this process."""
         return self.options.client is None and self._cluster is None
 
     @property
     def uses_running_scheduler(self) -> bool:
-        """Tell whether the workers are those of a scheduler that runs already."""
+        """True if the workers belong to a scheduler that runs already."""
         return self.options.client is None and isinstance(self._cluster, ExistingSchedulerConfig)
 
     def connect(self) -> ClusterConnection:
-        """Reach the workers, no more than `most`; ClusterError where there are none to be had."""
+        """Connect to the workers, and start at most `max_workers` if they do not run yet.
+
+        ClusterError if no worker is available.
+        """
         from sweep.tasks.engine.cluster_connection import (
             ClusterConnection,
             connect_cluster,
@@ -354,9 +321,8 @@ class ComputeBackend(ExitStack):
                         say=self.progress.say,
                     )
                 )
-                if self.uses_running_scheduler and self.study is not None:
-                    # Its workers are known from here on.
-                    refuse_too_large_study(self.study, worker_memory(self._connection.client, None))
+                if self.uses_running_scheduler:  # the memory of its workers is known from here on
+                    self.check_memory(worker_memory(self._connection.client, None))
             elif client.asynchronous:
                 raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             else:
@@ -375,15 +341,19 @@ class ComputeBackend(ExitStack):
         block_queue: BlockQueue,
         verify_receipt: ReceiptVerifier,
     ) -> Iterator[TaskResult]:
-        """Answers of a study's blocks as they arrive; `seen` tells what is in the store here."""
+        """Compute the blocks of a queue. Yield the results of tasks as they arrive.
+
+        `verify_receipt` tells whether the block of a receipt is in the store as seen from here.
+        """
         options = self.options
         settings = TaskSettings(
             store_path,
             study_id,
+            self._workload.read_study,
             options.evaluate,
             options.block_timeout,
             options.durable,
-            self._user_code_digests(),
+            tuple(user_code.module_digests(self._workload.user_modules).items()),
         )
         if self.is_serial:
             _logger.info("blocks are computed in this process, one after the other")
@@ -408,48 +378,39 @@ class ComputeBackend(ExitStack):
         )
         return dispatcher.iter_results(lambda: self.interrupts.is_stopping)
 
-    def _user_code_digests(self) -> tuple[tuple[str, str], ...]:
-        """Modules of the user's whose functions the study names, and their digests."""
-        if not any(user_functions(self._spec)):
-            return ()
-        from sweep.tasks.studies.user_functions import allowed_module_digests
-
-        return tuple(allowed_module_digests(self._spec).items())
-
     def restart_workers(self) -> None:
-        """Start workers of this machine again that are gone."""
+        """Restart lost workers of this machine."""
         if self._connection is not None:
             self._connection.restart_workers()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """Result of a run."""
+class SessionOutcome:
+    """Result of one session."""
 
     store: Location
-    unit: str  # what the points are called
-    points: int  # of the whole study
+    unit: str  # name of the points, in the plural
+    points: int  # number of points of the study
     blocks: int
-    points_done: int  # committed, in this run or before
+    points_done: int  # points of committed blocks, in this run or before
     blocks_done: int
-    points_computed: int  # in this run; not those that a smaller study's store had
+    points_computed: int  # in this run, without those taken from a smaller study's store
     blocks_computed: int
     failures: tuple[Failure, ...]
-    left_out: int  # blocks that were given up before and not tried again
-    stopped: str  # why the run ended before its blocks did; empty where it didn't
-    seconds: float  # wall time of this run
-    work_seconds: float  # evaluating and writing, summed over workers
-    write_seconds: float  # the writing in it
-    rays: Mapping[str, int] = field(default_factory=dict)  # cast in this run, by scanner
+    left_out: int  # blocks that failed in an earlier run and were not tried again
+    stopped: str  # reason for stopping early, or ''
+    seconds: float  # wall time of this run [s]
+    work_seconds: float  # time of evaluating and writing, summed over workers [s]
+    write_seconds: float  # part of it for writing [s]
 
     @property
     def complete(self) -> bool:
-        """Tell whether every block of the study is committed."""
+        """True if every block of the study is committed."""
         return self.blocks_done == self.blocks
 
     @property
     def why(self) -> str:
-        """Why blocks are missing, in words; empty if the study is complete."""
+        """Reason why blocks are missing; '' if the study is complete."""
         if self.complete:
             return ""
         if self.stopped:
@@ -461,12 +422,12 @@ class Outcome:
 
 
 def _blocks_text(count: int) -> str:
-    """Put a number of blocks into words."""
+    """Return a number of blocks as text."""
     return f"{count:,} block{'' if count == 1 else 's'}"
 
 
 class NoWorkerMonitor:
-    """Says when a cluster has had no worker for long, again after twice as long, and so on."""
+    """Source of warnings about a cluster without workers, at intervals that double."""
 
     def __init__(self) -> None:
         self._last_seen, self._has_had_workers, self._warn_after = (
@@ -476,7 +437,10 @@ class NoWorkerMonitor:
         )
 
     def message(self, n_workers: int, *, has_receipts: bool = False) -> str:
-        """Words for so many workers now, mostly none; ``has_receipts``: one has answered since."""
+        """Return a warning if there has been no worker for long, else ''.
+
+        `has_receipts` means that a worker has returned a result since the last call.
+        """
         if n_workers or has_receipts:
             self._last_seen, self._has_had_workers, self._warn_after = (
                 time.monotonic(),
@@ -495,7 +459,7 @@ class NoWorkerMonitor:
 
 
 class Session:
-    """One run over what a store lacks, whose lock this process holds."""
+    """One run over the missing blocks of a store, whose lock this process holds."""
 
     def __init__(
         self, store_path: Location, study: BlockStudy, backend: ComputeBackend, lock: StoreLock
@@ -508,18 +472,20 @@ class Session:
             raise StoreError(write_failure_text(store_path, error)) from error
         self._receipt_totals: dict[str, float] = defaultdict(
             float
-        )  # what receipts of this run come to
+        )  # sums over the receipts of this run
         self._permanent_failures: list[Failure] = []
         self._unflushed_receipts: list[
             Receipt
-        ] = []  # committed as soon as the journal has written them
-        self._bytes_before = 0  # bytes that there were before
-        self._checkpoint_points: dict[int, float] = {}  # points there are of unfinished blocks
+        ] = []  # receipts that the journal has not written yet
+        self._bytes_before = 0  # size of the blocks committed before this run [bytes]
+        self._checkpoint_points: dict[int, float] = {}  # points done, by unfinished block
 
-    def run(
-        self, *, prior_stop_reason: str = "", rays_by_scanner: Mapping[str, int] | None = None
-    ) -> Outcome:
-        """Compute all that is left; ``prior_stop_reason``: why what comes before is not there."""
+    def run(self, *, prior_stop_reason: str = "") -> SessionOutcome:
+        """Compute all missing blocks, and return the outcome.
+
+        `prior_stop_reason` is the reason why an earlier stage of the study is incomplete; if it is
+        not empty, no block is computed.
+        """
         start_time = time.monotonic()
         self._checkpoint_points = journal.checkpoint_points(self._store_path, self._study.id)
         receipts = read_receipt_totals(self._store_path, self._study.n_blocks)
@@ -553,7 +519,7 @@ class Session:
         finally:
             chunk_scan.stop()
         study, totals = self._study, self._receipt_totals
-        outcome = Outcome(
+        outcome = SessionOutcome(
             store=self._store_path,
             unit=study.points_noun,
             points=study.n_points,
@@ -568,7 +534,6 @@ class Session:
             seconds=time.monotonic() - start_time,
             work_seconds=totals["seconds"],
             write_seconds=totals["write_seconds"],
-            rays=rays_by_scanner or {},
         )
         _logger.info(
             "%s: %s blocks computed in %s, %s failed%s",
@@ -590,7 +555,7 @@ class Session:
         return outcome
 
     def _record_event(self, event: str, **details: Any) -> str:
-        """Put down what happened to the run; why that can't be, where it can't."""
+        """Append an event to the run log. Return an error message if it is unwritable, else ''."""
         try:
             self._journal.record_run_event(event, **details)
         except OSError as error:
@@ -598,7 +563,10 @@ class Session:
         return ""
 
     def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
-        """See the look at what was done to its end, and compute what of it is not there."""
+        """Wait for the scan of existing chunks, and compute the blocks that lack any.
+
+        Return the reason for stopping early, or ''.
+        """
         if not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
             self._progress.say("looking whether the chunks of what was done before are there")
         while not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
@@ -608,20 +576,23 @@ class Session:
         return self._compute_blocks(is_settled, is_settled & is_done)
 
     def _compute_blocks(self, is_settled: np.ndarray, is_done: np.ndarray) -> str:
-        """Compute all blocks but those that are settled; why it ended before, where it did."""
+        """Compute all unsettled blocks. Return the reason for stopping early, or ''.
+
+        `is_settled` and `is_done` are masks (blocks,) of bool.
+        """
         if is_settled.all():
             return ""
         block_queue = BlockQueue(is_settled)
         points_before = self._study.count_points(is_done) + self._receipt_totals["points"]
         with ExitStack() as stack:
             try:
-                self._interrupts.is_computing = True  # a start loses nothing either
+                self._interrupts.is_computing = True  # a stop while workers start loses nothing
                 compile_thread = threading.Thread(target=self._compile_kernels, daemon=True)
                 activity = "loading the model" + (
                     "" if self._backend.is_serial else ", reaching workers"
                 )
                 with show_activity(activity, self._progress):
-                    compile_thread.start()  # beside the workers' start, which is mostly waiting
+                    compile_thread.start()  # while workers start, which is mostly waiting
                     verify_receipt = partial(
                         study_store.is_block_visible, self._store_path, self._study
                     )
@@ -651,11 +622,11 @@ class Session:
                 self._interrupts.is_computing = False
 
     def _compile_kernels(self) -> None:
-        if self._backend.options.evaluate:  # in place of the model
+        if self._backend.options.evaluate:  # the model is not used
             return
         gc_threshold = gc.get_threshold()
-        gc.set_threshold(100_000)  # a compiler's objects live on: looking at them takes a tenth
-        with suppress(Exception):  # what raises here is a block's failure, recorded as one
+        gc.set_threshold(100_000)  # a compiler's objects persist: collecting them takes 10 %
+        with suppress(Exception):  # the same error makes a block fail, and is recorded there
             self._study.compile_kernels()
         gc.set_threshold(*gc_threshold)
 
@@ -706,7 +677,7 @@ class Session:
         )
 
     def _flush_commits(self, *, force: bool = False) -> None:
-        """Count the blocks whose receipts are written."""
+        """Write pending receipts, and add those that are written to the totals."""
         if not self._journal.flush(force=force):
             return
         if self._unflushed_receipts:
@@ -720,12 +691,12 @@ class Session:
         self._unflushed_receipts.clear()
 
     def _points_so_far(self) -> float:
-        """Points that there are so far of this run's blocks."""
+        """Return the number of points done in this run, with those of unfinished blocks."""
         return self._receipt_totals["points"] + sum(self._checkpoint_points.values())
 
 
 def write_failure_text(store_path: Location, error: OSError) -> str:
-    """Why a run stops that can't write, and what to do about it."""
+    """Return the reason why a store can't be written, and the remedy."""
     if isinstance(error, ObjectStoreError):
         return f"the store can't be written: {error.strerror}"
     if not _store_exists(store_path):
@@ -735,5 +706,5 @@ def write_failure_text(store_path: Location, error: OSError) -> str:
 
 
 def _store_exists(store_path: Location) -> bool:
-    """Tell whether a store is there: of one that went away, writers may leave folders anew."""
+    """Return True if the root of the store exists; writers may create folders of a lost store."""
     return (store_path / "zarr.json").exists()

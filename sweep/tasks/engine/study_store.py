@@ -1,8 +1,9 @@
-"""A study's Zarr store: a template made whole at once, then whole chunks written block by block.
+"""Zarr store of a study: created at once without results, then written block by block.
 
-No two blocks share a chunk, so writers need no locks between them. Only `.sweep/`, the journal,
-knows hosts and times: every other byte follows from the study, and from the versions of the
-software. All that a store held before there were results is listed there with digests.
+No two blocks share a chunk, so writers need no locks between them. Only the journal, `.sweep/`,
+contains hosts and times. Every other byte follows from the study and from the versions of the
+software. The journal also lists everything that the store contained before any result, with
+digests.
 """
 
 from __future__ import annotations
@@ -28,9 +29,7 @@ from numcodecs.zstd import Zstd
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from sweep.messages import option_name, option_text, suggestion
-from sweep.model import VERSION
 from sweep.regular_files import RefusedFileError
-from sweep.spec import GridSpec, SceneSpec, describe_differences
 from sweep.storage import locations, store_format
 from sweep.storage.foreign_files import is_litter, list_foreign_files
 from sweep.storage.locations import (
@@ -67,7 +66,8 @@ from sweep.storage.store_format import (
     stored_objects_digest,
 )
 from sweep.storage.verified_store import CHUNK_NAME
-from sweep.tasks.engine.blocks import CF_CONVENTIONS, ArrayLayout, BlockStudy, StoreTemplate
+from sweep.tasks.engine.block_study import BlockStudy, StoreTemplate
+from sweep.tasks.engine.blocks import CF_CONVENTIONS, ArrayLayout
 from sweep.tasks.engine.journal import (
     LOCK_FILE,
     LOG_NAMES,
@@ -83,13 +83,13 @@ ROOT_DOCUMENT = "zarr.json"
 
 MANIFEST_PATH = f"{JOURNAL_DIR}/{MANIFEST_FILE}"
 
-#: Object that says that what lies at a place in an object store is a store half made or removed.
+#: Object that marks a store in an object store as incompletely created or removed.
 UNFINISHED_MARKER = "partial"
 
-#: Files of others that are named where they are in the way.
+#: Largest number of foreign files that an error message names.
 FOREIGN_FILES_NAMED_MAX = 5
 
-#: Chunks are packed, and with a checksum.
+#: Compression of the chunks, and their checksum.
 CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
 _ZSTD = Zstd(level=ZSTD_LEVEL)
@@ -105,11 +105,11 @@ def create_store(
     recipe: Mapping[str, Any] | None = None,
     durable: bool = False,
 ) -> Location:
-    """Make a new store without results: metadata, known arrays, and the spec.
+    """Create a store without results: metadata and arrays with known values.
 
-    It is built in the same folder and renamed, so that a creation cut short leaves nothing that
-    looks like a store; one in an object store is built here and sent, its root last. StoreError
-    where something is in its place, or the place can't be written.
+    On disk the store is built in the same folder and renamed, so that an interrupted creation
+    leaves nothing that looks like a store. For an object store it is built on this machine and
+    uploaded, its root last. StoreError if something is at the path, or the path is not writable.
     """
     store_path = parse_location(store_path)
     try:
@@ -117,7 +117,7 @@ def create_store(
             with atomic_path(store_path, replace=replace_existing) as draft_path:
                 try:
                     _build_store(draft_path, template, recipe)
-                except OSError as error:  # told before the draft goes, and makes room
+                except OSError as error:  # the reason is found before the draft is removed
                     raise OSError(
                         error.errno, os_error_reason(error, draft_path), str(draft_path)
                     ) from error
@@ -148,7 +148,7 @@ def _build_store(
 
 
 def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
-    """Copy a store that was built on disk to its place in an object store, its root last."""
+    """Copy a store on disk to a path in an object store, its root last."""
     names = file_sizes_below(local_path).keys() - {ROOT_DOCUMENT}
     with reserve_object_location(store_path):
         map_concurrently(
@@ -161,10 +161,13 @@ def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
 
 @contextmanager
 def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
-    """Reserve a place while a store is made there, marked so; StoreError where it is taken."""
+    """Mark a path in an object store as reserved while a store is created there.
+
+    StoreError if something else is at the path.
+    """
     marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER
     with StoreLock(store_path):
-        if marker.exists():  # what a creation or removal cut short has left
+        if marker.exists():  # an interrupted creation or removal has left files
             remove_store(store_path)
         elif foreign := [
             name
@@ -181,7 +184,7 @@ def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
 
 
 def remove_store(store_path: Location) -> None:
-    """Take a store away in one step; in an object store its root first: it is none then."""
+    """Remove a store in one step; in an object store its root first, which makes it invalid."""
     if isinstance(store_path, Path):
         remove_atomically(store_path)
         return
@@ -201,7 +204,10 @@ def build_template(
     *,
     shard_shape_of: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
-    """Make a store without results; a file holds one chunk, or as many as `shards` has."""
+    """Create a store without results on disk.
+
+    A file holds one chunk, or a shard of the shape that `shard_shape_of` returns for an array.
+    """
     group = zarr.create_group(
         SingleWriterLocalStore(store_path), zarr_format=3, attributes=attributes
     )
@@ -218,11 +224,11 @@ def build_template(
 
 
 def template_attributes(template: StoreTemplate) -> dict[str, Any]:
-    """Attributes of the group of a new store: the study's own, and versions."""
+    """Return the root attributes of a new store: those of the study, and versions."""
     return template.store_attributes() | {
         "Conventions": CF_CONVENTIONS,
         "study_id": template.id,
-        "model_version": VERSION,
+        "model_version": template.model_version,
         "software": format_versions(current_versions()),
         "processor": processor_text(),
         "layout": LAYOUT_VERSION,
@@ -232,7 +238,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Put down a store's attributes, and digests of what it is made of before results."""
+    """Write the list of a store's root attributes and of digests of its first objects."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -263,7 +269,10 @@ def _create_array(
 
 
 def _consolidate_metadata(store_path: Path) -> None:
-    """Put the metadata of all arrays in the group's own; Zarr's library warns on doing it."""
+    """Copy the metadata of all arrays into the root document.
+
+    Zarr's own function warns that this is not part of the standard.
+    """
     documents = {
         str(file.parent.relative_to(store_path)): json.loads(file.read_text())
         for file in sorted(store_path.rglob("zarr.json"))
@@ -277,14 +286,15 @@ def _consolidate_metadata(store_path: Path) -> None:
     }
     (store_path / "zarr.json").write_text(
         json.dumps(root_document)
-    )  # not indented: ten times as fast
+    )  # without indentation, which is ten times as fast
 
 
 def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
-    """Bytes of a chunk of numbers, at the array's edge a part of one, as Zarr writes them.
+    """Return the bytes of a chunk of numbers, as Zarr writes it.
 
-    They are packed little-endian values in C order, and the crc32c of that. Zarr takes ten times as
-    long, some 2 % of a second's work for a block of 26 arrays.
+    `values` may be smaller than a chunk at the edge of the array; the rest is filled. The bytes are
+    compressed little-endian values in C order, and their crc32c. Zarr takes ten times as long, some
+    2 % of one second's work for a block of 26 arrays.
     """
     dtype = np.dtype(layout.dtype).newbyteorder("<")
     if values.shape == layout.chunks:
@@ -299,18 +309,18 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
 class StoredBlock(NamedTuple):
     """Digest and size of a block as stored."""
 
-    digest: str  # of its bytes and their places, `digest`
-    n_bytes: int
+    digest: str  # digest of the bytes and their paths, by `contents_digest`
+    n_bytes: int  # size as stored
 
 
 class BlockWriter:
-    """Arrays of a study's store, for writing blocks."""
+    """Writer of blocks into the arrays of a study's store."""
 
     def __init__(self, store_path: str | Location, study: BlockStudy) -> None:
         self.store_path, self.study = parse_location(store_path), study
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> StoredBlock:
-        """Write the chunks of one block, each whole; ValueError where results are not its own."""
+        """Write all chunks of one block; ValueError if the results don't match its arrays."""
         positions = self.study.chunk_positions(block)
         if results.keys() != positions.keys():
             mismatched_names = sorted(results.keys() ^ positions.keys())
@@ -319,7 +329,7 @@ class BlockWriter:
             )
 
         def write_chunk(array_name: str) -> tuple[str, bytes]:
-            """Write a chunk; its path inside the store, and its bytes."""
+            """Write a chunk. Return its path inside the store, and its bytes."""
             layout, position, values = (
                 self.study.layout_by_name[array_name],
                 positions[array_name],
@@ -347,7 +357,7 @@ class BlockWriter:
 
 
 def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
-    """Paths, inside the store, of the chunks of one block."""
+    """Return the paths, inside the store, of the chunks of one block."""
     return [
         chunk_name(array_name, position)
         for array_name, position in study.chunk_positions(block).items()
@@ -355,7 +365,7 @@ def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
 
 
 def chunk_size_limits(study: BlockStudy) -> Callable[[str], int]:
-    """Bytes that a chunk of a study can have at most, by its path inside the store."""
+    """Return a function from the path of a chunk inside the store to its largest size [bytes]."""
 
     def size_limit(chunk_path: str) -> int:
         layout = study.layout_by_name[array_of_chunk(chunk_path)]
@@ -365,7 +375,7 @@ def chunk_size_limits(study: BlockStudy) -> Callable[[str], int]:
 
 
 def array_of_chunk(chunk_path: str) -> str:
-    """Path, inside the store, of the array that an object is a chunk of; empty if of none.
+    """Return the path, inside the store, of the array of a chunk; '' if an object is no chunk.
 
     >>> [array_of_chunk(name) for name in ("tile/pd_up/c/0/3", "weight/c", "pd_up/zarr.json")]
     ['tile/pd_up', 'weight', '']
@@ -375,20 +385,20 @@ def array_of_chunk(chunk_path: str) -> str:
 
 
 def chunk_name(array_name: str, position: tuple[int, ...]) -> str:
-    """Path, inside the store, of one chunk of an array."""
+    """Return the path, inside the store, of one chunk of an array."""
     return "/".join([array_name, "c", *map(str, position)])
 
 
 def sync_to_disk(store_path: Location) -> None:
-    """Have all that was written to a store on its disk; OSError where the disk did not take it.
+    """Write the cache of the store's file system to disk; OSError if the disk fails.
 
-    One call syncs the whole file system, which costs as much as a few files one by one.
+    One call syncs the whole file system, which costs as much as syncing a few files.
     """
     if not isinstance(store_path, Path):
         return
     descriptor = os.open(store_path, os.O_RDONLY)
     try:
-        if not hasattr(_libc, "syncfs"):  # not Linux
+        if not hasattr(_libc, "syncfs"):  # systems other than Linux
             os.sync()
         elif _libc.syncfs(descriptor):
             error_number = ctypes.get_errno()
@@ -398,7 +408,7 @@ def sync_to_disk(store_path: Location) -> None:
 
 
 def remove_partial_files(store_path: Location) -> None:
-    """Remove the remains of writers that were killed within a file."""
+    """Remove incomplete files of writers that were killed."""
     if isinstance(store_path, Path):
         partial_files = (
             candidate
@@ -411,9 +421,9 @@ def remove_partial_files(store_path: Location) -> None:
 
 
 def refuse_links(store_path: Location) -> None:
-    """Refuse a store through whose links something would be written elsewhere.
+    """Raise a StoreError if a symbolic link would direct writes outside the store.
 
-    A link, or a pipe, in the place of a file is no harm: a new file is renamed into its place.
+    A link, or a pipe, in place of a file does no harm: a new file is renamed over it.
     """
     if isinstance(store_path, Path):
         links = (
@@ -430,10 +440,10 @@ def refuse_links(store_path: Location) -> None:
 def _exclude_foreign(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
-    """Leave out entries, few of those below a store, that are files of others."""
+    """Return the entries below a store that are not foreign files."""
     entries = list(entries)
     if not entries:
-        return []  # so that a large store is walked through once
+        return []  # without a search for foreign files, which walks through the store
     foreign_paths, prefix_length = list_foreign_files(store_path), len(str(store_path)) + 1
     folders = tuple(name for name in foreign_paths if name.endswith("/"))
     return [
@@ -445,16 +455,16 @@ def _exclude_foreign(
 
 
 class Damage(NamedTuple):
-    """An object of a store that is not as it was written."""
+    """Object of a store that differs from what was written."""
 
-    object: str  # path inside the store; a line of a log by its number
-    what: str  # what is wrong with it
-    block: int = -1  # that it belongs to
-    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
+    object: str  # path inside the store; with the line number in a log
+    what: str  # description of the damage
+    block: int = -1  # block of the object; -1 without one
+    mended_by: str = "resume"  # "repair" for objects of the template, "hand" for surplus ones
 
 
 def manifest_digests(store_path: Location) -> dict[str, str]:
-    """Digests of what a store was made of, by object, as far as its list is undamaged."""
+    """Return the digests of the objects of the template, from the undamaged lines of their list."""
     return {
         record["object"]: record["digest"]
         for record in iter_records(store_path / MANIFEST_PATH)
@@ -463,7 +473,7 @@ def manifest_digests(store_path: Location) -> dict[str, str]:
 
 
 def template_damages(store_path: Location) -> list[Damage]:
-    """Objects that a store was made of, and lines of their list, that are not as they were."""
+    """Return the damaged objects of the template, and the damaged lines of their list."""
     records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
     if not records:
         return [Damage(MANIFEST_PATH, "is missing or empty", mended_by="repair")]
@@ -483,7 +493,7 @@ def template_damages(store_path: Location) -> list[Damage]:
 
 
 def template_object_damage(store_path: Location, object_name: str, expected_digest: str) -> str:
-    """Damage of an object of the template, whose digest is known."""
+    """Return the damage of an object of the template with a known digest; '' if it has none."""
     return damage_or_read_error(
         lambda: (
             ""
@@ -494,7 +504,7 @@ def template_object_damage(store_path: Location, object_name: str, expected_dige
 
 
 def refuse_damaged_template(store_path: Location) -> None:
-    """Refuse a store whose template is not as it was made: what is added might not fit it."""
+    """Raise a StoreError if the template is damaged, as new results might not fit it."""
     refuse_links(store_path)
     if problems := template_damages(store_path):
         problem_lines = "\n".join(f"  {damage.object} {damage.what}" for damage in problems)
@@ -505,9 +515,9 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def damage_or_read_error(read_damage: Callable[[], str]) -> str:
-    """Damage of an object in words, as a function says that reads it; empty if there is none.
+    """Return the damage that `read_damage` finds in an object, or why the object can't be read.
 
-    ObjectStoreError where an object store does not give it.
+    The text is empty if the object is as it was written. ObjectStoreError if an object store fails.
     """
     try:
         return read_damage()
@@ -516,7 +526,7 @@ def damage_or_read_error(read_damage: Callable[[], str]) -> str:
     except RefusedFileError as error:
         return str(error.strerror)
     except ObjectStoreError:
-        raise  # its service's fault, of which the object says nothing
+        raise  # a fault of the service says nothing about the object
     except OSError as error:
         return f"can't be read: {error.strerror}"
 
@@ -524,7 +534,10 @@ def damage_or_read_error(read_damage: Callable[[], str]) -> str:
 def is_block_visible(
     store_path: Location, study: BlockStudy, receipt: Receipt, check_digest: bool
 ) -> bool:
-    """Tell whether a block that a worker has written is here: by size, or digest where `read`."""
+    """Return True if a block that a worker has written is in the store as seen from here.
+
+    Its chunks are compared by size with the receipt, or by digest if `check_digest`.
+    """
     chunk_paths = chunk_names_of_block(study, receipt.block)
     try:
         if check_digest:
@@ -542,19 +555,19 @@ def is_block_visible(
     return (store_path / chunk_paths[-1]).size() > 0
 
 
-#: Distributions whose version can change a result or how it is stored.
+#: Distributions whose version can change a result or its stored bytes.
 VERSIONED_DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
 @cache
 def current_versions() -> dict[str, str]:
-    """Versions of the software that a result depends on, by name."""
+    """Return the versions of the software that results depend on, by name."""
     return {name: version(name) for name in VERSIONED_DISTRIBUTIONS}
 
 
 @cache
 def processor_text() -> str:
-    """Machine, processor and vector instructions, by which numpy and LLVM choose their code."""
+    """Return machine, processor and vector instructions, by which NumPy and LLVM select code."""
     import llvmlite.binding
     import numpy as np
 
@@ -565,7 +578,7 @@ def processor_text() -> str:
 
 
 def refuse_foreign_store(store_path: Location) -> None:
-    """Refuse what no version of this program has made; a damaged store of ours passes."""
+    """Raise a StoreError if what is at a path was not made by sweep; a damaged store passes."""
     if not any(
         any(iter_records(store_path / JOURNAL_DIR / name)) for name in (MANIFEST_FILE, *LOG_NAMES)
     ):
@@ -573,7 +586,7 @@ def refuse_foreign_store(store_path: Location) -> None:
 
 
 def refuse_to_replace(store_path: Location) -> None:
-    """Refuse to replace what no version of this program has made, or what can't be renamed."""
+    """Raise a StoreError if what is at a path was not made by sweep, or can't be renamed."""
     if not isinstance(store_path, Path):
         raise StoreError(
             f"{store_path} can't be replaced or extended in its place, as an object store has no "
@@ -583,7 +596,7 @@ def refuse_to_replace(store_path: Location) -> None:
 
 
 def refuse_foreign_files(store_path: Location) -> None:
-    """Refuse to replace a store with files in its folder that are not sweep's."""
+    """Raise a StoreError if the folder of a store contains files that are not sweep's."""
     if not isinstance(store_path, Path):
         return
     if names := [name for name in list_foreign_files(store_path) if not is_litter(name)]:
@@ -597,7 +610,10 @@ def refuse_foreign_files(store_path: Location) -> None:
 
 
 def pending_replacement(store_path: Location) -> Path | None:
-    """Return the unfinished store that is to replace the one at a path; StoreError for another."""
+    """Return the unfinished store that will replace the one at a path; None without one.
+
+    StoreError if the unfinished store was begun to replace another store.
+    """
     recover_interrupted_replace(store_path)
     if (
         not isinstance(store_path, Path)
@@ -615,31 +631,15 @@ def pending_replacement(store_path: Location) -> Path | None:
     return staging_path
 
 
-def refuse_other_study(
-    store_path: Location,
-    attributes: dict[str, Any],
-    stored_spec: GridSpec | SceneSpec,
-    requested_spec: GridSpec | SceneSpec,
-) -> None:
-    """Refuse a store that holds another study than the one asked for."""
-    if attributes["study_id"] == requested_spec.id:
-        return
-    refuse_other_versions(
-        store_path, attributes, reader="this machine"
-    )  # the version is in the id too
-    lines = "\n".join(f"  {line}" for line in describe_differences(stored_spec, requested_spec))
-    raise StoreError(
-        f"{store_path} holds another study (in the store -> in the spec):\n{lines}\n"
-        f"Name another {option_name('store')}, or replace this one with {option_text('overwrite')}."
-    )
-
-
 def refuse_other_versions(
-    store_path: str | Location, attributes: dict[str, Any], *, reader: str
+    store_path: str | Location, attributes: dict[str, Any], model_version: str, *, reader: str
 ) -> None:
-    """Refuse a store begun with another model or other software: the bits could differ."""
+    """Raise a StoreError if a store was begun with another model or other software.
+
+    Its bits could differ from those of new results. `reader` names this process in the message.
+    """
     recorded = {"model": attributes["model_version"], **parse_software_versions(attributes)}
-    current = {"model": VERSION, **current_versions()}
+    current = {"model": model_version, **current_versions()}
     if recorded != current:
         difference_lines = "\n".join(
             f"  {name}: {recorded.get(name, 'none')} in the store, {current.get(name, 'none')} here"

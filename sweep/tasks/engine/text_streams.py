@@ -1,6 +1,6 @@
-"""Output to a terminal, a pipe or a log that may be full, gone or missing.
+"""Output to a terminal, a pipe or a log that may be full, closed or missing.
 
-Words of a program must not end its computing: a stream that fails goes silent.
+Messages must not end the computation: a stream that fails becomes silent.
 """
 
 from __future__ import annotations
@@ -19,48 +19,48 @@ from typing import Any
 #: Descriptors of standard input, output and error.
 STANDARD_DESCRIPTORS = (0, 1, 2)
 
-#: Time for which a text waits for a reader that has stopped [s].
+#: Time for which a write waits for a reader that has stopped [s].
 READER_PATIENCE_SECONDS = 0.3
 
-#: Time without any text after which the thread that writes ends [s].
+#: Time without any text after which the writer thread ends [s].
 WRITER_IDLE_SECONDS_MAX = 5.0
 
-#: Texts that wait for such a reader; further ones are dropped.
+#: Largest number of texts that wait for a stopped reader; further ones are dropped.
 WAITING_TEXTS_MAX = 1000
 
-#: Loggers of Dask and of what it is made of, whose handlers write to standard error.
+#: Loggers of Dask and of its parts, whose handlers write to standard error.
 DASK_LOGGERS = ("distributed", "tornado", "bokeh")
 
 
 class ForgivingStream(io.TextIOBase):
-    """Text stream around another, which may be None; silent once that one has failed."""
+    """Text stream around another one, which may be None; silent after the first error."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
-        self.failure: Exception | None = None  # why it is silent
+        self.failure: Exception | None = None  # error after which the stream is silent
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """Encoding of the stream inside."""
+        """Encoding of the inner stream."""
         return getattr(self._stream, "encoding", None) or "utf-8"
 
     def isatty(self) -> bool:
-        """Tell whether the stream inside is a terminal."""
+        """Return True if the inner stream is a terminal."""
         return is_terminal(self._stream)
 
     def fileno(self) -> int:
-        """Return the descriptor of the stream inside; UnsupportedOperation if it has none."""
+        """Return the descriptor of the inner stream; UnsupportedOperation if it has none."""
         try:
             return int(self._stream.fileno())
         except (AttributeError, OSError, ValueError, TypeError):
             raise io.UnsupportedOperation("fileno") from None
 
     def writable(self) -> bool:
-        """Tell that text can be written."""
+        """Return True."""
         return True
 
     def write(self, text: str) -> int:
-        """Write text, or drop it."""
+        """Write a text, or drop it if the stream has failed."""
         if not isinstance(text, str):
             raise TypeError(f"a stream of text takes no {type(text).__name__}")
         if self._stream is None or self.failure is not None:
@@ -71,14 +71,14 @@ class ForgivingStream(io.TextIOBase):
             except UnicodeEncodeError:
                 encoded = text.encode(self.encoding, "backslashreplace")
                 self._stream.write(encoded.decode(self.encoding))
-        except BlockingIOError:  # a reader that is late: the next text may pass
+        except BlockingIOError:  # the reader is late: the next text may pass
             pass
         except Exception as error:
             self._go_silent(error)
         return len(text)
 
     def flush(self) -> None:
-        """Pass on what is written, or drop it."""
+        """Flush the inner stream; an error makes the stream silent."""
         if self._stream is None or self.failure is not None:
             return
         with suppress(BlockingIOError):
@@ -90,7 +90,7 @@ class ForgivingStream(io.TextIOBase):
                 self._go_silent(error)
 
     def finish_writing(self) -> None:
-        """Pass on the last that is written, so that nothing is left to fail after this."""
+        """Flush for the last time, so that no later flush can fail."""
         self.flush()
         try:
             if self._stream is not None:
@@ -102,7 +102,7 @@ class ForgivingStream(io.TextIOBase):
         self.failure = error
         with suppress(OSError, ValueError):
             if (descriptor := self.fileno()) in STANDARD_DESCRIPTORS:
-                # What the stream holds still is written as the program ends, which fails as well.
+                # Text in the stream's buffer would be written at exit, which fails as well.
                 null_descriptor = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null_descriptor, descriptor)
                 os.close(null_descriptor)
@@ -111,10 +111,10 @@ class ForgivingStream(io.TextIOBase):
 class PatientStream(ForgivingStream):
     """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
 
-    A thread writes to the descriptor of the stream inside. Whoever writes waits for it for
-    `READER_PATIENCE_SECONDS` at the most, and from then on not at all until the reader
-    goes on. Beyond `WAITING_TEXTS_MAX` waiting texts, further ones are dropped. A stream without
-    a descriptor is written to at once.
+    A thread writes to the descriptor of the inner stream. A flush waits for the thread for at most
+    `READER_PATIENCE_SECONDS`, and not at all from then on until the reader continues. If
+    `WAITING_TEXTS_MAX` texts wait, further ones are dropped. If the inner stream has no descriptor,
+    texts are written to it at once.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -125,7 +125,7 @@ class PatientStream(ForgivingStream):
         self._handover_lock = threading.Lock()
 
     def write(self, text: str) -> int:
-        """Hand over text, or drop it."""
+        """Hand a text to the writer thread, or drop it."""
         try:
             self.fileno()
         except io.UnsupportedOperation:
@@ -137,13 +137,13 @@ class PatientStream(ForgivingStream):
                 with suppress(queue.Full):
                     self._waiting_texts.put_nowait(text)
                 if self._writer_thread is None:
-                    super().flush()  # what others have written comes first
+                    super().flush()  # earlier text in the buffer comes first
                     self._writer_thread = threading.Thread(target=self._write_all, daemon=True)
                     self._writer_thread.start()
         return len(text)
 
     def flush(self) -> None:
-        """Wait until all is written, but not for a reader that has stopped."""
+        """Wait until all texts are written, but not for a reader that has stopped."""
         if self._writer_thread is None:
             super().flush()
             return
@@ -157,7 +157,10 @@ class PatientStream(ForgivingStream):
             self._is_reader_stopped = self._waiting_texts.unfinished_tasks > 0
 
     def _write_all(self) -> None:
-        """Write texts as they come: past buffers, whose locks the main thread needs to end."""
+        """Write texts as they arrive.
+
+        Buffers of the stream are avoided, as the main thread needs their locks to exit.
+        """
         while True:
             try:
                 text = self._waiting_texts.get(timeout=WRITER_IDLE_SECONDS_MAX)
@@ -181,9 +184,9 @@ class PatientStream(ForgivingStream):
 
 
 def make_dask_logs_patient() -> None:
-    """Let no log message of Dask in this process wait for a terminal that has stopped.
+    """Replace the streams of Dask's log handlers, so that no message waits for a stopped terminal.
 
-    Dask logs from its event loops. One that waits answers neither workers nor clients.
+    Dask logs from its event loops. A loop that waits answers neither workers nor clients.
     """
     streams: dict[int, PatientStream] = {}
     for name, logger in [*logging.root.manager.loggerDict.items()]:
@@ -200,12 +203,12 @@ def make_dask_logs_patient() -> None:
                 continue
             if descriptor in STANDARD_DESCRIPTORS:
                 stream = streams.setdefault(descriptor, PatientStream(handler.stream))
-                # Not by setStream, which flushes the stream before.
+                # Not by setStream, which flushes the old stream first.
                 handler.stream = stream
 
 
 def is_terminal(stream: Any) -> bool:
-    """Tell whether a stream, which may be missing, closed or of any kind, is a terminal."""
+    """Return True if a stream, which may be missing, closed or of any type, is a terminal."""
     try:
         return bool(stream.isatty())
     except Exception:
@@ -214,7 +217,7 @@ def is_terminal(stream: Any) -> bool:
 
 @contextmanager
 def forgiving_output() -> Iterator[None]:
-    """Have standard output and error of this process go silent where they fail."""
+    """Make standard output and error of this process silent after their first error."""
     _open_standard_descriptors()
     original_streams = sys.stdout, sys.stderr
     output, errors = (ForgivingStream(stream) for stream in original_streams)
@@ -230,7 +233,7 @@ def forgiving_output() -> Iterator[None]:
 
 
 def _open_standard_descriptors() -> None:
-    """Open those that are closed: the next file would get their number, and others' output."""
+    """Open closed standard descriptors, so that no new file gets their numbers and their output."""
     for descriptor in STANDARD_DESCRIPTORS:
         try:
             os.fstat(descriptor)

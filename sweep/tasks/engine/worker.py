@@ -1,4 +1,7 @@
-"""Blocks handed out, and on a worker: evaluated in the time they may take, written, receipted."""
+"""Evaluation of blocks on a worker, and the queue of blocks that are not done.
+
+A worker evaluates each block within its time limit, writes it, and returns a receipt.
+"""
 
 from __future__ import annotations
 
@@ -22,32 +25,31 @@ import numpy as np
 
 from sweep.storage.locations import parse_location, store_identity
 from sweep.storage.store_format import read_attributes
-from sweep.tasks.engine import journal, study_store
-from sweep.tasks.engine.blocks import BlockEvaluator, Deadline, Results, UnfinishedBlock
+from sweep.tasks.engine import journal, study_store, user_code
+from sweep.tasks.engine.block_study import BlockEvaluator, Deadline, StudyReader, UnfinishedBlock
+from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
 from sweep.tasks.engine.progress import CodeError, StoreError
-from sweep.tasks.studies import study_loading
-from sweep.tasks.studies.grid_study import GridStudy
 
 T = TypeVar("T")
 
-#: Errors of the place that results go to: every further block would meet them too.
+#: Errors of the storage: every further block would raise them too.
 STORAGE_ERRNOS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
     errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
 
-#: Seconds after which draws are saved, and their block put back for another task: what is lost
-#: where a worker dies, and waited for after Ctrl-C.
+#: Time after which the results of an unfinished block are saved, and the block is put back for
+#: another task [s]. As much is lost if a worker dies, and Ctrl-C waits for as long.
 CHECKPOINT_INTERVAL = 10.0
 
-#: Seconds that a thread has, after its time, to come back from compiled code and be interrupted.
+#: Time in which a thread must return from compiled code after its time limit [s].
 INTERRUPT_GRACE_SECONDS = 10.0
 
-#: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
+#: Interval of checks of the scheduler, the lock and the clock while no result arrives [s].
 IDLE_POLL_SECONDS = 0.5
 
-#: Studies that a worker holds open at once.
+#: Number of studies that a worker keeps open.
 OPEN_STUDIES_MAX = 4
 
 
@@ -60,47 +62,55 @@ ReceiptVerifier = Callable[[Receipt, bool], bool]
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """Part that all tasks of a run have in common; small, for it travels with each."""
+    """Settings that all tasks of a run share; sent with each task, therefore small."""
 
     store_path: str
     study_id: str
-    evaluate: BlockEvaluator | None = None  # in place of the study, with the same results
-    block_timeout: float | None = None  # that one block may take
-    durable: bool = False  # whether its chunks are on the disk before its receipt
+    read_study: StudyReader  # reads the study of the store
+    evaluate: BlockEvaluator | None = None  # replaces the study's `evaluate`, with its results
+    block_timeout: float | None = None  # time limit of a block [s]
+    durable: bool = False  # whether chunks are on the disk before the receipt
     user_code: tuple[
         tuple[str, str], ...
-    ] = ()  # modules of the user's that may run, and their digests
+    ] = ()  # the user's modules that may be imported, and their digests
 
 
 @dataclass
 class TaskResult:
-    """Results of one task: what was written, what failed, what is begun."""
+    """Result of one task: receipts, failures, and the points of unfinished blocks."""
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     checkpoint_points: dict[int, float] = field(
         default_factory=dict
-    )  # points there are of unfinished blocks
-    worker_address: str = ""  # address of the one that computed them, where there is one
-    host: str = ""  # its machine
-    worker_error: Exception | None = None  # why that worker can't compute any
-    n_workers: int = 1  # that there were as it arrived
+    )  # number of points done so far, by unfinished block
+    worker_address: str = ""  # address of the worker; '' for serial computation
+    host: str = ""  # host name of the worker
+    worker_error: Exception | None = None  # why the worker can't compute any block
+    n_workers: int = 1  # number of usable workers when the result arrived
 
 
 _open_writer_lock = threading.Lock()
 
 
-def block_writer_of_store(store_path: str, study_id: str) -> study_store.BlockWriter:
-    """Return the study of a store, opened for writing once a process; StoreError for another."""
+def block_writer_of_store(
+    store_path: str, study_id: str, read_study: StudyReader
+) -> study_store.BlockWriter:
+    """Return the writer of a store, opened once per process; StoreError for another study."""
     with _open_writer_lock:
-        return _cached_block_writer(store_path, study_id)
+        return _cached_block_writer(store_path, study_id, read_study)
 
 
-def _open_block_writer(store_path: str, study_id: str) -> study_store.BlockWriter:
-    attributes, stored_study = study_loading.read_study(parse_location(store_path))
+def _open_block_writer(
+    store_path: str, study_id: str, read_study: StudyReader
+) -> study_store.BlockWriter:
+    attributes, stored_study = read_study(parse_location(store_path))
     _refuse_replaced_store(store_path, study_id)
     study_store.refuse_other_versions(
-        store_path, attributes, reader=f"worker on {socket.gethostname()}"
+        store_path,
+        attributes,
+        stored_study.model_version,
+        reader=f"worker on {socket.gethostname()}",
     )
     return study_store.BlockWriter(store_path, stored_study)
 
@@ -109,7 +119,7 @@ _cached_block_writer = lru_cache(maxsize=OPEN_STUDIES_MAX)(_open_block_writer)
 
 
 def _refuse_replaced_store(store_path: str, study_id: str) -> None:
-    """Refuse a store that was put in the place of the one that a task was sent for."""
+    """Raise a StoreError if the store was replaced since the task was sent."""
     store_stamp = store_identity(parse_location(store_path))
     stored_id = (
         _stored_study_id(store_path, store_stamp)
@@ -122,14 +132,14 @@ def _refuse_replaced_store(store_path: str, study_id: str) -> None:
 
 @lru_cache(maxsize=OPEN_STUDIES_MAX)
 def _stored_study_id(store_path: str, store_stamp: tuple[int, ...] | None) -> str:
-    """Id of the study in a store, which has a stamp."""
+    """Return the id of the study in a store; the stamp is part of the key of the cache."""
     return str(read_attributes(parse_location(store_path))["study_id"])
 
 
 def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
-    """Evaluate and write blocks, each on its own: one that raises does not stop the next.
+    """Evaluate and write blocks; an error of one block does not stop the others.
 
-    Of one that takes long a piece is computed, and saved for the next task.
+    A block that takes long is computed in part, and saved for the next task.
     """
     task_result = TaskResult(worker_address=worker_address(), host=socket.gethostname())
     try:
@@ -137,7 +147,7 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
             _allow_user_code(settings)
         _run_blocks(
             task_result,
-            block_writer_of_store(settings.store_path, settings.study_id),
+            block_writer_of_store(settings.store_path, settings.study_id, settings.read_study),
             blocks,
             settings,
         )
@@ -147,12 +157,9 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
 
 
 def _allow_user_code(settings: TaskSettings) -> None:
-    """Allow the code that the run's driver allows in this worker; CodeError if it has another."""
-    if settings.user_code:
-        from sweep.tasks.studies.user_functions import allow_same_module
-
-        for module, digest in settings.user_code:
-            allow_same_module(module, digest)
+    """Allow the user's modules that the driver allows; CodeError if a file differs here."""
+    for module, digest in settings.user_code:
+        user_code.allow_same_module(module, digest)
 
 
 def _run_blocks(
@@ -183,15 +190,15 @@ def _run_blocks(
 def _run_block(
     writer: study_store.BlockWriter, block: int, settings: TaskSettings, deadline: Deadline
 ) -> Receipt | float:
-    """Receipt of a block, or the points that there are of it."""
+    """Compute one block. Return its receipt, or the number of points done at the deadline."""
     stored_study, store_path, checkpoint = writer.study, writer.store_path, Checkpoint()
     started_at = time.perf_counter()
     evaluate: Callable[[], Results]
     if settings.evaluate:
         evaluate = partial(settings.evaluate, stored_study, block)
-    elif isinstance(stored_study, GridStudy) and stored_study.spec.draws.has_draws:
+    elif stored_study.has_checkpoints:
         checkpoint = journal.read_checkpoint(store_path, stored_study.id, block)
-        evaluate = partial(stored_study.evaluate, block, checkpoint.results, deadline)
+        evaluate = partial(stored_study.evaluate_until, block, checkpoint.results, deadline)
     else:
         evaluate = partial(stored_study.evaluate, block)
     try:
@@ -207,10 +214,9 @@ def _run_block(
         )
         return unfinished.n_points
     evaluated_at = time.perf_counter()
-    _refuse_replaced_store(str(store_path), stored_study.id)  # its driver may be long dead
+    _refuse_replaced_store(str(store_path), stored_study.id)  # the driver may have died long ago
     stored_block = writer.write(block, results)
     ended_at = time.perf_counter()
-    reuse_source = getattr(stored_study, "reuse_source", None)
     return Receipt(
         block=block,
         points=stored_study.block_size(block),
@@ -221,12 +227,12 @@ def _run_block(
         host=socket.gethostname(),
         pid=os.getpid(),
         versions=study_store.current_versions(),
-        taken=reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0,
+        taken=stored_study.pop_reused_points(block),
     )
 
 
 def make_failure(block: int, error: BaseException) -> Failure:
-    """Record of a block's error, as met in this process."""
+    """Return a record of a block's error in this process."""
     traceback_lines = traceback.format_exception(type(error), error, error.__traceback__)
     return Failure(
         block=block,
@@ -238,21 +244,20 @@ def make_failure(block: int, error: BaseException) -> Failure:
 
 
 class BlockTimeoutError(Exception):
-    """A block took longer than it may."""
+    """Raised if a block exceeds its time limit."""
 
 
 class _TimeoutInterruption(SystemExit):
-    """Raised in a thread from outside; no `except Exception` on its way takes it for its own."""
+    """Raised in another thread to end it; not caught by `except Exception`."""
 
 
 def run_with_timeout(
     function: Callable[[], T], timeout: float | None, seconds_spent: float = 0.0
 ) -> T:
-    """Call a function; BlockTimeoutError if it takes longer than the timeout less what was spent.
+    """Call a function; BlockTimeoutError if it exceeds `timeout` less `seconds_spent` [s].
 
-    It is done in a thread, in which Python code is interrupted. A worker process whose thread is
-    still in compiled code `INTERRUPT_GRACE_SECONDS` later ends itself; any other waits for it to
-    return.
+    The function runs in a thread, where Python code is interrupted. A worker process ends itself if
+    the thread is still in compiled code `INTERRUPT_GRACE_SECONDS` later; any other process waits.
     """
     if timeout is None:
         return function()
@@ -266,15 +271,15 @@ def run_with_timeout(
         except BaseException as error:
             errors.append(error)
         is_finished.set()
-        may_exit.wait()  # until then no other thread has the number that is interrupted
+        may_exit.wait()  # until then no other thread can get the id that is interrupted
 
-    # which sees what is set here, such as Dask's worker
+    # the thread inherits context variables, such as Dask's worker
     thread = threading.Thread(target=copy_context().run, args=(call_function,), daemon=True)
     in_time = False
     thread.start()
     try:
         in_time = is_finished.wait(max(timeout - seconds_spent, 0.0))
-    finally:  # after Ctrl-C too
+    finally:  # also after Ctrl-C
         if not in_time:
             thread_id, error = (
                 ctypes.c_ulong(thread.ident or 0),
@@ -283,7 +288,7 @@ def run_with_timeout(
             ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, error)
         may_exit.set()
     if not in_time:
-        # A worker in a process of its own may end without harm.
+        # A worker with a process of its own may end without harm.
         is_own_process = worker_address().partition("://")[0] not in ("", "inproc")
         thread.join(INTERRUPT_GRACE_SECONDS if is_own_process else None)
         if thread.is_alive():
@@ -296,7 +301,7 @@ def run_with_timeout(
 
 
 def worker_address() -> str:
-    """Address of the Dask worker that this thread computes for; empty where there is none."""
+    """Return the address of the Dask worker that runs this thread; '' without one."""
     if "distributed" not in sys.modules:
         return ""
     from distributed import get_worker
@@ -308,17 +313,24 @@ def worker_address() -> str:
 
 
 class BlockQueue:
-    """Blocks that are not done, (blocks,) bool, handed out lazily; what fails comes back, alone."""
+    """Queue of the blocks that are not done.
+
+    `is_done` is a mask (blocks,) of bool. A block that failed is returned once more, in a task by
+    itself.
+    """
 
     def __init__(self, is_done: np.ndarray) -> None:
-        self.n_unassigned = int(is_done.size - np.count_nonzero(is_done))  # not yet handed out
+        self.n_unassigned = int(is_done.size - np.count_nonzero(is_done))  # not yet taken
         self._untried = _iter_unmarked(is_done)
         self._failed_once: deque[int] = deque()
         self._requeued: deque[int] = deque()
         self.failed: set[int] = set()
 
     def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
-        """Up to `count` blocks for one task; one that failed before comes by itself, if at all."""
+        """Take up to `count` blocks for one task; a block that failed before is taken alone.
+
+        If not `include_failed`, blocks that failed before stay in the queue.
+        """
         if self._failed_once and include_failed:
             return [self._failed_once.popleft()]
         if self._requeued:
@@ -328,7 +340,7 @@ class BlockQueue:
         return blocks
 
     def requeue_failed(self, block: int) -> bool:
-        """Put a failed block back; False where this was its second failure."""
+        """Put a failed block back. Return False, and drop it, at its second failure."""
         if block in self.failed:
             return False
         self.failed.add(block)
@@ -336,9 +348,9 @@ class BlockQueue:
         return True
 
     def requeue(self, blocks: list[int]) -> None:
-        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
+        """Put blocks back that are unfinished, or whose task was lost.
 
-        One that failed before stays a suspect, and is never out together with another.
+        A block that failed before is still taken alone.
         """
         for block in blocks:
             (self._failed_once if block in self.failed else self._requeued).append(block)
@@ -355,7 +367,10 @@ def run_serial(
     is_stopping: Callable[[], bool],
     verify_receipt: ReceiptVerifier,
 ) -> Iterator[TaskResult]:
-    """Answers of a study computed here, one block after the other: what defines its bytes."""
+    """Yield the results of blocks that are computed in this process, one after the other.
+
+    Reference implementation: every backend must write the same bytes.
+    """
     while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
         task_result = run_blocks(settings, task_blocks)
         if not all(verify_receipt(receipt, False) for receipt in task_result.receipts):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.model import VERSION
 from sweep.model.beamlet_counts import next_ray_counts
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.outputs import (
@@ -23,15 +24,10 @@ from sweep.model.outputs import (
     SHOT_VARIABLES,
 )
 from sweep.storage.store_format import MAP_GROUP
-from sweep.tasks.engine.blocks import (
-    FILL_VALUE_BY_KIND,
-    SHOTS_PER_TILE,
-    ArrayLayout,
-    BlockGrid,
-    BlockStudy,
-    Results,
-    cf_attributes,
-)
+from sweep.tasks.engine.block_study import BlockStudy
+from sweep.tasks.engine.blocks import FILL_VALUE_BY_KIND, ArrayLayout, BlockGrid, Results
+from sweep.tasks.studies.output_layouts import cf_attributes, make_output_layout
+from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE
 
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
@@ -68,6 +64,7 @@ class EyepointStudy(BlockStudy):
     """Eyepoints of a flight's shots through one scanner; rays and scene by default its own."""
 
     points_noun = "shots"
+    model_version = VERSION
 
     def __init__(
         self,
@@ -143,7 +140,7 @@ class EyepointStudy(BlockStudy):
         """Shots, beamlets and cycles."""
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
-            self._grid.make_layout(name, output, output.dims, sizes)
+            make_output_layout(self._grid, name, output, output.dims, sizes)
             for name, output in (SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES).items()
         ]
 

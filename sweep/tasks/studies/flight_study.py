@@ -33,15 +33,8 @@ from sweep.spec.scene_sections import scene_projection
 from sweep.storage.locations import Location, eyepoints_path
 from sweep.storage.store_format import MAP_GROUP
 from sweep.storage.verified_store import open_array_group
-from sweep.tasks.engine.blocks import (
-    BLOCKS_MAX,
-    SHOTS_PER_TILE,
-    ArrayLayout,
-    BlockGrid,
-    ExtendableStudy,
-    ParameterGrid,
-    Results,
-)
+from sweep.tasks.engine.blocks import BLOCKS_MAX, ArrayLayout, BlockGrid, Results
+from sweep.tasks.studies.extendable_study import ExtendableStudy
 from sweep.tasks.studies.eyepoint_study import (
     VECTOR_DIM_SIZES,
     EyepointStudy,
@@ -55,6 +48,8 @@ from sweep.tasks.studies.grid_study import (
     SelectedEffects,
     axis_coordinate_layouts,
 )
+from sweep.tasks.studies.output_layouts import make_output_layout
+from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterGrid
 
 if TYPE_CHECKING:
     from sweep.model.effects.planning import EffectPlan
@@ -287,8 +282,8 @@ class FlightStudy(ExtendableStudy):
             for name, output in outputs.items():
                 dims = output.dims if name in GEOMETRY_OUTPUTS else axis_names + output.dims
                 layouts.append(
-                    scanner_grid.make_layout(
-                        name, output, dims, sizes, flag_array_attributes().get(name)
+                    make_output_layout(
+                        scanner_grid, name, output, dims, sizes, flag_array_attributes().get(name)
                     )
                 )
         return layouts

@@ -46,22 +46,21 @@ from sweep.model.outputs import (
 )
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import PEAKS_PATH
-from sweep.tasks.engine.blocks import (
-    CHUNK_READ_ERRORS,
+from sweep.tasks.engine.block_study import (
     NO_RESULTS,
-    TOLERANCE_PARAMETER,
-    ArrayLayout,
-    BlockGrid,
     Deadline,
-    ExtendableStudy,
-    ParameterBlockGrid,
-    ParameterValue,
     PartialResults,
-    Results,
     ReusedResults,
     UnfinishedBlock,
-    cf_attributes,
     concatenate_results,
+)
+from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid, Results
+from sweep.tasks.studies.extendable_study import CHUNK_READ_ERRORS, ExtendableStudy
+from sweep.tasks.studies.output_layouts import cf_attributes, make_output_layout
+from sweep.tasks.studies.parameter_grid import (
+    TOLERANCE_PARAMETER,
+    ParameterBlockGrid,
+    ParameterValue,
 )
 
 if TYPE_CHECKING:
@@ -445,7 +444,9 @@ class GridStudy(ExtendableStudy):
         }
         layouts = []
         for name, output in block_outputs(self.spec).items():
-            layout = self.grid.make_layout(name, output, self.grid.dims + output.dims, sizes)
+            layout = make_output_layout(
+                self.grid, name, output, self.grid.dims + output.dims, sizes
+            )
             layout_attributes = dict(layout.attributes)
             if name == EFFECTS_ARRAY:
                 layout_attributes |= effect_flag_attributes()
@@ -487,6 +488,17 @@ class GridStudy(ExtendableStudy):
             ):  # some are of use to later draws alone
                 results[name][local_indices] = part_results[name]
         return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
+
+    @property
+    def has_checkpoints(self) -> bool:
+        """True if points are drawn: a block may stop between draws."""
+        return self.spec.draws.has_draws
+
+    def evaluate_until(
+        self, block: int, checkpoint_results: ReusedResults, deadline: Deadline
+    ) -> Results:
+        """Return the outputs of a block, whose first draws are there; stop at the deadline."""
+        return self.evaluate(block, checkpoint_results, deadline)
 
     def _reused_results(self, block: int, selected_effects: SelectedEffects) -> ReusedResults:
         """Points of a block that a smaller study has: whole, or their first draws."""

@@ -20,7 +20,7 @@ from sweep.storage.locations import PACKED_ATTRIBUTE, Location, file_sizes_below
 from sweep.storage.store_format import read_receipt_totals
 from sweep.storage.verified_store import open_array_group
 from sweep.tasks.engine import journal
-from sweep.tasks.engine.blocks import TOLERANCE_PARAMETER, BlockStudy
+from sweep.tasks.engine.block_study import BlockStudy
 from sweep.tasks.engine.journal import blocks_with_receipt, checkpoint_points
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import study_loading
@@ -31,6 +31,7 @@ from sweep.tasks.studies.grid_study import (
     limit_draws,
     select_parameters,
 )
+from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER
 
 if TYPE_CHECKING:
     from sweep.spec import Axis

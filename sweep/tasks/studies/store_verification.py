@@ -49,7 +49,8 @@ from sweep.storage.store_format import (
 )
 from sweep.storage.verified_store import CHUNK_NAME, chunk_damage, open_array_group
 from sweep.tasks.engine import journal, study_store
-from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid, BlockStudy
+from sweep.tasks.engine.block_study import BlockStudy
+from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid
 from sweep.tasks.engine.journal import LOG_NAMES, RECIPE_FILE, committed_blocks, read_recipe
 from sweep.tasks.engine.progress import Progress, StoreError, make_progress, raise_as_store_error
 from sweep.tasks.engine.study_store import Damage, damage_or_read_error, template_object_damage
@@ -343,7 +344,9 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
     except StoreError:
         attributes = {}
     if attributes:
-        study_store.refuse_other_versions(store_path, attributes, reader="this machine")
+        study_store.refuse_other_versions(
+            store_path, attributes, study.model_version, reader="this machine"
+        )
     if attributes.get("study_id", study.id) != study.id:
         raise StoreError(
             f"{store_path / 'zarr.json'} is damaged{store_format.repair_hint(store_path)}"

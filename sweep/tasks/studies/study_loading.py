@@ -15,7 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.messages import NEW_PLACEHOLDER, SPEC_PLACEHOLDER, shell_command, suggestion
+from sweep.messages import (
+    NEW_PLACEHOLDER,
+    SPEC_PLACEHOLDER,
+    option_name,
+    option_text,
+    shell_command,
+    suggestion,
+)
+from sweep.model import VERSION
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import GridSpec, SceneSpec, SpecError, describe_differences, from_stored
 from sweep.spec.grid_checks import is_detector_or_estimator
@@ -25,18 +33,14 @@ from sweep.storage import store_format
 from sweep.storage.locations import Location, parse_location, resolve_links
 from sweep.storage.verified_store import open_array_group
 from sweep.tasks.engine import study_store
-from sweep.tasks.engine.blocks import (
-    CHUNK_READ_ERRORS,
-    TOLERANCE_PARAMETER,
-    ParameterGrid,
-    ParameterValue,
-    Results,
-)
+from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import EXTENDS_KEY, committed_blocks, committed_digests, read_recipe
 from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.extendable_study import CHUNK_READ_ERRORS
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy, canonical_point_rows
+from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER, ParameterGrid, ParameterValue
 
 AnySpec = GridSpec | SceneSpec
 
@@ -63,7 +67,7 @@ def _find_reuse_source(
     """Results that the store at a path has of a study; None where it is gone, or has none."""
     try:
         attributes = store_format.read_attributes(source_path)
-        study_store.refuse_other_versions(source_path, attributes, reader="this machine")
+        study_store.refuse_other_versions(source_path, attributes, VERSION, reader="this machine")
         source_spec = _read_spec(
             source_path, read_recipe(source_path), attributes.get("spec", "{}")
         )
@@ -116,6 +120,25 @@ def _read_spec(store_path: Location, recipe: dict[str, Any], spec_json: str) -> 
         raise StoreError(
             f"{store_path} holds a spec that this version of sweep can't read:\n{error}"
         ) from error
+
+
+def refuse_other_study(
+    store_path: Location,
+    attributes: dict[str, Any],
+    stored_spec: GridSpec | SceneSpec,
+    requested_spec: GridSpec | SceneSpec,
+) -> None:
+    """Refuse a store that holds another study than the one asked for."""
+    if attributes["study_id"] == requested_spec.id:
+        return
+    study_store.refuse_other_versions(
+        store_path, attributes, VERSION, reader="this machine"
+    )  # the version is in the id too
+    lines = "\n".join(f"  {line}" for line in describe_differences(stored_spec, requested_spec))
+    raise StoreError(
+        f"{store_path} holds another study (in the store -> in the spec):\n{lines}\n"
+        f"Name another {option_name('store')}, or replace this one with {option_text('overwrite')}."
+    )
 
 
 #: Fields that may grow, and one that may shrink; blocks may be of any size.

@@ -19,7 +19,7 @@ from sweep.model.outputs import SHOT_VARIABLES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoints_path
 from sweep.tasks.engine import cluster_connection
-from sweep.tasks.engine.blocks import SHOTS_PER_TILE, ParameterValue
+from sweep.tasks.engine.worker_memory import serial_worker_memory
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import (
@@ -35,8 +35,8 @@ from sweep.tasks.studies.memory_limits import (
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_scene,
-    serial_worker_memory,
 )
+from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterValue
 from sweep.tasks.studies.study_loading import make_study
 
 if TYPE_CHECKING:

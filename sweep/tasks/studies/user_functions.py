@@ -1,22 +1,15 @@
-"""Detectors and estimators that are functions of the user's: allowed, imported, checked.
+"""Detectors and estimators that are functions of the user's: imported and checked.
 
 A spec names them as ``module:function``; reading it imports nothing. Processes that compute import
-them only from modules allowed by ``--allow-code MODULE``, by ``allow_code=[...]``, or in the
-environment variable ``SWEEP_ALLOW_CODE``. A run tells its workers, wherever they are, which modules
-are allowed, and refuses a worker that has another file of that name.
+them only from modules that are allowed (:mod:`sweep.tasks.engine.user_code`).
 """
 
 from __future__ import annotations
 
-import os
-import socket
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
-from hashlib import blake2b
-from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -26,87 +19,21 @@ from sweep.messages import option_text
 from sweep.model.detection.detectors import DETECTORS, SpectrumSettings
 from sweep.model.detection.estimators import ESTIMATORS
 from sweep.model.window import get_window
-from sweep.tasks.engine.blocks import SPECTRUM_METHOD_PARAMETERS, user_functions
+from sweep.tasks.engine import user_code
 from sweep.tasks.engine.progress import CodeError
+from sweep.tasks.studies.user_function_names import SPECTRUM_METHOD_PARAMETERS, user_functions
 
 if TYPE_CHECKING:
     from sweep.model.sampling.noisy_spectra import SpectrumMethods
     from sweep.spec import GridSpec, SceneSpec
 
-ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
-
 DETECTOR_ROLE, ESTIMATOR_ROLE = SPECTRUM_METHOD_PARAMETERS
-
-
-def allow_modules(modules: Iterable[str]) -> None:
-    """Allow this process and its workers to import modules, named as before a spec's colon."""
-    for module in (modules := list(modules)):
-        if module.endswith(".py") or not all(
-            name_part.isidentifier() for name_part in module.split(".")
-        ):
-            name = module.partition(":")[0].removesuffix(".py").replace("/", ".")
-            suggestion_text = f"; write {name!r}" if name.replace(".", "_").isidentifier() else ""
-            raise CodeError(
-                f"{module!r} is no name of a Python module, as a spec has it before the "
-                f"colon{suggestion_text}"
-            )
-    allowed = {*_allowed_modules(), *modules}
-    if allowed:
-        os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(allowed))
-        _import_from_working_directory()  # handed on to workers that are spawned
-
-
-def _import_from_working_directory() -> None:
-    """Import from the working directory too, and what is found nowhere else: it may be anyone's."""
-    if (working_directory := os.getcwd()) not in sys.path:
-        sys.path.append(working_directory)
-
-
-def _allowed_modules() -> set[str]:
-    return set(filter(None, os.environ.get(ALLOWED_MODULES_VARIABLE, "").split(",")))
 
 
 def check_user_functions(spec: GridSpec | SceneSpec) -> None:
     """Import the functions that a study names, and try each; CodeError where one fails."""
     for role, name in user_functions(spec):
         _try_user_function(role, name)
-
-
-def module_digests(spec: GridSpec | SceneSpec) -> dict[str, str]:
-    """Digest of each module, as it is imported here, whose functions a study names."""
-    modules = {name.partition(":")[0] for _, name in user_functions(spec)}
-    digest_by_module = {module: _module_file_digest(import_module(module)) for module in modules}
-    return {module: digest for module, digest in digest_by_module.items() if digest}
-
-
-def _module_file_digest(module: ModuleType) -> str:
-    """Digest of the file of a module; empty where it has none."""
-    source = getattr(module, "__file__", None)
-    return blake2b(Path(source).read_bytes(), digest_size=16).hexdigest() if source else ""
-
-
-def allowed_module_digests(spec: GridSpec | SceneSpec) -> dict[str, str]:
-    """Modules, allowed here, whose functions a study names; digest of each that has a file."""
-    digest_by_module = module_digests(spec)
-    return {name.partition(":")[0]: digest_by_module.get(name.partition(":")[0], "")
-            for _, name in user_functions(spec)}  # fmt: skip
-
-
-@lru_cache(maxsize=64)
-def allow_same_module(module: str, digest: str) -> None:
-    """Allow a module in this worker, as the run's driver has done; CodeError for another file.
-
-    Once a process: what is imported stays as it is, whatever becomes of its file.
-    """
-    allow_modules([module])
-    imported = _import_user_module(module)
-    local_digest = _module_file_digest(imported)
-    if digest and local_digest != digest:
-        raise CodeError(
-            f"the module {module} is not the same file on {socket.gethostname()} "
-            f"({getattr(imported, '__file__', None)}) as where the run was started: "
-            "put the same file on all machines"
-        )
 
 
 def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
@@ -178,48 +105,15 @@ def _error_place_text(error: BaseException, module: ModuleType) -> str:
     )
 
 
-def _import_user_module(name: str) -> ModuleType:
-    """Import a module of the user's; a CodeError that says why it can't be."""
-    _import_from_working_directory()
-    try:
-        return import_module(name)
-    except (Exception, SystemExit) as error:
-        host_text = f" on {socket.gethostname()}"
-        if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
-            raise CodeError(
-                f"there is no module {error.name}{host_text}: put {error.name}.py into the folder "
-                f"{os.getcwd()}, or its folder into PYTHONPATH, for workers on other machines in "
-                "the section environment of the cluster's file"
-            ) from error
-        place_text = _import_error_place_text(error)
-        raise CodeError(
-            f"the module {name} can't be imported{host_text}: {type(error).__name__}: "
-            f"{error}{place_text}"
-        ) from error
-
-
-def _import_error_place_text(error: BaseException) -> str:
-    """File and line at which importing a module failed."""
-    if isinstance(error, SyntaxError):
-        return f" ({error.filename}:{error.lineno})"
-    frames = traceback.extract_tb(error.__traceback__)
-    user_frames = [
-        frame
-        for frame in frames
-        if frame.filename != __file__ and "importlib" not in frame.filename
-    ]
-    return f" ({user_frames[-1].filename}:{user_frames[-1].lineno})" if user_frames else ""
-
-
 def _import_user_function(name: str) -> Callable[..., Any]:
     module, _, attribute = name.partition(":")
-    if module not in _allowed_modules():
+    if module not in user_code.allowed_modules():
         raise CodeError(
             f"{name} is code that this study would run, and its module is not allowed: look at it, "
             f"then say {option_text('allow_code', [module])}"
         )
     try:
-        function = getattr(_import_user_module(module), attribute)
+        function = getattr(user_code.import_user_module(module), attribute)
     except AttributeError:
         module_file = getattr(sys.modules[module], "__file__", None) or module
         raise CodeError(

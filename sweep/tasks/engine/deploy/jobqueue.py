@@ -1,7 +1,7 @@
 """Workers in jobs of SLURM or PBS, by dask-jobqueue.
 
-The scheduler is part of the driver; jobs come and go. A worker leaves before its job's time is up,
-each at a moment of its own, after handing back what it was at; another job takes its place.
+The scheduler is part of the driver; jobs start and end. A worker leaves its job before the job's
+time limit, each at a different time, after returning its task. Another job replaces it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from sweep.tasks.engine.deploy import local_ssh
 
 @contextmanager
 def _signal_handlers_kept() -> Iterator[None]:
-    """Have this thread set no handlers of signals.
+    """Keep this thread's signal handlers while dask_jobqueue is imported.
 
-    dask_jobqueue sets one as it is imported, by which Ctrl-C ends the program at once. In any
-    thread but the main one that is an error.
+    dask_jobqueue sets a handler on import, by which Ctrl-C ends the program at once. In any thread
+    but the main one that is an error.
     """
     set_handler, protected_thread = signal.signal, threading.get_ident()
 
@@ -46,12 +46,12 @@ with _signal_handlers_kept():
     from dask_jobqueue.pbs import PBSJob
     from dask_jobqueue.slurm import SLURMJob
 
-#: Seconds until a running cluster submits again what was not taken.
+#: Time after which a running cluster submits a rejected job again [s].
 RESUBMIT_PAUSE = 15.0
 
 
 class _JobWithStatus:
-    """A job that says so where it was not taken."""
+    """Job that reports if the batch system rejects it."""
 
     status: Status
 
@@ -65,7 +65,7 @@ class _JobWithStatus:
 
 
 class _ResubmittingCluster:
-    """A cluster that lets go of jobs which were not taken, so that others are submitted later."""
+    """Cluster that forgets rejected jobs, so that others are submitted later."""
 
     worker_spec: dict[str, Any]
     workers: dict[str, Any]
@@ -100,7 +100,7 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 
 
 def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
-    """Return the cluster, its least number of workers submitted; RuntimeError if refused."""
+    """Return a cluster with its least number of workers submitted; RuntimeError if rejected."""
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
     try:
@@ -114,7 +114,7 @@ def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
 def keep_workers_in_bounds(
     dask_cluster: Any, cluster: BatchClusterConfig, bounds: WorkerBounds
 ) -> None:
-    """Submit jobs in the place of those that end, and more or fewer with the work, in bounds."""
+    """Replace jobs that end, and adapt the number of jobs to the work within bounds."""
     jobs_min, jobs_max = (count_jobs(cluster, n_workers) for n_workers in bounds)
     dask_cluster.adapt(
         minimum_jobs=jobs_min,
@@ -124,19 +124,19 @@ def keep_workers_in_bounds(
 
 
 async def _submit_jobs(dask_cluster: Any, n_jobs: int) -> None:
-    """Submit jobs, and wait for the batch system to take them."""
+    """Submit jobs, and wait for the batch system to accept them."""
     while len(dask_cluster.worker_spec) < n_jobs:
         dask_cluster.worker_spec.update(dask_cluster.new_worker_spec())
     await dask_cluster
 
 
 def count_jobs(cluster: BatchClusterConfig, n_workers: int) -> int:
-    """Jobs that hold so many workers."""
+    """Return the number of jobs that hold `n_workers` workers."""
     return -(-n_workers // cluster.job.workers)
 
 
 def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
-    """Arguments of dask-jobqueue's clusters."""
+    """Return the arguments of dask-jobqueue's clusters."""
     worker, job = cluster.worker, cluster.job
     lifetime, stagger = worker_lifetime(job.walltime)
     required: dict[str, Any] = {
@@ -167,16 +167,16 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
 
 
 def worker_lifetime(walltime: float) -> tuple[float, float]:
-    """Mean time [s] after which a worker leaves its job, and how far that is spread each way.
+    """Return the mean time after which a worker leaves its job, and its spread to each side [s].
 
-    The last leaves with 5 % of the walltime in hand: a minute at least, a quarter of very short
-    ones.
+    The last worker leaves when 5 % of the walltime is left, at least a minute, but at most a
+    quarter of a very short walltime.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return walltime - 1.5 * reserve, reserve / 2
 
 
 def walltime_text(seconds: float) -> str:
-    """Hours, minutes and seconds as batch systems write them."""
+    """Return a time as hours, minutes and seconds, as batch systems write it."""
     whole_seconds = int(seconds)
     return f"{whole_seconds // 3600:02d}:{whole_seconds // 60 % 60:02d}:{whole_seconds % 60:02d}"

@@ -1,4 +1,4 @@
-"""Workers in pods, which the Dask operator of a Kubernetes cluster starts: `sweep[kubernetes]`."""
+"""Workers in pods that the Dask operator of a Kubernetes cluster starts: `sweep[kubernetes]`."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from sweep.tasks.engine.progress import ClusterError
 API_VERSION = "kubernetes.dask.org/v1"
 SCHEDULER_PORT = 8786
 
-#: Seconds in which the scheduler's pod must be ready: an image may have to be fetched first.
+#: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
 POD_READY_SECONDS_MAX = 600.0
 
-#: Where certificates are in the pods.
+#: Folder of certificates in the pods.
 CERTIFICATE_FOLDER = "/etc/sweep-tls"
 
-#: Pages of the scheduler that the operator asks about workers.
+#: HTTP routes of the scheduler that the operator reads the state of workers from.
 SCHEDULER_HTTP_ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 
 
 @contextmanager
 def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> Iterator[str]:
-    """Address of the scheduler while the cluster is there; ClusterError where that can't be had."""
+    """Create a cluster for the context. Yield its scheduler's address; ClusterError on failure."""
     try:
         from httpx import HTTPError
         from kr8s import APITimeoutError, NotFoundError, ServerError
@@ -63,7 +63,7 @@ def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> It
 
 
 def _delete_resource(kubernetes_object: Any) -> None:
-    with suppress(Exception):  # gone already, or out of reach: the study is stored all the same
+    with suppress(Exception):  # removed, or out of reach: the results are stored anyway
         kubernetes_object.delete()
 
 
@@ -83,7 +83,7 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 
 @contextmanager
 def _reach_service(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
-    """Address of the service: its own from inside the cluster, a forwarded port from outside."""
+    """Return the address of a service: its own inside the cluster, a forwarded port outside."""
     if _is_known_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"
         return
@@ -107,19 +107,19 @@ def _is_known_host(name: str) -> bool:
 
 
 def connection_protocol(cluster: KubernetesClusterConfig) -> str:
-    """Protocol by which all parts talk to each other."""
+    """Return the protocol between scheduler, workers and client."""
     return "tls" if cluster.security else "tcp"
 
 
 def scheduler_host(cluster: KubernetesClusterConfig) -> str:
-    """Name of the scheduler inside the Kubernetes cluster."""
+    """Return the name of the scheduler inside the Kubernetes cluster."""
     return f"{cluster.name}-scheduler.{cluster.namespace}.svc.cluster.local"
 
 
 def autoscaler_resource(
     cluster: KubernetesClusterConfig, bounds: WorkerBounds
 ) -> dict[str, Any] | None:
-    """Resource that keeps the number of workers between bounds; None where it is fixed."""
+    """Return the resource that adapts the number of workers within bounds; None if it is fixed."""
     if bounds.least == bounds.most:
         return None
     return {
@@ -131,7 +131,7 @@ def autoscaler_resource(
 
 
 def cluster_resource(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> dict[str, Any]:
-    """Return the cluster as Kubernetes declares it."""
+    """Return the cluster as a Kubernetes resource."""
     try:
         from dask_kubernetes.operator import make_cluster_spec
     except ImportError as error:
@@ -168,7 +168,7 @@ def cluster_resource(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> 
         **local_ssh.worker_environment(cluster.environment),
     }
     _fill_pod(worker_pod, ["worker", *arguments], variables, cluster)
-    worker_pod["containers"][0].pop("ports")  # a worker shows no pages
+    worker_pod["containers"][0].pop("ports")  # a worker has no HTTP server
     return declaration
 
 
@@ -178,7 +178,7 @@ def _fill_pod(
     variables: dict[str, str],
     cluster: KubernetesClusterConfig,
 ) -> None:
-    """Put command, environment and volumes into a pod's only container."""
+    """Set command, environment and volumes of a pod's only container."""
     (container,) = pod["containers"]
     container["args"] = ["dask", *arguments, *_tls_arguments(cluster)]
     container["env"] = [{"name": name, "value": value} for name, value in variables.items()]

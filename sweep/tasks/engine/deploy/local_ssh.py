@@ -1,4 +1,4 @@
-"""Workers on this machine and on machines reached by SSH; settings that all clusters share."""
+"""Workers on this machine and on machines reached by SSH, and settings of all clusters."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from distributed import Security
 
 
-#: What a worker runs as it starts.
+#: Module that a worker runs on start.
 PRELOAD_MODULE = "sweep.tasks.preload"
 
-#: One thread a worker slot in every library that would start its own.
+#: Environment variables that limit libraries with threads of their own to one per worker slot.
 ONE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -36,14 +36,14 @@ ONE_THREAD_VARIABLES = {
     "NUMBA_NUM_THREADS": "1",
 }
 
-#: Variable that keeps the working directory out of the places that modules are imported from: a
-#: file `socket.py` there would be run by every worker.
+#: Environment variable that removes the working directory from Python's search path: a file
+#: `socket.py` there would be run by every worker.
 SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
 
-#: How often Dask looks at itself. By default it does so some 150 times a second in each worker,
-#: which takes a tenth of the processor's time from whatever else the worker does. And no pause near
-#: the memory's limit: tasks leave nothing behind that could be waited for, so a worker that paused
-#: would do so for ever. At the limit it is ended, and its blocks go elsewhere.
+#: Settings of Dask that reduce its self-monitoring, and disable the pause near the memory limit. By
+#: default each worker monitors itself some 150 times a second, which takes a tenth of its time.
+#: Tasks leave no data on a worker, so a worker that pauses would never resume. A worker at the
+#: memory limit is ended, and its blocks go to others.
 DASK_CONFIG: dict[str, Any] = {
     "distributed.admin.tick.interval": "500ms",
     "distributed.admin.system-monitor.interval": "2s",
@@ -51,19 +51,19 @@ DASK_CONFIG: dict[str, Any] = {
     "distributed.worker.profile.cycle": "10s",
     "distributed.worker.memory.monitor-interval": "200ms",
     "distributed.worker.memory.pause": False,
-    "distributed.worker.http.routes": [],  # pages that all users of the machine could see
+    "distributed.worker.http.routes": [],  # all users of the machine could read the pages
 }
 
-#: Settings of a scheduler without a dashboard: its HTTP server, which Dask starts all the same, has
-#: no page. By default it shows workers, tasks and logs to all users of the machine.
+#: Settings of a scheduler without a dashboard. Dask starts its HTTP server anyway, but without
+#: pages; by default it shows workers, tasks and logs to all users of the machine.
 NO_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 
-#: Seconds of work ahead for which a cluster between bounds takes another worker thread.
+#: Time of pending work per worker thread above which an adaptive cluster adds a thread [s].
 ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables of workers: one thread a slot, calm, wary, and those given."""
+    """Return the environment variables of workers: thread limits, safe path, and those given."""
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
@@ -72,7 +72,10 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
-    """Certificates of client, scheduler and workers, which then refuse whoever has none."""
+    """Return the TLS security of client, scheduler and workers; None without certificates.
+
+    With it they refuse connections without a certificate.
+    """
     from distributed import Security
 
     settings = security_settings(cluster)
@@ -80,7 +83,7 @@ def make_security(cluster: ClusterConfig) -> Security | None:
 
 
 def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
-    """Return settings of `distributed.Security`; empty without certificates."""
+    """Return the settings of `distributed.Security`; empty without certificates."""
     paths = cluster.certificate_paths()
     if paths is None:
         return {}
@@ -92,7 +95,7 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
-    """Address at which a scheduler of this process listens, and that of its dashboard, if any."""
+    """Return the addresses of a scheduler of this process and of its dashboard, if any."""
     options: dict[str, Any] = {
         "port": scheduler.port,
         "dashboard": shows_dashboard(scheduler),
@@ -104,14 +107,14 @@ def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
 
 
 def shows_dashboard(scheduler: SchedulerConfig) -> bool:
-    """Tell whether a dashboard is asked for."""
+    """Return True if a dashboard is asked for."""
     return scheduler.dashboard != NO_DASHBOARD
 
 
 def dashboard_address(scheduler: SchedulerConfig) -> str:
-    """Address of a scheduler's pages, on this machine's loopback interface.
+    """Return the address of a scheduler's HTTP server, on the loopback interface.
 
-    The port is the one asked for; any where that is taken, or where no dashboard is asked for.
+    The port is the requested one; any free port if that is taken, or if no dashboard is asked for.
     """
     port = int(scheduler.dashboard.rpartition(":")[2]) if shows_dashboard(scheduler) else 0
     with socket.socket() as test_socket:
@@ -124,24 +127,23 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
 
 WORKER_BYTES_MIN = 1 << 30
 
-#: Time after which a worker that shows no sign of life is ended, and started anew.
+#: Time after which a worker without a heartbeat is ended and restarted.
 WORKER_TTL = "2 minutes"
 
 
 @contextmanager
 def spawn_environment() -> Iterator[None]:
-    """Surroundings in which workers are started, and started anew, as processes.
+    """Context in which workers are started, and restarted, as processes.
 
-    A process that is spawned imports from the working directory, unless told otherwise, and
-    runs the script that its parent runs, of which workers need nothing: functions in it travel
-    by value.
+    By default a spawned process imports from the working directory, and runs the script of its
+    parent. Workers need neither: functions of the script are sent by value.
     """
     main_globals, previous_value = vars(sys.modules["__main__"]), os.environ.get(SAFE_PATH_VARIABLE)
     removed_globals = {
         name: main_globals.pop(name) for name in [*main_globals] if name in ("__file__", "__spec__")
     }
     main_globals["__spec__"] = None
-    os.environ[SAFE_PATH_VARIABLE] = "1"  # for what multiprocessing starts itself, too
+    os.environ[SAFE_PATH_VARIABLE] = "1"  # also for processes that multiprocessing starts itself
     try:
         yield
     finally:
@@ -154,7 +156,7 @@ def spawn_environment() -> Iterator[None]:
 def start_local_cluster(
     cluster: LocalClusterConfig, bounds: WorkerBounds, *, processes: bool
 ) -> Any:
-    """Start workers of this machine; OSError, RuntimeError, ImportError where they can't be."""
+    """Start workers on this machine; OSError, RuntimeError or ImportError if they can't start."""
     import dask
     from distributed import LocalCluster, Security
 
@@ -172,13 +174,13 @@ def start_local_cluster(
         "preload": [PRELOAD_MODULE],
         "security": make_security(cluster),
     }
-    if processes:  # threads need no port
+    if processes:  # worker threads need no port
         options |= listen_options | {"scheduler_port": port}
         dashboard_options["worker_ttl"] = WORKER_TTL
         options["security"] = options["security"] or Security.temporary()
     else:
         options["worker_dashboard_address"] = (
-            f"{LOOPBACK_ADDRESS}:0"  # by default all networks reach it
+            f"{LOOPBACK_ADDRESS}:0"  # by default it listens on all networks
         )
         options["worker_class"] = _worker_without_pages()
     config_name = "distributed.nanny.pre-spawn-environ"
@@ -189,13 +191,13 @@ def start_local_cluster(
     with dask.config.set({**DASK_CONFIG, config_name: environment_variables}):
         try:
             return LocalCluster(scheduler_kwargs=dashboard_options, **options)
-        except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
+        except (OSError, ImportError, RuntimeError):  # the run goes on without a dashboard
             dashboard_options |= {"dashboard": False, "dashboard_address": f"{LOOPBACK_ADDRESS}:0"}
             return LocalCluster(scheduler_kwargs=dashboard_options, **options)
 
 
 def _worker_without_pages() -> type:
-    """Class of workers as threads that have an address for pages, as Dask asks for, and no page."""
+    """Return a class of thread workers whose HTTP server, which Dask requires, has no page."""
     from distributed import Worker
 
     class WorkerWithoutPages(Worker):
@@ -206,7 +208,7 @@ def _worker_without_pages() -> type:
 
 
 def dashboard_link(dask_cluster: Any) -> str:
-    """Address of the dashboard of a cluster that was started here, for a browser."""
+    """Return the URL of the dashboard of a cluster that was started here."""
     from distributed.utils import format_dashboard_link
 
     return str(
@@ -217,7 +219,7 @@ def dashboard_link(dask_cluster: Any) -> str:
 
 
 def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
-    """Bytes that a worker may take before Dask restarts it: by default its share of 90 %."""
+    """Return the memory at which Dask restarts a worker [bytes]; by default its share of 90 %."""
     from distributed.system import MEMORY_LIMIT
 
     requested_bytes = cluster.worker.memory
@@ -229,7 +231,7 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
 
 
 def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start workers on all machines; OSError, RuntimeError where one can't be reached."""
+    """Start workers on all machines; OSError or RuntimeError if one can't be reached."""
     import asyncssh
     from distributed import Scheduler, SpecCluster
 
@@ -250,7 +252,7 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Workers to start on each machine, by its name: they are dealt out evenly."""
+    """Return the workers to start on each machine, by its name, evenly distributed."""
     from distributed.deploy.ssh import Worker
 
     hosts = cluster.hosts[:n_workers]
@@ -273,7 +275,7 @@ def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dic
 
 
 def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Arguments of `asyncssh.connect`."""
+    """Return the arguments of `asyncssh.connect`."""
     options = {
         "username": cluster.user,
         "client_keys": cluster.identity and [cluster.resolve_path(cluster.identity)],
@@ -283,7 +285,7 @@ def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Arguments of the nannies there: what JSON can hold."""
+    """Return the arguments of the nannies on the machines, all of them representable in JSON."""
     security = security_settings(cluster)
     return {
         "nthreads": cluster.worker.threads,
@@ -296,7 +298,7 @@ def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 class Certificates(NamedTuple):
-    """Files of a cluster's own certificate, which signs itself."""
+    """Files of a cluster's self-signed certificate."""
 
     ca: Path
     certificate: Path
@@ -304,7 +306,10 @@ class Certificates(NamedTuple):
 
 
 def make_certificates(directory: Path) -> Certificates:
-    """Make Dask's certificate, of a year, which its owner alone may read; else ClusterError."""
+    """Create a certificate for Dask, valid for a year, that only its owner can read.
+
+    ClusterError if that is not possible.
+    """
     from distributed import Security
 
     certificates = Certificates(*(directory / f"{name}.pem" for name in Certificates._fields))

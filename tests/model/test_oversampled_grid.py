@@ -8,8 +8,7 @@ import pytest
 
 from sweep.model import time_domain_truth
 from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
-from sweep.model.spectrum import segment_spectra
-from sweep.tasks.accuracy import study_sample
+from sweep.model.spectrum import oversampled_grid, segment_spectra
 
 WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")
 
@@ -42,8 +41,8 @@ def drawn(table_4_1, number=12, **changes):
 
 def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
     """Bins around a point's lines, and |X| there, without noise."""
-    (cells,) = study_sample.cells_per_point(shots)[[i]].tolist()
-    low, magnitude = study_sample.grid_magnitudes(
+    (cells,) = oversampled_grid.cells_per_point(shots)[[i]].tolist()
+    low, magnitude = oversampled_grid.grid_magnitudes(
         shots, shots.point_parameter_table(), np.array([i]), segment, cells, (degree, real, folded)
     )
     bins = low[0] + np.arange(magnitude.shape[1])
@@ -128,7 +127,7 @@ def test_the_same_detections_come_of_it(table_4_1):
     found = evaluate(
         scene,
         WITHOUT_LEAKAGE,
-        segment_evaluator=lambda s: study_sample.find_peaks_on_grid(s, degree=9),
+        segment_evaluator=lambda s: oversampled_grid.find_peaks_on_grid(s, degree=9),
     )
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
         # Images beyond the grid are left out: 1e-4 of a line at the very most.
@@ -141,8 +140,8 @@ def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
         table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE
     )
     ((_, shots),) = wide
-    assert list(study_sample.cells_per_point(shots)) == [2**13, 2**12]
-    assert list(study_sample.cells_per_point(shots, 2**11)) == [2**13, 2**11]
+    assert list(oversampled_grid.cells_per_point(shots)) == [2**13, 2**12]
+    assert list(oversampled_grid.cells_per_point(shots, 2**11)) == [2**13, 2**11]
     bins, found = spectrum(shots, 0, 0, degree=9)
     _, exact = segment_spectra.segment_spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
@@ -164,7 +163,7 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
 def test_direct_detection_has_no_doppler_segment(table_4_1):
     scene = table_4_1(architecture="direct", range=np.array([20.0, 30.0]), radial_velocity=0.0)
     for look in (
-        study_sample.find_peaks_on_grid,
+        oversampled_grid.find_peaks_on_grid,
         time_domain_truth.evaluate_segments_in_time_domain,
     ):
         found = evaluate(

@@ -1,0 +1,300 @@
+"""Spectra by an FFT on an oversampled grid of frequencies, as in the thesis; not used by studies.
+
+`sweep accuracy` compares its time and error with those of the closed form
+(:mod:`sweep.model.spectrum.segment_spectra`).
+
+[T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
+frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
+16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
+follows, a product with the transform of the window's own, and the way back. The improvements
+`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
+walk, line width) are skipped, and leakage beyond the grid.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from scipy import fft
+
+from sweep.kernel_cache import njit
+from sweep.model import window as windows
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection.echo_detection import detect_in_spectra
+from sweep.model.preparation import Shots
+from sweep.model.spectrum.lines import (
+    BLOCK,
+    IM,
+    PLACE,
+    RE,
+    add_image_lines,
+    compute_lines,
+    fold_lines,
+)
+
+CELLS_PER_BIN = 16
+"""Number of cells of the frequency grid per bin of the FFT."""
+
+GRID_CELLS_MIN = 1 << 12
+"""Default number of cells of the grid; points whose lines spread farther get more."""
+
+CLEARANCE_BINS = 16
+"""Number of bins on each side of the lines that the circular convolution must not reach."""
+
+_SPECTRA_PER_TRANSFORM = 32
+"""Number of spectra per call of the FFT: as many as the processor's cache holds."""
+
+
+def find_peaks_on_grid(
+    shots: Shots,
+    *,
+    degree: int = 0,
+    size: int = GRID_CELLS_MIN,
+    real: bool = False,
+    folded: bool = False,
+) -> np.ndarray:
+    """Find the largest bins of each segment's spectrum by FFT on an oversampled grid.
+
+    Parameters
+    ----------
+    shots
+        n shots. Changes of the lines within a record, and leakage, are ignored.
+    degree
+        Degree of the polynomial that shares each line out among cells: 0 puts it into the nearest
+        cell, 9 shares it among ten cells.
+    size
+        Least number of cells of a grid, a power of two. Points whose lines spread farther get more
+        cells.
+    real
+        Whether to transform powers as real numbers, if the powers of the lines add.
+    folded
+        Whether to transform back to the bins alone, not to all cells.
+
+    Returns
+    -------
+    numpy.ndarray
+        Peaks (3, 6, n) by segment, quantity and shot, as
+        :func:`sweep.model.evaluation.evaluate_segments` returns them; nan in segments that the
+        waveform lacks.
+    """
+    peaks = np.full((3, 6, shots.size), np.nan)
+    point_table, n_cells_of_point, grid_options = (
+        shots.point_parameter_table(),
+        cells_per_point(shots, size),
+        (degree, real, folded),
+    )
+    first_bin_and_width = shots.fft_size // 2, 1.0 / shots.fft_size
+    segments = np.flatnonzero(shots.has_segment).tolist()
+    for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
+        members = np.flatnonzero(n_cells_of_point == cells)
+        for points in np.split(
+            members, range(_SPECTRA_PER_TRANSFORM, members.size, _SPECTRA_PER_TRANSFORM)
+        ):
+            first_bin, magnitude = grid_magnitudes(
+                shots, point_table, points, segment, cells, grid_options
+            )
+            peak_rows = np.empty((6, points.size))
+            bin_levels = shots.bin_threshold_table[:, points]
+            speckle = shots.speckle_table.select(segment, points)
+            detect_in_spectra(
+                magnitude,
+                first_bin,
+                first_bin_and_width,
+                shots.detection_rule,
+                bin_levels,
+                speckle,
+                peak_rows,
+            )
+            peak_rows[3] *= point_table[6, points]
+            peaks[segment][:, points] = peak_rows
+    return peaks
+
+
+def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
+    """Return the number of grid cells of each point, (n,) int64, a power of two.
+
+    The lines are in the middle of the grid, with `CLEARANCE_BINS` and as much room as they take
+    on both sides.
+    """
+    beat_per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
+    carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.carriers])
+    offset_max = np.abs(shots.relative_range_offset).max(axis=1)[shots.footprint_row]
+    doppler_max = np.abs(shots.doppler_ratio_offset).max(axis=1)[shots.footprint_row]
+    line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
+    line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
+    cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
+    return np.maximum(cells_min, 2 ** cells_needed.astype(np.int64))
+
+
+def grid_magnitudes(
+    shots: Shots,
+    point_table: np.ndarray,
+    points: np.ndarray,
+    segment: int,
+    n_cells: int,
+    grid_options: tuple[int, bool, bool],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return |X| of m points' spectra around their lines in a segment, without noise.
+
+    Parameters
+    ----------
+    shots, point_table
+        All shots, and their parameters by `Shots.point_parameter_table`.
+    points
+        Indices of the m points, (m,), which have `n_cells` cells each.
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    grid_options
+        `degree`, `real` and `folded` of :func:`find_peaks_on_grid`.
+
+    Returns
+    -------
+    first_bin, magnitude
+        First bin of each spectrum (m,), and |X| (m, n_cells / CELLS_PER_BIN) from there on.
+    """
+    degree, real, folded = grid_options
+    adds_powers, record_length = shots.adds_powers, shots.window.length
+    real = real and adds_powers
+    grid = np.zeros((points.size, n_cells), float if real else complex)
+    centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
+    _deposit_lines(
+        np.ascontiguousarray(point_table[:, points]),
+        shots.footprint_row[points],
+        shots.beamlet_table,
+        segment,
+        np.array([shots.fft_size, record_length, 0, 0, adds_powers, 0]),
+        shots.sums_images,
+        np.array(
+            [
+                1 / np.prod(np.delete(node - polynomial_nodes, node_number))
+                for node_number, node in enumerate(polynomial_nodes)
+            ]
+        ),
+        centre_bin,
+        grid.view(float).reshape(points.size, n_cells, -1),
+    )
+    window_transform = _window_transform(
+        shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, real
+    )
+    convolved = _convolve_with_window(grid, window_transform, real, folded)
+    # Rounding takes a sum of squares that is all but nothing below it.
+    magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if adds_powers else np.abs(convolved)
+    return centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude
+
+
+def _convolve_with_window(
+    grid: np.ndarray, window_transform: np.ndarray, real: bool, folded: bool
+) -> np.ndarray:
+    """Convolve powers or amplitudes (rows, cells) with the window; return one value per bin."""
+    n_bins = grid.shape[1] // CELLS_PER_BIN
+    forward_transform, inverse_transform = (fft.rfft, fft.irfft) if real else (fft.fft, fft.ifft)
+    transform = forward_transform(grid, axis=1, overwrite_x=True)
+    transform *= window_transform
+    if not folded:
+        return np.asarray(
+            inverse_transform(transform, grid.shape[1], axis=1, overwrite_x=True)[
+                :, ::CELLS_PER_BIN
+            ]
+        )
+    if real:  # the upper half of the transform is the conjugate of the lower half
+        upper_half = transform[:, :-1].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+            :, :, : n_bins // 2 + 1
+        ]
+        lower_half = transform[:, 1:].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+            :, :, : n_bins // 2 - 2 : -1
+        ]
+        transform = upper_half.sum(axis=1) + lower_half.sum(axis=1).conj()
+    else:
+        transform = transform.reshape(-1, CELLS_PER_BIN, n_bins).sum(axis=1)
+    return (
+        np.asarray(inverse_transform(transform, n_bins, axis=1, overwrite_x=True)) / CELLS_PER_BIN
+    )
+
+
+@lru_cache(maxsize=32)
+def _window_transform(
+    window_name: str, length: int, fft_size: int, n_cells: int, adds_powers: bool, real: bool
+) -> np.ndarray:
+    """Return the FFT, over the grid's cells, of the window's spectrum with phase 0 at mid-record.
+
+    The window's spectrum is an FFT of its samples. It is squared if `adds_powers`.
+    """
+    cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
+    transform = fft.fft(windows.window_samples(window_name, length), CELLS_PER_BIN * fft_size)[
+        cell_offsets
+    ]
+    transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / CELLS_PER_BIN))
+    if adds_powers:
+        transform = np.abs(transform) ** 2
+    return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
+
+
+@njit(cache=True, error_model="numpy")
+def _deposit_lines(
+    point_table, footprint_row, footprint, segment, sizes, image, node_weights, centre_bin, grid
+):
+    """Add the lines of m points to their grids (m, cells, 2 or 1): amplitudes or powers.
+
+    Each line is shared among `node_weights.size` cells. Lines are at bins 0 .. N/2. If `image`, the
+    images of the lines about DC or Nyquist, whichever is nearer, are added too. `centre_bin` (m,)
+    receives the bin in the middle of each grid.
+    """
+    n_beamlets, n_cells = footprint.shape[2], grid.shape[1]
+    n_lines = 2 * n_beamlets if image else n_beamlets
+    line_scratch, cell_weights = np.empty((BLOCK + 1, n_lines)), np.empty(node_weights.size)
+    lowest_cell, highest_cell = (
+        (-0.5, n_cells - 1.0) if node_weights.size == 1 else (5.0, n_cells - 6.0)
+    )
+    for point in range(footprint_row.size):
+        signed_centre_bin = compute_lines(
+            point_table[:, point].copy(),
+            segment,
+            footprint,
+            footprint_row[point],
+            sizes,
+            line_scratch,
+        )
+        centre_bin[point] = abs(signed_centre_bin)
+        if signed_centre_bin < 0:
+            for beamlet in range(n_beamlets):
+                line_scratch[PLACE, beamlet], line_scratch[IM, beamlet] = (
+                    -line_scratch[PLACE, beamlet],
+                    -line_scratch[IM, beamlet],
+                )
+        if image:
+            add_image_lines(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
+            fold_lines(line_scratch[:, n_beamlets:], n_beamlets, sizes)
+        for beamlet in range(n_beamlets):
+            for line in range(beamlet, n_lines, n_beamlets):
+                cell_position = n_cells // 2 + CELLS_PER_BIN * line_scratch[PLACE, line]
+                if lowest_cell < cell_position < highest_cell:
+                    _deposit_line(
+                        grid[point],
+                        cell_position,
+                        line_scratch[RE, line],
+                        line_scratch[IM, line],
+                        node_weights,
+                        cell_weights,
+                    )
+
+
+@njit(cache=True, error_model="numpy")
+def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
+    """Add a line to the nearest cell, or share it among ten by Lagrange interpolation."""
+    first_cell = (
+        int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
+    )
+    offset, weight_sum = cell_position - first_cell, 0.0
+    for node in range(node_weights.size):
+        if offset == node or node_weights.size == 1:
+            cell_weights[:] = 0.0
+            cell_weights[node] = weight_sum = 1.0
+            break
+        cell_weights[node] = node_weights[node] / (offset - node)
+        weight_sum += cell_weights[node]
+    for node in range(node_weights.size):
+        cells[first_cell + node, 0] += re * cell_weights[node] / weight_sum
+        if cells.shape[1] > 1:
+            cells[first_cell + node, 1] += im * cell_weights[node] / weight_sum

@@ -1,0 +1,300 @@
+"""Interface between the engine and the studies that it computes.
+
+The engine knows a study as :class:`BlockStudy`: arrays, blocks of points, and a method that
+computes one block. :class:`Workload` says what the study asks of the machines. The study alone
+knows what a point is, and how it is computed.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid, Results
+
+if TYPE_CHECKING:
+    from sweep.spec.sections import Execution
+    from sweep.storage.locations import Location
+
+
+class PartialResults(NamedTuple):
+    """Results of some points of a block."""
+
+    local_indices: np.ndarray  # (m,) int64: indices of the points in C order over the block
+    results: Results  # arrays (m, ...) by name
+
+
+NO_RESULTS = PartialResults(np.zeros(0, np.int64), {})
+
+
+class ReusedResults(NamedTuple):
+    """Results of a block that exist before it is computed."""
+
+    done: PartialResults = NO_RESULTS  # points that need not be computed
+    begun: PartialResults = NO_RESULTS  # points that are computed in part, to be continued
+
+
+def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
+    """Concatenate results of several parts of a block, by the names of the first part's arrays."""
+    if not parts:
+        return NO_RESULTS
+    names = parts[0].results
+    return PartialResults(
+        np.concatenate([part.local_indices for part in parts]),
+        {name: np.concatenate([part.results[name] for part in parts]) for name in names},
+    )
+
+
+@dataclass
+class Deadline:
+    """End of the time for one task's work on a block; calling it tells whether that has passed."""
+
+    at: float = float("inf")  # time by `time.monotonic` [s]
+    has_passed: bool = False  # True if any call so far was after the deadline
+
+    def __call__(self) -> bool:
+        """Return True after the deadline."""
+        self.has_passed = self.has_passed or time.monotonic() >= self.at
+        return self.has_passed
+
+
+class UnfinishedBlock(Exception):
+    """Raised by a block that stops at its deadline, with the results so far.
+
+    `n_points` is the number of points that the results amount to; a point that is computed in part
+    counts in part.
+    """
+
+    def __init__(self, results: ReusedResults, n_points: float) -> None:
+        super().__init__()
+        self.results, self.n_points = results, n_points
+
+
+class StoreTemplate(Protocol):
+    """Content of a new store: its identity, attributes, groups and arrays."""
+
+    @property
+    def id(self) -> str:
+        """Hash of all that the results depend on."""
+
+    @property
+    def model_version(self) -> str:
+        """Version of the model that computes the results; stores of another one are refused."""
+
+    def store_attributes(self) -> dict[str, Any]:
+        """Return the attributes of the store's root except versions; the same on every machine."""
+
+    def group_attributes(self) -> dict[str, dict[str, Any]]:
+        """Return the attributes of each group by its path; empty if all arrays are in the root."""
+        return {}
+
+    def array_layouts(self) -> list[ArrayLayout]:
+        """Return the layouts of all arrays of the store."""
+
+
+class BlockStudy(StoreTemplate, ABC):
+    """A study as the engine sees it: blocks of points, numbered grid by grid.
+
+    A kind of study implements the abstract methods, and :class:`StoreTemplate`. One whose blocks
+    may be stopped in the middle sets `has_checkpoints` and overrides `evaluate_until`.
+    """
+
+    points_noun = "points"
+    """Name of its points, in the plural."""
+
+    @property
+    @abstractmethod
+    def grids(self) -> Sequence[BlockGrid]:
+        """Grid of blocks of each group of the store."""
+
+    @abstractmethod
+    def constant_arrays(self) -> list[ArrayLayout]:
+        """Return the arrays whose values are known when the store is made."""
+
+    @abstractmethod
+    def output_layouts(self) -> list[ArrayLayout]:
+        """Return the layouts of the arrays that blocks write."""
+
+    @abstractmethod
+    def evaluate(self, block: int) -> Results:
+        """Compute a block. Return one array per chunk that it writes, by the name of the array."""
+
+    @abstractmethod
+    def compile_kernels(self) -> None:
+        """Compile all that `evaluate` compiles, so that workers find it in the cache on disk."""
+
+    @property
+    def has_checkpoints(self) -> bool:
+        """True if the engine may stop a block at a deadline, and continue it in another task."""
+        return False
+
+    def evaluate_until(
+        self, block: int, checkpoint_results: ReusedResults, deadline: Deadline
+    ) -> Results:
+        """Return what `evaluate` does, from a checkpoint on; `UnfinishedBlock` at the deadline.
+
+        Called in place of `evaluate` if `has_checkpoints`.
+        """
+        raise NotImplementedError
+
+    def pop_reused_points(self, block: int) -> int:
+        """Return how many points of a block that was evaluated came from another store, once."""
+        return 0
+
+    def array_layouts(self) -> list[ArrayLayout]:
+        """Return the layouts of all arrays of the store."""
+        return [*self.constant_arrays(), *self.layout_by_name.values()]
+
+    @cached_property
+    def layout_by_name(self) -> dict[str, ArrayLayout]:
+        """Layouts of the arrays that blocks write, by name."""
+        return {layout.name: layout for layout in self.output_layouts()}
+
+    @property
+    def n_chunks(self) -> int:
+        """Number of chunks of all blocks."""
+        return sum(layout.n_chunks for layout in self.layout_by_name.values())
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all results before compression [bytes]."""
+        return sum(layout.nbytes_of(layout.shape) for layout in self.layout_by_name.values())
+
+    @property
+    def block_nbytes_max(self) -> int:
+        """Size of the results of the largest block before compression [bytes]."""
+        nbytes_by_group = dict.fromkeys(self._first_block_and_grid_by_group, 0)
+        for layout in self.layout_by_name.values():
+            nbytes_by_group[layout.group_path] += layout.nbytes_of(layout.chunks)
+        return max(nbytes_by_group.values())
+
+    @property
+    def n_points(self) -> int:
+        """Number of points of all blocks."""
+        return sum(grid.n_points for grid in self.grids)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return sum(grid.n_blocks for grid in self.grids)
+
+    def locate_in_grid(self, block: int) -> tuple[BlockGrid, int]:
+        """Return the grid that contains a block, and the number of the block there.
+
+        IndexError if there is no such block.
+        """
+        block_in_grid = block
+        for grid in self.grids:
+            if 0 <= block_in_grid < grid.n_blocks:
+                return grid, block_in_grid
+            block_in_grid -= grid.n_blocks
+        raise IndexError(f"block {block} of {self.n_blocks}")
+
+    @cached_property
+    def _first_block_and_grid_by_group(self) -> dict[str, tuple[int, BlockGrid]]:
+        """Number of the first block of each group, and the grid of the group."""
+        last_blocks = np.cumsum([grid.n_blocks for grid in self.grids]).tolist()
+        return {
+            block_grid.group: (end - block_grid.n_blocks, block_grid)
+            for block_grid, end in zip(self.grids, last_blocks, strict=True)
+        }
+
+    def first_block_of_group(self, group: str) -> int:
+        """Return the number of the first block of a group."""
+        return self._first_block_and_grid_by_group[group][0]
+
+    def block_size(self, block: int) -> int:
+        """Return the number of points of a block."""
+        grid, block_in_grid = self.locate_in_grid(block)
+        return grid.block_size(block_in_grid)
+
+    def count_points(self, is_included: np.ndarray) -> int:
+        """Count the points in the blocks that a mask (blocks,) of bool marks."""
+        parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
+        return sum(grid.count_points(part) for grid, part in zip(self.grids, parts, strict=True))
+
+    @cached_property
+    def _grid_dims_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
+        """Index of the grid dimension that each dimension of an array follows.
+
+        The keys are group and name of the array.
+        """
+        grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
+            group: {} for group in self._first_block_and_grid_by_group
+        }
+        for name, layout in self.layout_by_name.items():
+            grid_dims[layout.group_path][name] = self._first_block_and_grid_by_group[
+                layout.group_path
+            ][1].grid_dims_of(layout)
+        return grid_dims
+
+    def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
+        """Return the position of the chunk that a block writes, by the name of the array.
+
+        An array that lacks a dimension of the grid is written by the first block along it, and
+        missing for the others.
+        """
+        grid, block_in_grid = self.locate_in_grid(block)
+        position = grid.block_position(block_in_grid)
+        nonzero_dims = {
+            dim for dim, index in enumerate(position) if index
+        }  # the array must have all of these dimensions
+        return {
+            name: tuple(0 if dim is None else position[dim] for dim in grid_dims)
+            for name, grid_dims in self._grid_dims_by_array[grid.group].items()
+            if nonzero_dims.issubset(grid_dims)
+        }
+
+    def chunk_regions(self, block: int) -> dict[str, tuple[slice, ...]]:
+        """Return the slices that a block writes, by the name of the array."""
+        return {
+            name: self.layout_by_name[name].region(position)
+            for name, position in self.chunk_positions(block).items()
+        }
+
+    def chunk_owners(self) -> dict[str, np.ndarray]:
+        """Return the block that writes each chunk, by the name of the array.
+
+        Each value has the shape of the array's grid of chunks.
+        """
+        owners_by_array = {}
+        for array_name, layout in self.layout_by_name.items():
+            first_block, grid = self._first_block_and_grid_by_group[layout.group_path]
+            owners_by_array[array_name] = first_block + grid.chunk_owners(layout)
+        return owners_by_array
+
+
+BlockEvaluator = Callable[[Any, int], Results]
+"""Function of a study and the number of a block that replaces `BlockStudy.evaluate`."""
+
+StudyReader = Callable[["Location"], tuple[dict[str, Any], BlockStudy]]
+"""Function that returns the attributes of a store and its study; StoreError if it can't be read.
+
+It must be a function of a module, because it is sent to workers by name.
+"""
+
+
+class Workload(Protocol):
+    """What a study asks of the machines that compute it, known from its spec alone."""
+
+    @property
+    def execution(self) -> Execution:
+        """Workers, threads and scheduler that the spec asks for."""
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Estimated time of all blocks on one core [s]; infinite if unknown."""
+
+    @property
+    def user_modules(self) -> tuple[str, ...]:
+        """Names of the user's Python modules whose functions the blocks call."""
+
+    @property
+    def read_study(self) -> StudyReader:
+        """Function with which a worker opens the study of a store."""

@@ -1,0 +1,62 @@
+"""Memory that is available to the processes that compute blocks."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.spec.cluster_config import AnyClusterConfig, LocalClusterConfig, WorkerBounds
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+class WorkerMemory(NamedTuple):
+    """Memory available to a process that computes blocks."""
+
+    bytes_max: float
+    """Largest memory that the process may use [bytes]; inf if unknown."""
+    process_name: str
+    """Name of the process in messages, as the subject of a sentence: `this machine`."""
+    workers_sharing: int = 1
+    """Number of workers that share this machine's memory; 1 if each has a limit of its own."""
+
+
+def serial_worker_memory() -> WorkerMemory:
+    """Return the memory available to serial computation in this process."""
+    # Here, as a spec with mistakes is told without the second that this import takes.
+    from distributed.system import MEMORY_LIMIT
+
+    return WorkerMemory(MEMORY_LIMIT, "this machine")
+
+
+def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
+    """Return the memory of the smallest worker of a client, or of a cluster to be started."""
+    if client is not None:
+        return WorkerMemory(_least_memory_limit(client), "a worker of the client")
+    if isinstance(cluster, LocalClusterConfig):
+        from sweep.tasks.engine.cluster_connection import cpu_count
+        from sweep.tasks.engine.deploy.local_ssh import worker_memory_limit
+
+        bounds = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
+        workers_sharing = 1 if cluster.worker.memory else bounds.most
+        return WorkerMemory(worker_memory_limit(cluster, bounds), "each worker", workers_sharing)
+    bytes_max = getattr(getattr(cluster, "worker", None), "memory", None)
+    return WorkerMemory(bytes_max or np.inf, "each worker of the cluster")
+
+
+def _least_memory_limit(client: Client) -> float:
+    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
+
+    Of a client that is closed, or whose scheduler is gone, nothing is known: a study with blocks
+    left says so when it reaches for the workers, and a complete one needs none.
+    """
+    if client.status != "running":
+        return np.inf
+    try:
+        workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
+    except (OSError, RuntimeError, CancelledError):  # gone meanwhile
+        return np.inf
+    return min((worker.get("memory_limit") or np.inf for worker in workers), default=np.inf)

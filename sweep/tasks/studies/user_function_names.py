@@ -1,0 +1,28 @@
+"""Names of the user's functions in a spec, found without importing the model or any user code."""
+
+from collections.abc import Iterator
+from typing import Any
+
+SPECTRUM_METHOD_PARAMETERS = {
+    "detector": "instrument.processing.detector.kind",
+    "estimator": "instrument.processing.estimator.kind",
+}
+"""Parameters that name what looks at whole spectra: one of ours, or a function of the user's."""
+
+
+def user_functions(spec: Any) -> Iterator[tuple[str, str]]:
+    """Roles and names of the functions of the user's that a study names."""
+    draws = getattr(spec, "draws", None)
+    if not getattr(draws, "draws_whole_spectra", False):
+        return
+    for role, path in SPECTRUM_METHOD_PARAMETERS.items():
+        axis_values = [
+            member.values for axis in spec.axes for member in axis.parameters if member.path == path
+        ]
+        names = axis_values[0] if axis_values else [spec.parameters()[path]]
+        yield from ((role, name) for name in dict.fromkeys(map(str, names)) if ":" in name)
+
+
+def user_modules(spec: Any) -> tuple[str, ...]:
+    """Return the names of the modules whose functions a study names, each once."""
+    return tuple(dict.fromkeys(name.partition(":")[0] for _, name in user_functions(spec)))
