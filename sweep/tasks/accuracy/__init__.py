@@ -1,1 +1,1 @@
-"""Cost of accuracy in time: a ladder of settings, tried on some points of a study."""
+"""Cost of accuracy in time: a ladder of settings, tried on a sample of a study's points."""

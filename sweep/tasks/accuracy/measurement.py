@@ -1,4 +1,4 @@
-"""The measurement of what accuracy costs: rungs tried round after round, from a spec to a store."""
+"""Measurement of the cost of accuracy: settings tried in rounds on a sample, stored with errors."""
 
 from __future__ import annotations
 
@@ -54,37 +54,37 @@ from sweep.tasks.studies.output_layouts import cf_attributes
 from sweep.tasks.studies.study_loading import ACCURACY_KIND, make_study
 
 SAMPLE_POINTS, TIME_LIMIT_SECONDS = 200, 60.0
-"""Points of a sample; time that trying may take [s]."""
+"""Default number of points of a sample, and default time limit of the trials [s]."""
 
 ROUNDS_MAX = 27
-"""Rounds at the most, which a study that takes next to nothing has: chance tells most there."""
+"""Largest number of rounds, for studies whose points take little time and vary most in it."""
 
 TRIAL_TIME_FRACTION = 0.003
-"""Share of the time limit that a trial takes: its calls then cost little beside its points."""
+"""Fraction of the time limit per trial, large enough for a negligible overhead of calls."""
 
 STRETCH_TIME_FACTOR = 2
-"""Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
+"""Time of a timed stretch of points as a multiple of that, so that overhead is negligible too."""
 
 FIRST_STRETCH_DIVISOR = 8
-"""Factor by which the stretches are shorter in which settings are known to be dear."""
+"""Divisor of the length of the stretches that find out which settings are slow."""
 
 FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
-"""Shares of the time limit by which the first round, and then the truth, ends."""
+"""Fractions of the time limit at which the first round, and the time-domain comparison, end."""
 
 TIME_DOMAIN_POINTS_MIN, TIME_DOMAIN_POINTS_MAX = 3, 500
-"""Points in the time domain, however long they take, and at the most."""
+"""Least number of points in the time domain, whatever their time, and largest number."""
 
 TIME_DOMAIN_BEAMLETS = 109
-"""Beamlets in the time domain where accuracy decides on their number: each is a record."""
+"""Number of beamlets in the time domain if accuracy sets it; each beamlet needs a record."""
 
 SINGLE_TRIAL_SECONDS = 1.0
-"""Seconds from which on a trial is made once: it is timed well enough by that."""
+"""Time of a trial [s] above which it is made only once."""
 
 FIXED_EFFECTS_TOLERANCES = (1e-1, 1e-3, 1e-6)
-"""Tolerances whose effects are tried at every point alike."""
+"""Tolerances whose effects are tried as fixed sets, the same at every point."""
 
 STORING_TRIALS = 3
-"""Of each part of storing; the first may import and open what the others find."""
+"""Number of trials of each part of storing; the first may import and open modules and files."""
 
 
 def measure_accuracy(
@@ -96,14 +96,14 @@ def measure_accuracy(
     overwrite: bool = False,
     progress: bool | Progress = True,
 ) -> bool:
-    """Try a ladder of settings on a sample of a study's points, and store what they came to.
+    """Try a ladder of settings on a sample of a study's points, and store errors and times.
 
-    The store is there whole, or not at all. Trying takes about a ``time_limit`` [s];
-    ``progress`` is as of :func:`sweep.tasks.driver.run`. False where it was interrupted before
-    any point was through: there is no store then.
+    The store is written completely, or not at all. The trials take about ``time_limit`` [s].
+    ``progress`` is that of :func:`sweep.tasks.driver.run`. Return False, without a store, if the
+    measurement is interrupted before any point is complete.
 
-    StoreError where a store is in the way or can't be written, TaskError where the study draws
-    whole spectra, SceneError where a file of a scene is missing, changed or unfit.
+    StoreError if a store is in the way or can't be written. TaskError if the study draws whole
+    spectra. SceneError if a file of a scene is missing, changed or invalid.
     """
     if spec.draws.draws_whole_spectra:
         raise TaskError(
@@ -127,7 +127,7 @@ def measure_accuracy(
         except NothingMeasured:
             return False
     measured_template.storing_seconds = measure_storing_seconds(make_study(spec, store_path))
-    _refuse_occupied_path(store_path, overwrite)  # it may hold something else by now
+    _refuse_occupied_path(store_path, overwrite)  # another process may have written to it
     study_store.create_store(store_path, measured_template, replace_existing=overwrite)
     return True
 
@@ -146,7 +146,7 @@ def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
 
 
 def measure_storing_seconds(study: BlockStudy) -> float:
-    """Processor time that making a study's store takes [s], and writing its blocks, of zeros."""
+    """Return the processor time of creating a study's store and writing its blocks [s]."""
     block = study.n_blocks // 2
     results = {
         name: np.zeros(
@@ -172,14 +172,14 @@ def measure_storing_seconds(study: BlockStudy) -> float:
 
 
 class NothingMeasured(Exception):
-    """Broken off before any point was through."""
+    """Raised if the measurement is interrupted before any point is complete."""
 
 
 class Measurement:
-    """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
+    """Measurement of all settings on a sample, in turn, so that drifts affect all settings alike.
 
-    Each round takes them in an order of its own: a short trial takes longer after a long one.
-    All may take a time limit [s], about.
+    Each round has a different order of settings, as a short trial takes longer after a long one.
+    All rounds together take about `time_limit` [s].
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class Measurement:
         self._order_generator = np.random.default_rng(0)
 
     def run(self) -> AccuracyTemplate:
-        """All rounds that the time allows; Nothing where no point was through before the end."""
+        """Run all rounds that the time allows; `NothingMeasured` if no point is complete."""
         n_settings = len(self._settings)
         self._progress.say(
             f"trying {n_settings} settings on {self._sample.size:,} {self._sample.points_noun}"
@@ -251,9 +251,9 @@ class Measurement:
         )
 
     def _points_per_part(self) -> int:
-        """Points of a part: a few parts, and more where a point takes its time."""
+        """Return the number of points of a part of the sample, so that two or more parts fit in."""
         setting_numbers, first_part = range(len(self._settings)), self._sample.split(1)[0]
-        for setting_number in setting_numbers:  # compiles what it compiles, which is not counted
+        for setting_number in setting_numbers:  # compiles kernels, which does not count
             self._time_trial(setting_number, first_part)
         self._start = time.monotonic()
         seconds_per_round = sum(
@@ -264,12 +264,12 @@ class Measurement:
             * len(first_part)
             / seconds_per_round
         )
-        # Whole parts are kept where it is broken off. On one more all are tried before.
+        # After an interruption complete parts are kept. One more part is tried before the rounds.
         parts_min = max(2, len(self._sample.split(self._sample.size)))
         return max(1, min(self._sample.size // parts_min, int(points_that_fit / (parts_min + 1))))
 
     def _plan_rounds(self, parts: list[np.ndarray]) -> int:
-        """Return the rounds that fit in; set the points of a stretch that times each rung well."""
+        """Return the number of rounds that fit in; set the number of points to time per setting."""
         n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
         while (
             self._time_trial(0, parts[0]) < trial_seconds / 2
@@ -322,7 +322,7 @@ class Measurement:
         time_fraction: float,
         first_round: list[list[Trial]] | None = None,
     ) -> list[list[Trial]]:
-        """Every rung on every part that there is time for; long ones only in the first round."""
+        """Try every setting on each part that time allows; slow ones only in the first round."""
         trials_by_part: list[list[Trial]] = []
         for part in parts:
             if trials_by_part and self._elapsed_seconds > time_fraction * self._time_limit:
@@ -345,9 +345,10 @@ class Measurement:
     def _compare_with_time_domain(
         self, sample_rows: np.ndarray
     ) -> tuple[dict[int, np.ndarray], int]:
-        """Hold the reference at some points against the time domain, as time allows.
+        """Compare the reference with the time domain at some points, as time allows.
 
-        Their differences, as of :func:`result_differences`, and the beamlets of both.
+        Return the differences of each point, by :func:`result_differences`, and the number of
+        beamlets of both, 0 if it is that of the reference.
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}
@@ -377,9 +378,9 @@ class Measurement:
 def add_fixed_effects(
     setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
 ) -> SettingLadder:
-    """Return the ladder, with the effects of each tolerance fixed at every point."""
+    """Return the ladder with settings that fix the effects of each tolerance at every point."""
     if not any(setting.kind == ALL_EFFECTS_KIND for setting in setting_ladder.settings):
-        return setting_ladder  # of draws
+        return setting_ladder  # settings of draws have no such variants
     setting_by_tolerance = {
         tolerance_of_setting(setting): setting
         for setting in setting_ladder.settings
@@ -401,19 +402,19 @@ ERROR_ARRAYS = {
     "leakage_error": "error of a probability of leakage, of the two chirps",
     "standard_error": "standard error that the setting itself tells, where it draws",
 }
-"""Arrays by setting and point, and what they are.
+"""Arrays by setting and point, and their long names.
 
 The first four are in the order of :func:`result_differences`.
 """
 
 N_PROMISED_ERRORS = 3
-"""The first of these, which a tolerance promises to bound."""
+"""Number of the first arrays whose errors a tolerance promises to bound."""
 
 
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
-    """Largest differences from others, (n,) each: of pd, log10 pfa, magnitudes, leakage.
+    """Return the largest differences (n,) of pd, log10 pfa, magnitudes and leakage.
 
-    Magnitudes in relation to the other, or to sigma where it is below that.
+    Magnitudes are relative to the second results, or to sigma if they are below it.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log10_pfa_difference = np.abs(results.log10_pfa - reference.log10_pfa)
@@ -436,38 +437,38 @@ def result_differences(results: SampleResults, reference: SampleResults) -> tupl
 
 
 def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Differences of probabilities: what sees nothing detects nothing, and leaks nothing."""
+    """Return differences of probabilities; nan counts as 0 unless both are nan."""
     is_known = np.isfinite(first) | np.isfinite(second)
     return np.where(is_known, np.abs(np.nan_to_num(first) - np.nan_to_num(second)), np.nan)
 
 
 @dataclass
 class AccuracyTemplate:
-    """Content of the store: errors by rung and point, seconds by rung and round."""
+    """Content of a store of accuracy: errors by setting and point, times by setting and round."""
 
     sample: StudySample
     setting_ladder: SettingLadder
-    sample_rows: np.ndarray  # places in the sample of the points that every rung was tried on
-    rounds: list[list[Trial]]  # of all these points, by rung
-    n_timed_points: np.ndarray  # (rungs,): points of a stretch that is timed
+    sample_rows: np.ndarray  # indices in the sample of the points that every setting has tried
+    rounds: list[list[Trial]]  # trials of all these points, by round and setting
+    n_timed_points: np.ndarray  # (settings,): number of points that are timed together
     time_domain_differences: dict[int, np.ndarray]
-    """By place in the sample: differences of the reference from the time domain."""
-    time_domain_beamlets: int  # of both, where their number is not the reference's; else 0
-    stop_reason: str  # why the sample is not whole; empty where it is
-    storing_seconds: float = math.nan  # time that storing takes [s]
+    """Differences of the reference from the time domain, by index in the sample."""
+    time_domain_beamlets: int  # number of beamlets of both; 0 if that of the reference
+    stop_reason: str  # reason why the sample is incomplete, or ''
+    storing_seconds: float = math.nan  # processor time of storing the study [s]
 
     @property
     def model_version(self) -> str:
-        """Version of the model that was tried."""
+        """Version of the model that was measured."""
         return VERSION
 
     @property
     def id(self) -> str:
-        """The spec of the study."""
+        """Id of the study."""
         return self.sample.spec.id
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the spec, the reference of the errors, and the machine."""
+        """Return the spec, the reference of the errors, and totals of the measurement."""
         spec, settings_and_trials = (
             self.sample.spec,
             zip(self.setting_ladder.settings, self.rounds[0], strict=True),
@@ -488,7 +489,7 @@ class AccuracyTemplate:
             "study_points": self.sample.n_study_points,
             "storing_seconds": self.storing_seconds,
             "notes": "\n".join(self.setting_ladder.notes),
-            # 0 where the thesis's way was not tried, or nothing is seen
+            # 0 if the thesis's method was not tried, or nothing is hit
             "thesis_beamlets": int(
                 np.nan_to_num(np.fmax.reduce(thesis_beamlets, axis=None, initial=0))
             ),
@@ -506,11 +507,11 @@ class AccuracyTemplate:
         }
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
-        """None."""
+        """Return no groups."""
         return {}
 
     def array_layouts(self) -> list[ArrayLayout]:
-        """Coordinates, errors, seconds."""
+        """Return coordinates, errors and times."""
         settings, results = (
             self.setting_ladder.settings,
             [trial.results for trial in self.rounds[0]],
@@ -593,6 +594,6 @@ class AccuracyTemplate:
 
 
 def tolerance_of_setting(setting: AccuracySetting) -> float:
-    """Tolerance of an adaptive setting; nan of others."""
+    """Return the tolerance of an adaptive setting; nan of other settings."""
     value = setting.overrides.get("accuracy.tolerance", np.nan)
     return float(value) if setting.kind != REFERENCE_KIND else np.nan

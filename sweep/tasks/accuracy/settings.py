@@ -1,4 +1,4 @@
-"""Rungs: settings of a study that are tried against each other, as overrides of its spec."""
+"""Accuracy settings of a study that are compared, as overrides of its spec."""
 
 from __future__ import annotations
 
@@ -32,42 +32,44 @@ MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "draws counted",
     "draws in noise",
 )
-"""Kinds of rungs."""
+"""Kinds of settings."""
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
 TRIED_BEAMLETS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
-"""Beamlets that a study might fix: full shells of a hexagonal lattice."""
+"""Numbers of beamlets that a study might fix: complete shells of a hexagonal lattice."""
 
 TRIED_LINE_BEAMLETS = (3, 9, 33, 163, 1234)
-"""Beamlets in a line along the slope that a study over a plane might fix."""
+"""Numbers of beamlets in a line along the slope that a study over a plane might fix."""
 
 FIXED_EFFECTS_LINE_BEAMLETS = 163
-"""Of these where effects are fixed too: enough for the widest footprints."""
+"""Number of them with fixed effects: enough for the widest footprints."""
 
 THESIS_BEAMLETS = 109
-"""Beamlets of [T 3.3.1]."""
+"""Number of beamlets in [T 3.3.1]."""
 
 REFERENCE_RAYS, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
-"""Rays of each shot of a flight's reference, and what they may leave: else shots have more."""
+"""Rays per shot of a flight's reference, and error by rays above which a shot gets more."""
 
 FIXED_RAYS_MAX = 223
-"""Rays that are tried as a fixed number, at the most: more cost as much as all else together."""
+"""Largest fixed number of rays that is tried; more cost as much as everything else together."""
 
 FIXED_RAYS_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
-"""Where effects are fixed too: rays at the least, and rays times tolerance, which leaves one shot
-in a thousand over open ground that is off by more."""
+"""Numbers of rays with fixed effects: the least, and the product of rays and tolerance.
+
+With this product one shot in a thousand over open ground exceeds the tolerance.
+"""
 
 REFERENCE_TOLERANCE = 1e-9
-"""Tolerance of the reference: of lines, of leakage and, over a plane, of the number of beamlets."""
+"""Tolerance of the reference for lines, leakage and, over a plane, the number of beamlets."""
 
 TRIED_DRAWS = (10, 100, 1000)
 
 REFERENCE_DRAWS_FACTOR = 10
-"""Draws of the reference over those of the longest rung."""
+"""Number of draws of the reference over that of the longest setting."""
 
 TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
-"""Tolerances until which points are drawn."""
+"""Tolerances of pd until which points are drawn."""
 
 _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "accuracy.tolerance",
@@ -82,12 +84,12 @@ _REFERENCE_TOLERANCE_OVERRIDES = dict.fromkeys(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AccuracySetting:
-    """A setting of a study: values of fields of its spec by dotted path, as one would write them.
+    """Accuracy setting of a study: values of fields of its spec by dotted path, as in YAML.
 
-    ``thesis_grid_options`` has the options of
-    :func:`sweep.model.spectrum.oversampled_grid.find_peaks_on_grid`, where that
-    finds the peaks; ``rays_error_max`` is what a flight's rays may leave before there are more, 0
-    where the spec says that.
+    ``thesis_grid_options`` are options of
+    :func:`sweep.model.spectrum.oversampled_grid.find_peaks_on_grid`, if this function finds the
+    peaks. ``rays_error_max`` is the largest error by rays of a flight's shot before it gets more
+    rays; 0 if the spec sets it.
     """
 
     name: str
@@ -98,12 +100,15 @@ class AccuracySetting:
 
     @property
     def has_line_effects_only(self) -> bool:
-        """True where nothing is simulated that the thesis's way lacks: effects in a record."""
+        """True if only effects are simulated that the thesis's method can have.
+
+        These are effects on lines, without changes within a record.
+        """
         return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
 
     @property
     def plans_effects(self) -> bool:
-        """True where effects are planned, and the time that this takes counts."""
+        """True if effects are planned, and the time of planning counts."""
         return not self.has_line_effects_only and self.kind not in (
             FIXED_EFFECTS_KIND,
             ALL_EFFECTS_KIND,
@@ -112,30 +117,30 @@ class AccuracySetting:
 
     @property
     def counts_detections(self) -> bool:
-        """True where pd is a share of detected draws, not the mean of their probabilities."""
+        """True if pd is the fraction of detected draws, not the mean of their probabilities."""
         return self.kind in (COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND)
 
     def apply_to(self, spec: AnySpec) -> AnySpec:
-        """Return the spec with the overrides put onto it; SpecError where it is no study then."""
+        """Return the spec with the overrides; SpecError if the result is invalid."""
         return apply_changes(spec, self.overrides) if self.overrides else spec
 
 
 @dataclass(frozen=True)
 class SettingLadder:
-    """Rungs, the reference last, and what there is to say of them."""
+    """Settings, the reference last, and notes on them."""
 
     settings: tuple[AccuracySetting, ...]
-    reference_text: str  # what the reference is
+    reference_text: str  # description of the reference
     notes: tuple[str, ...] = ()
 
     @property
     def reference(self) -> AccuracySetting:
-        """The rung that the errors of all others are taken against."""
+        """Setting to which the results of all others are compared."""
         return self.settings[-1]
 
 
 def build_ladder(spec: AnySpec) -> SettingLadder:
-    """Return the rungs of a study, without those whose effects are fixed."""
+    """Return the settings of a study, without those with fixed effects."""
     if isinstance(spec, GridSpec) and spec.draws.has_draws:
         return _build_draws_ladder(spec)
     notes: list[str] = []
@@ -195,9 +200,10 @@ def add_fixed_effect_settings(
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
-    """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
+    """Add settings that simulate everywhere the effects that a tolerance needs anywhere.
 
-    ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
+    ``tolerances`` of lines and leakage are tried with each set of effects; by default the
+    tolerances of the sets.
     """
     tolerance_by_effects: dict[frozenset[str], float] = {}
     for tolerance, effect_names in effects_by_tolerance.items():
@@ -232,7 +238,7 @@ def add_fixed_effect_settings(
 
 
 def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
-    """Beamlets that a study whose effects are fixed might have, if their number is not given."""
+    """Return numbers of beamlets that a study with fixed effects might have, if none is given."""
     if _why_beamlets_are_fixed(spec):
         return {}
     if not isinstance(spec, SceneSpec):
@@ -250,7 +256,7 @@ def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
 
 
 def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
-    """Return fixed numbers of beamlets: in a lattice, and in a line over a plane."""
+    """Return settings with fixed numbers of beamlets: in a lattice, and in a line over a plane."""
     for n_beamlets in TRIED_BEAMLETS:
         if not is_flight or n_beamlets <= FIXED_RAYS_MAX:
             yield AccuracySetting(
@@ -266,7 +272,7 @@ def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
 
 
 def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterator[AccuracySetting]:
-    """Yield the same beamlets and effects in closed form, and by the thesis's way, improved too."""
+    """Yield settings of the thesis's method, its improvements, and the same in closed form."""
     yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
     variants: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
@@ -297,7 +303,7 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
 
 
 def _build_draws_ladder(spec: GridSpec) -> SettingLadder:
-    """Numbers of draws and what is read off them, against a long run with other draws."""
+    """Return settings of draws, with a long run of other draws as the reference."""
     reference_draws = REFERENCE_DRAWS_FACTOR * TRIED_DRAWS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     as_written_overrides: dict[str, Any] = {}
@@ -354,9 +360,11 @@ def _build_draws_ladder(spec: GridSpec) -> SettingLadder:
 
 
 def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
-    """All effects on; segments that all begin at one range are a law, which stays as written.
+    """Return overrides that enable all effects.
 
-    Random ones where probabilities are means over draws: of a flight they are not.
+    Segment motion stays off if the spec disables it, as it then is a rule of the scene that all
+    segments begin at one range. Random effects are enabled only if probabilities are means over
+    draws, which they are not in a flight.
     """
     segment_motion, has_draws = (
         SEGMENT_MOTION.name,
@@ -375,7 +383,7 @@ def _is_on_axis(spec: AnySpec, path: str) -> bool:
 
 
 def _why_beamlets_are_fixed(spec: AnySpec) -> str:
-    """Why the number of beamlets is the scene's and not accuracy's; empty where it is."""
+    """Return the reason why the scene, not accuracy, sets the number of beamlets; or ''."""
     if spec.parameters()["footprint.phases"] == "coherent":
         return "with coherent phases it is part of the scene, as the thesis has it"
     if spec.instrument.receiver.architecture == "direct":

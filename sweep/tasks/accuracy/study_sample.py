@@ -1,7 +1,8 @@
-"""A sample of points that rungs are tried on, by the machinery of a run, or the thesis's way.
+"""Sample of a study's points on which accuracy settings are tried.
 
-Of a grid these are points spread over all axes, of a flight whole tiles of shots, as effects are
-planned in them.
+Points of a grid are spread over all axes. Shots of a flight come in complete tiles, as effects are
+planned by tile. Points are computed as in a run, or by the thesis's method
+(:mod:`sweep.model.spectrum.oversampled_grid`).
 """
 
 from __future__ import annotations
@@ -41,56 +42,61 @@ from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_
 from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterBlockGrid
 
 PeakFinder = Callable[[Shots], np.ndarray]
-"""A way to the largest bins of each segment's spectrum, as :func:`sweep.model.evaluation.find`."""
+"""Function that returns the largest bins of each segment's spectrum.
+
+The result is that of :func:`sweep.model.evaluation.evaluate_segments`.
+"""
 
 PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
-"""Values of points and their attributes, by name."""
+"""Values of points and their attributes, by name of the coordinate."""
 
 
 def _flags_of_effects(effect_names: Collection[str]) -> np.uint32:
-    """Return the flags of some effects."""
+    """Return the flags of the named effects."""
     return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
 LINE_EFFECT_FLAGS = _flags_of_effects(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
-"""Flags of the effects that the thesis's way can have."""
+"""Flags of the effects that the thesis's method can have."""
 
 TIME_DOMAIN_EFFECT_FLAGS = ~_flags_of_effects(
     ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
     + [effect.name for effect in EFFECTS if effect.is_random]
 )
-"""Flags of the effects that the time-domain records know of."""
+"""Flags of the effects that the time-domain records contain."""
 
 TIMED_STRETCHES_PER_PART, TIMED_POINTS_MAX = 12, 8192
-"""Places of a part of a grid's sample at which stretches of a block are timed, and their length at
-the most."""
+"""Number of timed stretches of points per part of a grid's sample, and their largest length."""
 
 SAMPLED_AXIS_POINTS = 2
-"""Places along the axes at which each scanner of a flight is looked at."""
+"""Number of points of the axes at which each scanner of a flight is sampled."""
 
 RESERVED_COORDINATE_NAMES = ("number", "kind", "tolerance")
-"""Names of parameters that the store has for itself: on an axis they go by their whole path."""
+"""Names of coordinates of the store; parameters of these names have their complete path instead."""
 
 AS_WRITTEN_SETTING = AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
 
 
 class SampleResults(NamedTuple):
-    """Results of a rung at n points; nan for those that it lacks."""
+    """Results of a setting at n points; nan where it has none."""
 
-    pd: np.ndarray  # (n, 4): probability of detection: up, Doppler, down, shot
-    log10_pfa: np.ndarray  # (n, k): log10 of probabilities of false alarm
-    leakage: np.ndarray  # (n, 2): probability of leakage in the chirps, up and down
-    magnitude: np.ndarray  # (n, k): |X| of the peak bins, in a unit of all rungs
-    standard_error: np.ndarray  # (n,): of the worst of pd, where it is a mean over draws
-    noise_sigma: np.ndarray  # (n,): noise of a bin, per quadrature, in the magnitudes' unit
+    pd: np.ndarray  # (n, 4): probability of detection in up, Doppler, down segment, and shot
+    log10_pfa: np.ndarray  # (n, 2): log10 of the probability of false alarm of segment and shot
+    leakage: np.ndarray  # (n, 2): probability of leakage in up- and down-chirp
+    magnitude: np.ndarray  # (n, k): |X| of the peak bins, in a unit that all settings share
+    standard_error: np.ndarray  # (n,): largest standard error of pd, if it is a mean over draws
+    noise_sigma: np.ndarray  # (n,): noise of a bin per quadrature, in the unit of magnitudes
     n_beamlets: np.ndarray
-    """(n,): of each point; of a flight all rays that are cast, whatever is made of them."""
+    """Number of beamlets (n,); in a flight the number of rays cast."""
 
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
-    """Results in the outputs of points; ``n_draws``: in so many draws, 0 for means of them."""
+    """Return the results in the outputs of points.
+
+    With ``n_draws`` the outputs are counts of so many draws, otherwise probabilities.
+    """
     segments_and_shot = (*SEGMENT_NAMES, "shot")
 
     def stack_outputs(form: str, names: Iterable[str] = SEGMENT_NAMES) -> np.ndarray:
@@ -117,7 +123,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
 
 
 def unknown_results(n_points: int) -> SampleResults:
-    """Results of points of which nothing is known."""
+    """Return results of nan for `n` points."""
     shapes = (
         (n_points, 4),
         (n_points, 2),
@@ -131,16 +137,16 @@ def unknown_results(n_points: int) -> SampleResults:
 
 
 class Trial(NamedTuple):
-    """A rung tried on some points."""
+    """Trial of a setting on some points."""
 
     results: SampleResults
     seconds_per_point: float
-    """Processor time of a point, planning included: what others use of the machine is no part."""
-    planning_seconds_per_point: float  # a point
+    """Processor time per point [s], with planning; other processes of the machine do not count."""
+    planning_seconds_per_point: float  # processor time of planning per point [s]
 
 
 def merge_trials(trials: Sequence[Trial]) -> Trial:
-    """Trials of a rung on several parts of a sample as one."""
+    """Merge the trials of a setting on several parts of a sample."""
     weights = np.array([trial.results.noise_sigma.size for trial in trials], float)
     weights /= weights.sum()
     return Trial(
@@ -151,36 +157,34 @@ def merge_trials(trials: Sequence[Trial]) -> Trial:
 
 
 class StudySample(ABC):
-    """A sample of a study's points."""
+    """Sample of a study's points."""
 
     points_noun = "points"
     spec: AnySpec
-    study_with: Callable[[AccuracySetting], Any]  # the study with a rung's settings
-    point_indices: np.ndarray  # (size,): of the sample's points, by which they are computed
-    n_study_points: (
-        int  # points of the study, each computed once: draws of a flight are none of their own
-    )
-    timed_points_max: int  # points of the longest stretch that may be timed
+    study_with: Callable[[AccuracySetting], Any]  # returns the study with a setting
+    point_indices: np.ndarray  # (size,): indices of the points, by which they are computed
+    n_study_points: int  # number of points of the study, without the draws of a flight
+    timed_points_max: int  # largest number of points that are timed together
 
     @property
     def size(self) -> int:
-        """Points of the sample."""
+        """Number of points of the sample."""
         return self.point_indices.size
 
     @abstractmethod
     def split(self, points_per_part: int) -> list[np.ndarray]:
-        """Return the sample in parts of about so many points."""
+        """Divide the sample into parts of about `points_per_part` points."""
 
     @abstractmethod
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute a rung on a part of the sample, timed on so many points or on the part."""
+        """Compute a part of the sample; time it on `n_timed_points` points, or on a larger part."""
 
     @abstractmethod
     def point_coordinates(self) -> PointCoordinates:
-        """Return what tells the points of the sample apart."""
+        """Return the coordinates that identify the points of the sample."""
 
     def simulated_effects(self, setting: AccuracySetting) -> frozenset[str]:
-        """Effects that a rung simulates anywhere in the sample."""
+        """Return the effects that a setting simulates anywhere in the sample."""
         parts = (self.point_indices[part] for part in self.split(self.size))
         effect_flags = [
             np.bitwise_or.reduce(self._plan_flags(setting, indices)[0]) for indices in parts
@@ -190,10 +194,10 @@ class StudySample(ABC):
     def compare_with_time_domain(
         self, setting: AccuracySetting, sample_row: int
     ) -> tuple[SampleResults, SampleResults]:
-        """Compute a point in the time domain, and with the rung's effects that the truth has."""
+        """Compute a point in the time domain, and by the setting with the effects of both."""
         point_index = self.point_indices[[sample_row]]
         effect_flags = self._plan_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
-        # Records walk by themselves, whatever effects are named.
+        # Records contain range walk, whatever effects are named.
         time_domain, simulated = (
             self._collect_results(
                 setting, 1, self._iter_outputs(setting, point_index, effect_flags, find_peaks)
@@ -206,13 +210,13 @@ class StudySample(ABC):
         return time_domain, simulated
 
     def drop_caches(self) -> None:  # noqa: B027
-        """Drop what trials of one part share; its time counts for each of them."""
+        """Drop results that the trials of one part share; their time counts for each trial."""
 
     @abstractmethod
     def _plan_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Return flags of points (n,), and the time that planning takes one, its share."""
+        """Return the effect flags of points (n,), and the time of planning per point [s]."""
 
     @abstractmethod
     def _iter_outputs(
@@ -222,15 +226,15 @@ class StudySample(ABC):
         effect_flags: np.ndarray,
         find_peaks: PeakFinder | None,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Positions of some points, and their outputs; ``find_peaks`` replaces the search."""
+        """Yield indices of points, and their outputs; ``find_peaks`` replaces the peak search."""
 
     @cached_property
     def _line_effect_flags(self) -> np.uint32:
-        """Flags of the study's effects that the thesis's way can have."""
+        """Flags of the study's effects that the thesis's method can have."""
         return _flags_of_effects(self.simulated_effects(AS_WRITTEN_SETTING)) & LINE_EFFECT_FLAGS
 
     def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:
-        """Plan and compute points."""
+        """Plan and compute points; return the trial."""
         effect_flags, planning_seconds = self._plan_flags(setting, point_indices)
         find_peaks = (
             partial(find_peaks_on_grid, **setting.thesis_grid_options)
@@ -249,7 +253,7 @@ class StudySample(ABC):
         n_points: int,
         outputs_by_rows: Iterable[tuple[np.ndarray, Results]],
     ) -> SampleResults:
-        """Results of points in their places."""
+        """Return the results of all points from the outputs of groups of points."""
         n_counted_draws = (
             int(self.study_with(setting).spec.draws.number) if setting.counts_detections else 0
         )
@@ -263,27 +267,27 @@ class StudySample(ABC):
 
 
 def halton_sample(shape: tuple[int, ...], n_points: int) -> np.ndarray:
-    """Numbers of points of a grid, in C order, spread evenly along every axis by Halton's sequence.
+    """Return indices of points, in C order, spread evenly over a grid by Halton's sequence.
 
-    Any first part of them is spread as well, so that a part of the sample stands for all.
+    Any first part of the sample is spread evenly too, so that a part represents all.
     """
     n_grid_points = math.prod(shape)
     if not shape or n_grid_points <= 1:
         return np.zeros(min(n_grid_points, n_points), np.int64)
-    # The sequence's first point is the grid's corner.
+    # The first point of the sequence, a corner of the grid, is skipped.
     halton_points = qmc.Halton(len(shape), scramble=False).random(128 * n_points + 1)[1:]
     axis_indices = np.floor(halton_points * shape).astype(np.int64)
     grid_indices = dict.fromkeys(np.ravel_multi_index(tuple(axis_indices.T), shape).tolist())
     grid_indices |= dict.fromkeys(
         range(min(n_grid_points, 2 * n_points))
-    )  # some of small grids are never met
+    )  # the sequence may never reach some points of small grids
     return np.fromiter(grid_indices, np.int64)[:n_points]
 
 
 def axis_coordinates(
     axes: tuple[Axis, ...], axis_indices: tuple[np.ndarray, ...]
 ) -> PointCoordinates:
-    """Coordinates of points, by their places along each axis."""
+    """Return the coordinates of points from their indices along each axis."""
     coordinates: PointCoordinates = {}
     for axis, indices in zip(axes, axis_indices, strict=True):
         for member in axis.parameters:
@@ -298,9 +302,10 @@ def axis_coordinates(
 
 
 class GridSample(StudySample):
-    """A sample of the points of a grid, spread evenly, or of these numbers.
+    """Sample of the points of a grid: spread evenly, or given by their indices.
 
-    Points are timed with those that the block computes next, which share intermediate results.
+    Points are timed together with those that the block computes next, which share intermediate
+    results.
     """
 
     def __init__(
@@ -317,11 +322,11 @@ class GridSample(StudySample):
         self.timed_points_max = min(TIMED_POINTS_MAX, self._block_points)
 
     def split(self, points_per_part: int) -> list[np.ndarray]:
-        """Parts of the sample, each spread as evenly as all of it."""
+        """Divide the sample into parts, each spread as evenly as all of it."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part by itself; its time is that of more points of the same blocks."""
+        """Compute the part alone; the time is that of more points of the same blocks."""
         point_indices = self.point_indices[part]
         trial = self._run_setting(setting, point_indices)
         if n_timed_points == 1:
@@ -333,14 +338,14 @@ class GridSample(StudySample):
                 for timed_point in timed_points
             ]
         )
-        # As many points together as a block has: what a call costs is shared by these alone.
+        # As many points per call as a block has, which share the overhead of a call.
         blocks = np.array_split(stretches, -(-stretches.size // self._block_points))
         return merge_trials([self._run_setting(setting, block) for block in blocks])._replace(
             results=trial.results
         )
 
     def point_coordinates(self) -> PointCoordinates:
-        """Return the number of each point in C order, and its place along each axis."""
+        """Return the index of each point in C order, and its values along each axis."""
         axis_indices = (
             np.unravel_index(self.point_indices, self._grid.shape) if self._grid.shape else ()
         )
@@ -388,7 +393,7 @@ class GridSample(StudySample):
     def _points_computed_next(
         self, setting: AccuracySetting, point_index: int, n_points: int
     ) -> np.ndarray:
-        """Return a point and those that its block computes after it, round the block's end."""
+        """Return a point and those that its block computes next, cyclically."""
         grid = self.study_with(setting).grid
         (block,), (local_index,) = (
             array.tolist() for array in grid.locate_points(np.array([point_index]))
@@ -399,10 +404,10 @@ class GridSample(StudySample):
 
 
 class FlightSample(StudySample):
-    """A sample of the shots of a flight: whole tiles, as effects are planned in them.
+    """Sample of the shots of a flight: complete tiles, as effects are planned by tile.
 
-    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost
-    the same whatever the accuracy. Shots are computed by their places in the sample.
+    The time includes rays, plans, spectra and probabilities. Draws, points and navigation take the
+    same time whatever the accuracy. `point_indices` are indices in the sample.
     """
 
     points_noun = "shots"
@@ -411,7 +416,7 @@ class FlightSample(StudySample):
         self.spec = spec
         self.study_with = cache(self._make_study)
         self._cast_eyepoints: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
-        # What costs the same for any number of shots, as planning mostly does, a block shares.
+        # The shots of a block share work that does not depend on their number, such as planning.
         self.timed_points_max = max(int(spec.storage.block_shots), SHOTS_PER_TILE)
         self._flight_blocks, shots_by_part = zip(*self._sample_shots(n_points), strict=True)
         self._shot_numbers = np.concatenate(shots_by_part)
@@ -425,7 +430,7 @@ class FlightSample(StudySample):
         )
 
     def split(self, points_per_part: int) -> list[np.ndarray]:
-        """Whole tiles of one scanner at a place along the axes, from all of these in turn."""
+        """Divide the sample into complete tiles of one scanner at a point of the axes, in turn."""
         tiles_per_part, parts_by_block = max(1, round(points_per_part / SHOTS_PER_TILE)), []
         for rows in (
             np.flatnonzero(self._part_of_row == block_number)
@@ -445,7 +450,7 @@ class FlightSample(StudySample):
         ]
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part and neighbouring tiles of so many shots, timed with their rays."""
+        """Compute the part, timed with neighbouring tiles of `n_points` shots and their rays."""
         point_indices = self.extend_to_whole_tiles(part, n_timed_points)
         trial = self._run_setting(setting, point_indices)
         rows_of_part = np.searchsorted(point_indices, part)
@@ -458,7 +463,7 @@ class FlightSample(StudySample):
         )
 
     def point_coordinates(self) -> PointCoordinates:
-        """Scanner and number of each shot, and its place along the axes."""
+        """Return scanner and number of each shot, and its values along each axis."""
         axis_indices = np.reshape(
             [flight_block.axis_indices for flight_block in self._flight_blocks],
             (len(self._flight_blocks), -1),
@@ -470,11 +475,14 @@ class FlightSample(StudySample):
         } | axis_coordinates(self.spec.axes, tuple(axis_indices[self._part_of_row].T))
 
     def drop_caches(self) -> None:
-        """Drop the rays that rungs of the same geometry share."""
+        """Drop the rays that settings of the same geometry share."""
         self._cast_eyepoints.clear()
 
     def extend_to_whole_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
-        """Whole tiles of some of the sample, and so many shots with those that follow."""
+        """Return the rows of the tiles of some points, and of following tiles.
+
+        As many tiles follow as have `n_shots` shots with the first.
+        """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
             rows_of_whole_tiles(
@@ -485,7 +493,7 @@ class FlightSample(StudySample):
         ]
 
     def flight_block_and_shots(self, point_indices: np.ndarray) -> tuple[FlightBlock, np.ndarray]:
-        """Scanner and place along the axes of some of the sample, and their numbers there."""
+        """Return scanner and point of the axes of a part of the sample, and its shot numbers."""
         return self._flight_blocks[self._part_of_row[point_indices[0]]], self._shot_numbers[
             point_indices
         ]
@@ -537,7 +545,7 @@ class FlightSample(StudySample):
         )
 
     def _sample_shots(self, n_points: int) -> Iterator[tuple[FlightBlock, np.ndarray]]:
-        """Scanners at places along the axes, and shots of each, spread over the flight."""
+        """Yield scanners at points of the axes, and shot numbers spread over the flight."""
         study = self.study_with(AS_WRITTEN_SETTING)
         for scanner, scanner_grid in study.scanner_grids.items():
             axis_points = halton_sample(scanner_grid.axes_shape, SAMPLED_AXIS_POINTS)
@@ -557,7 +565,7 @@ class FlightSample(StudySample):
 
     def _make_study(self, setting: AccuracySetting) -> FlightStudy:
         spec: Any = setting.apply_to(self.spec)
-        # in a world that all share, as building one can take seconds
+        # all studies share a scene, as building it can take seconds
         study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
         if setting.rays_error_max:
             study.ray_accuracy = ErrorBudget(setting.rays_error_max, rays_tolerance_min=0.0)
@@ -566,7 +574,7 @@ class FlightSample(StudySample):
     def _cast_shots(
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
     ) -> tuple[Eyepoints, float]:
-        """Eyepoints of shots, cast once for rungs of a geometry, and the time that it took [s]."""
+        """Return the eyepoints of shots, cached by geometry, and the time of casting them [s]."""
         eyepoint_study = self.study_with(setting).get_eyepoint_study(flight_block.scanner)
         cache_key = eyepoint_study.id, shot_numbers.tobytes()
         if cache_key not in self._cast_eyepoints:
@@ -579,9 +587,10 @@ class FlightSample(StudySample):
 
 
 def rows_of_whole_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
-    """Rows of the whole tiles of so many shots: those of some and what follows, round the end.
+    """Return the rows of the tiles of some rows, and of following tiles, cyclically.
 
-    ``tile_of_row`` (n,) has the number of each row's tile, rising.
+    ``tile_of_row`` (n,) is the rising number of each row's tile. So many tiles follow that they
+    have `n_shots` shots with the first.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
@@ -599,7 +608,7 @@ def _shot_statistics(
     shot_numbers: np.ndarray,
     effect_flags: np.ndarray,
 ) -> Results:
-    """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
+    """Return statistics of shots by a function that finds peaks; nan of shots that hit nothing."""
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
         eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces

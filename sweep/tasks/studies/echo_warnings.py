@@ -1,9 +1,9 @@
-"""Echoes of a study that arrive late, are read as another range, or walk in phase, in words.
+"""Warnings about echoes that arrive late, are misread, or have a random walk of phase.
 
-A record begins at the acquisition delay and ends fft_size samples later, or where the chirp does.
-An echo is there from 2 R / c on. Beats beyond half the sample rate fold, and the readings of three
-peaks, or of two by an assumption, then give another range. Both follow from a few parameters, so
-they are told of a whole grid, and of shots spread over a flight, before anything runs.
+A record begins at the acquisition delay and ends `fft_size` samples later, or with the chirp. An
+echo arrives at 2 R / c. Beats above half the sample rate are aliased, so that three peaks, or two
+with an assumption, give a wrong range. Both follow from a few parameters. They are therefore
+checked for a whole grid, and for shots spread over a flight, before anything runs.
 """
 
 from __future__ import annotations
@@ -35,21 +35,28 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 ECHO_LOSS_WARNING_DB = 3.0
-"""Loss of an echo's power beyond which is warned of."""
+"""Loss of an echo's power above which a warning is given [dB]."""
 
 PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MAX = 0.125, 0.3
-"""Delay over the record's duration, and variance of the laser's phase over it [rad^2], beyond which
-a random walk leaves more than 0.02 of error in probabilities of detection."""
+"""Limits beyond which a random walk of phase changes pd by more than 0.02.
+
+The first is the delay over the duration of the record. The second is the variance of the laser's
+phase over the delay, or over the record if that is shorter [rad^2].
+"""
 
 ECHO_POINTS_SAMPLED_MAX = 200_000
-"""Points of the grid of the parameters that matter; of larger grids so many, spread over them."""
+"""Largest number of points, of the grid of parameters in `ECHO_PARAMETERS`, that are checked."""
 
 SAMPLED_TILES_PER_SCANNER = 16
-"""Tiles of a flight's shots that are looked at, of each scanner."""
+"""Number of tiles of each scanner's shots that are checked."""
 
 EDGE_SPREAD_BINS_MIN, EDGE_DISTANCE_BINS, EDGE_DISTANCE_DEVIATIONS = 0.2, 4.0, 3.0
-"""Deviation of a footprint's lines [bins of fs/L] beyond which an echo that any bin detects is not
-one line. With the bins and deviations within which such an echo lies across DC or Nyquist."""
+"""Limits for an echo across DC or Nyquist.
+
+The first is the standard deviation of a footprint's lines [bins of fs/L] above which an echo, if
+any bin may detect it, is not a single line. The others are the distances from DC or Nyquist, in
+bins and in standard deviations, within which such an echo lies across.
+"""
 
 ECHO_PARAMETERS = (
     "target.range",
@@ -82,49 +89,59 @@ ECHO_PARAMETERS = (
     beam.FOCUS_PATH,
     beam.COUPLING_PATH,
 )
-"""Parameters by which echoes arrive and are read."""
+"""Parameters that determine when echoes arrive, and how they are read."""
 
 
 PHASE_ESTIMATOR_LOSS_MAX = 0.03
-"""Share of the window's sum that an echo may lack for places by the phases of bins to be within
-some 0.02 bin. Half a record without an echo sets them off by up to 0.6 bin."""
+"""Largest fraction of the window's sum without echo at which phase estimators are valid.
+
+Their errors are then below some 0.02 bin. Half a record without an echo causes errors of up to 0.6
+bin.
+"""
 
 PHASE_ESTIMATORS = ("jacobsen", "candan")
-"""Estimators that take the phases of neighbouring bins for those of a whole record."""
+"""Estimators that interpret the phases of neighbouring bins as those of a complete record."""
 
 
 class EchoDiagnosis(NamedTuple):
-    """Echoes of n points."""
+    """Arrival and reading of the echoes of n points."""
 
     range: np.ndarray
-    """(n,) [m]."""
+    """Range (n,) [m]."""
     window_fraction_lost: np.ndarray
-    """(n,): share of the window's sum before the echo arrives, 0..1; 1: it never does."""
+    """Fraction (n,) of the window's sum before the echo arrives, 0..1; 1 if it never arrives."""
     is_misread: np.ndarray
-    """(n,): true where its beats are read as another range or velocity."""
+    """True (n,) if the beats are read as another range or velocity."""
     has_phase_walk: np.ndarray
-    """(n,): true where the laser's phase walks further than the law of detection allows."""
+    """True (n,) if the laser's phase varies more than the model of detection allows."""
     is_exchanged: np.ndarray
-    """(n,): true where up and down beat alone are read with range and velocity exchanged, and would
-    be read right by the other assumption of two beats."""
+    """True (n,) if up and down beat alone are read with range and velocity exchanged.
+
+    The other assumption for two beats would read them correctly.
+    """
     is_exchanged_by_other: np.ndarray
-    """(n,): likewise by the other assumption, where this one is right."""
+    """True (n,) if the other assumption for two beats exchanges range and velocity.
+
+    Points at which the present assumption does so too are not marked.
+    """
     crosses_spectrum_edge: np.ndarray
-    """(n,): true where an echo in developed speckle that any bin detects spreads over bins across
-    DC or Nyquist."""
+    """True (n,) if an echo in developed speckle spreads over bins across DC or Nyquist.
+
+    Only echoes that any bin may detect are marked.
+    """
 
 
 class FootprintDeviations(NamedTuple):
-    """Standard deviations over the beam of n footprints."""
+    """Standard deviations of range and radial velocity over the beams of n footprints."""
 
     range: np.ndarray
-    """[m]"""
+    """Standard deviation of the range (n,) [m]."""
     radial_velocity: np.ndarray
-    """[m/s]"""
+    """Standard deviation of the radial velocity (n,) [m/s]."""
 
     @classmethod
     def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
-        """Return the widths of footprints on the plane of points of one category."""
+        """Return the deviations of footprints on a plane, from parameters of equal strings."""
         with np.errstate(all="ignore"):
             places, directions = beam.footprint_angles(p, range_)
             range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
@@ -133,9 +150,9 @@ class FootprintDeviations(NamedTuple):
 
     @classmethod
     def on_ground(cls, eyepoints: Eyepoints) -> FootprintDeviations:
-        """Return the widths of footprints that rays have found; 0 where there are several surfaces.
+        """Return the deviations of ray-traced footprints; 0 for footprints on several surfaces.
 
-        Surfaces at different ranges are echoes of their own.
+        Surfaces at different ranges are separate echoes.
         """
         weight = eyepoints.weight / eyepoints.weight.sum()
         deviations = []
@@ -147,16 +164,16 @@ class FootprintDeviations(NamedTuple):
         return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
 
     def select(self, points: np.ndarray) -> FootprintDeviations:
-        """Select points by their numbers."""
+        """Return the footprints with these indices."""
         return FootprintDeviations(self.range[points], self.radial_velocity[points])
 
 
 def diagnose_echoes(
     parameters: Mapping[str, Any], footprint: FootprintDeviations | None = None
 ) -> EchoDiagnosis:
-    """Find when the echoes of points arrive, and how their beats are read, without a footprint.
+    """Determine when the echoes of points arrive, and how their beats are read.
 
-    ``footprint`` are those of footprints on any ground; by default on a plane.
+    ``footprint`` has the deviations of the footprints; by default those on a plane.
     """
     relevant = {
         path: parameter for path, parameter in parameters.items() if path in ECHO_PARAMETERS
@@ -222,7 +239,7 @@ def _crosses_spectrum_edge(
     p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, record_length: int,
     footprint: FootprintDeviations | None,
 ) -> np.ndarray:  # fmt: skip
-    """Mark echoes of the kind of :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
+    """Return :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
     is_speckled &= str(p[RECEIVER_PREFIX + "architecture"]) != "direct"
     if (
@@ -264,9 +281,9 @@ def _crosses_spectrum_edge(
 def _is_misread(
     p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, assumption: str | None = None
 ) -> np.ndarray:
-    """Return true where a target's beats, as a spectrum shows them, tell another target, (n,).
+    """Return True (n,) if the beats of a target, as a spectrum shows them, give another target.
 
-    All its beats, or up and down beat alone, read by the assumption ``assumption``.
+    All three beats are read, or with an ``assumption`` up and down beat alone.
     """
     carriers, slopes = waveform.segment_carriers(p), waveform.chirp_slopes(p)
     chirp_rate = p[CHIRP_PREFIX + "bandwidth"] / p[CHIRP_PREFIX + "duration"]
@@ -314,14 +331,14 @@ def _is_misread(
             two_beat_assumption=reading_assumption,
         )
     range_tolerance = MISREAD_TOLERANCE_BINS * bin_width / (2 / SPEED_OF_LIGHT * chirp_rate)
-    with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
+    with np.errstate(divide="ignore"):  # direct detection has a carrier of 0 and no velocity
         velocity_tolerance = MISREAD_TOLERANCE_BINS * bin_width * SPEED_OF_LIGHT / carriers[0]
     is_off = np.abs(reading.range - range_) > range_tolerance
     return np.asarray(is_off | (np.abs(reading.radial_velocity - velocity) > velocity_tolerance))
 
 
 def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Echoes that a study has not, has in part, or reads as others, a sentence each."""
+    """Yield warnings about echoes that a study misses, records in part, or misreads."""
     is_flight = isinstance(study, FlightStudy)
     diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
     if not diagnosis.range.size:
@@ -419,7 +436,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
-    """List the estimators of a study that places of late echoes are wrong by."""
+    """Return the phase estimators that a study uses."""
     path = f"{ESTIMATOR_PREFIX}kind"
     values = [
         member.values
@@ -432,7 +449,7 @@ def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
 
 
 def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
-    """Return true if up and down beat alone tell range and velocity, always or now and then."""
+    """Return True if range and velocity are always or sometimes read from two beats alone."""
     spec = study.spec
     p = PARAMETER_DEFAULTS | dict(spec.parameters())
     has_no_doppler = "doppler" not in waveform.existing_segments(
@@ -451,9 +468,10 @@ def _exchanged_warning(
     is_absent: np.ndarray,
     points_noun: str,
 ) -> Iterator[str]:
-    """Yield at how many points the assumption of two beats is wrong, and whether to change it.
+    """Yield a warning about the points at which the assumption for two beats is wrong.
 
-    Not where the target is fast at some points and far at others, and is taken to be fast.
+    No warning is given if the target is fast at some points and far at others, and assumed to be
+    fast.
     """
     is_exchanged, is_exchanged_by_other = (
         diagnosis.is_exchanged & ~is_absent,
@@ -493,7 +511,10 @@ def _fraction_text(mask: np.ndarray) -> str:
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Ranges of some points: from one on where all beyond are among them, or are ``is_absent``."""
+    """Return the ranges of some points as text: 'from x on' if it holds for all others beyond.
+
+    Points that are ``is_absent`` are ignored.
+    """
     if is_absent is not None and is_absent.any():
         mask, ranges = mask[~is_absent], ranges[~is_absent]
     low, high = ranges[mask].min(), ranges[mask].max()

@@ -12,12 +12,15 @@ import numpy as np
 from sweep.model import VERSION
 from sweep.tasks.engine.block_study import BlockStudy
 
-#: Errors of Zarr at a chunk that is not there, or not as it was written.
+#: Errors of Zarr at a chunk that is missing or damaged.
 CHUNK_READ_ERRORS = (OSError, ValueError, RuntimeError)
 
 
 class ExtendableStudy(BlockStudy):
-    """A study that may be extended, and may extend another."""
+    """Study that may be extended, and may extend another.
+
+    `find_reuse_source` returns the results of a smaller study, or None.
+    """
 
     model_version = VERSION
 
@@ -27,7 +30,7 @@ class ExtendableStudy(BlockStudy):
 
     @cached_property
     def reuse_source(self) -> Any:
-        """Results of a smaller study, or None; looked for as the first block is computed."""
+        """Results of a smaller study, or None; opened when the first block is computed."""
         return self.find_reuse_source()
 
     @property
@@ -37,10 +40,13 @@ class ExtendableStudy(BlockStudy):
 
     @abstractmethod
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
+        """Return a mask (points,), or one bool for all, of points that depend on the tolerance.
+
+        A tighter tolerance computes these points of the block more closely.
+        """
 
     def first_draw_block(self, block: int) -> int:
-        """Block with all that the draws of a block have in common."""
+        """Return the block that holds the results shared by all draws of a block's points."""
         return block
 
     def pop_reused_points(self, block: int) -> int:
@@ -49,7 +55,7 @@ class ExtendableStudy(BlockStudy):
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0
 
     def count_reusable_points(self, block: int) -> int:
-        """Points of a block that the smaller study has, if nothing is damaged."""
+        """Count the points of a block that the smaller study's store has, damaged or not."""
         shared = self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
         return (
             sum(shared_points.local_indices.size for shared_points in shared)

@@ -1,7 +1,7 @@
-"""Eyepoints as a study of its own: what every shot of a flight sees through one scanner.
+"""Study of the eyepoints of a flight: what every shot through one scanner hits.
 
-Rays are cast here and nowhere else. The store is named by its content, so that every study of the
-same geometry finds it. Shots that need more rays are cast again as they are looked at
+Only this module casts rays. The path of the store is a hash of its content, so that every study of
+the same geometry finds it. Shots that need more rays are cast again during the simulation
 (:func:`refine_rays`).
 """
 
@@ -34,34 +34,37 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
-#: Shots and beamlets of a block, as far as whole cycles allow.
+#: Largest numbers of shots and beamlets of a block, which contains complete cycles.
 BLOCK_SHOTS_MAX = 4096
 BLOCK_BEAMLETS_MAX = 1 << 20
 
-#: Beamlets cast at once, which bounds a worker's memory where cycles are long.
+#: Largest number of beamlets that are cast at once, which bounds memory if cycles are long.
 RAYS_PER_CAST_MAX = 1 << 18
 
-#: Nodes of a scene's map along the longer side, and along the shorter at least.
+#: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
 MAP_NODES_MAX = 256
 MAP_NODES_MIN = 16
 
-#: Shots of each scanner that say where the flight looks, or times that say where it is; and the
-#: room left around what they see.
+#: Number of shots of each scanner, or of times, that sample the extent of a flight; and the margin
+#: of the map around it, as a fraction of the extent.
 FLIGHT_SAMPLES = 512
 MAP_MARGIN_FRACTION = 0.08
 
-#: Distance above the scene from which it is seen for its map [m].
+#: Height of the viewpoint of the map above the scene and the flight [m].
 MAP_VIEW_CLEARANCE = 1.0
 
-#: Distance of the ground up to which a platform stands on it [m].
+#: Largest distance from the ground of a platform that stands on it [m].
 GROUND_CONTACT_MAX = 1e-6
 
-#: Size of an axis named by the model.
+#: Sizes of the model's dimensions of vectors and matrices.
 VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
 
 
 class EyepointStudy(BlockStudy):
-    """Eyepoints of a flight's shots through one scanner; rays and scene by default its own."""
+    """Study of the eyepoints of a flight's shots through one scanner.
+
+    `n_beamlets` and `world` are by default those of the spec.
+    """
 
     points_noun = "shots"
     model_version = VERSION
@@ -89,7 +92,7 @@ class EyepointStudy(BlockStudy):
 
     @property
     def grids(self) -> tuple[BlockGrid]:
-        """Its cycles."""
+        """Grid of the cycles, in a tuple."""
         return (self._grid,)
 
     @cached_property
@@ -99,15 +102,15 @@ class EyepointStudy(BlockStudy):
 
     @property
     def n_rays(self) -> int:
-        """Rays that all blocks cast: one a beamlet, and one straight down a cycle."""
+        """Number of rays of all blocks: one per beamlet, and one straight down per cycle."""
         return self.count_rays(self.n_points)
 
     def count_rays(self, n_shots: int) -> int:
-        """Rays that are cast for a number of shots in whole cycles."""
+        """Return the number of rays of `n_shots` shots in complete cycles."""
         return n_shots * self.n_beamlets + n_shots // self.shots_per_cycle
 
     def store_attributes(self) -> dict[str, Any]:
-        """Return the geometry, as it was hashed."""
+        """Return the geometry from which the id is hashed."""
         return {
             "kind": "eyepoints",
             "geometry": json.dumps(self.spec.geometry_identity(self.scanner), sort_keys=True),
@@ -115,7 +118,7 @@ class EyepointStudy(BlockStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Weights of the beamlets."""
+        """Return the weights of the beamlets."""
         weight_attributes = cf_attributes(
             BEAMLET_WEIGHT_VARIABLE.units, BEAMLET_WEIGHT_VARIABLE.long_name
         )
@@ -137,7 +140,7 @@ class EyepointStudy(BlockStudy):
         return place_beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Shots, beamlets and cycles."""
+        """Return the layouts of the arrays of shots, beamlets and cycles."""
         sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
         return [
             make_output_layout(self._grid, name, output, output.dims, sizes)
@@ -145,23 +148,23 @@ class EyepointStudy(BlockStudy):
         ]
 
     def evaluate(self, block: int) -> Results:
-        """Eyepoints of a block."""
+        """Cast the eyepoints of a block."""
         (cycles,) = self._grid.block_slices(block)
         return self.cast_cycles(
             np.arange(cycles.start * self.shots_per_cycle, cycles.stop * self.shots_per_cycle)
         )
 
     def compile_kernels(self) -> None:
-        """Compile the ray caster, on the first cycle."""
+        """Compile the ray caster, by the first cycle."""
         self.cast_cycles(np.arange(self.shots_per_cycle))
 
     def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
-        """Arrays of shots, by number (n,), in whole cycles, and of these."""
+        """Return the arrays of shots in complete cycles, and of the cycles, by shot number (n,)."""
         shot_arrays = self.cast_shots(shot_numbers)
         return shot_arrays | self._cycle_arrays(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
-        """Arrays of any shots, by number (n,)."""
+        """Return the arrays of any shots, by their numbers (n,)."""
         from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
@@ -174,7 +177,7 @@ class EyepointStudy(BlockStudy):
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def sample_tiles(self, n_tiles: int) -> np.ndarray:
-        """Numbers of the shots of some tiles, as the study plans them, spread over the flight."""
+        """Return the numbers of all shots of `n_tiles` tiles, spread over the flight."""
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
             np.unique(np.linspace(0, last_tile, n_tiles).astype(np.int64)) * SHOTS_PER_TILE
@@ -183,7 +186,7 @@ class EyepointStudy(BlockStudy):
         return np.asarray(shot_numbers[shot_numbers < self.n_points])
 
     def sample_cycles(self, n_tiles: int) -> np.ndarray:
-        """Numbers of the shots of whole cycles that hold some tiles, spread over the flight."""
+        """Return the numbers of all shots of cycles that overlap `n_tiles` tiles of the flight."""
         cycle_numbers = np.unique(self.sample_tiles(n_tiles) // self.shots_per_cycle)
         return np.asarray(
             (
@@ -192,7 +195,7 @@ class EyepointStudy(BlockStudy):
         )
 
     def cast_eyepoints(self, shot_numbers: np.ndarray) -> Eyepoints:
-        """Eyepoints of any shots, by number (n,): all their rays are cast at once."""
+        """Cast all rays of any shots, given by numbers (n,), at once. Return the eyepoints."""
         from sweep.model.pointcloud.eyepoints import observe_eyepoints
 
         world = self.world
@@ -218,12 +221,12 @@ class EyepointStudy(BlockStudy):
 
     @property
     def world(self) -> BuiltScene:
-        """The scene, built when it is first looked at."""
+        """Scene of the study, built when it is first needed."""
         return self._world or build_world(self.spec)
 
     @cached_property
     def _observe_keywords(self) -> dict[str, Any]:
-        """Arguments of :func:`observe_eyepoints` that describe the instrument and its flight."""
+        """Arguments of :func:`observe_eyepoints` for the instrument and its flight."""
         return {
             "flight": self.spec.build_flight(),
             "scanner": self.spec.scan_pattern(self.scanner),
@@ -245,7 +248,10 @@ def build_world(spec: SceneSpec) -> BuiltScene:
 def height_above_surface(
     world: BuiltScene, position: np.ndarray, time: float | np.ndarray
 ) -> np.ndarray:
-    """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
+    """Return the height of positions (n, 3) above the surface below them at times (n,) [m].
+
+    inf if nothing is below a position.
+    """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(
         world.caster.cast_bundles(position, down, poses=_body_poses(world, time)).range
@@ -253,13 +259,13 @@ def height_above_surface(
 
 
 def below_surface_warning(spec: SceneSpec) -> str:
-    """Warning of a flight that lies beneath its scene for a while; empty for one that does not."""
+    """Return a warning if the flight is below its scene at times; '' if it is not."""
     world, flight = build_world(spec), spec.build_flight()
     time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLES)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
     hits_above = world.caster.cast_bundles(position, up, poses=_body_poses(world, time))
-    # Whoever stands on the ground may be told, by rounding, that it lies above.
+    # For a platform on the ground, rounding may place the ground just above it.
     is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_MAX)
     is_low = is_covered & np.isinf(height_above_surface(world, position, time))
     if not is_low.any():
@@ -275,7 +281,7 @@ def below_surface_warning(spec: SceneSpec) -> str:
 
 
 def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
-    """Place and attitude of each body at a time, or at one for each ray; None of those at rest."""
+    """Return the pose of each body at a time, or at one time per ray; None for bodies at rest."""
     from sweep.model.geometry.ray_casting import Pose
 
     states = [
@@ -290,13 +296,22 @@ def refine_rays(
     accuracy: ErrorBudget,
     cast_more_rays: Callable[[np.ndarray, int], np.ndarray],
 ) -> None:
-    """Look at shots again, with more rays, until what these leave is within the tolerance.
+    """Cast shots again with more rays, until the error of each is within the tolerance.
 
-    The ``n_rays`` of each shot leave an ``ray_errors`` so far, (n,); ``cast_more_rays`` looks at
-    shots, by place, with more, and says what these leave.
+    Parameters
+    ----------
+    n_rays
+        Number of rays of each shot so far.
+    ray_errors
+        Errors (n,) that remain with these rays.
+    accuracy
+        Accuracy that sets the number of rays.
+    cast_more_rays
+        Function of the indices (m,) of shots and of a number of rays. It casts the shots with these
+        rays, and returns the errors (m,) that remain.
     """
     rays_needed = next_ray_counts(n_rays, ray_errors, accuracy)
-    for n_rays_now in accuracy.ray_counts:  # rising, and so are the needs of each shot
+    for n_rays_now in accuracy.ray_counts:  # the numbers rise, as do those that a shot needs
         shot_rows = np.flatnonzero(rays_needed == n_rays_now)
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // n_rays_now)
         for start in range(0, len(shot_rows), shots_per_cast):
@@ -307,7 +322,7 @@ def refine_rays(
 
 
 def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
-    """Heights of what a flight passes and looks at, as seen from above at its start."""
+    """Return the map of heights around a flight and its hits, seen from above at its start."""
     world = build_world(spec)
     positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
@@ -341,7 +356,7 @@ def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
 
 
 def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.ndarray:
-    """Positions of the platform and of what its beams hit, (n, 3)."""
+    """Return positions of the platform, and of hits of its beams, (n, 3)."""
     from sweep.model.geometry.quaternion import rotate
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
@@ -351,7 +366,7 @@ def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.n
     flight = spec.build_flight()
     state = flight.state(flight.start + scan.time)
     direction = rotate(state.attitude, scan.direction)
-    # Bodies that move are looked at where they are as the flight begins: it is only a map.
+    # Moving bodies are placed at their position at the start of the flight, as in the map.
     poses = _body_poses(world, flight.start)
     hits = world.caster.cast_bundles(state.position, direction[:, None], poses=poses)
     hit = np.isfinite(hits.range)
@@ -360,7 +375,7 @@ def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.n
 
 
 def _map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of square cells over a rectangle."""
+    """Return the coordinates x and y of nodes of square cells that cover a rectangle."""
     step = float((high - low).max()) / (MAP_NODES_MAX - 1)
     count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, MAP_NODES_MIN)
     centre = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Share of a flight's shots that hit something, and the extents of its path and its scene."""
+"""Fraction of a flight's shots that hit something, and the extents of its path and scene."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 SAMPLED_RAYS_PER_SCANNER = 1 << 17
-"""Rays of each scanner that tell what it sees, spread over the flight."""
+"""Number of rays per scanner, spread over the flight, that sample its hits."""
 
 MISSED_FRACTION_MAX = 0.01
-"""Share of a scanner's shots that hit nothing, above which it is warned of."""
+"""Fraction of a scanner's shots without a hit above which a warning is given."""
 
 _SAMPLED_TIMES = 65
-"""Times at which the places of the platform and of moving objects are looked at."""
+"""Number of times at which the positions of the platform and of moving objects are sampled."""
 
 
 class ScannerHits(NamedTuple):
-    """Share of a scanner's shots that hit something, of a sample."""
+    """Hits of a sample of one scanner's shots."""
 
     name: str
     n_shots: int
-    """Shots looked at."""
+    """Number of shots in the sample."""
     hit_fraction: float
-    """Share of them of which any beamlet hits something."""
+    """Fraction of the shots with at least one beamlet that hits something."""
     partial_hit_fraction: float
-    """Share of them of which some beamlets hit, and others do not."""
+    """Fraction of the shots with some beamlets that hit something, and others that do not."""
     beams_without_hits: tuple[int, ...]
-    """Beams of which no shot hits anything."""
+    """Numbers of the beams of which no shot hits anything."""
 
     def hits_text(self) -> str:
-        """Sentence for people."""
+        """Return the hits as a sentence."""
         sentence = f"{_percent_text(self.hit_fraction)} of the shots hit something"
         if self.partial_hit_fraction:
             sentence += f", {_percent_text(self.partial_hit_fraction)} with a part of their light"
@@ -53,22 +53,22 @@ class ScannerHits(NamedTuple):
 
 
 class FlightCoverage(NamedTuple):
-    """Shots of a flight that hit something, by scanner, and the extents of path and scene."""
+    """Hits of a flight by scanner, and the extents of path and scene."""
 
     scanners: tuple[ScannerHits, ...]
     path_box: np.ndarray
-    """(2, 3): least and largest coordinates of the platform [m]."""
+    """Least and largest coordinates of the platform, (2, 3) [m]."""
     scene_box: np.ndarray
-    """(2, 3): the same of the scene."""
+    """Least and largest coordinates of the scene, (2, 3) [m]."""
 
     def extents_text(self) -> str:
-        """Extents of path and scene, for people."""
+        """Return the extents of path and scene as text."""
         return (
             f"the path spans {_box_text(self.path_box)}, and the scene {_box_text(self.scene_box)}"
         )
 
     def warnings(self) -> Iterator[str]:
-        """Sentences on scanners, more than `MISSED_FRACTION_MAX` of whose shots hit nothing."""
+        """Yield a warning for each scanner that misses more than `MISSED_FRACTION_MAX` of shots."""
         mostly_missing = [
             scanner for scanner in self.scanners if scanner.hit_fraction < 1 - MISSED_FRACTION_MAX
         ]
@@ -89,7 +89,7 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
 
 
 def refuse_flight_without_hits(spec: SceneSpec) -> None:
-    """Refuse a flight of which no beam of the sample hits anything: a SceneError that says why."""
+    """Raise a SceneError, with the reason, if no beam of the sample hits anything."""
     flight_coverage = sample_coverage(spec)
     if any(scanner.hit_fraction for scanner in flight_coverage.scanners):
         return
@@ -117,7 +117,7 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
     )
     shot_numbers = (
         first_shots[:, None] + np.arange(shots_per_cycle)
-    ).ravel()  # whole cycles hold all beams
+    ).ravel()  # complete cycles contain all beams
     if shot_numbers.size > n_shots_max:
         shot_numbers = shot_numbers[
             np.linspace(0, shot_numbers.size - 1, n_shots_max).astype(np.int64)
@@ -137,7 +137,7 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
 
 
 def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
-    """Corners of all bodies, (n, 3); of one that moves, of a ball about it all along its way."""
+    """Return corners (n, 3) of all bodies; of a moving body, of a ball around it along its path."""
     corners = []
     for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin
@@ -162,7 +162,7 @@ def _box_text(box: np.ndarray) -> str:
 
 
 def _percent_text(fraction: float) -> str:
-    """Share in per cent, never rounded to all or nothing."""
+    """Return a fraction in per cent, never rounded to 0 or 100 %."""
     if 0.0 < fraction < 0.001:
         return "under 0.1 %"
     return "over 99.9 %" if 0.999 < fraction < 1.0 else f"{100 * fraction:.3g} %"

@@ -1,4 +1,4 @@
-"""A point cloud as a study: radiometry, draws and navigation on eyepoints that are there."""
+"""Study of a flight's point clouds: radiometry, draws and navigation on existing eyepoints."""
 
 from __future__ import annotations
 
@@ -63,20 +63,20 @@ if TYPE_CHECKING:
     CloudSimulator = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
     """Results of shots with some effects, by their eyepoints, numbers and flags."""
 
-#: Domain of the keys of draws; a shot's key is its number, so that the draws of a flight are the
-#: same along every axis and for every instrument.
+#: Domain of the keys of draws. The key of a shot is its number, so the draws of a flight are the
+#: same at every point of the axes and for every instrument.
 FLIGHT_KEY_DOMAIN = "sweep.flight"
 
-#: Shots that a cycle must have for a velocity vector.
+#: Smallest number of shots of a cycle for a velocity vector.
 NAVIGATION_SHOTS_MIN = 3
 
-#: Geometry of shots and cycles, the same at every place along a study's axes.
+#: Outputs of the geometry of shots and cycles, which do not depend on the axes.
 GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
 
 
 @cache
 def flag_array_attributes() -> dict[str, dict[str, Any]]:
-    """Attributes of the arrays that hold flags or one of some values, as the CF conventions say."""
+    """Return the CF attributes of arrays of flags and of categories, by the name of the array."""
     from sweep.model.pointcloud.navigation import (
         STATUS_EXCLUDED,
         STATUS_SOLVED,
@@ -100,7 +100,7 @@ def flag_array_attributes() -> dict[str, dict[str, Any]]:
 
 
 class FlightBlock(NamedTuple):
-    """The part of a flight that a block holds, at one place along the axes."""
+    """Block of a flight: cycles and draws of a scanner at one point of the axes."""
 
     scanner: str
     axis_indices: tuple[int, ...]
@@ -109,7 +109,7 @@ class FlightBlock(NamedTuple):
 
 
 class ScannerGrid(ParameterGrid, BlockGrid):
-    """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
+    """Grid of the blocks of one scanner: axes, draws and cycles, the last fastest."""
 
     def __init__(self, spec: SceneSpec, scanner: str) -> None:
         ParameterGrid.__init__(self, spec)
@@ -144,17 +144,17 @@ class ScannerGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Values along each dimension, by what they are of; there may be very many."""
+        """Return the values along each dimension by their name; there may be very many."""
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
     @property
     def has_navigation(self) -> bool:
-        """True if a cycle has the shots that a velocity vector takes."""
+        """True if a cycle has enough shots for a velocity vector."""
         return self.shots_per_cycle >= NAVIGATION_SHOTS_MIN
 
     def flight_block(self, block_in_grid: int) -> FlightBlock:
-        """Return a block of this scanner by its number."""
+        """Return the block of this scanner with a number."""
         *axis_ranges, draws, cycles = (
             range(block_slice.start, block_slice.stop)
             for block_slice in self.block_slices(block_in_grid)
@@ -164,16 +164,16 @@ class ScannerGrid(ParameterGrid, BlockGrid):
         )
 
     def first_flight_block(self, axis_indices: tuple[int, ...]) -> FlightBlock:
-        """Return the first block at a place along the axes."""
+        """Return the first block at a point of the axes."""
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 
 
-#: Shots of a scanner times draws and places along axes, at the most.
+#: Largest number of shots of a scanner, times draws and points of the axes.
 DRAWN_SHOTS_MAX = 10**10
 
 
 def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
-    """Refuse a flight of more shots than can be handled, before any array of them is made."""
+    """Raise a SpecError for too many shots, before any array of them is made."""
     n_draws = int(spec.draws.number)
     all_shots = n_shots * n_draws * math.prod(int(axis.size) for axis in spec.axes)
     if all_shots > DRAWN_SHOTS_MAX:
@@ -185,14 +185,14 @@ def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
 
 
 class ReusedCloud(NamedTuple):
-    """Results of a flight's block that are there before it is computed."""
+    """Results of a flight's block that a smaller study has."""
 
-    is_reused: np.ndarray  # (shots, draws): which
-    results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) what no draw changes
+    is_reused: np.ndarray  # (shots, draws) bool
+    results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) without draws
 
 
 class FlightStudy(ExtendableStudy):
-    """The point clouds of a flight, a group of arrays for each scanner."""
+    """Study of the point clouds of a flight, with a group of arrays for each scanner."""
 
     points_noun = "shots"
 
@@ -207,33 +207,36 @@ class FlightStudy(ExtendableStudy):
 
     @property
     def grids(self) -> list[ScannerGrid]:
-        """Blocks of each scanner."""
+        """Grid of blocks of each scanner."""
         return list(self.scanner_grids.values())
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Tell whether a tighter tolerance computes shots more closely, effects apart."""
+        """Return True if a tighter tolerance computes shots more closely, other than by effects."""
         return bool(
             self.spec.is_ray_number_set_by_tolerance or is_set_by_tolerance(self.spec.parameters())
         )
 
     def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
-        """Return the blocks of a block's scanner, and its number; IndexError if there is none."""
+        """Return the grid of a block's scanner, and the block; IndexError if there is none."""
         grid, block_in_grid = self.locate_in_grid(block)
         scanner_grid = self.scanner_grids[grid.group]
         return scanner_grid, scanner_grid.flight_block(block_in_grid)
 
     def first_draw_block(self, block: int) -> int:
-        """Block of the first draws of the same shots, with all that no draw changes."""
+        """Return the block of the first draws of the same shots.
+
+        It also holds the results that do not depend on draws.
+        """
         grid, block_in_grid = self.locate_in_grid(block)
         *axis_positions, _, cycle_position = grid.block_position(block_in_grid)
         return block - block_in_grid + grid.block_at((*axis_positions, 0, cycle_position))
 
     def store_attributes(self) -> dict[str, Any]:
-        """Title, question, spec, meaning of the numbers of scanners and surfaces, and origins.
+        """Return title, question, spec, names of scanners and surfaces, and origins.
 
         ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
-        and ``time_origin`` [s], a decimal with all its digits, are where these files have the zero
-        of positions and times in the store.
+        and ``time_origin`` [s], a decimal with all its digits, are the coordinates in these files
+        of the store's zero of positions and times.
         """
         return {
             "kind": "scene",
@@ -248,7 +251,7 @@ class FlightStudy(ExtendableStudy):
         }
 
     def group_attributes(self) -> dict[str, dict[str, Any]]:
-        """Return a group for each scanner, and one of the map, whose cells are none of theirs."""
+        """Return the attributes of each scanner's group, and of the group of the map."""
         coordinate_names = " ".join(
             member.coordinate for axis in self.spec.axes for member in axis.parameters
         )
@@ -262,7 +265,7 @@ class FlightStudy(ExtendableStudy):
         } | {MAP_GROUP: {}}
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the map of the scene, and every scanner's coordinates."""
+        """Return the map of the scene, and the coordinates of every scanner."""
         return height_map_layouts(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanner_grids
@@ -270,7 +273,7 @@ class FlightStudy(ExtendableStudy):
         ]
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Geometry, statistics, points and navigation of each scanner."""
+        """Return the layouts of geometry, statistics, points and navigation of each scanner."""
         axis_names = tuple(axis.name for axis in self.spec.axes)
         sizes = VECTOR_DIM_SIZES | {"return_number": int(self.spec.draws.returns)}
         layouts = []
@@ -289,7 +292,10 @@ class FlightStudy(ExtendableStudy):
         return layouts
 
     def evaluate(self, block: int) -> Results:
-        """Point cloud, statistics and navigation of a block; effects are chosen by whole tiles."""
+        """Compute point cloud, statistics and navigation of a block.
+
+        Effects are selected for complete tiles, which may extend beyond the block.
+        """
         scanner_grid, flight_block = self.locate_flight_block(block)
         first_shot, shots_end = (
             cycle * scanner_grid.shots_per_cycle
@@ -330,7 +336,7 @@ class FlightStudy(ExtendableStudy):
         return chunks
 
     def compile_kernels(self) -> None:
-        """Compile the radiometry and the navigation, on the first cycle of each scanner."""
+        """Compile radiometry and navigation, by the first cycle of each scanner."""
         for scanner_grid in self.grids:
             flight_block = scanner_grid.flight_block(0)._replace(draws=range(1))
             shot_range = range(scanner_grid.shots_per_cycle)
@@ -346,7 +352,7 @@ class FlightStudy(ExtendableStudy):
     def select_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, shot_numbers: np.ndarray
     ) -> SelectedEffects:
-        """Effects simulated at shots of these numbers, rising."""
+        """Return the effects simulated at shots with rising numbers `shot_numbers` (n,)."""
         n_shots = len(shot_numbers)
         effect_plan = self.plan_effects(flight_block, eyepoints, shot_numbers // SHOTS_PER_TILE)
         no_effects = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
@@ -355,7 +361,7 @@ class FlightStudy(ExtendableStudy):
     def plan_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, tile_numbers: np.ndarray
     ) -> ShotEffectPlan | None:
-        """Plans of shots whose tiles have these numbers, (n,), rising."""
+        """Plan the effects of shots by the rising numbers of their tiles, (n,)."""
         return plan_shot_effects(
             eyepoints,
             tile_numbers,
@@ -375,7 +381,10 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         reused: ReusedCloud | None = None,
     ) -> Results:
-        """Radiometry, draws and navigation of shots in whole cycles, but for what is ``reused``."""
+        """Simulate radiometry, draws and navigation of shots in complete cycles.
+
+        Results that are ``reused`` are not simulated again.
+        """
         scanner_grid = self.scanner_grids[flight_block.scanner]
         n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
         is_reused, results = reused or self._empty_cloud(
@@ -403,7 +412,7 @@ class FlightStudy(ExtendableStudy):
         return results
 
     def _empty_cloud(self, scanner_grid: ScannerGrid, n_shots: int, n_draws: int) -> ReusedCloud:
-        """Room for the results of some shots."""
+        """Return arrays of fill values for the results of shots."""
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_VARIABLES
@@ -425,7 +434,7 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Results of some shots, those together that need much the same; with more rays if so."""
+        """Yield results of shots in groups that are computed together; with more rays if needed."""
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
         ).iter_joint_groups():
@@ -449,7 +458,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         effect_flags: np.ndarray,
     ) -> Results:
-        """Points of eyepoints, of shots with these numbers and flags."""
+        """Return the points of shots, by their eyepoints, numbers and effect flags."""
         from sweep.model.pointcloud.error_floor import apply_error_floor
         from sweep.model.pointcloud.point_cloud import simulate_cloud
         from sweep.model.sampling.philox import point_keys
@@ -491,7 +500,7 @@ class FlightStudy(ExtendableStudy):
         results: Results,
         simulate_group: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
-        """Put points of shots that need more rays in the place of their results."""
+        """Replace the results of shots that need more rays."""
         assert self.ray_accuracy is not None
 
         def cast_more_rays(rows: np.ndarray, n_rays_now: int) -> np.ndarray:
@@ -515,7 +524,7 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         draw_slice: slice,
     ) -> Results:
-        """Navigation of cycles, of so many shots each, from the points of these in some draws."""
+        """Return the navigation of complete cycles from the points of their shots in some draws."""
         from sweep.model.pointcloud.navigation import solve_navigation
 
         row_index = slice(None) if rows.size == len(results["flags"]) else rows
@@ -536,7 +545,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Results of a block that a smaller study has, of shots with the same effects."""
+        """Return the results of a block from the smaller study, for shots with equal effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,
@@ -598,7 +607,7 @@ class FlightStudy(ExtendableStudy):
         return reused
 
     def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
-        """SI values of all parameters at a block's place along the axes."""
+        """Return the SI values of all parameters at a block's point of the axes."""
         scanner_grid = self.scanner_grids[flight_block.scanner]
         return scanner_grid.fixed_parameters | {
             path: axis_values[index].item()
@@ -610,7 +619,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Errors of the instrument that no echo lowers."""
+        """Errors of the instrument that do not decrease with the strength of the echo."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         stated = self.spec.error_floor
@@ -621,7 +630,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def motion_priors(self) -> MotionPriors:
-        """Deviations of motion that the instrument does not measure, as the spec states them."""
+        """Standard deviations of motion that the instrument does not measure, from the spec."""
         from sweep.model.pointcloud.ego_motion import MotionPriors
 
         stated = self.spec.navigation
@@ -629,12 +638,12 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceMaterial, ...]:
-        """Surfaces by their numbers."""
+        """Surface materials, in the order of their numbers."""
         return tuple(self.spec.surfaces())
 
     @cached_property
     def ray_accuracy(self) -> ErrorBudget | None:
-        """Says how many rays a shot needs; None where their number is given."""
+        """Accuracy that sets the number of rays of each shot; None if the number is given."""
         return (
             ErrorBudget.from_parameters(self.spec.parameters())
             if self.spec.is_ray_number_set_by_tolerance
@@ -642,7 +651,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
-        """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
+        """Open the eyepoint store of a scanner. Return its arrays by name, and beamlet weights."""
         group = open_array_group(eyepoints_path(self.store_path, self.spec.geometry_id(scanner)))
         arrays: dict[str, Any] = {
             name: group[name] for name in SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES
@@ -652,7 +661,7 @@ class FlightStudy(ExtendableStudy):
     def _read_eyepoint_arrays(
         self, scanner: str, names: Mapping[str, Any], index_range: range
     ) -> Results:
-        """Arrays of a scanner's eyepoints, of some shots or cycles."""
+        """Read arrays of a scanner's eyepoints for some shots or cycles."""
         arrays = self._get_eyepoint_arrays(scanner)
         return {
             name: np.asarray(arrays[name][index_range.start : index_range.stop]) for name in names
@@ -661,7 +670,7 @@ class FlightStudy(ExtendableStudy):
     def _read_shots_and_eyepoints(
         self, scanner: str, shot_range: range
     ) -> tuple[Results, Eyepoints]:
-        """Arrays of some shots, and their eyepoints."""
+        """Read the arrays of some shots. Return them, and the eyepoints."""
         from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
         shot_arrays = self._read_eyepoint_arrays(scanner, SHOT_VARIABLES, shot_range)
@@ -671,12 +680,12 @@ class FlightStudy(ExtendableStudy):
         )
 
     def eyepoint_studies(self) -> list[EyepointStudy]:
-        """Return the studies that this one looks with."""
+        """Return the studies that cast the eyepoints of this one, one per scanner."""
         return [self.get_eyepoint_study(scanner) for scanner in self.scanner_grids]
 
 
 def _iter_missing(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Rows and stretches of draws that are lacking; rows that lack the same come together."""
+    """Yield rows and ranges of draws that are missing; rows that lack the same come together."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
@@ -688,20 +697,20 @@ def _iter_missing(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
 def _insert_results(
     results: Results, rows: np.ndarray, draw_index: slice | np.ndarray, part_results: Results
 ) -> None:
-    """Put results of some rows and draws into those of all."""
+    """Insert the results of some rows and draws into the arrays of all."""
     for name, values in part_results.items():
         results[name][rows if name in SHOT_STATISTIC_VARIABLES else (rows, draw_index)] = values
 
 
 class ShotEffectPlan(NamedTuple):
-    """Plans of shots of a flight."""
+    """Plan of the effects of a flight's shots."""
 
-    hitting_shots: np.ndarray  # places of the shots that see something
-    tile_index: np.ndarray  # index of the tile of each of these
-    plan: EffectPlan  # Of the tiles
+    hitting_shots: np.ndarray  # (m,) indices of the shots that hit something
+    tile_index: np.ndarray  # (m,) index of the tile of each such shot in the plan
+    plan: EffectPlan  # plan of the tiles
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
-        """Effects simulated at that many shots; none where nothing is seen."""
+        """Return the effects simulated at `n_shots` shots; none at shots that hit nothing."""
         selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
         selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.plan.is_kept)[
             self.tile_index
@@ -720,9 +729,9 @@ def plan_shot_effects(
     rotating: bool,
     rays_by_tolerance: bool = False,
 ) -> ShotEffectPlan | None:
-    """Plans of a flight's shots at one place along its axes; None where none sees anything.
+    """Plan the effects of a flight's shots at one point of the axes; None if no shot hits anything.
 
-    ``tile_of_shot``: the number of the tile of each shot, rising.
+    ``tile_of_shot`` (n,) is the rising number of the tile of each shot.
     """
     from sweep.model.effects.planning import plan_effects
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
@@ -750,7 +759,7 @@ def plan_shot_effects(
 
 
 def _tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
+    """Return the edges of runs of equal tiles, at least one run, and the run of each element."""
     starts_new_run = np.diff(tile_numbers) != 0
     run_edges = np.concatenate([[0], np.flatnonzero(starts_new_run) + 1, [tile_numbers.size]])
     return run_edges, np.concatenate([[0], np.cumsum(starts_new_run)])

@@ -1,8 +1,7 @@
-"""A study over a grid of parameters: arrays of its store, and points of a block by the model.
+"""Study over a grid of parameters: arrays of its store, and blocks computed by the model.
 
-The effects of a block's points are planned tile by tile: boxes of neighbouring points, of a flight
-consecutive shots. They follow from the study alone: what is simulated at a point does not depend on
-how a study is cut.
+Effects are selected by tiles: boxes of neighbouring points, or consecutive shots of a flight. The
+selection follows from the study alone, so the effects of a point do not depend on the blocks.
 """
 
 from __future__ import annotations
@@ -70,10 +69,10 @@ if TYPE_CHECKING:
 
 
 def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
-    """Rows of float64, (count, parameters), that say what a point is by its values alone.
+    """Return rows of float64 (n_points, parameters) that identify points by their values alone.
 
-    A row holds every parameter, in the order of the sorted paths; strings stand as 62 bits of
-    their hash.
+    A row holds every parameter, in the order of the sorted paths. Strings are represented by 62
+    bits of their hash.
     """
     rows = np.empty((n_points, len(parameters)), dtype=np.uint64)
     for column, path in enumerate(sorted(parameters)):
@@ -87,26 +86,27 @@ def _value_bits(value: ParameterValue) -> np.ndarray:
         names, inverse = np.unique(array, return_inverse=True)
         hashes = np.array([_text_hash(str(name)) for name in names], dtype=np.uint64)
         return hashes[inverse].reshape(array.shape)
-    return (array.astype(np.float64) + 0.0).view(np.uint64)  # -0.0 and 0.0 are the same value
+    return (array.astype(np.float64) + 0.0).view(np.uint64)  # maps -0.0 to 0.0
 
 
 @lru_cache(maxsize=256)
 def _text_hash(word: str) -> int:
-    # 62 bits: with the upper two clear it is no nan, which no row may hold
+    # 62 bits: as a float64 with the upper two bits clear the hash is never nan
     digest = hashlib.blake2b(word.encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 2
 
 
-#: Arrays of a store that say what was simulated.
+#: Names of the arrays of simulated effects, and of the error bound of the omitted ones.
 EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
 
-#: Points of a tile at the most: few enough that they are much alike, enough that planning is cheap.
+#: Largest number of points of a tile: small enough for similar points, large enough for cheap
+#: planning.
 TILE_POINTS_MAX = 1024
 
-#: Points of a grid that are looked at together; of a tile, that are looked at first.
+#: Number of points that are planned at once, and number per tile in the preview of tiles.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
-#: Numbers that set the length of records, or how closely all is computed.
+#: Numeric parameters that are constant within a tile: sizes of records, and accuracy.
 CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -120,17 +120,17 @@ CONSTANT_IN_TILE = (
 
 
 class SelectedEffects(NamedTuple):
-    """Effects that are simulated at some points, (n,) each."""
+    """Effects that are simulated at n points."""
 
-    effect_flags: np.ndarray  # uint32: bit k for the k-th effect of the catalogue
-    error_bound: np.ndarray  # largest change of a probability that all that is left out may make
+    effect_flags: np.ndarray  # (n,) uint32: bit k for the k-th effect of the catalogue
+    error_bound: np.ndarray  # (n,): bound of the change by all omitted effects together
 
     def subset(self, index: slice | np.ndarray) -> SelectedEffects:
-        """Select some of the points."""
+        """Return the effects of some of the points."""
         return SelectedEffects(self.effect_flags[index], self.error_bound[index])
 
     def iter_equal_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...]]]:
-        """Points with the same effects, and these."""
+        """Yield indices (m,) of points with the same effects, and the names of these effects."""
         for group_flags in np.unique(self.effect_flags):
             yield (
                 np.flatnonzero(self.effect_flags == group_flags),
@@ -138,7 +138,11 @@ class SelectedEffects(NamedTuple):
             )
 
     def iter_joint_groups(self) -> Iterator[tuple[np.ndarray, tuple[str, ...], np.ndarray]]:
-        """Points that are computed together, the effects of all of them, and their flags."""
+        """Yield groups of points that are computed together.
+
+        A group has the indices (m,) of its points, the names of all their effects, and their flags
+        (m,).
+        """
         separating_flags = self.effect_flags & OWN_BATCH_FLAGS
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
@@ -147,17 +151,19 @@ class SelectedEffects(NamedTuple):
 
 
 class TileGroup(NamedTuple):
-    """Tiles that share every word and size."""
+    """Tiles that share the values of all strings and sizes."""
 
-    code: int  # the same for all tiles of the grid that share them
-    requested_indices: np.ndarray  # (m,): their numbers among those asked for
+    code: int  # number of the group in the grid
+    requested_indices: np.ndarray  # (m,): indices of the tiles in the request
     parameters: dict[str, ParameterValue]
-    """By dotted path: words, numbers, and arrays that broadcast over (m, *tile): tiles that the
-    grid's edge cuts have their last points several times."""
+    """Parameters by dotted path: strings, numbers, and arrays that broadcast over (m, *tile).
+
+    Tiles that are cut by the edge of the grid repeat their last points.
+    """
 
 
 class TileGrid(BlockGrid):
-    """Tiles of a grid; points of one tile share every word and every size."""
+    """Tiles of a grid; the points of a tile share the values of all strings and sizes."""
 
     def __init__(self, grid: ParameterBlockGrid) -> None:
         self.grid = grid
@@ -167,7 +173,7 @@ class TileGrid(BlockGrid):
         super().__init__(grid.dims, grid.shape, fit_tile_shape(grid.shape, self._is_constant_axis))
 
     def tiles_of_block(self, block: int) -> tuple[np.ndarray, np.ndarray]:
-        """Tiles that a block meets, (m,), and the index into them of each of its points."""
+        """Return the tiles (m,) that overlap a block, and the index of the tile of each point."""
         tile_indices = [
             np.arange(block_slice.start, block_slice.stop) // tile_length
             for block_slice, tile_length in zip(
@@ -184,10 +190,10 @@ class TileGrid(BlockGrid):
         return tiles, tile_index.ravel()
 
     def group_tiles(self, tiles: np.ndarray, stride: int = 1) -> Iterator[TileGroup]:
-        """Parameters of the points of some tiles, those together that share words and sizes.
+        """Yield groups of tiles that share strings and sizes, with the parameters of their points.
 
-        ``stride``: of every so manieth point along each axis, and of the largest of each
-        parameter.
+        With a ``stride`` n the parameters are those of every n-th point along each axis, and of the
+        point with the largest value of each parameter.
         """
         positions = np.unravel_index(tiles, self.blocks_per_dim) if self.blocks_per_dim else ()
         group_codes = np.zeros(len(tiles), np.int64)
@@ -221,7 +227,7 @@ class TileGrid(BlockGrid):
             tile_index_along[:, None] * tile_length + np.arange(tile_length), size - 1
         )
         sampled_indices = axis_indices[:, ::stride]
-        if stride > 1:  # with the largest of each, so that none is missed that is there at all
+        if stride > 1:  # with the largest values, so that no effect of the tile is missed
             largest_at = [
                 np.abs(array[axis_indices].astype(float)).argmax(axis=1)
                 for array in members.values()
@@ -237,7 +243,7 @@ class TileGrid(BlockGrid):
 
 
 def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tuple[int, ...]:
-    """Points of a tile along each axis: alike on all, but 1 where values are not to be joined."""
+    """Return the number of points of a tile along each axis: about equal, but 1 if constant."""
     shape, points_left = [1] * len(sizes), TILE_POINTS_MAX
     divisible_axes = sorted(
         (axis for axis in range(len(sizes)) if not is_constant[axis]), key=lambda k: sizes[k]
@@ -251,7 +257,7 @@ def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tup
 
 
 class EffectPlanner:
-    """Plans of a grid's tiles, each made once."""
+    """Planner of the effects of a grid's tiles; each tile is planned once."""
 
     def __init__(self, spec: GridSpec, grid: ParameterBlockGrid) -> None:
         self._effect_modes, self.tiles = spec.effect_modes(), TileGrid(grid)
@@ -260,9 +266,10 @@ class EffectPlanner:
     def select_for_block(
         self, block: int, local_indices: np.ndarray | None = None
     ) -> SelectedEffects:
-        """Effects simulated at the points of a block, in C order over it, or at some of these.
+        """Return the effects simulated at a block's points, in C order, or at some of them.
 
-        Only the tiles of the points asked for are planned.
+        `local_indices` (m,) are indices of points in the block; by default all. Only their tiles
+        are planned.
         """
         tiles, tile_index = self.tiles.tiles_of_block(block)
         parameters = self.tiles.grid.parameters(block)
@@ -293,7 +300,7 @@ class EffectPlanner:
         return SelectedEffects(flags_of_tiles[tile_index] & ~inactive, errors[tile_index])
 
     def inactive_flags(self, parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
-        """Return the flags of effects absent from points, whatever their tiles have."""
+        """Return the flags (n,) of effects that are absent at each point, whatever its tile has."""
         inactive_bits = np.zeros(n_points, np.uint32)
         for bit, effect in enumerate(EFFECT_CATALOGUE):
             is_inactive = effect.is_absent(PARAMETER_DEFAULTS | dict(parameters))
@@ -301,10 +308,10 @@ class EffectPlanner:
         return inactive_bits
 
     def iter_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
-        """Plans of some tiles: places among them, and the plan of these.
+        """Yield indices of tiles in `tiles`, and the plan of these tiles.
 
-        A few points are looked at first: if these need all effects, the others can't need
-        more.
+        A preview of a few points per tile comes first: if it already keeps all effects, the other
+        points are not planned.
         """
         tile_lengths = [tile_length for tile_length in self.tiles.block_shape if tile_length > 1]
         preview_stride = max(
@@ -336,7 +343,7 @@ class EffectPlanner:
             remaining = np.concatenate(unsettled) if unsettled else remaining[:0]
 
     def _plan_group(self, tile_group: TileGroup) -> EffectPlan:
-        """Return the plan of tiles that share words and sizes."""
+        """Return the plan of tiles that share strings and sizes."""
         from sweep.model.effects.planning import plan_effects
 
         parameters, n_tiles = tile_group.parameters, len(tile_group.requested_indices)
@@ -355,12 +362,12 @@ class EffectPlanner:
         )
 
 
-#: Dimension of the batches of draws.
+#: Name of the dimension of batches of draws.
 BATCH_DIM = "batch"
 
 
 def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
-    """Arrays that blocks of a study write, sorted by name, with dimensions besides the axes."""
+    """Return the arrays that blocks write, by sorted name, with their dimensions but the axes."""
     error_output = replace(
         EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -386,7 +393,7 @@ def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
 
 
 class GridStudy(ExtendableStudy):
-    """A study over a grid of parameters."""
+    """Study over a grid of parameters."""
 
     def __init__(self, spec: GridSpec) -> None:
         super().__init__(spec)
@@ -395,15 +402,15 @@ class GridStudy(ExtendableStudy):
 
     @property
     def grids(self) -> tuple[ParameterBlockGrid]:
-        """Its points."""
+        """Grid of the study's points, in a tuple."""
         return (self.grid,)
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
+        """Return a mask (points,), or one bool for all, of points that depend on the tolerance."""
         return is_set_by_tolerance(self.grid.parameters(block))
 
     def store_attributes(self) -> dict[str, Any]:
-        """Title, question, spec and the blocks' shape."""
+        """Return title, question, spec and shape of blocks."""
         coordinate_names = [
             member.coordinate for axis in self.spec.axes for member in axis.parameters
         ]
@@ -414,12 +421,12 @@ class GridStudy(ExtendableStudy):
             "question": self.spec.question,
             "spec": self.spec.to_json(),
             "block_shape": list(self.grid.block_shape),
-            # xarray's way to tell coordinates that share a dimension from variables
+            # by this attribute xarray distinguishes coordinates from variables
             "coordinates": " ".join(coordinate_names),
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Coordinates, and the sizes of batches."""
+        """Return the coordinates of the axes, and the sizes of batches of draws."""
         arrays = axis_coordinate_layouts(self.spec.axes)
         if draws_per_batch := batch_sizes(self.spec):
             batch_attributes = cf_attributes("1", "draws in the batch")
@@ -434,10 +441,10 @@ class GridStudy(ExtendableStudy):
         return arrays
 
     def output_layouts(self) -> list[ArrayLayout]:
-        """Return an array for each output of the model, and for the effects simulated."""
+        """Return the layouts of the model's outputs, and of the arrays of effects."""
         sizes = {BATCH_DIM: len(batch_sizes(self.spec)), "sum": N_RUNNING_SUMS}
         off_axes = self.spec.parameters_off_axes()
-        promised_accuracy = {  # that half-widths are held against
+        promised_accuracy = {  # accuracy that the half-widths of intervals are compared with
             name: float(off_axes[f"accuracy.{name}"])
             for name in ("tolerance", "confidence")
             if f"accuracy.{name}" in off_axes
@@ -461,7 +468,11 @@ class GridStudy(ExtendableStudy):
         checkpoint_results: ReusedResults = ReusedResults(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> Results:
-        """Return the outputs of a block; fill values where a point is beyond the model."""
+        """Compute a block; fill values at points that the model does not support.
+
+        Points in `checkpoint_results` are not computed again, or continued. `UnfinishedBlock` at
+        the deadline.
+        """
         selected_effects = self.effect_planner.select_for_block(block)
         reused = self._reused_results(block, selected_effects)
         extent, n_points = self.grid.block_extent(block), self.grid.block_size(block)
@@ -485,23 +496,23 @@ class GridStudy(ExtendableStudy):
         for local_indices, part_results in (reused.done, checkpoint_results.done, *computed):
             for name in (
                 results.keys() & part_results.keys()
-            ):  # some are of use to later draws alone
+            ):  # other results serve to continue draws only
                 results[name][local_indices] = part_results[name]
         return {name: values.reshape(extent + values.shape[1:]) for name, values in results.items()}
 
     @property
     def has_checkpoints(self) -> bool:
-        """True if points are drawn: a block may stop between draws."""
+        """True if points are drawn, as a block can stop between draws."""
         return self.spec.draws.has_draws
 
     def evaluate_until(
         self, block: int, checkpoint_results: ReusedResults, deadline: Deadline
     ) -> Results:
-        """Return the outputs of a block, whose first draws are there; stop at the deadline."""
+        """Compute a block from a checkpoint on; `UnfinishedBlock` at the deadline."""
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _reused_results(self, block: int, selected_effects: SelectedEffects) -> ReusedResults:
-        """Points of a block that a smaller study has: whole, or their first draws."""
+        """Return the points of a block from the smaller study: complete, or their first draws."""
         if (reuse_source := self.reuse_source) is None:
             return ReusedResults()
         parts = []
@@ -538,7 +549,7 @@ class GridStudy(ExtendableStudy):
         )
 
     def count_reusable_points(self, block: int) -> int:
-        """Points of a block that the smaller study has, with the same effects."""
+        """Count the points of a block that the smaller study has with the same effects."""
         if (reuse_source := self.reuse_source) is None:
             return 0
         selected_effects, n_reusable = self.effect_planner.select_for_block(block), 0
@@ -554,7 +565,7 @@ class GridStudy(ExtendableStudy):
         return n_reusable
 
     def compile_kernels(self) -> None:
-        """Compile what the model compiles: a point with all effects that may be, and with none."""
+        """Compile the model's kernels with a point of all possible effects, and a point of none."""
         effect_modes, single_draw_spec = self.spec.effect_modes(), limit_draws(self.spec, 1)
         possible_effects = [
             effect.name
@@ -572,7 +583,7 @@ class GridStudy(ExtendableStudy):
 
 
 def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
-    """Arrays of the values along axes, in the units that they were written in."""
+    """Return the layouts of the values along axes, in the units of the spec."""
     return [
         ArrayLayout.from_values(
             member.coordinate,
@@ -586,19 +597,19 @@ def axis_coordinate_layouts(axes: tuple[Axis, ...]) -> list[ArrayLayout]:
     ]
 
 
-#: Points evaluated at once: enough that a call costs nothing beside them, few enough that a
-#: worker's memory does not grow with the block. Their draws are cut further by the model.
+#: Number of points per call of the model: large enough for negligible overhead, small enough that
+#: memory does not grow with the block. The model divides their draws further.
 POINTS_PER_CALL_MAX = 1 << 16
 
-#: Counts of draws held at once; many batches make a point larger.
+#: Largest number of counts of draws per call; a point has one per batch.
 COUNTS_PER_CALL_MAX = 1 << 19
 
-#: Parameters that change how draws are looked at, and not what is drawn.
+#: Prefixes of parameters that change how draws are evaluated, and not the draws.
 NON_PHYSICAL_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
 
-#: Domain of the keys of draws, so that no other use of the same seed meets their streams.
+#: Domain of the keys of draws, which makes their random streams differ from any others of the seed.
 GRID_KEY_DOMAIN = "sweep.draws"
 
 
@@ -611,10 +622,11 @@ def iter_block_results(
     checkpoint_results: ReusedResults,
     deadline: Deadline,
 ) -> Iterator[PartialResults]:
-    """Compute a block's points that are not done, grouped by their effects.
+    """Yield the results of a block's points that are not done, in groups with the same effects.
 
-    Those that need not be computed are ``reused``, of another study, or ``checkpoint_results`` by a
-    call that was stopped. Unfinished where it is stopped; the next call goes on, to the same bits.
+    Points in ``reused``, from another study, or in ``checkpoint_results``, from an earlier task,
+    are not computed again. `UnfinishedBlock` at the deadline; a later call continues to the same
+    bits.
     """
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[
@@ -641,7 +653,7 @@ def iter_block_results(
             results = evaluate_points(
                 spec, subset, len(local_indices), effects, prior_draws, deadline
             )
-        except UnsupportedShotError:  # costs the point that is beyond the model, and no other
+        except UnsupportedShotError:  # halved until only unsupported points are left out
             if len(local_indices) > 1:
                 pending.extendleft(
                     (effects, half) for half in np.array_split(local_indices, 2)[::-1]
@@ -672,10 +684,10 @@ def evaluate_points(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Results:
-    """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
+    """Return the results of points, (n_points,) each; counts of draws (n_points, batches).
 
-    Parameters are scalars, strings or arrays (count,). Draws go on from those ``prior_draws``,
-    until there are all or ``should_stop`` says so.
+    Parameters are scalars, strings or arrays (n_points,). Draws continue from ``prior_draws`` until
+    all are made or ``should_stop`` returns True.
     """
     if spec.draws.has_draws:
         return _simulate_draws(spec, parameters, n_points, effects, prior_draws, should_stop)
@@ -693,7 +705,7 @@ def evaluate_points(
 def select_parameters(
     parameters: Mapping[str, ParameterValue], indices: np.ndarray
 ) -> dict[str, ParameterValue]:
-    """Parameters of some of the points: arrays are taken from, scalars stay."""
+    """Return the parameters of some of the points; scalars stay as they are."""
     return {
         path: value[indices] if isinstance(value, np.ndarray) else value
         for path, value in parameters.items()
@@ -705,7 +717,7 @@ def _points_per_call(spec: GridSpec) -> int:
 
 
 def batch_sizes(spec: GridSpec) -> list[int]:
-    """Draws in each batch of a fixed number; the last one holds what is left."""
+    """Return the number of draws in each batch of a fixed number; the last may be smaller."""
     n_draws, draws_per_batch = spec.draws.number, spec.draws.batch
     return [min(draws_per_batch, n_draws - first) for first in range(0, n_draws, draws_per_batch)]
 
@@ -713,7 +725,7 @@ def batch_sizes(spec: GridSpec) -> list[int]:
 def draw_keys(
     spec: GridSpec, parameters: Mapping[str, ParameterValue], n_points: int
 ) -> np.ndarray:
-    """Random keys (count, 2) uint64 of points, however closely these are looked at."""
+    """Return the random keys (n_points, 2) uint64 of points, which no accuracy setting changes."""
     from sweep.model.sampling.philox import point_keys
 
     physical = {
@@ -729,7 +741,7 @@ def draw_keys(
 def previous_draws(
     spec: GridSpec, previous: PartialResults, local_indices: np.ndarray
 ) -> PriorDraws | None:
-    """Draws that there are of some points of a block; None where there are none."""
+    """Return the earlier draws of some points of a block; None if there are none."""
     from sweep.model.sampling.samplers import PriorDraws
 
     _, previous_rows, rows = np.intersect1d(
@@ -786,13 +798,13 @@ def _simulate_draws(
 
 
 def empty_running_sums(spec: GridSpec, n_points: int) -> Results:
-    """Return empty running sums, if any point of the study may have some."""
+    """Return running sums of zeros (n_points, sums), if the study stores running sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}
 
 
 def limit_draws(spec: GridSpec, draws_max: int) -> GridSpec:
-    """Limit the draws of a study, if it has any."""
+    """Return the spec with at most `draws_max` draws."""
     draw_counts = {
         "number": min(spec.draws.number, draws_max),
         "limit": min(spec.draws.limit, draws_max),

@@ -21,8 +21,10 @@ FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
 
 BYTES_PER_BIN = 250
 BYTES_PER_DRAWN_BIN = 300
-"""Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22: for closed-form
-results, and for draws of whole spectra."""
+"""Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22.
+
+The first is for closed-form results, the second for draws of whole spectra.
+"""
 
 
 def fft_size_max(spec: GridSpec | SceneSpec) -> int:
@@ -63,7 +65,7 @@ def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemo
 
 
 def refuse_too_large_study(study: GridStudy | FlightStudy, worker_memory: WorkerMemory) -> None:
-    """Refuse a study of which a point, a block or the scene takes more than a process has."""
+    """Raise a SpecError if a point, a block or the scene needs more memory than a process has."""
     refuse_too_large_point(study.spec, worker_memory)
     refuse_too_large_blocks(study, worker_memory)
     if isinstance(study.spec, SceneSpec):
@@ -86,7 +88,7 @@ def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None
 
 def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if the results of one block need more memory than a process has."""
-    bytes_needed = 2 * study.block_nbytes_max  # its own, and those being encoded
+    bytes_needed = 2 * study.block_nbytes_max  # the results, and their encoded copy
     if bytes_needed > worker_memory.bytes_max:
         rule = (
             f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "

@@ -1,4 +1,4 @@
-"""Arrays of the model's outputs: layouts with attributes by the CF conventions."""
+"""Layouts of the model's output arrays, with attributes by the CF conventions."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ CF_STANDARD_NAMES = {
     "sun_elevation": "solar_elevation_angle",
     "wavelength": "radiation_wavelength",
 }
-"""Arrays and coordinates whose quantities are in the CF standard name table (version 90)."""
+"""Standard names of arrays and coordinates that are in the CF standard name table (version 90)."""
 
 
 def cf_attributes(units: str, long_name: str, comment: str = "", name: str = "") -> dict[str, Any]:
-    """Attributes that say what an array of this name holds, by the CF conventions."""
+    """Return the CF attributes of the array or coordinate `name`; empty ones are omitted."""
     attributes = {"units": units, "long_name": long_name}
     optional = {"comment": comment, "standard_name": CF_STANDARD_NAMES.get(name, "")}
     return attributes | {key: value for key, value in optional.items() if value}

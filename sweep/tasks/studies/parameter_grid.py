@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 ParameterValue = float | int | str | np.ndarray
 
-#: Parameters that move the beamlets over the target; every other one only scales or reads lines
-#: that are already placed, and is cheap once they are.
+#: Parameters that change the positions of the lines of beamlets. Any other parameter only scales
+#: the lines or changes how they are evaluated, which is cheap once the positions are known.
 GEOMETRIC_PARAMETERS = (
     "target.range",
     "target.grazing_angle",
@@ -31,25 +31,24 @@ GEOMETRIC_PREFIXES = (
 
 TOLERANCE_PARAMETER = "accuracy.tolerance"
 
-#: Shots of a flight that are planned together.
+#: Number of consecutive shots of a flight whose effects are planned together.
 SHOTS_PER_TILE = 256
 
-#: Seconds that a block takes at the most, as :func:`worst_cpu_seconds_per_point` has it: what is
-#: lost where a worker dies. It also bounds the counts of draws, one a point and batch, to some
-#: 100 MB.
+#: Largest time of a block by :func:`worst_cpu_seconds_per_point` [s], which is lost if a worker
+#: dies. It also bounds the counts of draws, one per point and batch, to some 100 MB.
 BLOCK_CPU_SECONDS_MAX = 60.0
 
-#: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and
-#: what lists, copies or removes a store handles them one by one.
+#: Default size of a block [points], and number of blocks above which blocks grow instead. A block
+#: is some 25 files, which are listed, copied and removed one by one.
 DEFAULT_BLOCK_POINTS = 1 << 16
 DEFAULT_BLOCKS_MAX = 1 << 14
 
 
 def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
-    """Time of the dearest point of a study on one core, by the study alone [s].
+    """Return an upper estimate of the time of any point of a study on one core [s].
 
-    Measured on one machine and rounded up: the content of a block must not depend on the
-    machine. Draws until a tolerance is met are reckoned with their limit.
+    The constants were measured on one machine and rounded up, as the content of a block must not
+    depend on the machine. If draws continue until a tolerance is met, their limit counts.
     """
     worst_parameters = {
         path: value for path, value in spec.parameters().items() if not isinstance(value, str)
@@ -68,10 +67,11 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
 def fit_block_shape(
     sizes: tuple[int, ...], is_geometric: tuple[bool, ...], block_points: int
 ) -> tuple[int, ...]:
-    """Points of a block along each axis, given whether each axis changes the geometry.
+    """Return the number of points of a block along each axis.
 
-    Radiometric axes are kept whole before geometric ones, and the last axis before the first,
-    as far as the block has room: it then holds every radiometric variation of its geometry.
+    `is_geometric` tells whether an axis changes the geometry. The block first takes whole
+    radiometric axes, then geometric ones, beginning with the last axis. It thus holds every
+    radiometric variation of its geometries.
     """
     order = sorted(range(len(sizes)), key=lambda k: (is_geometric[k], -k))
     shape, points_left = [1] * len(sizes), block_points
@@ -82,12 +82,12 @@ def fit_block_shape(
 
 
 def default_block_points(n_points: int) -> int:
-    """Points that a block holds at most in a study of so many, where it does not say."""
+    """Return the default number of points per block of a study with `n_points` points."""
     return max(DEFAULT_BLOCK_POINTS, -(-n_points // DEFAULT_BLOCKS_MAX))
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
-    """Points that a block may hold: as the spec says, or fits it; less where each takes long."""
+    """Return the largest number of points of a block: as specified, or less if points take long."""
     requested_points = spec.storage.block_points or default_block_points(n_points)
     return max(
         1, min(requested_points, int(BLOCK_CPU_SECONDS_MAX / worst_cpu_seconds_per_point(spec)))
@@ -95,7 +95,7 @@ def block_points_limit(spec: GridSpec, n_points: int) -> int:
 
 
 class ParameterGrid:
-    """Parameters along the axes of a study: those that are fixed, and those of each axis."""
+    """Parameters of a study: fixed values, and values along the axes."""
 
     def __init__(self, spec: GridSpec | SceneSpec) -> None:
         self.fixed_parameters: dict[str, float | int | str] = dict(spec.parameters())
@@ -104,15 +104,15 @@ class ParameterGrid:
             {member.path: np.asarray(member.values) for member in axis.parameters}
             for axis in spec.axes
         ]
-        """Values along each axis by the parameters that they set."""
+        """Values along each axis, by the paths of the parameters that they set."""
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Values along each dimension, by what they are of."""
+        """Return the values along each dimension of the grid, by the paths of their parameters."""
         return self.values_by_axis
 
 
 class ParameterBlockGrid(ParameterGrid, BlockGrid):
-    """Points of a study over a grid, their parameters, and the blocks they are computed in."""
+    """Points of a grid study with their parameters, cut into blocks."""
 
     def __init__(self, spec: GridSpec) -> None:
         ParameterGrid.__init__(self, spec)
@@ -138,11 +138,14 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("axes", rule, "", remedy)])
 
     def parameters(self, block: int) -> dict[str, ParameterValue]:
-        """Parameters of a block's points by path: scalars, or arrays (n,) in C order over it."""
+        """Return the parameters of a block's points by path: scalars, or arrays (n,) in C order."""
         return self.parameters_at(self.grid_indices(block, np.arange(self.block_size(block))))
 
     def parameters_at(self, grid_indices: np.ndarray) -> dict[str, ParameterValue]:
-        """Parameters of points given by their numbers in C order over the whole grid, (n,)."""
+        """Return the parameters of points by path: scalars, or arrays (n,).
+
+        `grid_indices` (n,) are indices in C order over the whole grid.
+        """
         parameters: dict[str, ParameterValue] = dict(self.fixed_parameters)
         indices = np.unravel_index(grid_indices, self.shape) if self.shape else ()
         for values, axis_indices in zip(self.values_by_axis, indices, strict=True):
@@ -150,10 +153,10 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         return parameters
 
     def geometry_order(self, block: int) -> np.ndarray:
-        """Order of a block's points, (n,) in C order over it, that brings equal geometry together.
+        """Return the permutation (n,) of a block's points that makes equal geometries adjacent.
 
-        Radiometric axes run fastest, and velocities slowest: a line's change within a
-        record follows them.
+        Radiometric axes vary fastest, and velocities slowest, as the change of a line within a
+        record depends on velocity.
         """
         local_indices = np.arange(self.block_size(block)).reshape(self.block_extent(block))
         is_velocity_axis = ["target.radial_velocity" in values for values in self.values_by_axis]

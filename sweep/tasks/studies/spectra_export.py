@@ -1,4 +1,4 @@
-"""Spectra of a shot, draw by draw, for code of one's own: with noise, its level, and the truth."""
+"""Export of the spectra of a shot, draw by draw: with noise, the noise level, and the truth."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def point_spectra(
     n_draws: int,
     first_draw: int = 0,
 ) -> xr.Dataset:
-    """Spectra of one point of a study, by the SI values of its parameters, as the study draws them.
+    """Return spectra of one point of a study, as the study draws them.
 
-    Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
-    Every effect is there that is not off and that the point has anything of. The draws begin at
-    ``first_draw``.
+    `parameters` are SI values. The result has the complex ``spectrum`` (draw, segment, frequency),
+    the ``signal`` without noise, and the true quantities. All effects are simulated that are not
+    off and not absent from the point. The draws begin at ``first_draw``.
     """
     from sweep.model.sampling.noisy_spectra import (
         draw_bin_speckle,
@@ -87,7 +87,7 @@ def point_spectra(
                 for segment, signal in zip(segments, signals, strict=True)
             ], axis=1))  # fmt: skip
             signals_by_draw.append(signals)
-    assert shots is not None  # one draw is asked for at least
+    assert shots is not None  # at least one draw is made
     return _spectra_dataset(
         spec, shots, np.concatenate(drawn_spectra), signals_by_draw, draw_numbers
     )
@@ -111,7 +111,7 @@ VARIABLE_ATTRIBUTES = {
     "segment": ("", "segment of the waveform"),
     "frequency": ("Hz", "frequency of the bin"),
 }
-"""Units and meaning of what is written."""
+"""Units and meaning of the exported variables."""
 
 
 def _spectra_dataset(
@@ -172,7 +172,7 @@ def _spectra_dataset(
 
 
 def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies of the beamlets' lines [Hz], (segments, lines), and their amplitudes [V]."""
+    """Return frequencies [Hz] and amplitudes [V] of the beamlets' lines, (segments, lines)."""
     from sweep.model.pointcloud.returns import beamlet_line_positions
 
     line_bins = beamlet_line_positions(shots)[-1, list(shots.has_segment)]
@@ -181,10 +181,10 @@ def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarr
 
 
 def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
-    """Write spectra as a Zarr store or as a numpy archive, by the path's suffix.
+    """Write spectra as a Zarr store or as a NumPy archive, by the suffix of the path.
 
-    StoreError for another suffix, or something in the way: with `overwrite`, what is no such
-    file.
+    StoreError for another suffix, or if something exists at the path. `overwrite` replaces only
+    files of spectra.
     """
     if path.suffix not in FILE_SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(FILE_SUFFIXES)}")
@@ -202,13 +202,13 @@ def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -
             )
             return
         arrays = {str(name): value.values for name, value in dataset.variables.items()}
-        arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
-        with open(draft_path, "wb") as file:  # by a name, numpy would give it a suffix
+        arrays["segment"] = arrays["segment"].astype("U")  # objects would need pickle
+        with open(draft_path, "wb") as file:  # given a name, NumPy would add a suffix
             np.savez_compressed(file, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
 
 
 def _is_spectra_file(path: Path) -> bool:
-    """Tell whether a file or folder is what `write` makes, by the names in it."""
+    """Return True if a file or folder contains the names that `write_spectra` writes."""
     expected_names = {*VARIABLE_ATTRIBUTES, "attributes"}
     try:
         if path.suffix == ".npz":

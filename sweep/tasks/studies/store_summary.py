@@ -1,6 +1,6 @@
-"""Stores in numbers: blocks done, detection, what came back in a flight, errors and tolerance.
+"""Summaries of stores: blocks done, detection, echoes of a flight, errors and tolerance.
 
-StoreError where there is no store of sweep's, or one of another kind.
+StoreError if there is no store of sweep at a path, or one of another kind.
 """
 
 from __future__ import annotations
@@ -39,30 +39,30 @@ if TYPE_CHECKING:
 #: Probability of detection above which a point counts as detected.
 DETECTED_PD_MIN = 0.9
 
-#: Rows of the table beside the one for the whole grid.
+#: Largest number of rows of the table of detection, without the row for the whole grid.
 SUMMARY_ROWS_MAX = 10
 
-#: Points and blocks that are looked at; of larger studies, blocks drawn by chance.
+#: Largest numbers of points and of blocks that are read; of larger studies a random sample.
 SAMPLED_POINTS_MAX = 1 << 23
 SAMPLED_BLOCKS_MAX = 1000
 
-#: Places along the axes that are told one by one, of a flight.
+#: Largest number of points of a flight's axes that have separate rows.
 AXIS_POINTS_LISTED_MAX = 12
 
 
 @dataclass(frozen=True)
 class DetectionRow:
-    """Detection over one part of the grid; NaN points, not computed, are left out."""
+    """Detection in one part of a grid; points that are not computed, NaN, are omitted."""
 
     label: str
     n_points: int
     detected_fraction: float  # fraction of points with pd_shot above `DETECTED`
-    median_pd_shot: float  # medians
+    median_pd_shot: float  # median of pd_shot
     median_pd_doppler: float
 
     @classmethod
     def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
-        """Return the row of some points, (n,) each; there may be no Doppler segment."""
+        """Return the row of n points; arrays of the Doppler segment may be missing."""
         is_computed = ~np.isnan(pd_shot)
         pd_shot, pd_doppler = (
             pd_shot[is_computed],
@@ -78,9 +78,10 @@ class DetectionRow:
 
 
 def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], float]:
-    """Heading of the slowest axis; a row for each part of it and one for all.
+    """Summarise detection. Return a heading, rows, and the fraction of the blocks that were read.
 
-    The share of the blocks that are done, of which some are looked at, comes last.
+    The heading names the slowest axis. There is a row for each part of it, and one for the whole
+    grid.
     """
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
@@ -90,7 +91,7 @@ def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], f
     axis = study.spec.axes[0] if study.spec.axes else None
     n_values = (
         axis.size if axis else 1
-    )  # in parts of a value each, or of several where there are many
+    )  # one part per value, or per several values if there are many
     part_edges = np.linspace(0, n_values, min(n_values, SUMMARY_ROWS_MAX) + 1).astype(int)
     values_by_part: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in part_edges[1:]]
     for region, values in iter_block_values(store_path, study, ("pd_shot", "pd_doppler"), blocks):
@@ -116,7 +117,7 @@ def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], f
 def count_unsupported_points(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> tuple[int, str]:
-    """Count points beyond the model, of a sample; return the reason for the first."""
+    """Count unsupported points in a sample. Return the count, and the reason for the first."""
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, GridStudy):
@@ -133,7 +134,7 @@ def count_unsupported_points(
 
 
 def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
-    """Reason that the model does not hold for a point of a block."""
+    """Return the reason why the model does not support a point of a block."""
     ((_, effects),) = (
         study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
     )
@@ -148,7 +149,7 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
 def _sample_blocks(
     store: Location, study: BlockStudy, done_blocks: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
-    """Blocks to look at, of those done: all, or some by chance but always the same; their share."""
+    """Return a reproducible random sample of the blocks that are done, and its fraction."""
     done_blocks = (
         np.flatnonzero(blocks_with_receipt(store, study)) if done_blocks is None else done_blocks
     )
@@ -163,7 +164,10 @@ def _sample_blocks(
 
 
 def _axis_range_label(axis: Axis, start: int, end: int) -> str:
-    """Values of a part of an axis; numbers of its points where it has several parameters."""
+    """Return the values of a part of an axis as text.
+
+    Indices stand for the values if the axis sets several parameters.
+    """
     values = range(axis.size) if len(axis.parameters) > 1 else axis.parameters[0].display_values
     return "..".join(dict.fromkeys([_format_value(values[start]), _format_value(values[end - 1])]))
 
@@ -177,7 +181,7 @@ def _format_value(value: object) -> str:
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Slices of some arrays, all cut alike, that each block has written, and their values."""
+    """Yield slices of arrays of equal chunks, and their values, for each committed block."""
     group = open_array_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
@@ -187,24 +191,24 @@ def iter_block_values(
 
 @dataclass
 class ScannerRow:
-    """Echoes of a scanner at one place along the axes, in the blocks that are committed."""
+    """Echoes of a scanner at one point of the axes, in the committed blocks."""
 
     label: str
-    n_shots: int = 0  # times draws
-    shots_with_true_return: int = 0  # of these, with at least one true return
-    false_points: int = 0  # points that are no true return
-    n_cycles: int = 0  # times draws; 0 where a cycle has too few shots
-    solved_cycles: int = 0  # of these, with a velocity vector
+    n_shots: int = 0  # number of shots times draws
+    shots_with_true_return: int = 0  # number of these with at least one true return
+    false_points: int = 0  # number of points that are no true return
+    n_cycles: int = 0  # number of cycles times draws; 0 if a cycle has too few shots
+    solved_cycles: int = 0  # number of these with a velocity vector
     pd_of_shots: list[np.ndarray] = field(default_factory=list, repr=False)
 
     @property
     def mean_pd(self) -> float:
-        """Mean probability of detection of shots that see something; nan where none does."""
+        """Mean probability of detection of shots that hit something; nan if none does."""
         all_pd = np.concatenate([*self.pd_of_shots, np.empty(0)])
         return float(all_pd.mean()) if all_pd.size else float("nan")
 
     def add(self, block_arrays: Mapping[str, np.ndarray]) -> None:
-        """Count a block, by its part of each array."""
+        """Add a block, given the part of each array that it wrote."""
         from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
         from sweep.model.pointcloud.pairing import TRUE_FLAG
 
@@ -212,7 +216,7 @@ class ScannerRow:
         self.n_shots += point_flags[..., 0].size
         self.shots_with_true_return += int(((point_flags & TRUE_FLAG) > 0).any(axis=-1).sum())
         self.false_points += int(((point_flags > 0) & ((point_flags & TRUE_FLAG) == 0)).sum())
-        if "pd_shot" in block_arrays:  # with the first draws alone
+        if "pd_shot" in block_arrays:  # only blocks of the first draws have it
             self.pd_of_shots.append(block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])])
         if "velocity_status" in block_arrays:
             status = block_arrays["velocity_status"]
@@ -221,7 +225,7 @@ class ScannerRow:
 
 
 def scene_summary(store: str | Location) -> list[ScannerRow]:
-    """Return a row for each scanner and place along the axes, or scanner if many."""
+    """Return a row for each scanner and point of the axes; for each scanner if there are many."""
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, FlightStudy):
@@ -254,7 +258,7 @@ def scene_summary(store: str | Location) -> list[ScannerRow]:
 
 
 def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list[str]:
-    """Values at a place along axes; of its first axes, where there are more."""
+    """Return the values at a point of the axes as text; of the first axes if there are many."""
     return [
         f"{member.coordinate} "
         f"{_format_value(member.display_values[index])}{' ' * bool(member.units)}{member.units}"
@@ -265,39 +269,42 @@ def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list
 
 @dataclass
 class AccuracyRow:
-    """Error of a probability of detection, or of all that depends on a scanner's rays."""
+    """Error of a probability of detection, or of the results that depend on a scanner's rays."""
 
     name: str
-    """Of the probability or the scanner; none for a grid's beamlets, which are counted as rays."""
+    """Name of the probability or of the scanner; empty for the beamlets of a grid."""
     n_points: int = (
-        0  # computed, with a known error; of a flight shots, times places along the axes
+        0  # points computed with a known error; for a flight shots times points of the axes
     )
-    n_met: int = 0  # of these, within the tolerance
+    n_met: int = 0  # number of these within the tolerance
     worst_error: float = (
         math.nan
-    )  # of the point that is furthest above its tolerance: its half-width
-    tolerance_at_worst: float = math.nan  # there
+    )  # error, as a half-width, of the point with the largest excess over its tolerance
+    tolerance_at_worst: float = math.nan  # tolerance at this point
     worst_label: str = ""
-    samples_at_worst: int = 0  # of draws, or of rays, that it has had there
-    total_samples: int = 0  # the same of all points
+    samples_at_worst: int = 0  # number of draws, or of rays, at this point
+    total_samples: int = 0  # number of draws, or of rays, at all points
     samples_max: int = 0
-    worst_index: tuple[int, ...] = ()  # place of that point in the array
-    block_fraction: float = 1.0  # share of the blocks, of large studies
+    worst_index: tuple[int, ...] = ()  # index of this point in the array
+    block_fraction: float = 1.0  # fraction of the blocks that were read
     _worst_excess: float = -math.inf
 
     @property
     def excess(self) -> float:
-        """By how much the tolerance is missed at the worst point; 0 where it is met."""
+        """Excess of the error over the tolerance at the worst point; 0 if it is met."""
         return max(0.0, self.worst_error - self.tolerance_at_worst)
 
     @property
     def mean_samples(self) -> float:
-        """Draws or rays of a point."""
+        """Mean number of draws or rays per point."""
         return self.total_samples / max(self.n_points, 1)
 
     @property
     def draws_needed(self) -> float:
-        """Draws that would do there, about; nan where these did, inf where none would."""
+        """Approximate number of draws that would meet the tolerance at the worst point.
+
+        nan if it is met, inf if no number would meet it.
+        """
         if not self.excess:
             return math.nan
         if not self.tolerance_at_worst:
@@ -311,7 +318,7 @@ class AccuracyRow:
         samples: np.ndarray,
         start_index: tuple[int, ...],
     ) -> None:
-        """Take in some points, the first of which is at ``start_index``."""
+        """Add points, the first of which is at ``start_index`` of the array."""
         is_known = np.isfinite(errors)
         samples = np.where(is_known, np.nan_to_num(samples), 0)
         excess = np.where(is_known, errors - tolerances, -np.inf)
@@ -334,7 +341,10 @@ class AccuracyRow:
 def draw_accuracy_rows(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row for each promised probability; none if nothing is drawn or computed."""
+    """Return a row for each probability with a promised accuracy.
+
+    Empty without draws or results.
+    """
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
@@ -352,7 +362,7 @@ def draw_accuracy_rows(
 def ray_accuracy_rows(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
-    """Return a row for each scanner; of a grid one where even the most beamlets are too few."""
+    """Return a row for each scanner; for a grid one row if the most beamlets are too few."""
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if isinstance(study, GridStudy):
@@ -390,7 +400,7 @@ def _accuracy_rows(
     samples_array: str,
     tolerance: np.ndarray,
 ) -> list[AccuracyRow]:
-    """Rows by the names of arrays of errors, and of draws or rays."""
+    """Return rows by the names of the arrays of errors, and of draws or rays."""
     (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
     rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.layout_by_name[samples_array].shape)
@@ -408,7 +418,7 @@ def _accuracy_rows(
 
 
 def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
-    """Tolerances that broadcast over the grid."""
+    """Return tolerances that broadcast over the grid."""
     for n_trailing_axes, values in enumerate(reversed(study.grid.values_by_axis)):
         if TOLERANCE_PARAMETER in values:
             return values[TOLERANCE_PARAMETER].reshape(-1, *(1,) * n_trailing_axes)
@@ -422,35 +432,35 @@ class Status:
     store: Location
     title: str
     study_id: str
-    unit: str  # what the points are called
+    unit: str  # name of the points, in the plural
     points: int
     points_done: int
     blocks: int
     blocks_done: int
-    done: np.ndarray  # their numbers
-    points_begun: float  # drawn in part, in blocks that take long
-    failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
-    holder: journal.LockHolder | None  # who writes to it
+    done: np.ndarray  # numbers of the blocks that are done
+    points_begun: float  # number of points done in unfinished blocks
+    failures: dict[int, dict[str, Any]]  # last failure by block that is not done
+    holder: journal.LockHolder | None  # process that holds the lock
     holder_lives: bool
-    draws_done: int  # where each point has a fixed number; else 0
-    bytes: int  # of all results, as they were stored; of a packed copy all its files
-    rate: float  # points a second in the last run, 0 where none committed anything
-    workers: int  # processes that computed in the last run
-    heartbeat: float  # age of its holder's last sign of life [s]; infinite without one
+    draws_done: int  # number of draws if each point has a fixed number, else 0
+    bytes: int  # size of all results as stored, or of all files of a packed copy
+    rate: float  # points per second in the last run; 0 if it committed nothing
+    workers: int  # number of processes that computed in the last run
+    heartbeat: float  # age of the last heartbeat of the lock [s]; inf without one
 
     @property
     def complete(self) -> bool:
-        """Tell whether every block is committed."""
+        """True if every block is committed."""
         return self.blocks_done == self.blocks
 
     @property
     def left(self) -> float:
-        """Seconds that are left at the rate of the last run; infinite where there is none."""
+        """Estimated time left at the rate of the last run [s]; inf if the rate is 0."""
         return (self.points - self.points_done) / self.rate if self.rate else float("inf")
 
 
 def status(store: str | Location) -> Status:
-    """State of a store, by its log of receipts; whether all chunks are there is not looked at."""
+    """Return the state of a store by its log of receipts, without checking that chunks exist."""
     store_path = parse_location(store)
     attributes, study = study_loading.read_study(store_path)
     run_start = journal.last_run_start(store_path)

@@ -1,7 +1,7 @@
-"""Every byte of a store held against its digests; a finished store copied into few large files.
+"""Verification of every byte of a store by digests, repair, and packing into few large files.
 
-Everything that a store held before there were results follows from the study, so that any of it can
-be made again, to the same bytes. A copy is checked value by value as it is made.
+Everything that a store contains before results follows from the study, so it can be made again to
+the same bytes. A packed copy is checked value by value when it is made.
 """
 
 from __future__ import annotations
@@ -61,31 +61,31 @@ from sweep.tasks.studies.study_loading import AnyStudy
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-#: Blocks that are read at a time, and by how many threads: reading is waiting.
+#: Number of blocks that are read at once, and number of threads that read them.
 BLOCKS_PER_BATCH = 256
 READER_THREADS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """State that a store was found in."""
+    """Result of the verification of a store."""
 
     store: Location
     blocks: int
-    whole: int  # blocks that are committed and undamaged
+    whole: int  # number of committed and undamaged blocks
     damages: tuple[Damage, ...]
-    restored: tuple[str, ...]  # objects of the template that were put back
-    foreign: tuple[str, ...]  # files that users and other programs have put there
-    unmarked: str  # why damaged blocks could not be marked for `resume`; empty where they are
+    restored: tuple[str, ...]  # objects of the template that were restored
+    foreign: tuple[str, ...]  # files that were not made by sweep
+    unmarked: str  # why damaged blocks could not be marked for `resume`; '' if they are
 
     @property
     def sound(self) -> bool:
-        """Tell whether nothing is damaged."""
+        """True if nothing is damaged."""
         return not self.damages
 
     @property
     def complete(self) -> bool:
-        """Tell whether every block is committed and undamaged."""
+        """True if every block is committed and undamaged."""
         return self.whole == self.blocks
 
 
@@ -96,14 +96,14 @@ def verify(
     spec: GridSpec | SceneSpec | None = None,
     progress: bool | Progress = True,
 ) -> list[Report]:
-    """Check every byte of a store, and of the eyepoints that its study looks with.
+    """Check every byte of a store, and of the eyepoint stores that its study uses.
 
-    Receipts of damaged blocks are withdrawn, so that `resume` computes them again, where nobody
-    writes to the store. `repair` puts back metadata, coordinates and the spec; a `spec` says
-    what the store holds where that no longer says so itself.
+    Receipts of damaged blocks are withdrawn, so that `resume` computes them again, unless another
+    process writes to the store. `repair` restores metadata, coordinates and the spec. `spec` states
+    the study of a store that no longer contains it.
 
-    StoreError where there is no store of this program's, or one of another study than `spec`;
-    where it can't be repaired.
+    StoreError if there is no store of sweep, if it holds another study than `spec`, or if it can't
+    be repaired.
     """
     path, listener = parse_location(path).absolute(), make_progress(progress)
     recover_interrupted_replace(path)
@@ -122,7 +122,7 @@ def verify(
 
 
 def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> AnyStudy | None:
-    """Return the study in a store; None if it holds none, or it can't be told."""
+    """Return the study in a store; None if it holds none, or if it can't be read."""
     try:
         attributes = _undamaged_attributes(store_path)
     except StoreError:
@@ -152,9 +152,7 @@ def _verify_store(
 ) -> Report:
     template_damage, restored = study_store.template_damages(store_path), []
     if template_damage and study and repair:
-        study_store.refuse_foreign_store(
-            store_path
-        )  # a lock would be the first thing of ours in it
+        study_store.refuse_foreign_store(store_path)  # a lock would be its first file made by sweep
         with journal.StoreLock(store_path, progress.say):
             template_damage, restored = [], restore_template(store_path, study)
     log_damage = _log_damages(store_path)
@@ -180,7 +178,10 @@ def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: li
 
 
 def _log_damages(store_path: Location) -> list[Damage]:
-    """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
+    """Return the damaged lines of the journal.
+
+    The last line of a log that is being written may be unfinished, and does not count.
+    """
     unreadable = store_format.irregular_journal_files(store_path)
     holder = None if unreadable else journal.read_lock_holder(store_path)
     holder_lives = holder is not None and journal.is_holder_alive(store_path, holder)
@@ -195,7 +196,7 @@ def _log_damages(store_path: Location) -> list[Damage]:
 
 
 def _foreign_object_names(store_path: Location) -> list[str]:
-    """Names of what users and other programs have put into a store."""
+    """Return the names of the objects in a store that were not made by sweep."""
     if isinstance(store_path, Path):
         return list_foreign_files(store_path)
     manifest = study_store.manifest_digests(store_path)
@@ -211,7 +212,7 @@ def _foreign_object_names(store_path: Location) -> list[str]:
 
 
 def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
-    """Chunks of arrays that are no part of a store; drafts of killed writers are not told."""
+    """Yield chunks outside the arrays of a store, except drafts of killed writers."""
     manifest = study_store.manifest_digests(store_path)
     chunk_grid_shapes = (
         {name: owner_blocks.shape for name, owner_blocks in study.chunk_owners().items()}
@@ -223,9 +224,9 @@ def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Da
             continue
         chunk = CHUNK_NAME.fullmatch(name)
         if not (chunk and f"{chunk[1]}/zarr.json" in manifest):
-            continue  # told as foreign
+            continue  # reported as foreign
         if not study:
-            continue  # only who made it could tell which chunks it has
+            continue  # the chunks of an array that is not the study's are unknown
         array, chunk_index = chunk[1], chunk[2].split("/")[1:]
         chunk_grid_shape = chunk_grid_shapes.get(array, (0,))
         if len(chunk_index) != len(chunk_grid_shape) or any(
@@ -237,12 +238,12 @@ def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Da
 def _iter_block_damages(
     store_path: Location, study: BlockStudy, progress: Progress
 ) -> Iterator[Damage]:
-    """Damages of the blocks that were committed."""
+    """Yield the damages of committed blocks."""
     committed_digests = journal.committed_digests(store_path, study.n_blocks)
     blocks = np.flatnonzero(committed_digests != b"")
     progress = (
         progress if len(blocks) > BLOCKS_PER_BATCH else Progress()
-    )  # what is over soon shows nothing
+    )  # a short verification shows no progress
     progress.begin(points=len(blocks), done=0, unit="blocks")
     try:
         with ThreadPoolExecutor(READER_THREADS) as pool:
@@ -271,7 +272,7 @@ def _damages_of_block(
         if has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max):
             return []
     except OSError:
-        pass  # told below, object by object
+        pass  # reported below, object by object
     damages = []
     for name in chunk_paths:
         if problem := damage_or_read_error(
@@ -283,13 +284,16 @@ def _damages_of_block(
         and isinstance(store_path, ObjectPath)
         and has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max)
     ):
-        return []  # answers were cut before
+        return []  # earlier responses were incomplete
     description = f"one of its {counted(len(chunk_paths), 'chunk')}"
     return damages or [Damage(description, "is whole but not the one that was committed", block)]
 
 
 def _damage_of_chunk(store_path: Location, chunk_path: str, bytes_max: int) -> str:
-    """Damage of a chunk in words; read once more from an object store, as an answer may be cut."""
+    """Return the damage of a chunk; '' if it has none.
+
+    In an object store a damaged chunk is read twice, as a response may be incomplete.
+    """
     problem = chunk_damage(read_object(store_path, chunk_path, bytes_max))
     if problem and isinstance(store_path, ObjectPath):
         content = read_object(store_path, chunk_path, bytes_max)
@@ -299,7 +303,7 @@ def _damage_of_chunk(store_path: Location, chunk_path: str, bytes_max: int) -> s
 
 
 def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Progress) -> str:
-    """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
+    """Withdraw the receipts of damaged blocks. Return an error message if that fails, else ''."""
     try:
         with (
             journal.StoreLock(store_path, progress.say),
@@ -320,7 +324,7 @@ def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Pr
 
 
 def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
-    """Attributes that a store was made with, from its list, else from its group, if undamaged."""
+    """Return the attributes of a store from its manifest, or from its root if undamaged."""
     if manifest_attributes := store_format.read_manifest_attributes(store_path):
         return store_format.check_attributes(store_path, manifest_attributes)
     attributes = store_format.read_attributes(store_path)
@@ -334,9 +338,9 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
 
 
 def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
-    """Put back, each in one step, what a store held before there were results; names of objects.
+    """Restore damaged objects of the template, each in one step. Return their names.
 
-    The caller holds the store's lock. StoreError where this machine can't make the same again.
+    The caller holds the store's lock. StoreError if this machine can't make the same objects.
     """
     study_store.refuse_links(store_path)
     try:
@@ -377,7 +381,10 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
 
 
 def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
-    """Refuse to put back what an undamaged line of the list says is not what was there."""
+    """Raise a StoreError if new objects differ from the digests in the manifest.
+
+    Only undamaged lines of the manifest count.
+    """
     for name, expected_digest in study_store.manifest_digests(store_path).items():
         if template_object_damage(template_path, name, expected_digest):
             raise StoreError(
@@ -390,7 +397,10 @@ def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
 def _refuse_unproven_study(
     store_path: Location, study: BlockStudy, template_path: Path, altered_names: list[str]
 ) -> None:
-    """Refuse a spec that makes other arrays or results, where all else that could tell is lost."""
+    """Raise a StoreError if an object of the store, or its first block, belongs to another study.
+
+    It is called if the recorded digests of the template are lost.
+    """
     if other_names := set(altered_names) - {"zarr.json", study_store.MANIFEST_PATH}:
         raise StoreError(
             f"{store_path} holds another study, or too little is left: {min(other_names)} differs"
@@ -408,17 +418,17 @@ def _refuse_unproven_study(
             )
 
 
-#: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
+#: Largest size of a shard of complete chunks before compression [bytes]; each thread holds one.
 SHARD_BYTES_MAX = 64 << 20
 
 
 def pack_store(
     store_path: str | Location, output: str | Location, *, progress: bool | Progress = True
 ) -> Location:
-    """Copy a complete store into one of few files, each many chunks: whole, or not at all.
+    """Copy a complete store into one of few files with many chunks each: completely, or not at all.
 
-    StoreError where it is not complete, where something is in the way of the copy, or it can't
-    be written or read back as it was.
+    StoreError if the store is incomplete, if something is at the path of the copy, or if the copy
+    can't be written and read back.
     """
     store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
     attributes, study = study_loading.read_study(store_path)
@@ -440,7 +450,7 @@ def pack_store(
                 _write_packed_store(store_path, draft_path, study, listener)
                 study_store.sync_to_disk(
                     draft_path
-                )  # else a power cut may leave the name without the values
+                )  # otherwise a power failure may leave the name without the values
         else:
             with study_store.reserve_object_location(output):
                 _write_packed_store(store_path, output, study, listener)
@@ -450,7 +460,7 @@ def pack_store(
 def _write_packed_store(
     store_path: Location, output: Location, study: BlockStudy, progress: Progress
 ) -> None:
-    """Write a packed copy, the document of its group last."""
+    """Write a packed copy, its root document last."""
     attributes = {**study_loading.read_study(store_path)[0], PACKED_ATTRIBUTE: True}
     with tempfile.TemporaryDirectory() as directory:
         template = Path(directory) / "template"
@@ -471,7 +481,7 @@ def _write_packed_store(
         raise StoreError(f"{store_path} was extended or replaced while it was copied: try again")
     for name in (*LOG_NAMES, RECIPE_FILE):
         lines = iter_records(store_path / JOURNAL_DIR / name)
-        # without the machine, as copies are given away
+        # without the name of the machine, as copies are given to others
         anonymous_lines = [
             {key: value for key, value in line.items() if key not in ("host", "pid")}
             for line in lines
@@ -486,9 +496,9 @@ def _write_packed_store(
 
 
 def _pack_array(source: Any, output: Location) -> None:
-    """Copy an array, shard by shard, and read each back."""
+    """Copy an array shard by shard, and compare each shard as read back."""
     target = zarr.open_array(to_zarr_store(output), mode="r+")
-    target = target.with_config({"write_empty_chunks": True})  # else one of fill values is lost
+    target = target.with_config({"write_empty_chunks": True})  # else chunks of fill values are lost
     dims = tuple(map(str, range(target.ndim)))
     shard_grid = BlockGrid(dims, target.shape, target.shards or target.chunks)
     with ThreadPoolExecutor(READER_THREADS) as pool:
@@ -510,7 +520,7 @@ def _copy_region(
 
 
 def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
-    """Whole chunks along each axis that make a file, the last axis filled first; or None."""
+    """Return the shape of a shard of complete chunks, filled along the last axis first; or None."""
     if layout.values is not None:
         return None
     chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of(layout.chunks))

@@ -1,8 +1,9 @@
-"""The study in a store, of whatever kind; results of an older one that a larger one has too.
+"""Reading of the study in a store, and reuse of a smaller study's results.
 
-Those are taken from there, bit for bit. A result follows from the parameters at its point, its
-draws and the effects that are simulated. Points are looked up axis by axis. The older store is only
-read; a block of it that does not match the digest in its receipt counts as absent.
+A larger study takes results from the store of a smaller one, bit for bit. A result depends on the
+parameters of its point, its draws and the simulated effects. Points are matched axis by axis. The
+older store is only read. A block of it that does not match the digest in its receipt counts as
+missing.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER, ParameterGri
 AnySpec = GridSpec | SceneSpec
 
 ACCURACY_KIND = "accuracy"
-"""Kind of the stores of `sweep accuracy`, in which there is no study."""
+"""Kind of the stores of `sweep accuracy`, which hold no study."""
 
 GridOrFlightStudy = GridStudy | FlightStudy
 AnyStudy = GridOrFlightStudy | EyepointStudy
@@ -54,7 +55,10 @@ AnyStudy = GridOrFlightStudy | EyepointStudy
 def make_study(
     spec: GridSpec | SceneSpec, store_path: Location, source_path: Location | None = None
 ) -> GridOrFlightStudy:
-    """Return the study that a spec declares, to be stored at a path; it may extend another."""
+    """Return the study of a spec, to be stored at a path.
+
+    It takes results from the store at `source_path`, if given.
+    """
     study = FlightStudy(spec, store_path) if isinstance(spec, SceneSpec) else GridStudy(spec)
     if source_path:
         study.find_reuse_source = partial(_find_reuse_source, source_path, study)
@@ -64,7 +68,7 @@ def make_study(
 def _find_reuse_source(
     source_path: Location, target_study: GridOrFlightStudy
 ) -> ReuseSource | None:
-    """Results that the store at a path has of a study; None where it is gone, or has none."""
+    """Return the results that the store at a path has of a study; None if it is unusable."""
     try:
         attributes = store_format.read_attributes(source_path)
         study_store.refuse_other_versions(source_path, attributes, VERSION, reader="this machine")
@@ -79,14 +83,14 @@ def _find_reuse_source(
         if isinstance(target_study, FlightStudy) and extension_obstacles(
             source_spec, target_study.spec
         ):
-            return None  # a grid's points are told apart by their parameters
+            return None  # a grid needs no such test, as its points have unique parameters
         return ReuseSource(source_path, make_study(source_spec, source_path), target_study)
     except (StoreError, SceneError):
         return None
 
 
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
-    """Attributes of a store and the study that it holds; StoreError where it can't be read."""
+    """Return the attributes of a store, and its study; StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
     if attributes["kind"] == ACCURACY_KIND:
         figures_command = shell_command("figures", store_path)
@@ -97,7 +101,7 @@ def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
 
 
 def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
-    """Read the study of a store from its attributes; StoreError if it can't be read."""
+    """Return the study of a store from its attributes; StoreError if it can't be read."""
     recipe = read_recipe(store_path)
     if attributes["kind"] == "eyepoints":
         if "spec" not in recipe:
@@ -113,7 +117,7 @@ def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
 
 
 def _read_spec(store_path: Location, recipe: dict[str, Any], spec_json: str) -> Any:
-    """Read the spec of a store; StoreError if this program can't read it."""
+    """Return the spec of a store; StoreError if this version of sweep can't read it."""
     try:
         return from_stored(spec_json, base=Path(recipe["base"]) if "base" in recipe else None)
     except (SpecError, ValueError) as error:
@@ -128,12 +132,12 @@ def refuse_other_study(
     stored_spec: GridSpec | SceneSpec,
     requested_spec: GridSpec | SceneSpec,
 ) -> None:
-    """Refuse a store that holds another study than the one asked for."""
+    """Raise a StoreError if a store holds another study than the requested one."""
     if attributes["study_id"] == requested_spec.id:
         return
     study_store.refuse_other_versions(
         store_path, attributes, VERSION, reader="this machine"
-    )  # the version is in the id too
+    )  # the id depends on the version too
     lines = "\n".join(f"  {line}" for line in describe_differences(stored_spec, requested_spec))
     raise StoreError(
         f"{store_path} holds another study (in the store -> in the spec):\n{lines}\n"
@@ -141,28 +145,28 @@ def refuse_other_study(
     )
 
 
-#: Fields that may grow, and one that may shrink; blocks may be of any size.
+#: Fields that an extension may increase, decrease, or change at will.
 FIELDS_THAT_MAY_GROW = ("draws.number", "draws.limit")
 FIELDS_THAT_MAY_SHRINK = (TOLERANCE_PARAMETER,)
 FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
 
-#: Values of an axis that are told where they would be lost.
+#: Largest number of lost values of an axis that an error message lists.
 LOST_VALUES_LISTED_MAX = 5
 
-#: Blocks of the older store that a process keeps in memory.
+#: Number of blocks of the older store that a process keeps in memory.
 CACHED_BLOCKS_MAX = 2
 
 
 class SharedPoints(NamedTuple):
-    """Points of a block that an older block has."""
+    """Points of a block that a block of the older store contains."""
 
-    source_block: int  # Of the older store
-    local_indices: np.ndarray  # (m,) int64: their numbers in C order over the block
-    source_local_indices: np.ndarray  # (m,) int64: their numbers in the older one
+    source_block: int  # block of the older store
+    local_indices: np.ndarray  # (m,) int64: indices in C order over the new block
+    source_local_indices: np.ndarray  # (m,) int64: indices in C order over the older block
 
 
 class ReuseSource:
-    """Results that the store of an older study has of a larger one."""
+    """Results in the store of a smaller study that a larger one reuses."""
 
     def __init__(
         self,
@@ -177,7 +181,7 @@ class ReuseSource:
         )
         self.reused_points_by_block: dict[
             int, int
-        ] = {}  # points of each block that need not be computed
+        ] = {}  # number of points of each block that were not computed
         self.has_final_results = has_same_results(source_study.spec, target_study.spec)
         self.has_first_draws = not self.has_final_results and continues_draws(
             source_study.spec, target_study.spec
@@ -188,7 +192,7 @@ class ReuseSource:
         self._matching_of_group = cache(self._match_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
-        """Return the committed older blocks that have points of a block of the larger study."""
+        """Yield the points of a block that committed blocks of the older store contain."""
         target_grid, block_in_grid = self._target_study.locate_in_grid(block)
         source_grids = {grid.group: grid for grid in self.source_study.grids}
         if (
@@ -236,7 +240,7 @@ class ReuseSource:
         )
 
     def _read_block(self, source_block: int) -> Results | None:
-        """Results of an older block, each with its chunk's shape; None where damaged or lost."""
+        """Return the results of an older block by array; None if a chunk is damaged or missing."""
         try:
             chunk_paths = study_store.chunk_names_of_block(self.source_study, source_block)
             digest = store_format.stored_objects_digest(
@@ -252,7 +256,7 @@ class ReuseSource:
             return None
 
     def read_chunk(self, name: str, source_block: int) -> np.ndarray:
-        """Return an older block's chunk of an array, whether damaged or not."""
+        """Return a chunk of an older block, without checking its digest."""
         return np.asarray(
             self._source_arrays[name].blocks[self.source_study.chunk_positions(source_block)[name]]
         )
@@ -262,7 +266,7 @@ class ReuseSource:
         return open_array_group(self._source_path)
 
     def reuse_remark(self) -> str:
-        """Remark on what is not simply taken from it; empty where all of it is."""
+        """Return a remark on results that can't be reused as they are; '' if all can."""
         if not (self.has_final_results or self.has_first_draws):
             return "whole spectra are drawn anew"
         remarks = ["points that are there are drawn further"] if self.has_first_draws else []
@@ -286,7 +290,7 @@ class ReuseSource:
 
 
 def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
-    """Count the points of a larger study that are done, here or in the store it extends."""
+    """Return a message on how many points are done, in this store or in the one it extends."""
     is_done = committed_blocks(store_path, study)
     n_points_there, remark = study.count_points(is_done), ""
     if study.reuse_source is not None:
@@ -300,10 +304,10 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
 
 
 def parameters_to_ignore(source_spec: AnySpec, target_spec: AnySpec) -> tuple[str, ...]:
-    """Parameters in which points may differ that are to be taken for the same.
+    """Return the parameters that may differ between points with the same results.
 
-    The tolerance, where neither study varies it, and what looks at spectra where none are
-    drawn.
+    These are the tolerance, if neither study varies it, and detector and estimator, if no spectra
+    are drawn.
     """
     draws_spectra = target_spec.draws.draws_whole_spectra
     method_paths = [
@@ -318,7 +322,7 @@ def parameters_to_ignore(source_spec: AnySpec, target_spec: AnySpec) -> tuple[st
 
 
 def has_other_tolerance(source_spec: AnySpec, target_spec: AnySpec) -> bool:
-    """Tell whether all points have another tolerance; one on an axis identifies points."""
+    """Return True if the two studies have different tolerances, each the same at all points."""
     source_tolerance, target_tolerance = (
         _fixed_tolerance(source_spec),
         _fixed_tolerance(target_spec),
@@ -331,7 +335,7 @@ def has_other_tolerance(source_spec: AnySpec, target_spec: AnySpec) -> bool:
 
 
 def has_same_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
-    """Tell whether points of two studies that are computed as finely have the same results."""
+    """Return True if equal points of two studies have equal results at equal accuracy."""
     if isinstance(target_spec, SceneSpec) or isinstance(source_spec, SceneSpec):
         return True
     if not target_spec.draws.has_draws:
@@ -342,7 +346,7 @@ def has_same_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
 
 
 def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
-    """Tell whether the draws of a study, not of whole spectra, are the first ones of another."""
+    """Return True if the draws of a study are the first draws of another, without spectra."""
     draw_counts = {"number": target_spec.draws.number, "limit": target_spec.draws.limit}
     is_looser = (_fixed_tolerance(source_spec) or 1.0) < (_fixed_tolerance(target_spec) or 0.0)
     return (
@@ -357,13 +361,16 @@ def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
 
 
 def _fixed_tolerance(spec: AnySpec) -> float | None:
-    """Return the tolerance of all points; None where an axis varies it."""
+    """Return the tolerance of all points; None if an axis varies it."""
     value = spec.parameters_off_axes().get(TOLERANCE_PARAMETER)
     return None if value is None else float(value)
 
 
 def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
-    """Set values of a study by dotted path: ``{"axes.target.range": ["1 km"]}``; or SpecError."""
+    """Return a spec with values changed by dotted path: ``{"axes.target.range": ["1 km"]}``.
+
+    SpecError if the result is no valid spec.
+    """
     mapping = spec.to_yaml_mapping()
     for path, value in changes.items():
         section_name, _, field_path = path.partition(".")
@@ -385,7 +392,7 @@ def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
 def refuse_not_larger_study(
     source_path: Location, source_spec: AnySpec, target_spec: AnySpec
 ) -> None:
-    """Refuse what is not a larger study than the one in a store, field by field."""
+    """Raise a StoreError if a study is not larger than the one in a store."""
     if type(source_spec) is not type(target_spec):
         raise StoreError(
             f"{source_path} can't be extended to this study: a flight over a scene and a study "
@@ -407,7 +414,7 @@ def refuse_not_larger_study(
 
 
 def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]:
-    """Reasons why a study is no larger one than another of its kind, field by field."""
+    """Return the reasons why a study is not larger than another of its kind, one per field."""
     return [
         *_disallowed_changes(source_spec, target_spec),
         *_lost_axis_values(source_spec, target_spec),
@@ -415,7 +422,7 @@ def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]
 
 
 def _disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Fields that are not as they must be."""
+    """Yield the changes of fields that an extension does not allow."""
     on_axes = {
         member.path
         for any_spec in (source_spec, target_spec)
@@ -445,7 +452,7 @@ def _disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[
 
 
 def _scanner_names(spec: AnySpec) -> Collection[str]:
-    """Names of a flight's scanners; a study over a grid has none."""
+    """Return the names of a flight's scanners; empty for a grid."""
     return getattr(spec, "scanners", ())
 
 
@@ -455,7 +462,7 @@ def _field_value(spec: AnySpec, path: str) -> float:
 
 
 def _lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
-    """Values of the store that the study lacks."""
+    """Yield the values of the store's axes that the study lacks."""
     source_grid, target_grid = ParameterGrid(source_spec), ParameterGrid(target_spec)
     varying_paths = {
         path
@@ -476,7 +483,7 @@ def _lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[st
 
 
 def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> str:
-    """Values of a parameter at places of a grid, (axes, places)."""
+    """Return the values of a parameter at grid indices (axes, n) as text."""
     values: list[object] = [grid.fixed_parameters[path]]
     for axis_values, index in zip(grid.values_by_axis, indices, strict=True):
         if path in axis_values:
@@ -491,20 +498,22 @@ def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> st
 
 
 class AxisLookup(NamedTuple):
-    """Places of the values of some parameters of one study along an axis of another."""
+    """Indices, along an axis of one study, of the values of parameters of another."""
 
     paths: tuple[str, ...]
-    axis: int | None  # axis that is looked in; None for parameters that are fixed there
+    axis: int | None  # axis of the other study; None if the parameters are fixed there
     index_along_axis: np.ndarray
-    """int64, of the shape that is looked from, but 1 along axes without any of these parameters:
-    index along the axis, -1 where it lacks the values."""
+    """int64 index along the axis, -1 if it lacks the values.
+
+    The shape is that of this study's grid, with length 1 along axes without any of the parameters.
+    """
 
 
 class PointMatching:
-    """Points along the axes of one study by the points of another.
+    """Matching of the points of two studies by their parameters.
 
-    Axes may be longer, in another order, new, or zipped otherwise; paths that are
-    ``parameters_to_ignore`` may differ.
+    Axes may be longer, in another order, new, or zipped differently. Parameters in ``ignored`` may
+    differ.
     """
 
     def __init__(
@@ -519,7 +528,10 @@ class PointMatching:
         ]
 
     def match_slices(self, grid_slices: tuple[slice, ...]) -> np.ndarray:
-        """Numbers, in C order over the other axes, of points in slices of its own; -1 for none."""
+        """Return the indices of points in the other grid, in C order, for slices of this grid.
+
+        -1 for points that the other grid lacks.
+        """
         grid_indices = np.zeros((1,) * len(grid_slices), np.int64)
         is_missing = np.zeros((1,) * len(grid_slices), bool)
         for lookup in self.lookups:
@@ -543,7 +555,7 @@ class PointMatching:
 def _parameter_groups(
     other_grid: ParameterGrid, grid: ParameterGrid
 ) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
-    """Parameters that are looked up together: those of each axis, and all that are fixed."""
+    """Yield parameters that are matched together: those of each axis, and the fixed ones."""
     yield from enumerate(other_grid.values_by_dim())
     on_axes = {path for values in other_grid.values_by_dim() for path in values}
     fixed_values = {
@@ -559,7 +571,7 @@ def _parameter_groups(
 def _axis_lookup(
     grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
 ) -> AxisLookup:
-    """Places of a grid's values among others of the same parameters, which go together."""
+    """Match the values of a group of parameters in a grid with those of the other grid."""
     varying_axes = [
         axis_number
         for axis_number, axis_values in enumerate(grid.values_by_dim())
@@ -588,7 +600,7 @@ def _axis_lookup(
 
 
 def _find_rows(known_rows: np.ndarray, wanted_rows: np.ndarray) -> np.ndarray:
-    """Index of each wanted row, (m,), among rows (n, columns); -1 of those that are not there."""
+    """Return the index (m,) of each wanted row in `known_rows` (n, columns); -1 if missing."""
     if not known_rows.shape[1]:
         return np.zeros(len(wanted_rows), np.int64)
     all_rows = np.concatenate([known_rows, wanted_rows]).view(np.uint64)

@@ -1,4 +1,4 @@
-"""Plans of studies, before anything runs: points, blocks, bytes, time, memory, effects."""
+"""Plan of a study before it runs: points, blocks, bytes, time, memory and effects."""
 
 from __future__ import annotations
 
@@ -44,63 +44,63 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.blocks import Results
 
-#: Time that measuring may take [s], and places of the grid that it looks at.
+#: Time limit of measuring the time per point [s], and number of blocks that are measured.
 POINT_TIMING_SECONDS = 1.0
 TIMED_BLOCKS_MAX = 16
 
-#: Time that measuring a scanner may take [s], about.
+#: Approximate time limit of measuring one scanner [s].
 SCANNER_TIMING_SECONDS = 0.5
 
-#: Draws of a point while measuring.
+#: Largest number of draws of a point that are measured.
 TIMED_DRAWS_MAX = 1000
 
-#: The same, of whole spectra.
+#: Largest number of draws of whole spectra that are measured.
 TIMED_SPECTRA_MAX = 10
 
-#: What a worker takes to start [s], and to write a chunk [s].
+#: Time of a worker to start, and to write a chunk [s].
 WORKER_START_SECONDS = 3.0
 CHUNK_WRITE_SECONDS = 2e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerPlan:
-    """Plan of one scanner."""
+    """Plan of one scanner of a flight."""
 
     name: str
     n_cycles: int
     n_shots: int
     n_rays: int
-    is_cast: bool  # eyepoints are there already
-    seconds_per_ray: float  # on one worker, measured
-    seconds_per_draw: float  # of one shot, with radiometry and navigation
+    is_cast: bool  # whether the eyepoints exist already
+    seconds_per_ray: float  # measured time of a ray on one worker [s]
+    seconds_per_draw: float  # measured time of one draw of a shot, with navigation [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyPlan:
-    """Plan of a study; scanners and reports are those of a flight."""
+    """Plan of a study; `scanners` and `scene_reports` are empty for a grid."""
 
     n_points: int
     n_blocks: int
-    block_shape: dict[str, int]  # points along each axis; none of a flight
+    block_shape: dict[str, int]  # points along each axis; empty for a flight
     n_chunks: int
-    nbytes: int  # before compression, of all results
+    nbytes: int  # size of all results before compression [bytes]
     n_workers: int
-    seconds_per_point: float  # on one worker, measured
-    wall_seconds: float  # of the whole study, estimated
-    worker_bytes: int  # bytes, estimated
+    seconds_per_point: float  # measured time of a point on one worker [s]
+    wall_seconds: float  # estimated wall time of the study [s]
+    worker_bytes: int  # estimated memory of a worker [bytes]
     scanners: tuple[ScannerPlan, ...] = ()
-    scene_reports: tuple[str, ...] = ()  # what was mended as the scene was loaded
+    scene_reports: tuple[str, ...] = ()  # repairs of meshes when the scene was loaded
 
     @property
     def cpu_seconds(self) -> float:
-        """Time on one core [s]."""
+        """Estimated time of the study on one core [s]."""
         return self.n_points * self.seconds_per_point
 
 
 def plan_study(
     spec: GridSpec | SceneSpec, *, store_path: Location | None = None, n_workers: int | None = None
 ) -> StudyPlan:
-    """Plan a study to be stored at a place, by its size and a second of measuring points."""
+    """Plan a study from its size, and from points that are computed for about a second."""
     refuse_too_large_point(spec, serial_worker_memory())
     study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
     refuse_too_large_blocks(study, serial_worker_memory())
@@ -137,7 +137,7 @@ def plan_study(
         n_workers=n_workers,
         seconds_per_point=seconds_per_point,
         wall_seconds=WORKER_START_SECONDS + cpu_seconds / min(n_workers, study.n_blocks),
-        # with the model loaded, and a block's results twice: its own, and those being encoded
+        # with the model loaded, the results of a block, and their encoded copy
         worker_bytes=psutil.Process().memory_info().rss
         + 2 * study.block_nbytes_max
         + point_bytes_max(spec),
@@ -147,16 +147,16 @@ def plan_study(
 
 
 def measure_seconds_per_point(study: GridStudy) -> float:
-    """Processor time of a point [s], measured on points spread over the grid.
+    """Return the processor time of a point [s], measured at points spread over the grid.
 
-    Whole sets of points that share a geometry are taken, so that sharing shows as it will.
-    Points that miss an accuracy after few draws are taken to reach their limit.
+    Complete sets of points that share a geometry are computed, as in a run. Points that miss the
+    accuracy after few draws count with the limit of draws.
     """
     study.compile_kernels()
     blocks = _blocks_to_time(study)
 
     def time_round(n_geometries: int) -> TimedRound:
-        for block in blocks:  # effects are planned once for many points, and are not timed
+        for block in blocks:  # planning of effects serves many points, and is not timed
             study.effect_planner.select_for_block(
                 block, _sample_points_of_block(study, block, n_geometries)
             )
@@ -171,15 +171,15 @@ def measure_seconds_per_point(study: GridStudy) -> float:
 
 
 def _blocks_to_time(study: GridStudy) -> list[int]:
-    """Blocks spread over the grid, fewer where points take long: looked at once.
+    """Return blocks spread over the grid, fewer if points take long; each is computed once.
 
-    That loads what is compiled, which takes longer than many points.
+    This loads compiled kernels, which takes longer than many points.
     """
     blocks: list[int] = []
     last_block, start = study.grid.n_blocks - 1, time.process_time()
     for k in sorted(
         range(TIMED_BLOCKS_MAX), key=lambda k: -math.gcd(k, TIMED_BLOCKS_MAX)
-    ):  # 0, the middle, quarters
+    ):  # first and middle block, quarters, and so on
         block = k * last_block // (TIMED_BLOCKS_MAX - 1)
         if block not in blocks:
             _evaluate_sample(study, block, 1)
@@ -190,24 +190,24 @@ def _blocks_to_time(study: GridStudy) -> list[int]:
 
 
 class TimedRound(NamedTuple):
-    """A look at some points."""
+    """Time of one round of measurement."""
 
     n_points: int
-    seconds_by_part: tuple[float, ...]  # time of each kind of work [s]
+    seconds_by_part: tuple[float, ...]  # time of each part of the work [s]
 
 
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Compute so much of a study that the time can be measured, or all of it."""
+    """Time rounds of increasing size, until one takes long enough or covers the study."""
     from numba.core.event import install_recorder
 
     n_samples, start = 1, time.perf_counter()
-    while True:  # once at the least, however long this process has been held up
+    while True:  # at least one round, even if this process was delayed
         with install_recorder("numba:compile") as compile_events:
             timed_round = time_round(n_samples)
         now = time.perf_counter()
-        if compile_events.buffer:  # a round that compiles tells nothing of those that do not
+        if compile_events.buffer:  # a round with compilation is not representative
             start = now
             continue
         if timed_round.n_points >= n_points_max or now - start > seconds_max / 3:
@@ -216,7 +216,7 @@ def _time_growing_rounds(
 
 
 def _sample_points_of_block(study: GridStudy, block: int, n_geometries: int) -> np.ndarray:
-    """Points of a block, by number within it: so many whole sets that share a geometry."""
+    """Return indices of points in a block: complete sets that share a geometry."""
     grid, points_per_geometry = study.grid, 1
     for length, is_geometric in zip(grid.block_extent(block), grid.is_geometric_axis, strict=True):
         points_per_geometry *= 1 if is_geometric else length
@@ -228,7 +228,7 @@ def _sample_points_of_block(study: GridStudy, block: int, n_geometries: int) -> 
 
 
 def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
-    """Return the number of points evaluated, and the time [s] of their skipped draws."""
+    """Return the number of points computed, and the estimated time of their omitted draws [s]."""
     spec, extrapolated_seconds = study.spec, 0.0
     local_indices = _sample_points_of_block(study, block, n_geometries)
     parameters = study.grid.parameters(block)
@@ -244,11 +244,11 @@ def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[i
 
 
 class PointTimes(NamedTuple):
-    """Time of some points on one core."""
+    """Processor time of some points."""
 
-    measured: float  # measured
+    measured: float  # measured time [s]
     extrapolated: float
-    """Of draws that were left out: of all up to their limit, of points that are not settled."""
+    """Estimated time of omitted draws [s]: up to the limit, at points that miss their accuracy."""
 
 
 def time_points(
@@ -259,10 +259,13 @@ def time_points(
     *,
     draws_max: int,
 ) -> PointTimes:
-    """Time of some points, each drawn so many times at the most; as of :func:`evaluate_points`."""
+    """Time `n_points` points with at most `draws_max` draws each.
+
+    The arguments are those of :func:`evaluate_points`.
+    """
     limited_spec = limit_draws(spec, draws_max)
     if spec.draws.draws_whole_spectra:
-        evaluate_points(limit_draws(spec, 1), parameters, n_points, effects)  # makes tables once
+        evaluate_points(limit_draws(spec, 1), parameters, n_points, effects)  # fills caches
     start = time.process_time()
     results = evaluate_points(limited_spec, parameters, n_points, effects)
     measured_seconds = time.process_time() - start
@@ -273,7 +276,7 @@ def time_points(
         return PointTimes(measured_seconds, 0.0)
     if (
         spec.draws.draws_whole_spectra
-    ):  # a point's spectrum without noise costs as much as many draws
+    ):  # the noise-free spectrum of a point takes as long as many draws
         start = time.process_time()
         evaluate_points(limit_draws(spec, 1), parameters, n_points, effects)
         single_draw_seconds = time.process_time() - start
@@ -308,7 +311,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         simulated_at = time.process_time()
         return TimedRound(len(shot_numbers), (cast_at - start, simulated_at - cast_at))
 
-    time_round(1)  # loads what is compiled, which takes longer than many points
+    time_round(1)  # loads compiled kernels, which takes longer than many points
     timed_round = _time_growing_rounds(time_round, eyepoints.n_points, SCANNER_TIMING_SECONDS)
     casting_seconds, draw_seconds = timed_round.seconds_by_part
     return ScannerPlan(
@@ -322,51 +325,50 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     )
 
 
-#: Tiles that are looked at; of larger grids as many as these, spread over them.
+#: Largest number of tiles of a grid that are planned; in larger grids they are spread evenly.
 GRID_TILES_SAMPLED_MAX = 1024
 
-#: Tiles of a flight that are looked at, of each scanner, and places along its axes.
+#: Number of tiles of each scanner of a flight that are planned, and of points along the axes.
 SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
 
-#: Tiles on which an effect's cost is measured, points of each, and draws of a point; in flights
-#: scanners and places along the axes, and shots of each. Rounds: of short work, and of long.
+#: Sample for measuring the cost of an effect: tiles of a grid, points or shots of each, draws of
+#: each point, and samples of a flight's scanners.
 COST_TILES_MAX, COST_POINTS_MAX, COST_DRAWS_MAX, COST_SCANNER_SAMPLES_MAX = 4, 24, 20, 3
+#: Number of rounds of measuring the cost of an effect, at most, and at least if they take long.
 COST_ROUNDS_MAX, COST_ROUNDS_MIN = 5, 3
 
-#: Spread of an effect's cost over the rounds, relative to it, up to which the cost is known. It is
+#: Largest relative spread of an effect's cost over the rounds for which the cost is reported. It is
 #: about twice the error of the median.
 COST_SPREAD_MAX = 0.1
 
-#: Time [s] of a round of measuring an effect's cost that is long enough.
+#: Sufficient time of a round of measuring an effect's cost [s].
 COST_ROUND_SECONDS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffectRow:
-    """An effect in a study."""
+    """Row of the table of effects."""
 
     name: str
     mode: str
-    simulated_fraction: float  # of the points at which it is simulated
-    simulated_at: str  # the part of the study that holds these
-    change_bound: float  # largest change that it may make anywhere: of pd, log10 pfa or a magnitude
-    largest_change_at: str  # where that is
-    time_fraction: (
-        float  # share of a point's time that it takes where it is simulated; nan: not known
-    )
+    simulated_fraction: float  # fraction of the points at which the effect is simulated
+    simulated_at: str  # region of the study that contains these points
+    change_bound: float  # largest bound of its change of pd, log10 pfa or relative |X|
+    largest_change_at: str  # region of the largest bound
+    time_fraction: float  # fraction of the time of the points where it is simulated; nan if unknown
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffectsTable:
-    """All effects in a study."""
+    """Table of all effects of a study."""
 
     rows: tuple[EffectRow, ...]
     tolerance: float
-    error_bound: float  # largest sum of what is left out
-    tile_fraction: float  # share of the tiles
+    error_bound: float  # largest bound of the change by all omitted effects together
+    tile_fraction: float  # fraction of the tiles that were planned
 
     def warnings(self) -> Iterator[str]:
-        """Effects that are forced off though they matter."""
+        """Yield warnings about disabled effects that exceed the tolerance."""
         for row in self.rows:
             if row.mode == "off" and row.change_bound > self.tolerance:
                 yield (
@@ -378,7 +380,10 @@ class EffectsTable:
 
 
 def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
-    """Effects of a study, by the plans of its tiles, and what they cost, if asked."""
+    """Return the table of a study's effects from the plans of its tiles.
+
+    `costs` measures the time that each effect takes.
+    """
     if isinstance(study, GridStudy):
         return _grid_effects_table(study, costs)
     return _flight_effects_table(study, costs)
@@ -411,7 +416,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
         ]
     )
     timed_spec = spec
-    if spec.draws.draws_whole_spectra:  # what an effect costs does not go by what looks at spectra
+    if spec.draws.draws_whole_spectra:  # detectors of spectra do not change the cost of effects
         draws = spec.draws.model_copy(update={"method": "probabilities"})
         timed_spec = spec.model_copy(update={"draws": draws})
     sample_tile = _make_tile_sampler(timed_spec, effect_planner)
@@ -478,11 +483,11 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
 
 
 class _TileEffects(NamedTuple):
-    """Plans of m tiles."""
+    """Effects of m tiles."""
 
-    n_simulated: np.ndarray  # (effects, m): points at which each effect is simulated
-    change_bounds: np.ndarray  # (effects, m)
-    error_bounds: np.ndarray  # (m,)
+    n_simulated: np.ndarray  # (effects, m): number of points at which an effect is simulated
+    change_bounds: np.ndarray  # (effects, m): bound of the change by an effect
+    error_bounds: np.ndarray  # (m,): bound of the change by all omitted effects together
 
 
 def _make_effects_table(
@@ -494,7 +499,7 @@ def _make_effects_table(
     effect_cost: Callable[[str, np.ndarray], float],
     tile_fraction: float,
 ) -> EffectsTable:
-    """Return the table, from what is kept and changed in tiles."""
+    """Return the table of effects from the effects of the tiles."""
     effect_modes = spec.effect_modes()
     rows = tuple(
         EffectRow(
@@ -524,7 +529,7 @@ def _time_range_text(times: np.ndarray) -> str:
 
 
 def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
-    """Return the smallest box of the grid that holds some tiles, in the user's units."""
+    """Return the smallest box of the grid that contains the tiles, in the user's units."""
     slices = [effect_planner.tiles.block_slices(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):
@@ -555,7 +560,7 @@ class _PointSample(NamedTuple):
 def _make_tile_sampler(
     spec: GridSpec, effect_planner: EffectPlanner
 ) -> Callable[[int], _PointSample]:
-    """Choice of points of a tile, made once: of few, or of one where that takes long."""
+    """Return a cached function that samples points of a tile: one point if points take long."""
 
     @cache
     def sample_tile(tile: int) -> _PointSample:
@@ -582,18 +587,18 @@ def _seconds_of_points(
     n_points: int,
     effect_names: Collection[str],
 ) -> float:
-    """Time of some points [s] with some effects."""
+    """Return the time of some points with some effects [s]."""
     return sum(time_points(spec, parameters, n_points, effect_names, draws_max=COST_DRAWS_MAX))
 
 
 Stopwatch = Callable[[], float]
-"""Measure some work once: its time [s]."""
+"""Function that does some work once and returns its time [s]."""
 
 
 def _grid_effect_cost(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
-    """Share of the time of points that an effect takes, from points with it and without."""
+    """Return the fraction of the time of points that an effect takes."""
 
     def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
         parameters, n_points, effect_names = sample_tile(tile)
@@ -609,23 +614,23 @@ def _grid_effect_cost(
 
 
 def reproducible_share(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
-    """Share of the time that an effect takes; nan where rounds of measuring disagree on it.
+    """Return the fraction of the time that an effect takes; nan if it is not reproducible.
 
     Parameters
     ----------
     stopwatches
-        Clocks of the same work with the effect and without. As many are read as take
-        :data:`COST_ROUND_SECONDS` together.
+        Pairs of functions that time the same work with and without the effect. They are used until
+        the work with the effect takes :data:`COST_ROUND_SECONDS` in total.
 
     Returns
     -------
     float
-        Median over rounds, each of which takes one reading with the effect and one without by
-        turns. nan if the rounds differ by more than :data:`COST_SPREAD_MAX` of it.
+        Median over rounds, in which work with and without the effect alternates. nan if the rounds
+        differ by more than :data:`COST_SPREAD_MAX` of the median.
     """
     timed_pairs, total_seconds = [], 0.0
     for time_with, time_without in stopwatches:
-        time_without()  # loads what is compiled
+        time_without()  # loads compiled kernels
         total_seconds += time_with()
         timed_pairs.append((time_with, time_without))
         if total_seconds > COST_ROUND_SECONDS:
@@ -647,7 +652,7 @@ def reproducible_share(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> fl
 
 
 class _ShotSample(NamedTuple):
-    """Arguments of :meth:`FlightStudy.simulate_shots`, of whole cycles of a scanner."""
+    """Arguments of :meth:`FlightStudy.simulate_shots`, for complete cycles of a scanner."""
 
     flight_block: FlightBlock
     shot_arrays: Results
@@ -656,7 +661,7 @@ class _ShotSample(NamedTuple):
     shot_numbers: np.ndarray
 
     def subset(self, rows: np.ndarray, *, removed_flags: np.uint32) -> _ShotSample:
-        """Select shots, without the effects of some flags."""
+        """Return the sample of some shots, without the effects in `removed_flags`."""
         shot_arrays = {name: self.shot_arrays[name][rows] for name in SHOT_VARIABLES}
         effect_flags = self.selected_effects.effect_flags[rows] & ~removed_flags
         selected_effects = SelectedEffects(effect_flags, self.selected_effects.error_bound[rows])
@@ -670,7 +675,7 @@ class _ShotSample(NamedTuple):
 
 
 def _sample_flight(study: FlightStudy) -> list[_ShotSample]:
-    """Cycles spread over each scanner's flight, at the ends of its axes, with few draws."""
+    """Sample cycles spread over the flight of each scanner, at the ends of the axes."""
     axis_corners = {
         tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
         for end_factor in (0, 1)
@@ -697,7 +702,7 @@ def _sample_flight(study: FlightStudy) -> list[_ShotSample]:
 def _flight_effect_cost(
     study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
 ) -> float:
-    """Share of the time of shots that an effect takes, from cycles with it and without."""
+    """Return the fraction of the time of shots that an effect takes."""
     no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
 
     def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
@@ -712,7 +717,7 @@ def _flight_effect_cost(
             if (
                 _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags)
                 > COST_ROUND_SECONDS / 2
-            ):  # so few tell enough
+            ):  # one cycle takes long enough
                 break
         return (
             lambda: _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags),
@@ -730,7 +735,7 @@ def _flight_effect_cost(
 
 
 def _evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
-    """Select some items, from the first to the last."""
+    """Return at most `n_max` items, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
 
@@ -738,7 +743,7 @@ def _evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any
 def _seconds_of_cycles(
     study: FlightStudy, sample: _ShotSample, cycles: np.ndarray, *, removed_flags: np.uint32
 ) -> float:
-    """Time of some cycles [s] without the effects of some flags."""
+    """Return the time of some cycles without the effects in `removed_flags` [s]."""
     shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle
     cycle_sample = sample.subset(
         (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel(),
@@ -753,7 +758,7 @@ def _seconds_of_cycles(
 def _tile_grid_indices(
     effect_planner: EffectPlanner, tile: int, n_max: int | None = None
 ) -> np.ndarray:
-    """Numbers of the points of a tile, or of some, in C order over the grid."""
+    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid."""
     tile_size = effect_planner.tiles.block_size(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
     return effect_planner.tiles.grid_indices(tile, local_indices)

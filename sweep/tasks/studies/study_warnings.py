@@ -32,7 +32,7 @@ class StudyWarning(UserWarning):
 
 
 def spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
-    """Yield what is doubtful of a study's beam, scene, path and threshold.
+    """Yield warnings about a study's beam, scene, path and threshold.
 
     Raises
     ------
@@ -60,10 +60,10 @@ def result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
 
 
 def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> None:
-    """Tell each doubt of a study, and then errors that it does not state.
+    """Issue the warnings about a study, and notes on errors that it does not state.
 
-    Doubts are a `StudyWarning` each, at the line of the caller's program; the command says them.
-    Errors that are not stated are said as notes.
+    Each warning is a `StudyWarning` at the line of the caller's program; the command prints it.
+    Errors that are not stated are messages of `say`.
     """
     stack_level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
@@ -79,13 +79,13 @@ def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], No
 
 
 def issue_study_warning(sentence: str, stack_level: int) -> None:
-    """Issue a `StudyWarning` at a frame's line; only a filter of the user's raises it.
+    """Issue a `StudyWarning` at the line of a frame; only a warning filter of the user's raises it.
 
-    A standard error that is closed or broken ends no computation.
+    A closed or broken standard error does not end the computation.
     """
     try:
         warnings.warn(sentence, StudyWarning, stacklevel=stack_level)
     except StudyWarning:
         raise
-    except Exception:  # what writing to the user's own `sys.stderr` or `showwarning` raises
+    except Exception:  # a user's own `sys.stderr` or `showwarning` may raise anything
         pass

@@ -7,11 +7,11 @@ SPECTRUM_METHOD_PARAMETERS = {
     "detector": "instrument.processing.detector.kind",
     "estimator": "instrument.processing.estimator.kind",
 }
-"""Parameters that name what looks at whole spectra: one of ours, or a function of the user's."""
+"""Parameters that name the detector and the estimator of whole spectra: built-in or the user's."""
 
 
 def user_functions(spec: Any) -> Iterator[tuple[str, str]]:
-    """Roles and names of the functions of the user's that a study names."""
+    """Yield role and name of each function of the user's that a spec names."""
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "draws_whole_spectra", False):
         return
@@ -24,5 +24,5 @@ def user_functions(spec: Any) -> Iterator[tuple[str, str]]:
 
 
 def user_modules(spec: Any) -> tuple[str, ...]:
-    """Return the names of the modules whose functions a study names, each once."""
+    """Return the names of the modules whose functions a spec names, each once."""
     return tuple(dict.fromkeys(name.partition(":")[0] for _, name in user_functions(spec)))

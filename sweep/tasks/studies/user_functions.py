@@ -1,7 +1,7 @@
 """Detectors and estimators that are functions of the user's: imported and checked.
 
-A spec names them as ``module:function``; reading it imports nothing. Processes that compute import
-them only from modules that are allowed (:mod:`sweep.tasks.engine.user_code`).
+A spec names them as ``module:function``; reading a spec imports nothing. Processes that compute
+import only modules that are allowed (:mod:`sweep.tasks.engine.user_code`).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ DETECTOR_ROLE, ESTIMATOR_ROLE = SPECTRUM_METHOD_PARAMETERS
 
 
 def check_user_functions(spec: GridSpec | SceneSpec) -> None:
-    """Import the functions that a study names, and try each; CodeError where one fails."""
+    """Import the functions that a study names, and test each; CodeError if one fails."""
     for role, name in user_functions(spec):
         _try_user_function(role, name)
 
 
 def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
-    """Detectors and estimators by the names in the parameters of some points.
+    """Return the built-in detectors and estimators, and the user's that the parameters name.
 
-    As :func:`check_user_functions`.
+    CodeError if a function of the user's is not allowed, or can't be imported.
     """
     from sweep.model.sampling.noisy_spectra import SpectrumMethods
 
@@ -59,7 +59,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 
 @lru_cache(maxsize=64)
 def checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
-    """Wrap a function of the user: read-only arrays, checked answers."""
+    """Return a user's function with read-only arguments and checked results."""
     function = _import_user_function(name)
     definition = f"{name}{_definition_text(function)}"
 
@@ -79,7 +79,7 @@ def checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
 
 
 def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Answer of a function of the user's; a CodeError with its file and line where it fails."""
+    """Call a user's function; CodeError with file and line if it fails."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -88,13 +88,13 @@ def _call_user_function(name: str, function: Callable[..., Any], *arguments: Any
 
 
 def _definition_text(function: Callable[..., Any]) -> str:
-    """File and line at which a function is defined; empty for one that is not in Python."""
+    """Return file and line of a function's definition; '' if it is not in Python."""
     code_object = getattr(getattr(function, "py_func", function), "__code__", None)
     return f" ({code_object.co_filename}:{code_object.co_firstlineno})" if code_object else ""
 
 
 def _error_place_text(error: BaseException, module: ModuleType) -> str:
-    """File, line and function of the user's in which an error arose; empty where unknown."""
+    """Return file, line and function of the user's code that raised an error; '' if unknown."""
     frames = traceback.extract_tb(error.__traceback__)
     file = getattr(module, "__file__", None)
     module_frames = [frame for frame in frames if frame.filename == file]
@@ -134,7 +134,7 @@ def _read_only_view(array: np.ndarray) -> np.ndarray:
 
 
 def _checked_answer(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Return an answer of the right kind."""
+    """Return the array that a function returned; CodeError for a wrong type, shape or value."""
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
     if answer.shape != shape or answer.dtype != dtype:
@@ -147,7 +147,7 @@ def _checked_answer(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dt
 
 
 def _try_user_function(role: str, name: str) -> None:
-    """One call on three spectra of a tone at bin 40.25 of 128, in a little noise."""
+    """Call a function with three spectra of a tone at bin 40.25 of 128 in weak noise."""
     n_samples, generator = 256, np.random.default_rng(1)
     setting = SpectrumSettings(
         fft_size=n_samples,
