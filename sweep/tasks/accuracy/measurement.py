@@ -98,12 +98,34 @@ def measure_accuracy(
 ) -> bool:
     """Try a ladder of settings on a sample of a study's points, and store errors and times.
 
-    The store is written completely, or not at all. The trials take about ``time_limit`` [s].
-    ``progress`` is that of :func:`sweep.tasks.driver.run`. Return False, without a store, if the
-    measurement is interrupted before any point is complete.
+    Parameters
+    ----------
+    spec
+        Study without whole spectra.
+    store_path
+        Path of the store of the results, which is written completely, or not at all.
+    n_points
+        Number of points of the sample.
+    time_limit
+        Approximate time of the trials [s].
+    overwrite
+        Whether to replace earlier results at the path.
+    progress
+        True for a bar or lines on standard error, False for none, or a `Progress`.
 
-    StoreError if a store is in the way or can't be written. TaskError if the study draws whole
-    spectra. SceneError if a file of a scene is missing, changed or invalid.
+    Returns
+    -------
+    bool
+        False, without a store, if the measurement is interrupted before any point is complete.
+
+    Raises
+    ------
+    StoreError
+        If a store is in the way or can't be written.
+    TaskError
+        If the study draws whole spectra.
+    SceneError
+        If a file of a scene is missing, changed or invalid.
     """
     if spec.draws.draws_whole_spectra:
         raise TaskError(

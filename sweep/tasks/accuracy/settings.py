@@ -32,7 +32,7 @@ MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "draws counted",
     "draws in noise",
 )
-"""Kinds of settings."""
+"""Kinds of accuracy settings, by how a point is computed."""
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 

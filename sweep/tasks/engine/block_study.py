@@ -106,7 +106,7 @@ class BlockStudy(StoreTemplate, ABC):
     """
 
     points_noun = "points"
-    """Name of its points, in the plural."""
+    """Noun for the points in messages, in the plural."""
 
     @property
     @abstractmethod
@@ -281,7 +281,7 @@ It must be a function of a module, because it is sent to workers by name.
 
 
 class Workload(Protocol):
-    """What a study asks of the machines that compute it, known from its spec alone."""
+    """Requirements of a study on the machines that compute it, known from its spec alone."""
 
     @property
     def execution(self) -> Execution:

@@ -2,8 +2,8 @@
 
 Python calls a signal handler only between two of its own instructions, but a call of compiled code
 may take minutes, and batch systems kill 30 s after SIGTERM. A watcher thread therefore receives
-each signal as it arrives and prints what happens. If the main thread does not handle a signal that
-should stop it at once, the watcher ends the process, which stores survive as they survive any kill.
+each signal as it arrives and prints a message. If the main thread does not handle a signal that
+should stop it at once, the watcher ends the process. Stores survive this as they survive any kill.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class InterruptHandler:
             self._exit_process(EXIT_INCOMPLETE if is_run_as_command() else 128 + signal.SIGTERM)
         elif is_asked_again and is_run_as_command():
             self._exit_process(EXIT_INCOMPLETE)
-        elif is_asked_again:  # a program of the user's is not ended
+        elif is_asked_again:  # a Python program of the user's is not ended
             self._listener.say("compiled code runs: stopping as soon as it returns")
         else:
             self.print_stopping()

@@ -1,9 +1,8 @@
-"""Python modules of the user's that a run may import: allowed, imported, told apart by digest.
+"""Python modules of the user's that a run may import: permission, import, and digests.
 
 Processes that compute import code of the user's only from modules allowed by ``--allow-code
 MODULE``, by ``allow_code=[...]``, or in the environment variable ``SWEEP_ALLOW_CODE``. A run tells
-its workers, wherever they are, which modules are allowed, and refuses a worker that has another
-file of that name.
+its workers which modules are allowed. It excludes a worker that has another file of that name.
 """
 
 from __future__ import annotations
@@ -25,7 +24,10 @@ ALLOWED_MODULES_VARIABLE = "SWEEP_ALLOW_CODE"
 
 
 def allow_modules(modules: Iterable[str]) -> None:
-    """Allow this process and its workers to import modules, named as before a spec's colon."""
+    """Allow this process, and the processes that it starts, to import modules.
+
+    The names are those before the colon in a spec. CodeError for an invalid name.
+    """
     for module in (modules := list(modules)):
         if module.endswith(".py") or not all(
             name_part.isidentifier() for name_part in module.split(".")
@@ -39,11 +41,14 @@ def allow_modules(modules: Iterable[str]) -> None:
     allowed = {*allowed_modules(), *modules}
     if allowed:
         os.environ[ALLOWED_MODULES_VARIABLE] = ",".join(sorted(allowed))
-        _import_from_working_directory()  # handed on to workers that are spawned
+        _import_from_working_directory()  # spawned workers inherit the search path
 
 
 def _import_from_working_directory() -> None:
-    """Import from the working directory too, and what is found nowhere else: it may be anyone's."""
+    """Append the working directory to Python's search path.
+
+    It comes last, as any user may have put files there.
+    """
     if (working_directory := os.getcwd()) not in sys.path:
         sys.path.append(working_directory)
 
@@ -59,16 +64,16 @@ def module_digests(modules: Iterable[str]) -> dict[str, str]:
 
 
 def _module_file_digest(module: ModuleType) -> str:
-    """Digest of the file of a module; empty where it has none."""
+    """Return the digest of the file of a module; '' if it has none."""
     source = getattr(module, "__file__", None)
     return blake2b(Path(source).read_bytes(), digest_size=16).hexdigest() if source else ""
 
 
 @lru_cache(maxsize=64)
 def allow_same_module(module: str, digest: str) -> None:
-    """Allow a module in this worker, as the run's driver has done; CodeError for another file.
+    """Allow a module in this worker, as in the run's driver; CodeError if its file differs.
 
-    Once a process: what is imported stays as it is, whatever becomes of its file.
+    It is checked once per process: an imported module does not change with its file.
     """
     allow_modules([module])
     imported = import_user_module(module)
@@ -82,7 +87,7 @@ def allow_same_module(module: str, digest: str) -> None:
 
 
 def import_user_module(name: str) -> ModuleType:
-    """Import a module of the user's; a CodeError that says why it can't be."""
+    """Import a module of the user's; CodeError with the reason if that fails."""
     _import_from_working_directory()
     try:
         return import_module(name)
@@ -102,7 +107,7 @@ def import_user_module(name: str) -> ModuleType:
 
 
 def _import_error_place_text(error: BaseException) -> str:
-    """File and line at which importing a module failed."""
+    """Return file and line at which the import of a module failed; '' if unknown."""
     if isinstance(error, SyntaxError):
         return f" ({error.filename}:{error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)

@@ -21,12 +21,12 @@ class WorkerMemory(NamedTuple):
     process_name: str
     """Name of the process in messages, as the subject of a sentence: `this machine`."""
     workers_sharing: int = 1
-    """Number of workers that share this machine's memory; 1 if each has a limit of its own."""
+    """Number of workers that share this machine's memory; 1 if each has a limit."""
 
 
 def serial_worker_memory() -> WorkerMemory:
     """Return the memory available to serial computation in this process."""
-    # Here, as a spec with mistakes is told without the second that this import takes.
+    # Imported here: errors of a spec are reported without the second that this import takes.
     from distributed.system import MEMORY_LIMIT
 
     return WorkerMemory(MEMORY_LIMIT, "this machine")
@@ -50,13 +50,13 @@ def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> Wo
 def _least_memory_limit(client: Client) -> float:
     """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
 
-    Of a client that is closed, or whose scheduler is gone, nothing is known: a study with blocks
-    left says so when it reaches for the workers, and a complete one needs none.
+    inf also if the client is closed or its scheduler is gone. A study with missing blocks then
+    fails when it connects to the workers, and a complete one needs none.
     """
     if client.status != "running":
         return np.inf
     try:
         workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
-    except (OSError, RuntimeError, CancelledError):  # gone meanwhile
+    except (OSError, RuntimeError, CancelledError):  # the scheduler has just gone
         return np.inf
     return min((worker.get("memory_limit") or np.inf for worker in workers), default=np.inf)

@@ -23,7 +23,7 @@ BYTES_PER_BIN = 250
 BYTES_PER_DRAWN_BIN = 300
 """Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22.
 
-The first is for closed-form results, the second for draws of whole spectra.
+`BYTES_PER_BIN` is for closed-form results, `BYTES_PER_DRAWN_BIN` for draws of whole spectra.
 """
 
 

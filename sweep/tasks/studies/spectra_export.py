@@ -36,11 +36,22 @@ def point_spectra(
     n_draws: int,
     first_draw: int = 0,
 ) -> xr.Dataset:
-    """Return spectra of one point of a study, as the study draws them.
+    """Draw the spectra of one point of a study, as the study draws them.
 
-    `parameters` are SI values. The result has the complex ``spectrum`` (draw, segment, frequency),
-    the ``signal`` without noise, and the true quantities. All effects are simulated that are not
-    off and not absent from the point. The draws begin at ``first_draw``.
+    Parameters
+    ----------
+    spec
+        Study of whole spectra or not, for its effects and seed.
+    parameters
+        SI values of all parameters of the point, by path.
+    n_draws, first_draw
+        Number of draws, and number of the first one.
+
+    Returns
+    -------
+    xarray.Dataset
+        Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and the true
+        quantities. All effects are simulated that are not off and not absent from the point.
     """
     from sweep.model.sampling.noisy_spectra import (
         draw_bin_speckle,
@@ -183,8 +194,19 @@ def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarr
 def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
     """Write spectra as a Zarr store or as a NumPy archive, by the suffix of the path.
 
-    StoreError for another suffix, or if something exists at the path. `overwrite` replaces only
-    files of spectra.
+    Parameters
+    ----------
+    dataset
+        Spectra of :func:`point_spectra`.
+    path
+        Path that ends in .zarr or .npz.
+    overwrite
+        Whether to replace a file of spectra at the path; no other file is replaced.
+
+    Raises
+    ------
+    StoreError
+        For another suffix, or if something exists at the path.
     """
     if path.suffix not in FILE_SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(FILE_SUFFIXES)}")

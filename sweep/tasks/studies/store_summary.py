@@ -427,7 +427,7 @@ def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """State of a store."""
+    """State of a store: points and blocks done, failures, lock, and rate of the last run."""
 
     store: Location
     title: str
@@ -460,7 +460,23 @@ class Status:
 
 
 def status(store: str | Location) -> Status:
-    """Return the state of a store by its log of receipts, without checking that chunks exist."""
+    """Return the state of a store by its logs, without checking that its chunks exist.
+
+    Parameters
+    ----------
+    store
+        Path of a store: on disk, or `s3://bucket/key.zarr` (gs, az).
+
+    Returns
+    -------
+    Status
+        Points and blocks done, failures, the holder of the lock, and the rate of the last run.
+
+    Raises
+    ------
+    StoreError
+        If there is no store of sweep, or if its study can't be read.
+    """
     store_path = parse_location(store)
     attributes, study = study_loading.read_study(store_path)
     run_start = journal.last_run_start(store_path)

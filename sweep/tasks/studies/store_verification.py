@@ -99,11 +99,29 @@ def verify(
     """Check every byte of a store, and of the eyepoint stores that its study uses.
 
     Receipts of damaged blocks are withdrawn, so that `resume` computes them again, unless another
-    process writes to the store. `repair` restores metadata, coordinates and the spec. `spec` states
-    the study of a store that no longer contains it.
+    process writes to the store.
 
-    StoreError if there is no store of sweep, if it holds another study than `spec`, or if it can't
-    be repaired.
+    Parameters
+    ----------
+    path
+        Path of a store: on disk, or `s3://bucket/key.zarr` (gs, az).
+    repair
+        Whether to restore damaged metadata, coordinates and the spec.
+    spec
+        Study of a store that no longer contains it; used by `repair` only.
+    progress
+        True for a bar or lines on standard error, False for none, or a `Progress`.
+
+    Returns
+    -------
+    list of Report
+        Result for the store, then for each eyepoint store that exists.
+
+    Raises
+    ------
+    StoreError
+        If there is no store of sweep, if it holds another study than `spec`, or if it can't be
+        repaired.
     """
     path, listener = parse_location(path).absolute(), make_progress(progress)
     recover_interrupted_replace(path)
@@ -425,10 +443,25 @@ SHARD_BYTES_MAX = 64 << 20
 def pack_store(
     store_path: str | Location, output: str | Location, *, progress: bool | Progress = True
 ) -> Location:
-    """Copy a complete store into one of few files with many chunks each: completely, or not at all.
+    """Copy a complete store into a store of few files with many chunks each.
 
-    StoreError if the store is incomplete, if something is at the path of the copy, or if the copy
-    can't be written and read back.
+    Parameters
+    ----------
+    store_path, output
+        Paths of the store and of its copy. The copy is written completely, or not at all.
+    progress
+        True for a bar or lines on standard error, False for none, or a `Progress`.
+
+    Returns
+    -------
+    Location
+        Path of the copy.
+
+    Raises
+    ------
+    StoreError
+        If the store is incomplete or packed already, if something is at the path of the copy, or if
+        the copy can't be written and read back.
     """
     store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
     attributes, study = study_loading.read_study(store_path)

@@ -100,7 +100,27 @@ class StudyPlan:
 def plan_study(
     spec: GridSpec | SceneSpec, *, store_path: Location | None = None, n_workers: int | None = None
 ) -> StudyPlan:
-    """Plan a study from its size, and from points that are computed for about a second."""
+    """Plan a study from its size, and from points that are computed for about a second.
+
+    Parameters
+    ----------
+    spec
+        Study to plan.
+    store_path
+        Path of its store; eyepoints that exist there need not be cast.
+    n_workers
+        Number of workers; by default that of the spec's `execution`, else all cores.
+
+    Returns
+    -------
+    StudyPlan
+        Numbers of points, blocks and chunks, size, time and memory.
+
+    Raises
+    ------
+    SpecError
+        If a point, a block or the scene needs more memory than this machine has.
+    """
     refuse_too_large_point(spec, serial_worker_memory())
     study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
     refuse_too_large_blocks(study, serial_worker_memory())
@@ -347,7 +367,7 @@ COST_ROUND_SECONDS = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class EffectRow:
-    """Row of the table of effects."""
+    """Simulation, largest change and cost of one effect in a study."""
 
     name: str
     mode: str
@@ -380,9 +400,19 @@ class EffectsTable:
 
 
 def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
-    """Return the table of a study's effects from the plans of its tiles.
+    """Return the table of a study's effects, from the plans of a sample of its tiles.
 
-    `costs` measures the time that each effect takes.
+    Parameters
+    ----------
+    study
+        Study over a grid, or flight.
+    costs
+        Whether to measure the fraction of time that each effect takes.
+
+    Returns
+    -------
+    EffectsTable
+        Where each effect is simulated, the largest change by it, and its cost.
     """
     if isinstance(study, GridStudy):
         return _grid_effects_table(study, costs)
