@@ -252,5 +252,5 @@ class BlockGrid:
 
 
 #: Largest number of blocks of a study: a run keeps some 30 bytes per block in memory, and a block
-#: takes files.
+#: is stored in one file per array.
 BLOCKS_MAX = 2 * 10**7

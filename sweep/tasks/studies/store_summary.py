@@ -195,10 +195,10 @@ class ScannerRow:
 
     label: str
     n_shots: int = 0  # number of shots times draws
-    shots_with_true_return: int = 0  # number of these with at least one true return
+    shots_with_true_return: int = 0  # number of shots, times draws, with at least one true return
     false_points: int = 0  # number of points that are no true return
     n_cycles: int = 0  # number of cycles times draws; 0 if a cycle has too few shots
-    solved_cycles: int = 0  # number of these with a velocity vector
+    solved_cycles: int = 0  # number of cycles, times draws, with a velocity vector
     pd_of_shots: list[np.ndarray] = field(default_factory=list, repr=False)
 
     @property
@@ -276,7 +276,7 @@ class AccuracyRow:
     n_points: int = (
         0  # points computed with a known error; for a flight shots times points of the axes
     )
-    n_met: int = 0  # number of these within the tolerance
+    n_met: int = 0  # number of points within the tolerance
     worst_error: float = (
         math.nan
     )  # error, as a half-width, of the point with the largest excess over its tolerance
