@@ -99,10 +99,19 @@ class StoreTemplate(Protocol):
 
 
 class BlockStudy(StoreTemplate, ABC):
-    """A study as the engine sees it: blocks of points, numbered grid by grid.
+    """Study as the engine sees it: blocks of points, numbered grid by grid.
 
-    A kind of study implements the abstract methods, and :class:`StoreTemplate`. One whose blocks
-    may be stopped in the middle sets `has_checkpoints` and overrides `evaluate_until`.
+    A kind of study implements these parts:
+
+    * `id`, `model_version`, `store_attributes` and `group_attributes`: identity, and attributes of
+      its store. Equal ids have equal results, to the bit.
+    * `grids`: how its points are cut into blocks, one grid per group of the store.
+    * `constant_arrays` and `output_layouts`: its arrays, with values, and to be written by blocks.
+    * `evaluate` and `compile_kernels`: computation of one block.
+    * `has_checkpoints` and `evaluate_until`, if a block can stop at a deadline and be continued.
+    * `pop_reused_points`, if results of another store are reused.
+
+    Workers read the study of a store by `Workload.read_study`.
     """
 
     points_noun = "points"
