@@ -320,6 +320,7 @@ def _check_spec_type(spec: object) -> None:
 def _read_resumable_study(
     store_path: Location,
 ) -> tuple[dict[str, object], GridStudy | FlightStudy]:
+    """Return the attributes of a store, and its study; StoreError if it can't be resumed."""
     attributes, study = study_loading.read_study(store_path)
     if isinstance(study, EyepointStudy):
         raise StoreError(
@@ -523,6 +524,10 @@ def _compute_missing(
     backend: ComputeBackend,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
+    """Lock a store and compute its missing blocks; of a flight, its missing eyepoints first.
+
+    `prepare` creates the store if needed. It is called before the store is locked.
+    """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)
     refuse_too_large_blocks(study, backend.memory)

@@ -155,6 +155,7 @@ def measure_accuracy(
 
 
 def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
+    """Raise a StoreError if something at a path may not be replaced."""
     if is_free(store_path):
         return
     if store_format.read_attributes(store_path)["kind"] != ACCURACY_KIND:
@@ -236,6 +237,10 @@ class Measurement:
             self._progress.end()
 
     def _run_rounds(self, parts: list[np.ndarray], n_rounds: int) -> AccuracyTemplate:
+        """Run the rounds, and compare with the time domain after the first one.
+
+        Return the content of the store.
+        """
         first_round, stop_reason = (
             self._run_round(parts, time_fraction=FIRST_ROUND_TIME_FRACTION),
             "",
@@ -322,9 +327,11 @@ class Measurement:
 
     @property
     def _elapsed_seconds(self) -> float:
+        """Time since the start of the trials [s]."""
         return time.monotonic() - self._start
 
     def _time_trial(self, setting_number: int, part: np.ndarray) -> float:
+        """Try a setting on a part of the sample. Return the wall time [s]."""
         start = time.monotonic()
         if self._interrupts.is_stopping:
             raise NothingMeasured
@@ -333,6 +340,7 @@ class Measurement:
         return time.monotonic() - start
 
     def _try_setting(self, setting_number: int, part: np.ndarray) -> Trial:
+        """Try a setting on a part of the sample, timed on as many points as are planned."""
         return self._sample.try_setting(
             self._settings[setting_number], part, int(self._n_timed_points[setting_number])
         )

@@ -379,6 +379,7 @@ def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
 
 
 def _is_on_axis(spec: AnySpec, path: str) -> bool:
+    """Return True if an axis of the spec varies a parameter."""
     return any(member.path == path for axis in spec.axes for member in axis.parameters)
 
 

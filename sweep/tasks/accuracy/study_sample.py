@@ -564,6 +564,7 @@ class FlightSample(StudySample):
                 yield scanner_grid.first_flight_block(tuple(map(int, axis_indices))), shot_numbers
 
     def _make_study(self, setting: AccuracySetting) -> FlightStudy:
+        """Return the study of the flight with a setting."""
         spec: Any = setting.apply_to(self.spec)
         # all studies share a scene, as building it can take seconds
         study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))

@@ -146,6 +146,7 @@ def _start_workers(
     bounds: WorkerBounds,
     processes: bool,
 ) -> Any:
+    """Start the workers of a cluster that ends with this process; ClusterError if that fails."""
     import dask
 
     try:
@@ -183,6 +184,7 @@ def _keep_workers_in_bounds(
 
 
 def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
+    """Return the number of workers, and where they run, as text."""
     count_text = (
         f"{bounds.least} to {bounds.most}" if bounds.least < bounds.most else f"{bounds.most}"
     )

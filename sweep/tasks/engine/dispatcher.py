@@ -264,6 +264,7 @@ class TaskDispatcher:
         return bool(self._excluded_workers) and not self._usable_workers()
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
+        """Submit tasks until twice as many are in flight as there are worker threads."""
         n_slots = self._slots.current_count()
         if time.monotonic() - self._duplicated_at > SLOT_COUNT_AGE_MAX:
             self._duplicated_at = time.monotonic()
@@ -295,6 +296,7 @@ class TaskDispatcher:
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
     def _submit(self, task: _InFlightTask, **placement: Any) -> None:
+        """Submit a task, with further arguments of `Client.submit`."""
         first_block = task.blocks[0]
         key = task_key(
             self._settings,
@@ -369,6 +371,7 @@ class TaskDispatcher:
         )
 
     def _next_result(self) -> TaskResult:
+        """Return the result of the next task that ends; an empty one after `IDLE_POLL_SECONDS`."""
         task_result = TaskResult()
         try:
             future = self._finished_futures.get(timeout=IDLE_POLL_SECONDS)
@@ -383,6 +386,7 @@ class TaskDispatcher:
         return task_result
 
     def _finish_task(self, future: Future) -> TaskResult:
+        """Return the result of a task that has ended, and update the state of the run by it."""
         task = self._in_flight[future.key]
         for key in task.futures:
             del self._in_flight[key]
@@ -462,6 +466,7 @@ class TaskDispatcher:
         self._say(f"worker {worker} on {host} is left out: {error}")
 
     def _check_connection(self) -> None:
+        """Raise a SchedulerLostError if the client is not connected."""
         if self._client.status != "running":
             raise SchedulerLostError(f"the client is {self._client.status}")
 

@@ -320,6 +320,7 @@ def _is_nonempty_file(status: os.stat_result) -> bool:
 def _iter_chunk_keys(
     folder: ObjectPath, shape: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], int]]:
+    """Yield position and size [bytes] of the chunks of an array in an object store."""
     if not shape:
         yield (), max(0, folder.size())
         return
@@ -463,10 +464,12 @@ def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
 
 
 def _checkpoint_path(store_path: Location, block: int) -> Location:
+    """Return the path of a block's checkpoint."""
     return store_path / JOURNAL_DIR / f"{CHECKPOINT_PREFIX}{block}"
 
 
 def _checkpoint_arrays(results: ReusedResults) -> dict[str, Any]:
+    """Return the arrays of a checkpoint, by the names in its archive."""
     return {
         f"{part}/{name}": values
         for part, (points, arrays) in results._asdict().items()
@@ -475,6 +478,7 @@ def _checkpoint_arrays(results: ReusedResults) -> dict[str, Any]:
 
 
 def _content_digest(content: bytes) -> str:
+    """Return the digest of a checkpoint's content."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
@@ -609,6 +613,7 @@ def heartbeat_age(store_path: Location) -> float:
 
 
 def _modification_time(path: Location) -> float | None:
+    """Return the modification time of a file [s since the epoch]; None if it is missing."""
     if isinstance(path, ObjectPath):
         return path.last_modified()
     try:
@@ -746,6 +751,7 @@ class _FileLock:
 
 
 def _read_lock_file(lock_path: Path) -> str | None:
+    """Return the text of a lock file; None if it is missing."""
     try:
         descriptor = open_regular(lock_path, follow_links=False)
     except FileNotFoundError:
@@ -832,10 +838,12 @@ class _ObjectLock:
 
 
 def _first_line(content: bytes) -> str:
+    """Return the first line of a lock's content, which names the holder."""
     return content.decode("utf-8", "replace").partition("\n")[0]
 
 
 def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
+    """Return the lock of a store, on disk or in an object store."""
     lock_path = store_path / JOURNAL_DIR / LOCK_FILE
     return _ObjectLock(lock_path) if isinstance(lock_path, ObjectPath) else _FileLock(lock_path)
 
@@ -925,6 +933,7 @@ class StoreLock:
         raise self._busy_error(other_holder)
 
     def _refuse_living_holder(self) -> None:
+        """Raise a BusyError if another process holds the lock, and is not known to be dead."""
         other_holder = read_lock_holder(self._store_path)
         if (
             other_holder is None
@@ -939,6 +948,7 @@ class StoreLock:
             raise self._busy_error(other_holder)
 
     def _busy_error(self, other_holder: LockHolder) -> BusyError:
+        """Return the error of a lock that another process holds."""
         holder_text = (
             f"process {escape_to_one_line(other_holder.pid)} on "
             f"{escape_to_one_line(other_holder.host)}"
@@ -949,6 +959,7 @@ class StoreLock:
         )
 
     def _send_heartbeats(self) -> None:
+        """Update the heartbeat until the lock is released."""
         while not self._is_released.wait(HEARTBEAT_INTERVAL):
             try:
                 if self.is_held():

@@ -102,6 +102,7 @@ class _GuardedListener(Progress):
         self._listener, self._has_failed = listener, False
 
     def _call_listener(self, method: str, *values: Any, **keywords: Any) -> None:
+        """Call a method of the listener, unless an earlier call has failed."""
         if self._has_failed:
             return
         try:

@@ -622,6 +622,7 @@ class Session:
                 self._interrupts.is_computing = False
 
     def _compile_kernels(self) -> None:
+        """Compile the kernels of the study, which workers then load from the cache on disk."""
         if self._backend.options.evaluate:  # the model is not used
             return
         gc_threshold = gc.get_threshold()
@@ -631,6 +632,7 @@ class Session:
         gc.set_threshold(*gc_threshold)
 
     def _consume_results(self, task_results: Iterator[TaskResult], block_queue: BlockQueue) -> str:
+        """Commit results of tasks as they arrive. Return the reason for stopping early, or ''."""
         no_worker_monitor = NoWorkerMonitor()
         for task_result in task_results:
             if not self._lock.is_held():
@@ -656,6 +658,7 @@ class Session:
         return "interrupted" if self._interrupts.is_stopping else ""
 
     def _commit(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
+        """Append receipts and failures to the journal, and report the progress."""
         points_before, failures_before = self._points_so_far(), len(self._permanent_failures)
         self._journal.commit(*task_result.receipts)
         self._unflushed_receipts += task_result.receipts

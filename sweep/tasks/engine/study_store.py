@@ -142,6 +142,7 @@ def create_store(
 def _build_store(
     store_path: Path, template: StoreTemplate, recipe: Mapping[str, Any] | None
 ) -> None:
+    """Create a store without results on disk, with its recipe."""
     build_template(store_path, template, template_attributes(template))
     if recipe:
         write_recipe(store_path, **recipe)
@@ -250,6 +251,7 @@ def write_manifest(
 def _create_array(
     group: zarr.Group, layout: ArrayLayout, shard_shape: tuple[int, ...] | None
 ) -> None:
+    """Create an array in a group, and write its values if they are known."""
     fill_option: dict[str, Any] = (
         {} if layout.fill_value is None else {"fill_value": layout.fill_value}
     )

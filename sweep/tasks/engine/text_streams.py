@@ -99,6 +99,7 @@ class ForgivingStream(io.TextIOBase):
             self._go_silent(error)
 
     def _go_silent(self, error: Exception) -> None:
+        """Make the stream drop all further text, and record the error."""
         self.failure = error
         with suppress(OSError, ValueError):
             if (descriptor := self.fileno()) in STANDARD_DESCRIPTORS:

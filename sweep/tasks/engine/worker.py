@@ -104,6 +104,7 @@ def block_writer_of_store(
 def _open_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
+    """Open the store of a study for writing; StoreError for another study or other versions."""
     attributes, stored_study = read_study(parse_location(store_path))
     _refuse_replaced_store(store_path, study_id)
     study_store.refuse_other_versions(
@@ -168,6 +169,7 @@ def _run_blocks(
     blocks: list[int],
     settings: TaskSettings,
 ) -> None:
+    """Compute and write blocks, and add their receipts, failures and points to the result."""
     receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL
     for block in blocks:
         try:
@@ -357,6 +359,7 @@ class BlockQueue:
 
 
 def _iter_unmarked(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
+    """Yield the indices of False elements, found in steps of `step` elements."""
     for start in range(0, mask.size, step):
         yield from (start + np.flatnonzero(~mask[start : start + step])).tolist()
 

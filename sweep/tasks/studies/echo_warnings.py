@@ -507,6 +507,7 @@ def _exchanged_warning(
 
 
 def _fraction_text(mask: np.ndarray) -> str:
+    """Return the fraction of True elements in per cent, as text."""
     return f"{100 * np.count_nonzero(mask) / mask.size:.3g} %"
 
 
@@ -528,6 +529,7 @@ def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | No
 
 
 def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
+    """Diagnose the echoes of a grid at points that differ in `ECHO_PARAMETERS`."""
     axes = study.spec.axes
     sizes = [axis.size for axis in axes]
     used_indices = [
@@ -554,6 +556,7 @@ def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
 
 
 def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
+    """Diagnose the echoes of shots spread over a flight, at the ends of its axes."""
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 

@@ -207,6 +207,7 @@ class EyepointStudy(BlockStudy):
         )
 
     def _cycle_arrays(self, shot_arrays: Results) -> Results:
+        """Return the arrays of cycles from those of their shots."""
         cycle_starts = slice(None, None, self.shots_per_cycle)
         time, position = (
             shot_arrays["time"][cycle_starts],

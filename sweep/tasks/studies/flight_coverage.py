@@ -106,6 +106,7 @@ def refuse_flight_without_hits(spec: SceneSpec) -> None:
 
 
 def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
+    """Cast a sample of the shots of one scanner. Return its hits."""
     study = EyepointStudy(spec, name)
     n_shots_max, shots_per_cycle = (
         max(1, SAMPLED_RAYS_PER_SCANNER // study.n_beamlets),
@@ -150,10 +151,12 @@ def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
 
 
 def _bounding_box(points: np.ndarray) -> np.ndarray:
+    """Return the least and largest coordinates of points (n, 3), as (2, 3)."""
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _box_text(box: np.ndarray) -> str:
+    """Return the ranges of x, y and z of a box as text."""
     axis_texts = (
         f"{axis} {low:.6g}" + (f" to {high:.6g}" if high != low else "")
         for axis, low, high in zip("xyz", *box, strict=True)

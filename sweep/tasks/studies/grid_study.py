@@ -81,6 +81,7 @@ def canonical_point_rows(parameters: Mapping[str, ParameterValue], n_points: int
 
 
 def _value_bits(value: ParameterValue) -> np.ndarray:
+    """Return values as uint64: bits of their float64, or hashes of strings."""
     array = np.asarray(value)
     if array.dtype.kind == "U":
         names, inverse = np.unique(array, return_inverse=True)
@@ -91,6 +92,7 @@ def _value_bits(value: ParameterValue) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _text_hash(word: str) -> int:
+    """Return 62 bits of the hash of a string."""
     # 62 bits: as a float64 with the upper two bits clear the hash is never nan
     digest = hashlib.blake2b(word.encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 2
@@ -210,6 +212,7 @@ class TileGrid(BlockGrid):
             yield TileGroup(int(group_code), members, parameters)
 
     def _is_constant_in_tile(self, axis: int) -> bool:
+        """Return True if the values of an axis must not vary within a tile."""
         return any(
             values.dtype.kind in "UO" or path in CONSTANT_IN_TILE or path in EFFECT_CATEGORY_PATHS
             for path, values in self.grid.values_by_axis[axis].items()
@@ -218,6 +221,7 @@ class TileGrid(BlockGrid):
     def _values_along(
         self, axis: int, tile_index_along: np.ndarray, stride: int
     ) -> dict[str, ParameterValue]:
+        """Return the values of an axis in tiles, by path, shaped to broadcast with other axes."""
         members = self.grid.values_by_axis[axis]
         if self._is_constant_axis[axis]:
             tile_index = int(tile_index_along[0])
@@ -668,6 +672,7 @@ def iter_block_results(
 def _unfinished_block(
     spec: GridSpec, finished: list[PartialResults], unfinished: PartialResults
 ) -> UnfinishedBlock:
+    """Return the exception of a block that stops at its deadline, with the results so far."""
     results = ReusedResults(
         concatenate_results([part for part in finished if part.local_indices.size]), unfinished
     )
@@ -713,6 +718,7 @@ def select_parameters(
 
 
 def _points_per_call(spec: GridSpec) -> int:
+    """Return the number of points per call of the model."""
     return max(1, min(POINTS_PER_CALL_MAX, COUNTS_PER_CALL_MAX // max(1, len(batch_sizes(spec)))))
 
 
@@ -777,6 +783,7 @@ def _simulate_draws(
     prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
+    """Draw points until all draws are made, the tolerance is met, or `should_stop`."""
     from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods
 

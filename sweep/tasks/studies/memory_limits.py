@@ -98,6 +98,7 @@ def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> N
 
 
 def _available_phrase(worker_memory: WorkerMemory) -> str:
+    """Return the available memory as a clause of a message."""
     return f"and {worker_memory.process_name} has {_gigabytes_text(worker_memory.bytes_max)}"
 
 
@@ -112,4 +113,5 @@ def _fewer_workers_remedy(worker_memory: WorkerMemory, bytes_needed: float) -> s
 
 
 def _gigabytes_text(n_bytes: float) -> str:
+    """Return a size in GB as text."""
     return f"{n_bytes / 1e9:,.1f} GB"

@@ -132,6 +132,7 @@ def _spectra_dataset(
     signals_by_draw: list[list[Any]],
     draw_numbers: np.ndarray,
 ) -> xr.Dataset:
+    """Return spectra, signals and true quantities as a Dataset."""
     import xarray as xr
 
     bin_width = float(shots.sample_rate[0]) / shots.fft_size

@@ -173,6 +173,7 @@ def _axis_range_label(axis: Axis, start: int, end: int) -> str:
 
 
 def _format_value(value: object) -> str:
+    """Return a value of an axis as text."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"

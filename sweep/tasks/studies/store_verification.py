@@ -168,6 +168,7 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
 def _verify_store(
     store_path: Location, study: AnyStudy | None, repair: bool, progress: Progress
 ) -> Report:
+    """Verify one store; restore its template if `repair`."""
     template_damage, restored = study_store.template_damages(store_path), []
     if template_damage and study and repair:
         study_store.refuse_foreign_store(store_path)  # a lock would be its first file made by sweep
@@ -190,6 +191,7 @@ def _verify_store(
 
 
 def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: list[Damage]) -> int:
+    """Count the committed blocks without damage."""
     is_undamaged = journal.blocks_with_receipt(store_path, study)
     is_undamaged[[damage.block for damage in damages]] = False
     return int(np.count_nonzero(is_undamaged))
@@ -282,6 +284,7 @@ def _iter_block_damages(
 def _damages_of_block(
     store_path: Location, study: BlockStudy, block: int, expected_digest: bytes
 ) -> list[Damage]:
+    """Return the damages of a block's chunks, whose digest is in its receipt."""
     chunk_paths, bytes_max = (
         study_store.chunk_names_of_block(study, block),
         study_store.chunk_size_limits(study),
@@ -545,6 +548,7 @@ def _pack_array(source: Any, output: Location) -> None:
 def _copy_region(
     source: zarr.Array[Any], target: zarr.Array[Any], region: tuple[slice, ...]
 ) -> None:
+    """Copy a region of an array, and compare it as read back; OSError if it differs."""
     values = np.asarray(source[region or ...])
     target[region or ...] = values
     read_back = np.asarray(target[region or ...])

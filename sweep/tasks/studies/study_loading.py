@@ -229,6 +229,7 @@ class ReuseSource:
                 )
 
     def _match_group(self, group: str) -> PointMatching:
+        """Return the matching of points between the grids of a group in both studies."""
         source_grid, target_grid = (
             next(grid for grid in study.grids if grid.group == group)
             for study in (self.source_study, self._target_study)
@@ -263,6 +264,7 @@ class ReuseSource:
 
     @cached_property
     def _source_arrays(self) -> Any:
+        """Arrays of the older store, opened once."""
         return open_array_group(self._source_path)
 
     def reuse_remark(self) -> str:
@@ -457,6 +459,7 @@ def _scanner_names(spec: AnySpec) -> Collection[str]:
 
 
 def _field_value(spec: AnySpec, path: str) -> float:
+    """Return a numeric field of a spec by dotted path."""
     section, _, name = path.partition(".")
     return float(getattr(getattr(spec, section), name))
 

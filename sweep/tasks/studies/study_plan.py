@@ -311,6 +311,7 @@ def time_points(
 
 
 def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    """Return the plan of a scanner, with times measured on a sample of its cycles."""
     scanner_grid = study.scanner_grids[eyepoints.scanner]
     flight_block = scanner_grid.flight_block(0)
     flight_block = flight_block._replace(draws=flight_block.draws[:TIMED_DRAWS_MAX])
@@ -420,6 +421,7 @@ def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> Effe
 
 
 def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
+    """Return the table of effects of a grid, from a sample of its tiles."""
     spec, effect_planner = study.spec, study.effect_planner
     n_tiles = effect_planner.tiles.n_blocks
     tiles = np.unique(
@@ -465,6 +467,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
 
 
 def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
+    """Return the table of effects of a flight, from tiles spread over it and its axes."""
     tile_effects, tile_times, n_shots = [], [], 0
     axes = tuple(int(axis.size) for axis in study.spec.axes)
     axis_points = list(np.ndindex(axes))
@@ -554,6 +557,7 @@ def _make_effects_table(
 
 
 def _time_range_text(times: np.ndarray) -> str:
+    """Return a range of times as text."""
     first, last = times.min(), times.max()
     return f"time {first:.4g} s" if first == last else f"time {first:.4g}..{last:.4g} s"
 

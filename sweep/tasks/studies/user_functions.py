@@ -106,6 +106,7 @@ def _error_place_text(error: BaseException, module: ModuleType) -> str:
 
 
 def _import_user_function(name: str) -> Callable[..., Any]:
+    """Import a user's function; CodeError if it is not allowed, missing, or no function."""
     module, _, attribute = name.partition(":")
     if module not in user_code.allowed_modules():
         raise CodeError(
@@ -128,6 +129,7 @@ def _import_user_function(name: str) -> Callable[..., Any]:
 
 
 def _read_only_view(array: np.ndarray) -> np.ndarray:
+    """Return a view of an array that can't be written."""
     view = array.view()
     view.flags.writeable = False
     return view

@@ -63,6 +63,7 @@ def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> It
 
 
 def _delete_resource(kubernetes_object: Any) -> None:
+    """Delete a resource of Kubernetes; errors are ignored."""
     with suppress(Exception):  # removed, or out of reach: the results are stored anyway
         kubernetes_object.delete()
 
@@ -99,6 +100,7 @@ def _reach_service(service: Any, cluster: KubernetesClusterConfig) -> Iterator[s
 
 
 def _is_known_host(name: str) -> bool:
+    """Return True if the name of a host can be resolved."""
     try:
         socket.getaddrinfo(name, SCHEDULER_PORT)
     except OSError:
@@ -196,6 +198,7 @@ def _fill_pod(
 
 
 def _tls_arguments(cluster: KubernetesClusterConfig) -> list[str]:
+    """Return the command-line arguments of TLS; empty without certificates."""
     if not cluster.security:
         return []
     name_by_option = {"ca-file": "ca", "cert": "certificate", "key": "key"}
