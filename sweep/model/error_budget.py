@@ -129,7 +129,10 @@ class ErrorBudget:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any], **overrides: Any) -> "ErrorBudget":
-        """Return the accuracy stated by parameters by dotted path; `overrides` set other fields."""
+        """Return the budget with the values under ``accuracy.`` in `parameters`, by dotted path.
+
+        `overrides` set other fields.
+        """
         names = ("tolerance", "confidence", "line_error", "leakage_error", "leakage_floor")
         stated_values = {name: parameters[f"accuracy.{name}"] for name in names
                  if f"accuracy.{name}" in parameters}  # fmt: skip

@@ -74,8 +74,8 @@ ECHO_NOISE_SOURCES = frozenset({"signal_shot"})
 """Noise sources that are present only with an echo; the threshold does not depend on them."""
 
 LINE_APPROXIMATIONS_MAX = 2
-"""Largest number of steps of a sum of lines that omit something; each may err by the same amount.
-"""
+"""Largest number of approximations in one sum of lines. The tolerated error is divided equally
+among them."""
 
 
 class PhaseError(NamedTuple):

@@ -279,7 +279,7 @@ COMPONENTS = {VELOCITY: ("x", "y", "z"), ALTITUDE: ("",)}
 
 UNIT_BY_QUANTITY = {VELOCITY: "m/s", ALTITUDE: "m"}
 LENGTH_NAME = "vector"
-"""Name of the length of a vector, among its components."""
+"""Label of a vector's length where it is listed after the components x, y, z."""
 
 ComponentStatistic = tuple[str, int]
 """Name of a statistic, and index of its component; the index m stands for the length."""

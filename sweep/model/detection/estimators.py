@@ -314,10 +314,11 @@ class RangeVelocityDeviation(NamedTuple):
 
 
 def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
-    """Power of a tone over that of the noise before the FFT, from that of a tone's bin after it.
+    """Return the tone-to-noise power ratio before the FFT, by the SNR of its strongest bin after it.
 
-    A tone between bins has its scalloping loss more than its strongest bin shows. On a bin
-    |X| = A sum(w) / 2; the noise has the power sum(w^2) s^2.
+    The tone is taken to lie on a bin; between bins the true ratio is higher by the scalloping loss.
+    For a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2 on a bin, and a
+    bin's noise power is sum(w^2) s^2.
     """
     return np.asarray(snr, float) * 2 * window.energy / window.sum**2
 

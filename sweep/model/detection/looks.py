@@ -506,7 +506,7 @@ class Looks(NamedTuple):
 
         It keeps its digits where the probability itself leaves float64's range.
 
-        >>> round(float(Looks(4).log_alarm(np.array(2.0))), 4)  # ln Q(4, 8)
+        >>> round(float(Looks(4).log_pfa(np.array(2.0))), 4)  # ln Q(4, 8)
         -3.1611
         """
         y, n = 0.5 * np.square(np.asarray(threshold_ratio, float)), self.number
@@ -528,7 +528,7 @@ class Looks(NamedTuple):
             return np.minimum(special.logsumexp(log_combinations + log_terms, axis=-1), 0.0)
 
     def threshold_ratio_from_log_pfa(self, log_pfa: np.ndarray) -> np.ndarray:
-        """Threshold over sigma at which :meth:`log_pfa` is so much."""
+        """Return the threshold over sigma at which :meth:`log_pfa` equals ``log_pfa``."""
         if self.is_noncoherent:
             return solve_threshold_ratio(np.asarray(log_pfa, float), self.log_pfa)
         return np.asarray(np.sqrt(-2 * np.asarray(log_pfa)))

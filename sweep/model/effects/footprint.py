@@ -116,14 +116,17 @@ FOOTPRINT_PHASE = Effect(
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by the ranges of other surfaces than the axis's.
+    """Bound the change of the largest bin because other surfaces lie at other ranges.
+
+    None if all power is on the surface that the beam's axis meets.
 
     Notes
     -----
     Let a fraction f of the power be off the axis's surface, and let the lines of the axis's surface
     have the power a in their largest bin. With the effect the largest bin holds at least a, and no
-    bin holds more than a + f. Without it the largest bin holds at least a, and at most a and f's
-    line on the axis. If amplitudes add, only the sum in phase is a bound.
+    bin holds more than a + f. Without it the power f lies at the range of the axis, so the largest
+    bin holds at most a plus the peak power of a line of power f there. If amplitudes add, the only
+    bound is their sum in phase.
     """
     off_axis_fraction = np.minimum(points.footprint_extent.off_axis_fraction, 1.0)
     if not (off_axis_fraction > 0).any():

@@ -46,7 +46,8 @@ class TurbulenceProfile(NamedTuple):
     """Profile of the refractive index's structure constant over height above the ground."""
 
     uniform: float = 0.0
-    """Part that is constant over height [m^(-2/3)]; alone, a constant C_n^2."""
+    """Part of C_n^2 that is the same at all heights [m^(-2/3)]. If the other fields are 0, it is
+    C_n^2."""
     surface_layer: float = 0.0
     """Hufnagel and Valley's A, the value on the ground [m^(-2/3)]: 1.7e-14; it falls by e over 100
     m."""

@@ -709,5 +709,5 @@ def write_failure_text(store_path: Location, error: OSError) -> str:
 
 
 def _store_exists(store_path: Location) -> bool:
-    """Return True if the root of the store exists; writers may create folders of a lost store."""
+    """Return True if the store's root metadata, zarr.json, exists."""
     return (store_path / "zarr.json").exists()

@@ -506,7 +506,7 @@ class GridStudy(ExtendableStudy):
 
     @property
     def has_checkpoints(self) -> bool:
-        """True if points are drawn, as a block can stop between draws."""
+        """True if the study makes random draws: a block can stop between two draws."""
         return self.spec.draws.has_draws
 
     def evaluate_until(
