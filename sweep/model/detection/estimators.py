@@ -314,7 +314,7 @@ class RangeVelocityDeviation(NamedTuple):
 
 
 def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
-    """Return the tone-to-noise power ratio before the FFT, by the SNR of its strongest bin after it.
+    """Return the tone-to-noise power ratio before the FFT, by the SNR of its strongest bin.
 
     The tone is taken to lie on a bin; between bins the true ratio is higher by the scalloping loss.
     For a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2 on a bin, and a
