@@ -13,7 +13,7 @@ from sweep.model import waveform
 from sweep.model.beamlet_counts import split_with_beamlet_counts
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.echo_detection import at_least_two_of_three
-from sweep.model.detection.looks import pd_and_miss_any_two_in_speckle
+from sweep.model.detection.looks import DetectionArrays, pd_and_miss_any_two_in_speckle
 from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 from sweep.model.detection.pseudo_variance import mean_over_phases
 from sweep.model.effects.catalogue import (
@@ -255,7 +255,7 @@ def shot_statistics(
 
 def shot_pd_and_miss(
     shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> DetectionArrays:
     """Return the probabilities that a shot is detected, and that it is missed.
 
     Parameters
@@ -269,12 +269,13 @@ def shot_pd_and_miss(
 
     Returns
     -------
-    pd_shot, miss_shot : ndarray (n,)
-        A miss is not computed as 1 - pd, so that both keep their precision.
+    DetectionArrays
+        pd and miss of the shots, (n,). A miss is not computed as 1 - pd, so that both keep their
+        precision.
     """
     if shots.any_two:
         if shots.segment_correlations is None:
-            return at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd)
+            return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
         threshold_ratio = shots.threshold / shots.line_noise_sigma
         if shots.looks.is_noncoherent:
             look_speckle = shots.look_speckle
@@ -301,12 +302,12 @@ def shot_pd_and_miss(
                     np.array(pd), 1 - np.array(pd), threshold_ratio, correlations
                 ),
             )
-        return pd_shot, miss_shot
+        return DetectionArrays(pd_shot, miss_shot)
     pd_both = shots.joint_detection_probability(pd[0], pd[2], (magnitudes[0], magnitudes[2]))
     miss_shot = miss[0] + pd[0] * miss[2]
     if shots.segment_correlations is not None:
         miss_shot = miss[0] + np.maximum(pd[0] - pd_both, 0.0)
-    return pd_both, np.minimum(miss_shot, 1.0)  # rounding may exceed 1
+    return DetectionArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
 
 
 def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:

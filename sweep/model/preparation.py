@@ -19,7 +19,12 @@ from sweep.model import beam, receiver_chain, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import bin_noise
 from sweep.model.detection.detectors import main_lobe_half_width
-from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH, Looks
+from sweep.model.detection.looks import (
+    LOOKS_NUMBER_PATH,
+    LOOKS_VOTES_PATH,
+    DetectionArrays,
+    Looks,
+)
 from sweep.model.error_budget import AUTOMATIC, ErrorBudget
 from sweep.model.ground import Ground
 from sweep.model.spectrum.search_band import n_alarm_bins, search_band_bins
@@ -642,7 +647,7 @@ class Shots:
         magnitude: np.ndarray,
         bins: np.ndarray,
         point_indices: np.ndarray | slice = slice(None),
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> DetectionArrays:
         """Return the probabilities that a bin is detected in several looks, and that it is missed.
 
         Parameters
@@ -656,8 +661,8 @@ class Shots:
 
         Returns
         -------
-        pd, miss : ndarray (..., m)
-            nan where `magnitude` is.
+        DetectionArrays
+            pd and miss, (..., m); nan where `magnitude` is.
         """
         is_present, sigma_and_threshold = (
             np.isfinite(magnitude),
@@ -676,8 +681,9 @@ class Shots:
             pd_and_miss = self.looks.pd_and_miss_steady(
                 signal_ratio, threshold / noise_sigma, is_real_bin
             )
-        pd, miss = (np.where(is_present, probability, np.nan) for probability in pd_and_miss)
-        return pd, miss
+        return DetectionArrays(
+            *(np.where(is_present, probability, np.nan) for probability in pd_and_miss)
+        )
 
     def _pd_in_looks_far_from_ends(
         self, signal_up: np.ndarray, signal_down: np.ndarray, threshold_ratio: np.ndarray
@@ -687,7 +693,7 @@ class Shots:
         pd_up, _, pd_down = np.moveaxis(
             self.looks.pd_and_miss_in_speckle(
                 signals, threshold_ratio[..., None, :], self.look_speckle
-            )[0],
+            ).pd,
             -2,
             0,
         )
@@ -699,7 +705,7 @@ class Shots:
         threshold_ratio: np.ndarray,
         bins: np.ndarray,
         point_indices: np.ndarray | slice,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> DetectionArrays:
         """Compute pd and 1 - pd in developed speckle, from signal and threshold over the noise."""
         from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
 
@@ -724,7 +730,7 @@ class Shots:
             ]
             noise_pseudo_variance_ratio = (
                 rule.noise_pseudo_variance_ratio[bins_from_end[is_near_end]]
-                if rule.real_fft_size
+                if rule.real_noise_at_ends
                 else np.zeros(signal_pseudo_variance_ratio.size)
             )
             near_threshold_ratio = np.broadcast_to(threshold_ratio, signal_ratio.shape)[is_near_end]
@@ -743,7 +749,7 @@ class Shots:
                 noise_pseudo_variance_ratio,
                 look_covariance,
             )
-        return pd, miss
+        return DetectionArrays(pd, miss)
 
     def _look_amplitude_covariance(self, segment: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return the covariance of an echo's amplitudes over k looks, (m, k, k) for m segments."""
@@ -979,48 +985,35 @@ class Shots:
     def detection_rule(self) -> "DetectionRule":
         """Rule of detection of one record's bins."""
         from sweep.model.detection.echo_detection import DetectionRule
+        from sweep.model.detection.joint_tail import joint_tail_rule
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
         from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
 
-        speckle_noise_correlation = (
-            -1.0 if self.segment_correlations is None else self.noise_bin_correlation
-        )
-        noise_ratio, nyquist_bin = np.empty(0), 0
-        if self.segment_correlations is not None and not self.complex_record:
-            nyquist_bin = self.fft_size // 2
-            if self.real_fft_size:
-                noise_ratio = noise_pseudo_variance_ratio(self.window, self.fft_size)
-        joint_tail_rule = bin_noise.joint_tail_rule(self.noise_bin_correlation)
-        noise_correlation_in_sidelobes = sidelobe_correlation(self.window, self.fft_size)
-        if self.detection == "peak_bin":
-            return DetectionRule(
-                self.real_fft_size,
-                0,
-                joint_tail_rule,
-                speckle_noise_correlation,
-                nyquist_bin,
-                noise_ratio,
-                NO_MODES,
-                self.noise_bin_correlation,
-                noise_correlation_in_sidelobes,
+        in_speckle, any_bin = self.segment_correlations is not None, self.detection != "peak_bin"
+        real_record_in_speckle = in_speckle and not self.complex_record
+        real_noise_at_ends = self.real_fft_size > 0
+        noise_ratio, lobe_half_width, modes = np.empty(0), 0, NO_MODES
+        if real_record_in_speckle and real_noise_at_ends:
+            noise_ratio = noise_pseudo_variance_ratio(self.window, self.fft_size)
+        if any_bin:
+            lobe_half_width = math.ceil(
+                main_lobe_half_width(self.window) * self.fft_size / self.window.length
             )
-        lobe_half_width = main_lobe_half_width(self.window) * self.fft_size / self.window.length
-        modes = (
-            NO_MODES
-            if self.segment_correlations is None
-            else mode_table(self.window, self.fft_size)
-        )
+            if in_speckle:
+                modes = mode_table(self.window, self.fft_size)
         return DetectionRule(
-            self.real_fft_size,
-            math.ceil(lobe_half_width),
-            joint_tail_rule,
-            speckle_noise_correlation,
-            nyquist_bin,
-            noise_ratio,
-            modes,
-            self.noise_bin_correlation,
-            noise_correlation_in_sidelobes,
+            any_bin=any_bin,
+            lobe_half_width=lobe_half_width,
+            real_noise_at_ends=real_noise_at_ends,
+            fft_size=self.fft_size,
+            in_speckle=in_speckle,
+            noise_correlation=self.noise_bin_correlation,
+            real_record_in_speckle=real_record_in_speckle,
+            joint_tail_rule=joint_tail_rule(self.noise_bin_correlation),
+            noise_pseudo_variance_ratio=noise_ratio,
+            mode_table=modes,
+            sidelobe_correlation=sidelobe_correlation(self.window, self.fft_size),
         )
 
     @cached_property

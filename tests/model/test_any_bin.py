@@ -13,15 +13,20 @@ import pytest
 from shot_helpers import parametrize_product
 
 from sweep.model import evaluation, receiver_chain, time_domain_truth
-from sweep.model.detection.bin_noise import first_circular_bin, neighbour_noise_correlation
+from sweep.model.detection.bin_noise import (
+    first_circular_bin,
+    neighbour_noise_correlation,
+)
 from sweep.model.detection.detectors import main_lobe_half_width
 from sweep.model.detection.echo_detection import (
     BinSpeckle,
     BinThreshold,
     DetectionRule,
+    EchoBins,
     mark_exempt_bins,
     pd_and_miss,
 )
+from sweep.model.detection.joint_tail import joint_tail_rule
 from sweep.model.detection.speckle_modes import mode_table
 from sweep.model.sampling import philox
 from sweep.model.sampling.samplers import simulate_draws
@@ -201,11 +206,21 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     beside = math.ceil(main_lobe_half_width(shape))
     mark_exempt_bins(magnitude, 61, level, echo, beside)
     rule = DetectionRule(
-        0, beside, np.empty((3, 0)), neighbour_noise_correlation(shape, size), 0, np.empty(0),
+        True,
+        beside,
+        False,
+        size,
+        True,
+        neighbour_noise_correlation(shape, size),
+        False,
+        joint_tail_rule(0.0),
+        np.empty(0),
         mode_table(shape, size),
-    )  # fmt: skip
+    )
     speckle, levels = BinSpeckle(0.0, np.empty(0)), BinThreshold(1.0, level, 1.0, 1.0)
-    pd, _ = pd_and_miss(magnitude, echo, int(magnitude.argmax()), 70, rule, levels, speckle)
+    pd, _ = pd_and_miss(
+        EchoBins(magnitude, echo, 70), int(magnitude.argmax()), rule, levels, speckle
+    )
     rng, found = np.random.default_rng(int(10 * place) + snr), 0
     for _ in range(draws // 2000):
         noise = rng.normal(size=(2000, size, 2)) @ np.array([1, 1j])

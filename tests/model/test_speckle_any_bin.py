@@ -15,9 +15,11 @@ from sweep.model.detection.echo_detection import (
     BinSpeckle,
     BinThreshold,
     DetectionRule,
+    EchoBins,
     mark_exempt_bins,
     pd_and_miss,
 )
+from sweep.model.detection.joint_tail import joint_tail_rule
 from sweep.model.detection.speckle_modes import mode_table
 from sweep.model.window import get_window, window_samples
 
@@ -55,13 +57,21 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
         numbers = rng.normal(size=(5000, values.size, 2)) @ [1, 1j]
         detected[first : first + 5000] = (abs(numbers @ factor.T) >= LEVEL).any(axis=1)
     rule = DetectionRule(
-        0, beside, np.empty((3, 0)), neighbour_noise_correlation(shape, size), 0, np.empty(0),
+        True,
+        beside,
+        False,
+        size,
+        True,
+        neighbour_noise_correlation(shape, size),
+        False,
+        joint_tail_rule(0.0),
+        np.empty(0),
         mode_table(shape, size),
-    )  # fmt: skip
+    )
     levels = BinThreshold(1.0, LEVEL, 1.0, 1.0)
     speckle = BinSpeckle(spread * padding, np.empty(0))
     pd, missed = pd_and_miss(
-        magnitude, echo, int(magnitude.argmax()), int(bins[0]), rule, levels, speckle
+        EchoBins(magnitude, echo, int(bins[0])), int(magnitude.argmax()), rule, levels, speckle
     )
     assert pd + missed == pytest.approx(1, abs=1e-9)
     return detected.mean(), pd

@@ -481,7 +481,7 @@ def _crossing_probability(
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
     probability = looks.pd_and_miss_steady(
         np.where(is_finite, signal_ratio, 0), np.where(is_finite, threshold_ratio, 0)
-    )[0]
+    ).pd
     return np.where(is_finite, probability, np.nan)
 
 

@@ -226,7 +226,7 @@ def edge_crossing_probability(edge_ratio, neighbour_ratio, threshold_ratio, side
             - (threshold_ratio - edge_ratio - sidelobe_correlation * noise_mean) / noise_deviation,
             0.0,
         )
-    return marcum_q1_tails(edge_ratio, threshold_ratio)[0]
+    return marcum_q1_tails(edge_ratio, threshold_ratio).above
 
 
 @njit(cache=True, error_model="numpy")

@@ -110,21 +110,6 @@ def _equivalent_bins_per_bin(
     )
 
 
-@lru_cache(maxsize=64)
-def joint_tail_rule(correlation: float) -> np.ndarray:
-    """Quadrature of the joint tail of two correlated normal numbers.
-
-    Twelve Gauss points u in 0 .. asin(correlation): sin u, weights, 1 / (2 cos^2 u), (3, 12); or
-    none, (3, 0), for independent numbers.
-    """
-    if correlation == 0.0:
-        return np.empty((3, 0))
-    node, weight = np.polynomial.legendre.leggauss(12)
-    half_angle = 0.5 * math.asin(correlation)
-    sine = np.sin(half_angle * (node + 1))
-    return np.stack([sine, half_angle * weight / (2 * math.pi), 0.5 / (1 - sine**2)])
-
-
 NOISE_FILTER_TAPS = 17
 """Independent numbers of which a bin's noise is made."""
 

@@ -12,7 +12,12 @@ from sweep.model.detection.hoyt import (
     hoyt_tails,
     pseudo_variance_ratio_at,
 )
-from sweep.model.detection.marcum import marcum_q1, marcum_q1_tails
+from sweep.model.detection.joint_tail import (
+    JointTailRule,
+    joint_tail_excess,
+    joint_tail_excess_at,
+)
+from sweep.model.detection.marcum import Tails, marcum_q1, marcum_q1_tails
 from sweep.model.detection.speckle_modes import (
     ModeTable,
     interpolate_mode_table,
@@ -70,27 +75,70 @@ def negligible_signal_ratio(
 class DetectionRule(NamedTuple):
     """Rule by which the bins of an echo detect it; common to all points."""
 
-    real_fft_size: int
-    """FFT size N if the noise in bins 0 and N/2 is real, else 0."""
+    any_bin: bool
+    """True if any bin of an echo may detect it, False if only its strongest bin."""
     lobe_half_width: int
-    """Half-width of the main lobe [bins] if any bin of an echo may detect it; 0 if only its
-    largest."""
-    joint_tail_rule: np.ndarray
-    """(3, k): quadrature for the joint crossing of two bins,
-    :func:`sweep.model.detection.bin_noise.joint_tail_rule`."""
-    speckle_noise_correlation: float
-    """Correlation of neighbouring bins' noise if echoes are in developed speckle, else -1."""
-    nyquist_bin: int
-    """Nyquist bin N/2 of a real record whose echoes are in developed speckle, else 0."""
+    """Half-width of a main lobe [bins of fs/N], rounded up; 0 unless ``any_bin``."""
+    real_noise_at_ends: bool
+    """True if the noise in bins 0 and N/2 is real, as that of a real record is."""
+    fft_size: int
+    """FFT size N."""
+    in_speckle: bool
+    """True if echoes are in developed speckle."""
+    noise_correlation: float
+    """Correlation of the noise of neighbouring bins, 0..1."""
+    real_record_in_speckle: bool
+    """True if echoes in developed speckle come from a real record. Their amplitudes are then
+    noncircular near DC and Nyquist."""
+    joint_tail_rule: JointTailRule
+    """Quadrature for the joint crossing of neighbouring bins."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the noise, by bins from the nearer of DC and Nyquist."""
+    """(bins,): pseudo-variance ratio of the noise, by bins from the nearer of DC and Nyquist; empty
+    unless the noise is real there and echoes are in developed speckle."""
     mode_table: ModeTable
-    """Speckle modes of echoes that any bin may detect."""
-    noise_correlation: float = 0.0
-    """Correlation of the noise of neighbouring bins."""
+    """Speckle modes of an echo; ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
     sidelobe_correlation: float = 0.0
-    """Correlation of their noise in phase with a line's sidelobes, which change sign from one to
-    the next, -1..1."""
+    """Correlation of the noise of neighbouring bins in phase with the sidelobes of a line, -1..1.
+    Sidelobes change sign from one to the next."""
+
+
+class EchoBins(NamedTuple):
+    """Noiseless magnitudes of a span of bins, and the bins that belong to the echo."""
+
+    magnitude: np.ndarray
+    """(bins,): |X| without noise [V, summed over the record]."""
+    is_echo: np.ndarray
+    """(bins,) bool: True in bins of the echo."""
+    first_bin: int
+    """Number of the first bin."""
+
+
+class GivenMode(NamedTuple):
+    """Parameters of an echo's bins given the amplitude z of its strongest speckle mode.
+
+    All are over the noise of the bin: that of the receiver plus the other speckle modes.
+    """
+
+    signal: np.ndarray
+    """(bins,): root mean square magnitude of the mode, over the noise per quadrature."""
+    threshold: np.ndarray
+    """(bins,): threshold, over the noise per quadrature."""
+    correlation: np.ndarray
+    """(bins,): correlation of the noise with that of the bin below."""
+    pedestal: np.ndarray
+    """(bins,): mean power of the phase-noise pedestal that fades with the mode, over the noise."""
+    other_echo_fraction: np.ndarray
+    """(bins,): part of the noise that is other modes, which turn with the mode's phase near DC and
+    Nyquist."""
+
+
+class Detection(NamedTuple):
+    """Probabilities that an echo is detected and that it is missed; each keeps all its digits."""
+
+    pd: float
+    """Probability that the echo is detected, 0..1."""
+    miss: float
+    """Probability that the echo is missed, 1 - pd."""
 
 
 class PedestalShape(NamedTuple):
@@ -419,7 +467,7 @@ def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) ->
     ``probabilities`` and ``complements`` (3, ...) are the events' probabilities and their
     complements, which are passed separately to keep precision in both tails.
 
-    >>> round(float(any_two(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
+    >>> round(float(at_least_two_of_three(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
     0.85
     """
     (a, b, c), (no_a, no_b, no_c) = probabilities, complements
@@ -479,20 +527,21 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def is_real_bin(bin_, real_fft_size):
-    """Return whether a bin is DC or Nyquist of a real record, where noise is real.
+def is_real_bin(bin_, real_noise_at_ends, fft_size):
+    """Return True if the noise of a bin is real: bins 0 and N/2 of a real record.
 
-    ``real_fft_size`` is the FFT size N, or 0 if noise is circular in all bins.
+    ``real_noise_at_ends`` and ``fft_size`` are those of :class:`DetectionRule`.
     """
-    return real_fft_size > 0 and (bin_ == 0 or 2 * bin_ == real_fft_size)
+    return real_noise_at_ends and (bin_ == 0 or 2 * bin_ == fft_size)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
-    """Return P(|X| >= b) and P(|X| < b) of a bin with a steady signal a, both over sigma.
+    """Return both :class:`.Tails` of |X| of a bin with a steady signal at the threshold.
 
-    Q_1(a, b) and its complement. If the noise is ``is_real``, it has the power of both quadratures
-    in one, a variance of 2 sigma^2: P(|a + n| >= b).
+    ``signal_ratio`` a and ``threshold_ratio`` b are over the noise per quadrature sigma. The tails
+    are Q_1(a, b) and its complement. If the noise ``is_real``, it has the power of both quadratures
+    in one, a variance of 2 sigma^2, and the upper tail is P(|a + n| >= b).
     """
     if not is_real:
         return marcum_q1_tails(signal_ratio, threshold_ratio)
@@ -501,100 +550,121 @@ def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
         + math.erfc(0.5 * (threshold_ratio + signal_ratio))
     )
     if signal_ratio < threshold_ratio:
-        return p_cross, 0.5 * (
+        p_stay = 0.5 * (
             math.erf(0.5 * (threshold_ratio - signal_ratio))
             + math.erf(0.5 * (threshold_ratio + signal_ratio))
         )
-    return p_cross, 0.5 * (
-        math.erfc(0.5 * (signal_ratio - threshold_ratio))
-        - math.erfc(0.5 * (signal_ratio + threshold_ratio))
-    )
+    else:
+        p_stay = 0.5 * (
+            math.erfc(0.5 * (signal_ratio - threshold_ratio))
+            - math.erfc(0.5 * (signal_ratio + threshold_ratio))
+        )
+    return Tails(p_cross, p_stay)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def pd_and_miss(magnitude, is_echo, peak_index, first_bin, rule, bin_threshold, bin_speckle):
-    """Return the probabilities that an echo is detected, and that it is missed.
+def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
+    """Return the probabilities that an echo is detected and that it is missed.
 
-    The echo is detected by any of its bins (``rule.beside`` > 0, :func:`pd_and_miss_any_bin`) or by
-    the
-    largest bin of the run alone. The pedestal of phase noise is light of the echo and fades with
+    If ``rule.any_bin``, any bin of the echo detects it (:func:`pd_and_miss_any_bin`), else the
+    largest bin of the span alone. The pedestal of phase noise is light of the echo and fades with
     it.
 
     Parameters
     ----------
-    magnitude
-        (bins,): |X| of the run without noise [V].
-    is_echo
-        (bins,) bool: bins of the echo.
-    peak_index, first_bin
-        Index of the largest bin, and number of the run's first bin.
+    echo
+        :class:`EchoBins` of the span.
+    peak_index
+        Index of the largest bin in the span.
     rule, bin_threshold, bin_speckle
         :class:`DetectionRule`, :class:`BinThreshold` and :class:`BinSpeckle`.
+
+    Returns
+    -------
+    Detection
     """
-    line_noise, threshold = bin_threshold.line_noise, bin_threshold.threshold
-    if rule.speckle_noise_correlation >= 0.0:
-        if rule.lobe_half_width > 0:
-            return pd_and_miss_in_speckle(
-                magnitude, is_echo, first_bin, rule, bin_threshold, bin_speckle
-            )
-        if line_noise > bin_threshold.noise_without_pedestal:
+    if rule.in_speckle:
+        if rule.any_bin:
+            return pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle)
+        if bin_threshold.line_noise > bin_threshold.noise_without_pedestal:
             return _pd_and_miss_of_peak_on_pedestal(
-                magnitude[peak_index], first_bin + peak_index, rule, bin_threshold, bin_speckle
+                echo.magnitude[peak_index],
+                echo.first_bin + peak_index,
+                rule,
+                bin_threshold,
+                bin_speckle,
             )
-        signal_power, noise_power = (
-            magnitude[peak_index] * magnitude[peak_index],
-            2.0 * line_noise * line_noise,
+        return _pd_and_miss_of_peak_in_speckle(
+            echo.magnitude[peak_index],
+            echo.first_bin + peak_index,
+            rule,
+            bin_threshold,
+            bin_speckle,
         )
-        ratio = 0.0
-        if bin_speckle.pseudo_variance_ratio.size > 0:
-            ratio = signal_power * pseudo_variance_ratio_at(
-                first_bin + peak_index, rule.nyquist_bin, bin_speckle.pseudo_variance_ratio
-            )
-            ratio += noise_power * pseudo_variance_ratio_at(
-                first_bin + peak_index, rule.nyquist_bin, rule.noise_pseudo_variance_ratio
-            )
-            ratio /= signal_power + noise_power
-        return hoyt_tails(signal_power + noise_power, ratio, threshold)
-    if rule.lobe_half_width > 0:
+    if rule.any_bin:
         if bin_threshold.pedestal.reach_bins > 0.0:
-            return _pd_and_miss_on_pedestal(magnitude, is_echo, first_bin, rule, bin_threshold)
-        return pd_and_miss_any_bin(
-            magnitude, is_echo, first_bin, rule.real_fft_size, bin_threshold, rule.joint_tail_rule
+            return _pd_and_miss_on_pedestal(echo, rule, bin_threshold)
+        return pd_and_miss_any_bin(echo, rule, bin_threshold)
+    line_noise = bin_threshold.line_noise
+    tails = bin_crossing_tails(
+        echo.magnitude[peak_index] / line_noise,
+        bin_threshold.threshold / line_noise,
+        is_real_bin(echo.first_bin + peak_index, rule.real_noise_at_ends, rule.fft_size),
+    )
+    return Detection(tails.above, tails.below)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_speckle):
+    """Return pd and 1 - pd of a bin in developed speckle, by itself, without a pedestal.
+
+    ``magnitude`` is the root mean square |X| of its signal [V].
+    """
+    signal_power = magnitude * magnitude
+    noise_power = 2.0 * bin_threshold.line_noise * bin_threshold.line_noise
+    ratio = 0.0
+    if bin_speckle.pseudo_variance_ratio.size > 0:
+        nyquist_bin = rule.fft_size // 2
+        ratio = signal_power * pseudo_variance_ratio_at(
+            bin_, nyquist_bin, bin_speckle.pseudo_variance_ratio
         )
-    is_real = is_real_bin(first_bin + peak_index, rule.real_fft_size)
-    return bin_crossing_tails(magnitude[peak_index] / line_noise, threshold / line_noise, is_real)
+        ratio += noise_power * pseudo_variance_ratio_at(
+            bin_, nyquist_bin, rule.noise_pseudo_variance_ratio
+        )
+        ratio /= signal_power + noise_power
+    tails = hoyt_tails(signal_power + noise_power, ratio, bin_threshold.threshold)
+    return Detection(tails.above, tails.below)
 
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_speckle):
     """Return pd and 1 - pd of a bin in developed speckle, by itself, whose pedestal fades too."""
-    given_mode = np.zeros((4, 1))
-    given_mode[0, 0], given_mode[1, 0] = (
-        magnitude / bin_threshold.noise_without_pedestal,
-        bin_threshold.threshold / bin_threshold.noise_without_pedestal,
-    )
-    given_mode[3, 0] = (bin_threshold.line_noise / bin_threshold.noise_without_pedestal) ** 2 - 1.0
-    return _mean_over_mode_phase(given_mode, np.ones(1, np.bool_), bin_, rule, bin_speckle)
+    noise = bin_threshold.noise_without_pedestal
+    rows = np.zeros((5, 1))
+    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    given_mode.signal[0] = magnitude / noise
+    given_mode.threshold[0] = bin_threshold.threshold / noise
+    given_mode.pedestal[0] = (bin_threshold.line_noise / noise) ** 2 - 1.0
+    echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
+    return _mean_over_mode_phase(given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def pd_and_miss_any_bin(
-    magnitude, is_echo, first_bin, real_fft_size, bin_threshold, joint_tail_rule
-):
+def pd_and_miss_any_bin(echo, rule, bin_threshold):
     """Return the probabilities that any bin of an echo reaches the threshold, and that none does.
 
     Each bin by itself crosses with :func:`bin_crossing_tails`. The noise of neighbours is
-    correlated, in
-    phase with a signal that is in step from bin to bin, as in a main lobe. The joint probability of
-    two neighbours is that of correlated normal numbers with the same probabilities: their product
-    plus
+    correlated, in phase with a signal that is in step from bin to bin, as in a main lobe. The joint
+    probability of two neighbours is that of correlated normal numbers with the same probabilities:
+    their product plus
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
     [Owen, Ann. Math. Statist. 27, 1956], with the normal deviates s and t, by the quadrature
-    ``joint_tail_rule`` (:func:`sweep.model.detection.bin_noise.joint_tail_rule`). Bins are treated
-    as a first-order Markov chain.
+    ``rule.joint_tail_rule`` (:class:`sweep.model.detection.joint_tail.JointTailRule`). Bins are
+    treated as a first-order Markov chain.
     """
+    magnitude, is_echo = echo.magnitude, echo.is_echo
     pd, miss, previous_p_stay, previous_deviate, largest = 0.0, 1.0, -1.0, 0.0, 0.0
     threshold = bin_threshold.threshold
     for i in range(magnitude.size):
@@ -606,57 +676,50 @@ def pd_and_miss_any_bin(
         noise = (
             bin_threshold.line_noise if magnitude[i] >= 0.5 * largest else bin_threshold.side_noise
         )
-        is_real = is_real_bin(first_bin + i, real_fft_size)
-        p_cross, p_stay = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
-        if not p_stay > 0.0:
-            return 1.0, 0.0
-        conditional_cross, conditional_stay, deviate = _crossing_given_neighbour_below(
-            (p_cross, p_stay), previous_p_stay, previous_deviate, joint_tail_rule
+        is_real = is_real_bin(echo.first_bin + i, rule.real_noise_at_ends, rule.fft_size)
+        tails = bin_crossing_tails(magnitude[i] / noise, threshold / noise, is_real)
+        if not tails.below > 0.0:
+            return Detection(1.0, 0.0)
+        given_neighbour, deviate = _crossing_given_neighbour_below(
+            tails, previous_p_stay, previous_deviate, rule.joint_tail_rule
         )
-        pd += miss * conditional_cross
-        miss *= conditional_stay
-        previous_p_stay, previous_deviate = p_stay, deviate
-    return (pd if pd < 0.5 else 1.0 - miss), miss
+        pd += miss * given_neighbour.above
+        miss *= given_neighbour.below
+        previous_p_stay, previous_deviate = tails.below, deviate
+    return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
 
 
 @njit(cache=True, error_model="numpy")
-def _pd_and_miss_on_pedestal(magnitude, is_echo, first_bin, rule, bin_threshold):
-    """:func:`pd_and_miss_any_bin` of an echo whose pedestal detects too."""
-    n_bins = magnitude.size
-    pedestal_ratios, given_mode = np.empty(n_bins), np.empty((4, n_bins))
-    fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios)
+def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
+    """Compute :func:`pd_and_miss_any_bin` for an echo whose pedestal detects too."""
+    n_bins = echo.magnitude.size
+    pedestal_ratios, rows = np.empty(n_bins), np.zeros((5, n_bins))
+    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         noise = bin_threshold.noise_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
-        given_mode[0, k], given_mode[1, k] = magnitude[k] / noise, bin_threshold.threshold / noise
-        given_mode[2, k], given_mode[3, k] = rule.noise_correlation, 0.0
+        given_mode.signal[k] = echo.magnitude[k] / noise
+        given_mode.threshold[k] = bin_threshold.threshold / noise
+        given_mode.correlation[k] = rule.noise_correlation
     return _pd_and_miss_given_mode(
-        given_mode, 1.0, is_echo, first_bin, rule.real_fft_size, np.inf, 0.0
+        given_mode, 1.0, echo, rule.real_noise_at_ends, rule.fft_size, np.inf, 0.0
     )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, joint_tail_rule):
-    """Probabilities that a bin crosses, and that it does not, where the bin before has not.
+    """Return the :class:`.Tails` of a bin if the bin below it does not cross.
 
-    ``tails`` are those of the bin by itself, ``previous_p_stay`` and ``previous_deviate`` the
-    probability that the
-    bin before does not cross and the normal deviate of that; below 0 where there is none before.
-    Returns the deviate of this bin as well.
+    ``tails`` are those of the bin by itself. ``previous_p_stay`` is the probability that the bin
+    below does not cross, ``previous_deviate`` its normal deviate; the probability is below 0 if no
+    bin of the echo lies below. The second result is the normal deviate of this bin.
     """
-    p_cross, p_stay = tails
-    deviate = _normal_deviate(p_cross) if p_cross < p_stay else -_normal_deviate(p_stay)
+    deviate = _normal_deviate_of_tails(tails)
     if not previous_p_stay > 0.0:
-        return p_cross, p_stay, deviate
-    p_joint = 0.0
-    for k in range(joint_tail_rule.shape[1]):
-        quadratic_form = (
-            deviate * deviate
-            + previous_deviate * previous_deviate
-            - 2.0 * deviate * previous_deviate * joint_tail_rule[0, k]
-        )
-        p_joint += joint_tail_rule[1, k] * math.exp(-quadratic_form * joint_tail_rule[2, k])
-    p_joint = min(p_joint / previous_p_stay, p_cross)
-    return p_cross - p_joint, p_stay + p_joint, deviate
+        return tails, deviate
+    p_joint = joint_tail_excess(deviate, previous_deviate, joint_tail_rule)
+    p_joint = min(p_joint / previous_p_stay, tails.above)
+    return Tails(tails.above - p_joint, tails.below + p_joint), deviate
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -675,11 +738,11 @@ def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
         if p_cross < 1e-4:
             p_any, p_none, previous_p_stay = p_any + p_none * p_cross, p_none * p_stay, -1.0
             continue
-        conditional_cross, conditional_stay, deviate = _crossing_given_neighbour_below(
-            (p_cross, p_stay), previous_p_stay, previous_deviate, joint_tail_rule
+        given_neighbour, deviate = _crossing_given_neighbour_below(
+            Tails(p_cross, p_stay), previous_p_stay, previous_deviate, joint_tail_rule
         )
-        p_any += p_none * conditional_cross
-        p_none *= conditional_stay
+        p_any += p_none * given_neighbour.above
+        p_none *= given_neighbour.below
         previous_p_stay, previous_deviate = p_stay, deviate
     return p_any
 
@@ -705,13 +768,12 @@ def clear_image_exemptions(magnitude, is_exempt, first_bin, fft_size, image_gain
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def pd_and_miss_in_speckle(magnitude, is_echo, first_bin, rule, bin_threshold, bin_speckle):
+def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     """Return the probabilities that any, and that no, bin of an echo in developed speckle crosses.
 
     The strongest speckle mode (:mod:`sweep.model.detection.speckle_modes`) is one complex Gaussian
-    number z
-    for all bins. Given z, bin k has the steady signal u_k z, and the other modes add to its noise,
-    with their own variance and correlation. The result is the mean over |z|^2, which is
+    number z for all bins. Given z, bin k has the steady signal u_k z. The other modes add to its
+    noise, with their own variance and correlation. The result is the mean over |z|^2, which is
     exponential. A single line has all its power in this mode, and its sidelobes fade with it. Near
     DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
     pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
@@ -719,6 +781,7 @@ def pd_and_miss_in_speckle(magnitude, is_echo, first_bin, rule, bin_threshold, b
     Stretches of bins of half the largest magnitude are echoes by themselves; weaker stretches
     belong to the one below. Errors: docs/physics.md.
     """
+    magnitude, is_echo = echo.magnitude, echo.is_echo
     largest = 0.0
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
@@ -730,27 +793,20 @@ def pd_and_miss_in_speckle(magnitude, is_echo, first_bin, rule, bin_threshold, b
             i += 1
         if has_strong_bin:
             if n_stretches > 0:
-                stretch_pd_and_miss = _pd_and_miss_of_stretch(
-                    magnitude,
-                    is_echo,
-                    (stretch_begin, echo_begin),
-                    first_bin,
-                    rule,
-                    bin_threshold,
-                    bin_speckle,
+                stretch = _pd_and_miss_of_stretch(
+                    echo, stretch_begin, echo_begin, rule, bin_threshold, bin_speckle
                 )
                 pd, miss, stretch_begin = (
-                    pd + miss * stretch_pd_and_miss[0],
-                    miss * stretch_pd_and_miss[1],
+                    pd + miss * stretch.pd,
+                    miss * stretch.miss,
                     echo_begin,
                 )
             n_stretches += 1
         i += 1
-    end = magnitude.size
-    stretch_pd_and_miss = _pd_and_miss_of_stretch(
-        magnitude, is_echo, (stretch_begin, end), first_bin, rule, bin_threshold, bin_speckle
+    stretch = _pd_and_miss_of_stretch(
+        echo, stretch_begin, magnitude.size, rule, bin_threshold, bin_speckle
     )
-    return pd + miss * stretch_pd_and_miss[0], miss * stretch_pd_and_miss[1]
+    return Detection(pd + miss * stretch.pd, miss * stretch.miss)
 
 
 _GAUSS_ORDER = 7
@@ -760,18 +816,16 @@ _RARE_CROSSING_MAX = 1e-6
 _NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-8, 1e-6
 """Probability, and part of pd and of 1 - pd, below which what a bin adds may be left out."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
-_JOINT_TAIL_NODES, _JOINT_TAIL_WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 @njit(cache=True, error_model="numpy")
-def _pd_and_miss_of_stretch(
-    magnitude, is_echo, bounds, first_bin, rule, bin_threshold, bin_speckle
-):
-    """Return pd and 1 - pd of one echo in developed speckle, bins bounds[0] .. bounds[1] - 1.
+def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
+    """Return pd and 1 - pd of one stretch of :func:`pd_and_miss_in_speckle`.
 
-    As of :func:`pd_and_miss_in_speckle`.
+    It is the bins of the indices begin .. end - 1 of the span ``echo``.
     """
-    begin, end = bounds
+    magnitude, is_echo = echo.magnitude, echo.is_echo
+    nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
     while begin < end - 1 and not is_echo[begin]:
         begin += 1
     while end > begin + 1 and not is_echo[end - 1]:
@@ -782,8 +836,8 @@ def _pd_and_miss_of_stretch(
             strongest = i
     below = magnitude[strongest - 1] if strongest > 0 else 0.0
     above = magnitude[strongest + 1] if strongest + 1 < magnitude.size else 0.0
-    if rule.nyquist_bin > 0 and (
-        first_bin + strongest == 0 or first_bin + strongest == rule.nyquist_bin
+    if rule.real_record_in_speckle and (
+        echo.first_bin + strongest == 0 or echo.first_bin + strongest == nyquist_bin
     ):
         below = above = max(below, above)  # bins mirror there
     asymmetry = power_asymmetry(below, magnitude[strongest], above)
@@ -792,13 +846,12 @@ def _pd_and_miss_of_stretch(
         rule.mode_table,
     )
     noise_power = 2.0 * bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
-    # Over the noise per quadrature that the other modes make with the receiver's: the strongest
-    # mode, the threshold; the correlation of this noise with that of the bin below; the pedestal
-    # that fades with the mode, as a power.
-    given_mode, n_bins = np.empty((6, end - begin)), end - begin
-    previous_fraction = 0.0
-    pedestal_ratios = np.empty(n_bins)
-    fill_pedestal_ratios(magnitude[begin:end], is_echo[begin:end], bin_threshold, pedestal_ratios)
+    n_bins = end - begin
+    stretch = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
+    rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
+    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    previous_fraction, previous_inverse_noise = 0.0, 0.0
+    fill_pedestal_ratios(stretch.magnitude, stretch.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         i = begin + k
         signal_power, pedestal_power = magnitude[i] * magnitude[i], noise_power * pedestal_ratios[k]
@@ -812,12 +865,10 @@ def _pd_and_miss_of_stretch(
         )
         other_power = (1.0 - mode_fraction) * (signal_power + pedestal_power) + noise_power
         inverse_noise = math.sqrt(2.0 / other_power)
-        given_mode[3, k] = mode_fraction * pedestal_power / other_power
-        given_mode[0, k], given_mode[1, k] = (
-            inverse_noise * math.sqrt(mode_fraction * signal_power),
-            inverse_noise * bin_threshold.threshold,
-        )
-        given_mode[2, k] = 0.0
+        given_mode.pedestal[k] = mode_fraction * pedestal_power / other_power
+        given_mode.signal[k] = inverse_noise * math.sqrt(mode_fraction * signal_power)
+        given_mode.threshold[k] = inverse_noise * bin_threshold.threshold
+        given_mode.correlation[k] = 0.0
         if k > 0 and is_echo[i] and is_echo[i - 1]:
             neighbour_correlation = interpolate_mode_table(
                 mode_table.neighbour_correlation, cell, i - strongest
@@ -828,78 +879,70 @@ def _pd_and_miss_of_stretch(
                 * magnitude[i - 1]
             )
             noise_covariance += noise_power * math.copysign(
-                rule.speckle_noise_correlation, neighbour_correlation
+                rule.noise_correlation, neighbour_correlation
             )
-            given_mode[2, k] = min(
-                max(0.5 * noise_covariance * inverse_noise * given_mode[4, k - 1], -0.999), 0.999
+            given_mode.correlation[k] = min(
+                max(0.5 * noise_covariance * inverse_noise * previous_inverse_noise, -0.999), 0.999
             )
-        given_mode[4, k], given_mode[5, k], previous_fraction = (
-            inverse_noise,
-            mode_fraction,
-            mode_fraction,
-        )
-    for k in range(n_bins):
-        # Of bins near an end, but these, the other modes go with the phase too.
-        bin_ = first_bin + begin + k
-        other_modes_power = (1.0 - given_mode[5, k]) * magnitude[begin + k] ** 2
-        given_mode[4, k] = 0.0
-        if bin_ != 0 and bin_ != rule.nyquist_bin:
-            given_mode[4, k] = other_modes_power / (other_modes_power + noise_power)
-    return _mean_over_mode_phase(
-        given_mode, is_echo[begin:end], first_bin + begin, rule, bin_speckle
-    )
+        previous_fraction, previous_inverse_noise = mode_fraction, inverse_noise
+        # The other modes turn with the phase too, except in the bins 0 and N/2 themselves.
+        bin_, other_modes_power = stretch.first_bin + k, (1.0 - mode_fraction) * magnitude[i] ** 2
+        given_mode.other_echo_fraction[k] = 0.0
+        if bin_ != 0 and bin_ != nyquist_bin:
+            given_mode.other_echo_fraction[k] = other_modes_power / (
+                other_modes_power + noise_power
+            )
+    return _mean_over_mode_phase(given_mode, stretch, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_phase(given_mode, is_echo, first_bin, rule, bin_speckle):
-    """Average :func:`_mean_over_mode_power` over the phase of the mode, where bins are noncircular.
-
-    An optional fifth row of ``given_mode`` is the fraction of the noise that is echo as well.
-    """
+def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
+    """Average :func:`_mean_over_mode_power` over the phase of the mode if bins are noncircular."""
     if bin_speckle.pseudo_variance_ratio.size == 0:
-        return _mean_over_mode_power(given_mode, is_echo, first_bin, rule.real_fft_size)
-    return _mean_over_noncircular_mode_phase(given_mode, is_echo, first_bin, rule, bin_speckle)
+        return _mean_over_mode_power(given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
+    return _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy")
-def _mean_over_noncircular_mode_phase(given_mode, is_echo, first_bin, rule, bin_speckle):
-    """Average as :func:`_mean_over_mode_phase` does, for noncircular bins."""
-    pd, miss = 0.0, 0.0
-    given_mode_at_phase = given_mode.copy()
+def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
+    """Average :func:`_mean_over_mode_power` over the phase t of the mode, for noncircular bins.
+
+    At a phase the mode's power in a bin changes by the factor 1 + q cos t, with the pseudo-variance
+    ratio q of the bin. So does the power of the other modes.
+    """
+    pd, miss, n_bins = 0.0, 0.0, echo.is_echo.size
+    rows = np.empty((3, n_bins))
+    given_phase = GivenMode(
+        rows[0], rows[1], given_mode.correlation, rows[2], given_mode.other_echo_fraction
+    )
     for node in range(N_PHASE_NODES):
-        for k in range(is_echo.size):
+        for k in range(n_bins):
             ratio = pseudo_variance_ratio_at(
-                first_bin + k, rule.nyquist_bin, bin_speckle.pseudo_variance_ratio
+                echo.first_bin + k, rule.fft_size // 2, bin_speckle.pseudo_variance_ratio
             )
             power_factor = max(1.0 + ratio * PHASE_COSINES[node], 0.0)
-            inverse_noise = 1.0
-            if given_mode.shape[0] > 4:
-                inverse_noise = 1.0 / math.sqrt(1.0 + (power_factor - 1.0) * given_mode[4, k])
-            given_mode_at_phase[0, k] = given_mode[0, k] * math.sqrt(power_factor) * inverse_noise
-            given_mode_at_phase[1, k] = given_mode[1, k] * inverse_noise
-            given_mode_at_phase[3, k] = (
-                given_mode[3, k] * power_factor * inverse_noise * inverse_noise
+            inverse_noise = 1.0 / math.sqrt(
+                1.0 + (power_factor - 1.0) * given_mode.other_echo_fraction[k]
             )
-        pd_and_miss_at_phase = _mean_over_mode_power(
-            given_mode_at_phase, is_echo, first_bin, rule.real_fft_size
-        )
-        pd, miss = (
-            pd + pd_and_miss_at_phase[0] / N_PHASE_NODES,
-            miss + pd_and_miss_at_phase[1] / N_PHASE_NODES,
-        )
-    return pd, miss
+            given_phase.signal[k] = given_mode.signal[k] * math.sqrt(power_factor) * inverse_noise
+            given_phase.threshold[k] = given_mode.threshold[k] * inverse_noise
+            given_phase.pedestal[k] = (
+                given_mode.pedestal[k] * power_factor * inverse_noise * inverse_noise
+            )
+        at_phase = _mean_over_mode_power(given_phase, echo, rule.real_noise_at_ends, rule.fft_size)
+        pd, miss = pd + at_phase.pd / N_PHASE_NODES, miss + at_phase.miss / N_PHASE_NODES
+    return Detection(pd, miss)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _mean_over_mode_power(given_mode, is_echo, first_bin, real_fft_size):
+def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
     """Return the probabilities that any, and that no, bin crosses, averaged over the mode's power.
 
-    ``given_mode`` (>= 4, bins): root mean square signal of the mode over the noise; threshold over
-    the
-    noise; noise correlation with the bin below; mean power of the noise that fades with the mode,
-    over that of the rest. Given z the signal is z times row 0. The average is over |z| with the
-    density 2 z e^(-z^2).
+    Given z the signal of a bin is |z| times ``given_mode.signal``, a :class:`GivenMode`. The
+    average is over |z| with the density 2 z e^(-z^2). ``real_noise_at_ends`` and ``fft_size`` are
+    those of :class:`DetectionRule`.
     """
+    is_echo = echo.is_echo
     z_first, z_last, z_middle, pedestal_ratio_max, strongest_index = (
         _MODE_MAGNITUDE_MAX,
         _MODE_MAGNITUDE_MAX,
@@ -908,21 +951,21 @@ def _mean_over_mode_power(given_mode, is_echo, first_bin, real_fft_size):
         -1,
     )
     for k in range(is_echo.size):
-        pedestal_ratio_max = max(pedestal_ratio_max, given_mode[3, k])
-        if is_echo[k] and given_mode[0, k] > 0.0:
-            pedestal_reach = _THRESHOLD_REACH_SIGMA * math.sqrt(given_mode[3, k])
-            if given_mode[1, k] < z_middle * given_mode[0, k]:
-                z_middle, strongest_index = given_mode[1, k] / given_mode[0, k], k
+        pedestal_ratio_max = max(pedestal_ratio_max, given_mode.pedestal[k])
+        if is_echo[k] and given_mode.signal[k] > 0.0:
+            pedestal_reach = _THRESHOLD_REACH_SIGMA * math.sqrt(given_mode.pedestal[k])
+            if given_mode.threshold[k] < z_middle * given_mode.signal[k]:
+                z_middle, strongest_index = given_mode.threshold[k] / given_mode.signal[k], k
             z_first = min(
                 z_first,
-                max(given_mode[1, k] - _THRESHOLD_REACH_SIGMA, 0.0)
-                / (given_mode[0, k] + pedestal_reach),
+                max(given_mode.threshold[k] - _THRESHOLD_REACH_SIGMA, 0.0)
+                / (given_mode.signal[k] + pedestal_reach),
             )
-            if given_mode[0, k] > pedestal_reach:
+            if given_mode.signal[k] > pedestal_reach:
                 z_last = min(
                     z_last,
-                    (given_mode[1, k] + _THRESHOLD_REACH_SIGMA)
-                    / (given_mode[0, k] - pedestal_reach),
+                    (given_mode.threshold[k] + _THRESHOLD_REACH_SIGMA)
+                    / (given_mode.signal[k] - pedestal_reach),
                 )
     z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # what is beyond is 5e-5 of it all
     interval_ends = (z_first, z_last, z_last)
@@ -931,7 +974,7 @@ def _mean_over_mode_power(given_mode, is_echo, first_bin, real_fft_size):
         z_last = max(z_first, min(z_last, 4.5))  # what is beyond is 2e-9
         z_between = z_middle if z_first < z_middle < z_last else 0.5 * (z_first + z_last)
         interval_ends = (z_first, z_between, z_last)
-    is_real = is_real_bin(first_bin + strongest_index, real_fft_size)
+    is_real = is_real_bin(echo.first_bin + strongest_index, real_noise_at_ends, fft_size)
     # From the largest |z| on, so that bins that add nothing to what there is can be left out.
     pd, miss, p_below_first = math.exp(-z_last * z_last), 0.0, -math.expm1(-z_first * z_first)
     for interval in range(1, -1, -1):
@@ -950,16 +993,16 @@ def _mean_over_mode_power(given_mode, is_echo, first_bin, real_fft_size):
                     z, given_mode, strongest_index, is_real, negligible_probability
                 )
             )
-            pd_and_miss_at_z = _pd_and_miss_given_mode(
+            at_z = _pd_and_miss_given_mode(
                 given_mode,
                 z,
-                is_echo,
-                first_bin,
-                real_fft_size,
+                echo,
+                real_noise_at_ends,
+                fft_size,
                 squared_reach,
                 negligible_probability,
             )
-            pd, miss = pd + weight * pd_and_miss_at_z[0], miss + weight * pd_and_miss_at_z[1]
+            pd, miss = pd + weight * at_z.pd, miss + weight * at_z.miss
     if z_first > 0.0:
         negligible_probability = (
             min(_NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION * min(pd, p_below_first))
@@ -972,21 +1015,18 @@ def _mean_over_mode_power(given_mode, is_echo, first_bin, real_fft_size):
                 0.6 * z_first, given_mode, strongest_index, is_real, negligible_probability
             )
         )
-        pd_and_miss_at_z = _pd_and_miss_given_mode(
+        at_z = _pd_and_miss_given_mode(
             given_mode,
             0.6 * z_first,
-            is_echo,
-            first_bin,
-            real_fft_size,
+            echo,
+            real_noise_at_ends,
+            fft_size,
             squared_reach,
             negligible_probability,
         )
-        pd, miss = (
-            pd + p_below_first * pd_and_miss_at_z[0],
-            miss + p_below_first * pd_and_miss_at_z[1],
-        )
+        pd, miss = pd + p_below_first * at_z.pd, miss + p_below_first * at_z.miss
     total = pd + miss  # 1 but for the quadrature
-    return pd / total, miss / total
+    return Detection(pd / total, miss / total)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -999,7 +1039,9 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
     """
     if not negligible_probability > 0.0 or strongest_index < 0:
         return math.inf
-    excess_ratio = max(given_mode[0, strongest_index] * z - given_mode[1, strongest_index], 0.0)
+    excess_ratio = max(
+        given_mode.signal[strongest_index] * z - given_mode.threshold[strongest_index], 0.0
+    )
     return -2.0 * math.log(negligible_probability) - excess_ratio * excess_ratio * (
         0.5 if is_real else 1.0
     )
@@ -1007,7 +1049,7 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_given_mode(
-    given_mode, z, is_echo, first_bin, real_fft_size, squared_reach, negligible_probability
+    given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
 ):
     """Return the probabilities that any, and that no, bin crosses, given the mode's magnitude z.
 
@@ -1022,53 +1064,52 @@ def _pd_and_miss_given_mode(
     that add less than ``negligible_probability`` to the probability count as independent of their
     neighbours.
     """
+    is_echo = echo.is_echo
     pd, miss, previous_p_stay, previous_deviate, previous_signal = 0.0, 1.0, -1.0, 0.0, 0.0
     for k in range(is_echo.size):
         if not is_echo[k]:
             previous_p_stay = -1.0
             continue
-        scale = 1.0 / math.sqrt(1.0 + given_mode[3, k] * z * z)
-        signal = given_mode[0, k] * z * scale
-        distance_below = given_mode[1, k] * scale - signal
-        is_real = is_real_bin(first_bin + k, real_fft_size)
+        scale = 1.0 / math.sqrt(1.0 + given_mode.pedestal[k] * z * z)
+        signal = given_mode.signal[k] * z * scale
+        distance_below = given_mode.threshold[k] * scale - signal
+        is_real = is_real_bin(echo.first_bin + k, real_noise_at_ends, fft_size)
         if distance_below > 0.0 and distance_below * distance_below > (
             2.0 * squared_reach if is_real else squared_reach
         ):
             previous_p_stay = -1.0
             continue
-        p_cross, p_stay = bin_crossing_tails(signal, given_mode[1, k] * scale, is_real)
+        tails = bin_crossing_tails(signal, given_mode.threshold[k] * scale, is_real)
+        p_cross, p_stay = tails.above, tails.below
         if not p_stay > 0.0:
-            return 1.0, 0.0
+            return Detection(1.0, 0.0)
         if (
             p_cross < _RARE_CROSSING_MAX or miss * p_cross < negligible_probability
         ):  # so is that both of a pair cross
             pd, miss, previous_p_stay = pd + miss * p_cross, miss * p_stay, -1.0
             continue
-        deviate = _normal_deviate(p_cross) if p_cross < p_stay else -_normal_deviate(p_stay)
+        deviate = _normal_deviate_of_tails(tails)
         conditional_cross, conditional_stay = p_cross, p_stay
-        correlation = given_mode[2, k]
+        correlation = given_mode.correlation[k]
         if previous_p_stay > 0.0 and correlation != 0.0:
             correlation = (
                 correlation * correlation + correlation * signal * previous_signal
             ) / math.sqrt((1.0 + signal * signal) * (1.0 + previous_signal * previous_signal))
-            p_joint, half_angle = 0.0, 0.5 * math.asin(correlation)
-            for j in range(_JOINT_TAIL_NODES.size):
-                sine = math.sin(half_angle * (_JOINT_TAIL_NODES[j] + 1.0))
-                quadratic_form = (
-                    deviate * deviate
-                    + previous_deviate * previous_deviate
-                    - 2.0 * deviate * previous_deviate * sine
-                )
-                p_joint += _JOINT_TAIL_WEIGHTS[j] * math.exp(
-                    -quadratic_form / (2.0 * (1.0 - sine * sine))
-                )
-            p_joint *= half_angle / (2.0 * math.pi)
+            p_joint = joint_tail_excess_at(deviate, previous_deviate, correlation)
             p_joint = max(min(p_joint / previous_p_stay, p_cross), -p_stay)
             conditional_cross, conditional_stay = p_cross - p_joint, p_stay + p_joint
         pd += miss * conditional_cross
         miss *= conditional_stay
         previous_p_stay, previous_deviate, previous_signal = p_stay, deviate, signal
-    return (pd if pd < 0.5 else 1.0 - miss), miss
+    return Detection(pd if pd < 0.5 else 1.0 - miss, miss)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _normal_deviate_of_tails(tails):
+    """Return the normal deviate that a standard normal number exceeds with ``tails.above``."""
+    if tails.above < tails.below:
+        return _normal_deviate(tails.above)
+    return -_normal_deviate(tails.below)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1147,15 +1188,17 @@ def detect_in_spectra(
         peak, n_exempt = mark_exempt_bins(
             searched, searched.size, threshold_rows[1, i], is_exempt, lobe_half_width
         )
-        pd, miss = pd_and_miss(
-            searched,
-            is_exempt[: searched.size],
+        detection = pd_and_miss(
+            EchoBins(searched, is_exempt[: searched.size], first_bins[i] + low),
             peak,
-            first_bins[i] + low,
             rule,
             bin_threshold_at(threshold_rows, i),
             bin_speckle_at(speckle_table, 0, i),
         )
-        results[0, i], results[1, i], results[2, i] = pd, miss, searched[peak]
+        results[0, i], results[1, i], results[2, i] = (
+            detection.pd,
+            detection.miss,
+            searched[peak],
+        )
         results[3, i] = (first_bins[i] + low + peak) * bin_width
         results[4, i], results[5, i] = n_exempt, 0.0

@@ -17,10 +17,10 @@ import math
 import numpy as np
 
 from sweep.kernel_cache import njit
-from sweep.model.detection.marcum import marcum_q1_tails
+from sweep.model.detection.marcum import Tails, marcum_q1_tails
 
 N_PHASE_NODES = 8
-"""Number of nodes t_j = pi (j + 1/2) / ANGLES of the midpoint rule over the phase t."""
+"""Number of nodes t_j = pi (j + 1/2) / N_PHASE_NODES of the midpoint rule over the phase t."""
 
 PHASE_COSINES = np.cos(np.pi * (np.arange(N_PHASE_NODES) + 0.5) / N_PHASE_NODES)
 
@@ -38,25 +38,27 @@ def pseudo_variance_ratio_at(bin_, nyquist_bin, ratios):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def hoyt_tails(power, ratio, threshold):
-    """Return P(|X| >= level) and P(|X| < level) of a noncircular complex Gaussian number X.
+    """Return both :class:`Tails` of the magnitude of a noncircular complex Gaussian number X.
 
-    ``power`` is E[|X|^2], ``ratio`` the pseudo-variance ratio q = E[X^2] / E[|X|^2], -1 .. 1.
+    ``power`` is E[|X|^2], ``ratio`` the pseudo-variance ratio q = E[X^2] / E[|X|^2], -1 .. 1;
+    ``threshold`` is in units of |X|.
     """
     q = abs(ratio)
     if q == 0.0:
         y = threshold * threshold / power
-        return math.exp(-y), -math.expm1(-y)
+        return Tails(math.exp(-y), -math.expm1(-y))
     if q > 1.0 - 1e-9:
         x = threshold / math.sqrt(2.0 * power)
-        return math.erfc(x), math.erf(x)
+        return Tails(math.erfc(x), math.erf(x))
     deviation_1, deviation_2 = (
         math.sqrt(0.5 * power * (1.0 + q)),
         math.sqrt(0.5 * power * (1.0 - q)),
     )
     scale = 0.5 * threshold / (deviation_1 * deviation_2)
     a, b = scale * (deviation_1 + deviation_2), scale * (deviation_1 - deviation_2)
-    q_ab, p_ab = marcum_q1_tails(a, b)
-    q_ba, p_ba = marcum_q1_tails(b, a)
-    p_above = p_ab + q_ba
-    p_below = q_ab - q_ba if q_ab < 0.5 else p_ba - p_ab
-    return p_above, max(p_below, 0.0)
+    tails_ab, tails_ba = marcum_q1_tails(a, b), marcum_q1_tails(b, a)
+    p_above = tails_ab.below + tails_ba.above
+    p_below = tails_ba.below - tails_ab.below
+    if tails_ab.above < 0.5:
+        p_below = tails_ab.above - tails_ba.above
+    return Tails(p_above, max(p_below, 0.0))

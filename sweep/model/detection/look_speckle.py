@@ -365,7 +365,7 @@ def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnit
             )
             crossing_table[k] = 0.5 * (tail_above + tail_below)
         else:
-            crossing_table[k] = marcum_q1_tails(faded_signal, threshold_ratio)[0]
+            crossing_table[k] = marcum_q1_tails(faded_signal, threshold_ratio).above
     vote_probability, count_distribution = np.empty(magnitude.shape[0]), np.empty(votes_needed + 1)
     for i in range(magnitude.shape[0]):
         count_distribution[:] = 0.0

@@ -70,13 +70,22 @@ _GAUSS_NODES = 24
 """Gauss points of each stretch of a mean over speckle."""
 
 
+class DetectionArrays(NamedTuple):
+    """Probabilities of detection and of a miss of many bins or shots, of one common shape."""
+
+    pd: np.ndarray
+    """Probability of detection, 0..1."""
+    miss: np.ndarray
+    """Probability of a miss, 1 - pd; keeps its digits where pd is near 1."""
+
+
 class Looks(NamedTuple):
     """Records of each segment, and how a bin is detected from them.
 
     Examples
     --------
-    >>> pd, miss = Looks(8).steady(np.array([1.5]), np.array([2.0]))
-    >>> bool(pd > Looks(1).steady(np.array([1.5]), np.array([2.0]))[0])
+    >>> pd, miss = Looks(8).pd_and_miss_steady(np.array([1.5]), np.array([2.0]))
+    >>> bool(pd > Looks(1).pd_and_miss_steady(np.array([1.5]), np.array([2.0])).pd)
     True
     """
 
@@ -132,11 +141,12 @@ class Looks(NamedTuple):
 
     def pd_and_miss_steady(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, is_real: np.ndarray | bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities that a bin of a steady signal is detected, and that it is not.
+    ) -> DetectionArrays:
+        """Return the probabilities that a bin of a steady signal is detected and missed.
 
-        |X| and threshold are over the noise per quadrature of one record. If the noise is
-        ``is_real`` it has the power of both quadratures in one.
+        |X| (``signal``) and threshold are over the noise per quadrature of one record. If the noise
+        ``is_real``, it has the power of both quadratures in one. The results have the shape of the
+        broadcast arguments.
         """
         from sweep.model.detection.marcum import marcum_q1
 
@@ -147,7 +157,9 @@ class Looks(NamedTuple):
                 near, far = 0.5 * (threshold_ratio - signal), 0.5 * (threshold_ratio + signal)
                 pd = np.where(is_real, 0.5 * (special.erfc(near) + special.erfc(far)), pd)
                 miss = np.where(is_real, 0.5 * (special.erfc(-near) - special.erfc(far)), miss)
-            return self.vote_probabilities(pd, miss) if self.is_noncoherent else (pd, miss)
+            if self.is_noncoherent:
+                return self.vote_probabilities(pd, miss)
+            return DetectionArrays(pd, miss)
         from scipy import stats  # which takes a second, and one look has no need of
 
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, threshold_ratio))
@@ -165,14 +177,14 @@ class Looks(NamedTuple):
         for members, tail_law in ((is_upper_tail, stats.ncx2.sf), (~is_upper_tail, stats.ncx2.cdf)):
             tail[members] = tail_law(x[members], degrees_of_freedom[members], signal[members])
         pd[near], miss[near] = np.where(is_upper_tail, (tail, 1 - tail), (1 - tail, tail))
-        return pd, miss
+        return DetectionArrays(pd, miss)
 
     def pd_and_miss_in_speckle(
         self,
         signal: np.ndarray,
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> DetectionArrays:
         """Compute pd and 1 - pd for a signal in developed speckle, of mean power signal^2.
 
         ``look_speckle`` is that of looks which share it in part; signals are (..., 3, n) then.
@@ -187,18 +199,22 @@ class Looks(NamedTuple):
             self.combine == COMBINE_BINARY and self.has_independent_speckle
         ):
             pd, miss = np.exp(-y), -np.expm1(-y)
-            return self.vote_probabilities(pd, miss) if self.is_noncoherent else (pd, miss)
+            if self.is_noncoherent:
+                return self.vote_probabilities(pd, miss)
+            return DetectionArrays(pd, miss)
         if self.has_independent_speckle:
-            return special.gammaincc(self.number, self.number * y), special.gammainc(
-                self.number, self.number * y
+            return DetectionArrays(
+                special.gammaincc(self.number, self.number * y),
+                special.gammainc(self.number, self.number * y),
             )
         if self.combine == COMBINE_BINARY:
             magnitude, weight = self.speckle_quadrature(threshold_ratio, signal)
             tails_given_speckle = self.pd_and_miss_steady(
                 signal[..., None] * magnitude, threshold_ratio[..., None]
             )
-            pd, miss = (np.minimum((v * weight).sum(axis=-1), 1.0) for v in tails_given_speckle)
-            return pd, miss
+            return DetectionArrays(
+                *(np.minimum((v * weight).sum(axis=-1), 1.0) for v in tails_given_speckle)
+            )
         n, gamma_threshold = self.number, 0.5 * self.number * np.square(threshold_ratio)
         total_snr = np.maximum(0.5 * self.number * np.square(signal), 1e-200)
         noise_tail = special.gammaincc(n - 1, gamma_threshold)
@@ -212,11 +228,11 @@ class Looks(NamedTuple):
             (n - 1) * np.log1p(1 / total_snr) - gamma_threshold / (1 + total_snr) + log_p, 0.0
         )
         pd = np.minimum(noise_tail + np.exp(log_signal_tail), 1.0)
-        return pd, np.maximum(-np.expm1(log_signal_tail) - noise_tail, 0.0)
+        return DetectionArrays(pd, np.maximum(-np.expm1(log_signal_tail) - noise_tail, 0.0))
 
     def _pd_and_miss_in_moving_speckle(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, look_speckle: "LookSpeckle"
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> DetectionArrays:
         """Compute :meth:`pd_and_miss_in_speckle` for looks that share their speckle in part."""
         from sweep.model.detection.look_speckle import (
             mean_power_tails,
@@ -225,7 +241,7 @@ class Looks(NamedTuple):
 
         if self.combine == COMBINE_POWER:
             snr, threshold = 0.5 * np.square(signal), 0.5 * self.number * np.square(threshold_ratio)
-            return mean_power_tails(look_speckle, self.number, snr, threshold)
+            return DetectionArrays(*mean_power_tails(look_speckle, self.number, snr, threshold))
         pd = np.empty(signal.shape)
         for segment, point in np.ndindex(signal.shape[-2:]):
             magnitude = self._correlated_magnitudes(look_speckle, segment, point)
@@ -236,7 +252,7 @@ class Looks(NamedTuple):
                 )
                 pd[index] = pd_given_speckle.mean()
         record_pd = np.exp(-np.square(threshold_ratio) / (2 + np.square(signal)))
-        independent_pd = self.vote_probabilities(record_pd, 1 - record_pd)[0]
+        independent_pd = self.vote_probabilities(record_pd, 1 - record_pd).pd
         for index in np.ndindex(signal.shape):
             lattice_pd = vote_probability_given_speckle(
                 signal[index], threshold_ratio[index], self.votes, self._lattice_magnitudes()
@@ -244,7 +260,7 @@ class Looks(NamedTuple):
             independence = (look_speckle.effective_looks[index[-2:]] - 1) / (self.number - 1)
             pd[index] += independence * (independent_pd[index] - lattice_pd)
         pd = np.clip(pd, 0.0, 1.0)
-        return pd, 1 - pd
+        return DetectionArrays(pd, 1 - pd)
 
     def _lattice_magnitudes(self) -> np.ndarray:
         """Magnitudes (nodes, N) of independent speckles."""
@@ -291,7 +307,7 @@ class Looks(NamedTuple):
                 threshold_ratio, *signals, gamma_shape=effective_looks
             )
             pd_by_signal = [
-                self.pd_and_miss_steady(v[..., None] * magnitude, threshold_ratio[..., None])[0]
+                self.pd_and_miss_steady(v[..., None] * magnitude, threshold_ratio[..., None]).pd
                 for v in signals
             ]
             return pd_by_signal, weight
@@ -345,16 +361,16 @@ class Looks(NamedTuple):
         if look_speckle is not None:
             signals = np.stack([a, 0 * a, b], axis=-2)
             p, _, q = np.moveaxis(
-                self.pd_and_miss_in_speckle(signals, threshold_ratio[..., None, :], look_speckle)[
-                    0
-                ],
+                self.pd_and_miss_in_speckle(
+                    signals, threshold_ratio[..., None, :], look_speckle
+                ).pd,
                 -2,
                 0,
             )
         else:
             p, q = (
-                self.pd_and_miss_in_speckle(a, threshold_ratio)[0],
-                self.pd_and_miss_in_speckle(b, threshold_ratio)[0],
+                self.pd_and_miss_in_speckle(a, threshold_ratio).pd,
+                self.pd_and_miss_in_speckle(b, threshold_ratio).pd,
             )
         if look_speckle is not None or not self.has_independent_speckle:
             (pd_first, pd_second), weight = self.pd_given_speckle(
@@ -441,8 +457,8 @@ class Looks(NamedTuple):
         correlations: np.ndarray,
         pd: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities that at least two of three segments are detected, and that they are not.
+    ) -> DetectionArrays:
+        """Return the probabilities that at least two of three segments, or fewer, are detected.
 
         Parameters
         ----------
@@ -497,9 +513,11 @@ class Looks(NamedTuple):
         inverse_looks = 1 / self._effective_looks(look_speckle)
         pd_in_one_speckle = pd_and_miss_any_two_in_speckle(
             p, 1 - p, np.full(threshold_ratio.shape, 1e100), correlations
-        )[0]
+        ).pd
         p_any_two = inverse_looks * pd_in_one_speckle + (1 - inverse_looks) * p_any_two
-        return np.where(is_defined, p_any_two, np.nan), np.where(is_defined, 1 - p_any_two, np.nan)
+        return DetectionArrays(
+            np.where(is_defined, p_any_two, np.nan), np.where(is_defined, 1 - p_any_two, np.nan)
+        )
 
     def log_pfa(self, threshold_ratio: np.ndarray) -> np.ndarray:
         """Natural logarithm of the probability that a bin of noise alone is detected.
@@ -654,13 +672,15 @@ class Looks(NamedTuple):
             )
         return np.asarray(np.minimum(signal_max, 1 / (self.number * threshold_ratio)))
 
-    def vote_probabilities(
-        self, p_cross: np.ndarray, p_stay: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities that enough records cross, and that they do not."""
+    def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> DetectionArrays:
+        """Return the probabilities that enough records cross, and that they do not.
+
+        ``p_cross`` and ``p_stay`` are the probabilities that one record crosses and does not.
+        """
         votes_needed, misses_needed = self.votes, self.number - self.votes + 1
-        return special.betainc(votes_needed, misses_needed, p_cross), special.betainc(
-            misses_needed, votes_needed, p_stay
+        return DetectionArrays(
+            special.betainc(votes_needed, misses_needed, p_cross),
+            special.betainc(misses_needed, votes_needed, p_stay),
         )
 
     def speckle_power_quadrature(
@@ -758,8 +778,8 @@ def solve_threshold_ratio(
 
 def pd_and_miss_any_two_in_speckle(
     pd: np.ndarray, miss: np.ndarray, threshold_ratio: np.ndarray, correlations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities that at least two of three segments in developed speckle are detected, and not.
+) -> DetectionArrays:
+    """Return the probabilities that two or more of three segments in speckle are detected, or not.
 
     The amplitude of each segment, signal and noise, is normal, of the part l_i z of one common
     amplitude z and a rest of its own. With A_i = Th^2 over the mean power, u = |z|^2 exponential,
@@ -855,7 +875,9 @@ def pd_and_miss_any_two_in_speckle(
     # A segment that is never detected has no threshold: what stands for it above is too low.
     is_possible = np.count_nonzero(pd > 0.0, axis=0) >= 2
     p_cross, p_stay = np.where(is_possible, [p_cross / total, p_stay / total], [[0.0], [1.0]])
-    return np.where(is_defined, p_cross, np.nan), np.where(is_defined, p_stay, np.nan)
+    return DetectionArrays(
+        np.where(is_defined, p_cross, np.nan), np.where(is_defined, p_stay, np.nan)
+    )
 
 
 def _marcum_q1_derivatives(
@@ -887,7 +909,7 @@ def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Logarithms of signals and of what :meth:`Looks.added_crossing_probability` has for them."""
     signal = np.geomspace(1e-3 / math.sqrt(looks.number), threshold_ratio + 1.0, 300)
-    p_noise_cross, p_noise_stay = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))
-    p_cross = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio))[0]
-    added = np.maximum(p_cross - p_noise_cross, 1e-300) / np.maximum(p_noise_stay, 1e-300)
+    noise = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))
+    p_cross = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio)).pd
+    added = np.maximum(p_cross - noise.pd, 1e-300) / np.maximum(noise.miss, 1e-300)
     return np.log(signal), np.log(added)

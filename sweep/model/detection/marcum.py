@@ -45,6 +45,15 @@ _LOG_P_TINY = -600.0
 """Below this ln p, 1-(1-p)^n and n p are the same double for any n up to 1e240."""
 
 
+class Tails(NamedTuple):
+    """Both tails of a magnitude |X| at a threshold, each with all its digits; they add to 1."""
+
+    above: float
+    """P(|X| >= threshold), 0..1."""
+    below: float
+    """P(|X| < threshold), 0..1."""
+
+
 class MarcumQ(NamedTuple):
     """Both tails of the Rice distribution, of one common shape."""
 
@@ -63,23 +72,24 @@ def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
     """
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     tails = np.empty((2, a.size))
-    _fill_tails(a.ravel(), b.ravel(), tails)
+    _fill_tails(a.ravel(), b.ravel(), *tails)
     return MarcumQ(*tails.reshape(2, *a.shape))
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_tails(a, b, tails):
-    """Tails (2, n) of n pairs."""
+def _fill_tails(a, b, q, p):
+    """Fill ``q`` and ``p`` (n,) with Q1(a, b) and 1 - Q1(a, b) of n pairs."""
     for i in range(a.size):
-        tails[0, i], tails[1, i] = marcum_q1_tails(a[i], b[i])
+        tails = marcum_q1_tails(a[i], b[i])
+        q[i], p[i] = tails.above, tails.below
 
 
 @njit(cache=True, error_model="numpy")
 def marcum_q1_tails(a, b):
-    """(Q1(a, b), 1 - Q1(a, b)) of one pair; nan outside the domain.
+    """Return Q1(a, b) and 1 - Q1(a, b) of one pair as :class:`Tails`; nan outside the domain.
 
-    The tail computed is Q1 for b >= a, else 1 - Q1; but below b = 1.2, where Q1 is near 1 for any
-    a, always 1 - Q1. Its exponential, exp(-(a - b)^2 / 2), is carried in two doubles.
+    The tail that is computed is Q1 if b >= a, else 1 - Q1. Below b = 1.2, where Q1 is near 1 for
+    any a, it is always 1 - Q1. Its exponential, exp(-(a - b)^2 / 2), is carried in two doubles.
 
     Below ab = 30, Q1 = exp(-(a^2+b^2)/2) sum_{k>=0} (a/b)^k I_k(ab), and 1 - Q1 the same from k = 1
     with a and b exchanged. The recurrence N_k = 2k N_{k+1} + (ab)^2 N_{k+2}, started at k = K from
@@ -89,10 +99,10 @@ def marcum_q1_tails(a, b):
     v = (h (k + 1/2))^2, with + for Q1; written in ratios of a and b so that it cannot overflow.
     """
     if not (a >= 0.0 and b >= 0.0) or (math.isinf(a) and math.isinf(b)):
-        return math.nan, math.nan
+        return Tails(math.nan, math.nan)
     d, is_p = abs(a - b), b < a
     if b == 0.0 or d * d > _SQUARED_DISTANCE_MAX:
-        return (1.0, 0.0) if b == 0.0 or is_p else (0.0, 1.0)
+        return Tails(1.0, 0.0) if b == 0.0 or is_p else Tails(0.0, 1.0)
     high = 0.5 * d * d
     low = exact_product(0.5 * d, d)[1] + d * ((max(a, b) - d) - min(a, b))
     decay = math.exp(-high)
@@ -123,12 +133,12 @@ def marcum_q1_tails(a, b):
             )
         pole = 1.0 / (1.0 + math.exp(_POLE_REACH * d)) if d < _POLE_REACH else 0.0
         tail = total * decay + pole
-    return (1.0 - tail, tail) if is_p else (tail, 1.0 - tail)
+    return Tails(1.0 - tail, tail) if is_p else Tails(tail, 1.0 - tail)
 
 
 @njit(cache=True, error_model="numpy")
 def marcum_q1_excess(a, b):
-    """Q1(a, b) - Q1(0, b): what a bin's own signal adds to its probability to cross; nan outside.
+    """Return the crossing probability that a bin's signal adds, Q1(a, b) - Q1(0, b); nan outside.
 
     If the sum is short (a <= 2 and ab <= 8; a leaking bin), with x = a^2/2 and y = b^2/2,
 
@@ -159,10 +169,12 @@ def marcum_q1_excess(a, b):
             kummer = x * _HARMONIC[m] * kummer + 1.0
             total = (w * _INVERSE_SQUARE[m]) * (kummer + total)
         return (decay - decay * low) * total
-    q, p = marcum_q1_tails(a, b)
+    tails = marcum_q1_tails(a, b)
     noise_alone = math.exp(-high)
     noise_alone -= noise_alone * low
-    return q - noise_alone if q >= 2.0 * noise_alone else -math.expm1(-high) - p
+    if tails.above >= 2.0 * noise_alone:
+        return tails.above - noise_alone
+    return -math.expm1(-high) - tails.below
 
 
 def at_least_one_probability(p: ArrayLike, n: ArrayLike) -> np.ndarray:

@@ -35,7 +35,7 @@ from sweep.model.detection.look_speckle import (
     speckle_lattice,
     vote_probability_given_speckle,
 )
-from sweep.model.detection.looks import COMBINE_POWER, Looks
+from sweep.model.detection.looks import COMBINE_POWER, DetectionArrays, Looks
 from sweep.model.detection.speckle_correlation import window_transform
 from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet_line_positions
 from sweep.model.window import Window, window_samples
@@ -211,7 +211,7 @@ def multilook_pd_and_miss_near_ends(
     signal_pseudo_variance: np.ndarray,
     noise_pseudo_variance: np.ndarray,
     look_covariance: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> DetectionArrays:
     """Return pd and 1 - pd of a bin near DC or Nyquist for several looks in developed speckle.
 
     Parameters
@@ -263,7 +263,9 @@ def multilook_pd_and_miss_near_ends(
             looks.number - n_kept
         )  # looks that others represent: noise
         gamma_scale = 2 * np.maximum(eigenvalues, 0.0)
-        return gamma_sum_tails(gamma_shape, gamma_scale, looks.number * np.square(threshold_ratio))
+        return DetectionArrays(
+            *gamma_sum_tails(gamma_shape, gamma_scale, looks.number * np.square(threshold_ratio))
+        )
     pd = np.empty(signal.shape)
     for bin_index, covariance_matrix in enumerate(look_covariance):
         n_represented = covariance_matrix.shape[-1]
@@ -291,10 +293,8 @@ def multilook_pd_and_miss_near_ends(
             signal_power[bin_index] * signal_pseudo_variance[bin_index]
             + 2 * noise_pseudo_variance[bin_index]
         ) / (signal_power[bin_index] + 2)
-        record_tails = np.array(
-            hoyt_tails(signal_power[bin_index] + 2, abs(q), threshold_ratio[bin_index])
-        )
-        pd[bin_index] = looks.vote_probabilities(*record_tails)[0]
+        record_tails = hoyt_tails(signal_power[bin_index] + 2, abs(q), threshold_ratio[bin_index])
+        pd[bin_index] = looks.vote_probabilities(*np.array(record_tails)).pd
         independence = (n_represented**2 / np.square(np.abs(covariance_matrix)).sum() - 1) / max(
             n_represented - 1, 1
         )
@@ -309,4 +309,4 @@ def multilook_pd_and_miss_near_ends(
             )
             pd[bin_index] = lattice_pd + independence * lattice_error
     pd = np.clip(pd, 0.0, 1.0)
-    return pd, 1 - pd
+    return DetectionArrays(pd, 1 - pd)

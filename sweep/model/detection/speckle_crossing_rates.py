@@ -126,7 +126,8 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
             threshold_ratio + _CERTAIN_MARGIN_SIGMA
         ):
             p_signal_stay = (
-                marcum_q1_tails(math.sqrt(squared_amplitudes[k]), threshold_ratio)[1] / p_noise_stay
+                marcum_q1_tails(math.sqrt(squared_amplitudes[k]), threshold_ratio).below
+                / p_noise_stay
             )
             rate = min(-math.log(max(p_signal_stay, 1e-300)), CERTAIN_CROSSING_RATE)
         rates[k] = rate / squared_amplitudes[k]

@@ -412,7 +412,12 @@ def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
     BinSpans
         Spectra with changed magnitudes, probabilities, exempt bins and leakage.
     """
-    from sweep.model.detection.echo_detection import bin_speckle_at, bin_threshold_at, pd_and_miss
+    from sweep.model.detection.echo_detection import (
+        EchoBins,
+        bin_speckle_at,
+        bin_threshold_at,
+        pd_and_miss,
+    )
 
     magnitudes = bin_spans.magnitudes.copy()
     pd, miss, exempted, leakage = (
@@ -465,10 +470,12 @@ def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
             pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
         else:
             pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
-                raised_magnitudes, is_echo, peak, bin_spans.first_bin[segment_index, i], rule,
+                EchoBins(raised_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
+                peak,
+                rule,
                 bin_threshold_at(shots.bin_threshold_table, bin_spans.point_numbers[i]),
                 bin_speckle_at(speckle, segment_index, bin_spans.point_numbers[i]),
-            )  # fmt: skip
+            )
         exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)
         if shots.waveform_segments[segment_index].includes_leakage:
             alarm_probability = line_alarm_probability(

@@ -301,7 +301,7 @@ def leakage_table(
         (_OCTAVE_MAX - _OCTAVE_MIN) * _ROWS_PER_OCTAVE + 1,
     )
     total_ratio = threshold_ratio * 2.0 ** (np.arange(n_rows) / _ROWS_PER_OCTAVE + _OCTAVE_MIN)
-    noise_crossing = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))[0][0]
+    noise_crossing = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio])).pd[0]
     crossing_of_total = _added_crossing_probability(
         np.minimum(total_ratio, threshold_ratio), threshold_ratio, noise_crossing, looks
     )
@@ -340,7 +340,7 @@ def _added_crossing_probability(
     signal: np.ndarray, threshold_ratio: float, noise_crossing: float, looks: Looks
 ) -> np.ndarray:
     """Return by how much a signal raises a bin's probability to cross the threshold."""
-    crossing = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio))[0]
+    crossing = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio)).pd
     return np.maximum(crossing - noise_crossing, 0.0) / max(1 - noise_crossing, 1e-12)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.echo_detection import (
+    EchoBins,
     bin_speckle_at,
     bin_threshold_at,
     echo_bounds,
@@ -128,7 +129,7 @@ def find_groups_in_spans(
         )
         peak_pd = shots.pd_and_miss_in_looks(
             peak_magnitudes.T, strongest_bins.T, spans.point_numbers
-        )[0]
+        ).pd
         pd[spans.point_numbers] = peak_pd.T
     lacks_group = (bin_groups.strongest_bin[spans.point_numbers, :, 0] < 0) & shots.has_segment
     strongest_magnitudes = bin_groups.neighbour_magnitudes[spans.point_numbers, :, 0, 1]
@@ -216,16 +217,17 @@ def _fill_groups(
                     threshold,
                     lobe_half_width,
                 )
-                echo_mask = np.ones(last_index - first_index + 1, np.bool_)
                 pd[i, segment, group] = pd_and_miss(
-                    magnitude[first_index : last_index + 1],
-                    echo_mask,
+                    EchoBins(
+                        magnitude[first_index : last_index + 1],
+                        np.ones(last_index - first_index + 1, np.bool_),
+                        first_bin[segment, j] + first_index,
+                    ),
                     strongest_index - first_index,
-                    first_bin[segment, j] + first_index,
                     rule,
                     bin_threshold_at(bin_threshold_table, i),
                     bin_speckle_at(speckle_table, segment, i),
-                )[0]
+                ).pd
                 for side in range(3):
                     neighbour_magnitudes[i, segment, group, side] = _mirrored_magnitude(
                         magnitude, first_bin[segment, j], strongest_index + side - 1, nyquist_bin

@@ -644,7 +644,9 @@ def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
             if p_noise_stay > 0.0 and amplitude < ratio:
                 rate = -math.log1p(-marcum_q1_excess(amplitude, ratio) / p_noise_stay)
             elif p_noise_stay > 0.0:
-                rate = -math.log(max(marcum_q1_tails(amplitude, ratio)[1], 1e-300) / p_noise_stay)
+                rate = -math.log(
+                    max(marcum_q1_tails(amplitude, ratio).below, 1e-300) / p_noise_stay
+                )
             log_rates[j, k] = math.log(max(rate, 1e-300))
 
 

@@ -384,7 +384,7 @@ class DrawConfig(NamedTuple):
             down_beat_sign,
             two_beat_reading,
             shots.real_fft_size,
-            shots.detection_rule[1],
+            shots.detection_rule.lobe_half_width,
             make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
             np.zeros((0, 0)),
             make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
@@ -1827,7 +1827,7 @@ def draw_peak_bin(
     strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
     k = strongest_bin - spectra.first_bin[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
-    is_real = is_real_bin(strongest_bin, config.real_fft_size)
+    is_real = is_real_bin(strongest_bin, config.real_fft_size > 0, config.real_fft_size)
     if is_real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * line_noise_ratio, im * line_noise_ratio
@@ -1989,7 +1989,7 @@ def detect_in_speckle(
             abs(strongest_bin), config.nyquist_bin, config.noise_pseudo_variance_ratio
         )
         is_detected = (
-            hoyt_tails(1.0, mean_pseudo_variance, math.hypot(in_phase, in_quadrature))[0] < pd
+            hoyt_tails(1.0, mean_pseudo_variance, math.hypot(in_phase, in_quadrature)).above < pd
         )
     else:
         is_detected = math.exp(-(in_phase * in_phase + in_quadrature * in_quadrature)) < pd

@@ -190,7 +190,7 @@ def make_echo_noise_filter(
         detects it.
     """
     n_echo_bins = (
-        max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule[1] else 0
+        max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule.any_bin else 0
     )
     n_filter_bins = 1 << (n_echo_bins - 1).bit_length() if n_echo_bins else 0
     if shots.noise_bins == "independent":

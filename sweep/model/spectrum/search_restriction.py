@@ -12,6 +12,8 @@ from sweep.model.detection.added_crossings import (
     exclude_bins_joining_echo,
 )
 from sweep.model.detection.echo_detection import (
+    Detection,
+    EchoBins,
     bin_speckle_at,
     bin_threshold_at,
     echo_bounds,
@@ -226,17 +228,16 @@ def _restrict_spans(
                 else max(largest_index - first, 0)
             )
             n_exempt[s, j] = is_exempt.sum()
-            probabilities[0, s, j], probabilities[1, s, j] = 0.0, 1.0
+            detection = Detection(0.0, 1.0)
             if peak_is_searched[s, j]:
-                probabilities[0, s, j], probabilities[1, s, j] = pd_and_miss(
-                    magnitudes,
-                    is_exempt,
+                detection = pd_and_miss(
+                    EchoBins(magnitudes, is_exempt, first_bin[s, j]),
                     peak_index[s, j],
-                    first_bin[s, j],
                     rule,
                     bin_threshold_at(threshold_rows, j),
                     bin_speckle_at(points_and_speckle[1], s, points_and_speckle[0][j]),
                 )
+            probabilities[0, s, j], probabilities[1, s, j] = detection.pd, detection.miss
             if evaluates_leakage[s]:
                 probabilities[2, s, j] = span_leakage(
                     magnitudes,

@@ -21,6 +21,8 @@ from sweep.model.detection.added_crossings import (
 )
 from sweep.model.detection.echo_detection import (
     BinThreshold,
+    Detection,
+    EchoBins,
     PedestalShape,
     any_crossing_of_chain,
     bin_speckle_at,
@@ -914,16 +916,14 @@ def _evaluate_points(
         pedestal = PedestalShape(point[18], point[19], point[20])
         layout[8] = max(rule.lobe_half_width, int(pedestal.reach_bins))
         threshold_ratio = threshold / noise_sigma
-        if (
-            rule.speckle_noise_correlation >= 0.0
-        ):  # one table serves thresholds that differ by light's shot noise
+        if rule.in_speckle:  # one table serves thresholds that differ by light's shot noise
             threshold_ratio = (
                 math.floor(threshold_ratio / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
             )
         if leakage_methods.any() and threshold_ratio != previous_ratio:
             previous_ratio = threshold_ratio
             fill_crossing_series(previous_ratio, crossing_series)
-            if rule.speckle_noise_correlation >= 0.0:
+            if rule.in_speckle:
                 speckle_rates = tabulate_crossing_rates(previous_ratio, crossing_series)
         for s in range(segment_exists.size):
             if not segment_exists[s]:
@@ -952,8 +952,7 @@ def _evaluate_points(
                 weight_sum,
                 point[15] * noise_sigma / LINE_APPROXIMATIONS_MAX,
             )
-            in_speckle = rule.speckle_noise_correlation >= 0.0
-            speckle_power_max, leakage = SPECKLE_POWER_MAX if in_speckle else 1.0, 0.0
+            speckle_power_max, leakage = SPECKLE_POWER_MAX if rule.in_speckle else 1.0, 0.0
             leakage_limits = (
                 noise_sigma,
                 threshold,
@@ -999,16 +998,18 @@ def _evaluate_points(
                 next_start = _store_span(
                     next_start, n_bins, scratch, is_exempt, all_magnitudes, all_is_exempt
                 )
-            pd, miss = np.nan, np.nan
+            detection = Detection(np.nan, np.nan)
             if with_pd:
-                pd, miss = pd_and_miss(
-                    scratch[OUT, :n_bins], is_exempt[:n_bins], peak_index, first_bin, rule,
+                detection = pd_and_miss(
+                    EchoBins(scratch[OUT, :n_bins], is_exempt[:n_bins], first_bin),
+                    peak_index,
+                    rule,
                     BinThreshold(point[13], threshold, noise_sigma, point[17], pedestal),
                     bin_speckle_at(speckle_table, s, point_index[2, i]),
-                )  # fmt: skip
+                )
             if leakage_methods[s] == LEAKAGE_BIN_BY_BIN:
                 bin_limits = noise_sigma, threshold, point[14], rule.sidelobe_correlation
-                if in_speckle:
+                if rule.in_speckle:
                     negligible_signal_ratio = point[12] / math.sqrt(SPECKLE_POWER_MAX)
                     leakage = leakage_of_bins_in_speckle(
                         n_bins,
@@ -1022,7 +1023,7 @@ def _evaluate_points(
                     leakage = leakage_of_bins(
                         n_bins, bin_limits, point[12], scratch, is_exempt, crossing_series
                     )
-                    if point[16] > 0.0 and rule.joint_tail_rule.size > 0:
+                    if point[16] > 0.0 and rule.joint_tail_rule.sine.size > 0:
                         leakage = any_crossing_of_chain(
                             scratch[CHANCE], n_bins, rule.joint_tail_rule
                         )
@@ -1033,6 +1034,6 @@ def _evaluate_points(
                 peak_index,
             )
             span_numbers[3, s, i] = n_exempt
-            span_values[0, s, i], span_values[1, s, i] = pd, miss
+            span_values[0, s, i], span_values[1, s, i] = detection.pd, detection.miss
             span_values[2, s, i], span_values[3, s, i] = scratch[OUT, peak_index], leakage
     return point_rows.shape[0]

@@ -32,6 +32,8 @@ from sweep.model import waveform
 from sweep.model.detection import bin_noise
 from sweep.model.detection.echo_detection import (
     BinThreshold,
+    Detection,
+    EchoBins,
     bin_speckle_at,
     bin_threshold_at,
     pd_and_miss,
@@ -210,14 +212,14 @@ def _joint_excess(exponent_first, exponent_second, squared_correlation):
         * marcum_q1_tails(
             math.sqrt(exponent_second * inverse_remainder),
             math.sqrt(squared_correlation * exponent_first * inverse_remainder),
-        )[1]
+        ).below
     )
     p_both += (
         math.exp(-exponent_second)
         * marcum_q1_tails(
             math.sqrt(squared_correlation * exponent_second * inverse_remainder),
             math.sqrt(exponent_first * inverse_remainder),
-        )[0]
+        ).above
     )
     return max(p_both - math.exp(-exponent_first - exponent_second), 0.0)
 
@@ -254,19 +256,13 @@ def _evaluate_levels(
                 continue
             magnitudes = span_bins[0][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
             is_echo = span_bins[1][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
-            pd_at_threshold, miss_at_threshold, bin_threshold = (
-                0.0,
-                1.0,
-                bin_threshold_at(threshold_rows, j),
-            )
+            at_threshold, bin_threshold = Detection(0.0, 1.0), bin_threshold_at(threshold_rows, j)
             for k in range(levels.shape[2]):
                 threshold = levels[s, j, k]
                 if peak_is_searched[s, j]:
-                    pd, miss = pd_and_miss(
-                        magnitudes,
-                        is_echo,
+                    at_level = pd_and_miss(
+                        EchoBins(magnitudes, is_echo, first_bin[s, j]),
                         peak_index[s, j],
-                        first_bin[s, j],
                         rule_and_leakage[0],
                         BinThreshold(
                             bin_threshold.line_noise,
@@ -278,8 +274,11 @@ def _evaluate_levels(
                         bin_speckle_at(points_and_speckle[1], s, points_and_speckle[0][j]),
                     )
                     if k == 0:
-                        pd_at_threshold, miss_at_threshold = pd, miss
-                    loss_at_level = miss - miss_at_threshold if miss < 0.5 else pd_at_threshold - pd
+                        at_threshold = at_level
+                    # The difference of the smaller probabilities keeps its digits.
+                    loss_at_level = at_threshold.pd - at_level.pd
+                    if at_level.miss < 0.5:
+                        loss_at_level = at_level.miss - at_threshold.miss
                     pd_loss[s, j, k] = max(loss_at_level, 0.0)
                 if rule_and_leakage[1]:
                     p_leak = span_leakage(

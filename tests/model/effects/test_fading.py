@@ -11,10 +11,12 @@ from sweep.model.detection.echo_detection import (
     NO_SPECKLE,
     BinThreshold,
     DetectionRule,
+    EchoBins,
     SegmentCorrelations,
     joint_pd_in_speckle,
     pd_and_miss,
 )
+from sweep.model.detection.joint_tail import joint_tail_rule
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.detection.speckle_correlation import SEGMENT_PAIRS
 from sweep.model.detection.speckle_modes import NO_MODES
@@ -49,10 +51,12 @@ def amplitudes(rng, size):
 
 def of_one_bin(magnitude, level):
     """Chances of a bin in noise of power 1 to be found, and to be missed."""
-    rule = DetectionRule(0, 0, np.empty((3, 0)), 0.0, 0, np.empty(0), NO_MODES)
+    rule = DetectionRule(
+        False, 0, False, 64, True, 0.0, False, joint_tail_rule(0.0), np.empty(0), NO_MODES
+    )
     noise = np.sqrt(0.5)
     levels, one = BinThreshold(noise, level, noise, noise), np.ones(1, bool)
-    return pd_and_miss(np.array([magnitude]), one, 0, 5, rule, levels, NO_SPECKLE)
+    return pd_and_miss(EchoBins(np.array([magnitude]), one, 5), 0, rule, levels, NO_SPECKLE)
 
 
 def db(value):
