@@ -57,15 +57,8 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import Looks
 from sweep.model.effects.window_response import WindowResponse, window_response
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.preparation import (
-    BEAMLETS_ERROR_PATH,
-    CHIRP_PREFIX,
-    LASER_PREFIX,
-    PROCESSING_PREFIX,
-    Parameters,
-    doppler_ratio,
-    split_by_category,
-)
+from sweep.model.link_budget import CHIRP_PREFIX, LASER_PREFIX, PROCESSING_PREFIX, doppler_ratio
+from sweep.model.preparation import BEAMLETS_ERROR_PATH, Parameters, split_by_category
 from sweep.model.threshold import tnr_from_parameters
 from sweep.model.window import canonical_window_name, window_samples
 

@@ -9,13 +9,13 @@ footprint's geometry is computed once for all points that share it, whatever the
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, receiver_chain, waveform
+from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import bin_noise
 from sweep.model.detection.detectors import main_lobe_half_width
@@ -27,11 +27,22 @@ from sweep.model.detection.looks import (
 )
 from sweep.model.error_budget import AUTOMATIC, ErrorBudget
 from sweep.model.ground import Ground
+from sweep.model.link_budget import (
+    PROCESSING_PREFIX,
+    LineMotion,
+    LinkBudget,
+    NoiseBudget,
+    ReceiverFilter,
+    RecordSettings,
+    TargetState,
+    WaveformSettings,
+    relative_amplitude,
+    threshold,
+)
 from sweep.model.spectrum.search_band import n_alarm_bins, search_band_bins
-from sweep.model.threshold import tnr_from_parameters
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import WaveformSegment
-from sweep.model.window import Window, canonical_window_name, get_window
+from sweep.model.window import Window
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import (
@@ -44,20 +55,9 @@ if TYPE_CHECKING:
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
-LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX = (
-    f"instrument.{section}."
-    for section in ("laser", "chirp", "telescope", "receiver", "processing")
-)
-RECORD_PATH = RECEIVER_PREFIX + "record"
-"""Path of the kind of samples of a record: ``real``, or ``complex`` from I and Q."""
-
 BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
 """Path of the error of pd due to the number of beamlets, present if that number follows from the
 tolerance."""
-
-APPROACH_SPEED_PATH = "target.approach"
-"""Path of the speed [m/s] at which the range along the beam falls, present if it was found by ray
-tracing."""
 
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
 """Paths of the chirp rates of Doppler segment and down-chirp over that of the up-chirp."""
@@ -71,12 +71,6 @@ CATEGORY_PATHS = (
 )
 """Paths of numeric parameters that points must share to be prepared together. They must share all
 text parameters as well."""
-
-ADC_NOISE_SOURCE = "quantisation"
-"""Noise source that does not pass the receiver."""
-
-ECHO_NOISE_SOURCES = frozenset({"signal_shot"})
-"""Noise sources that are present only with an echo; the threshold does not depend on them."""
 
 LINE_APPROXIMATIONS_MAX = 2
 """Largest number of approximations in one sum of lines. The tolerated error is divided equally
@@ -122,12 +116,18 @@ class Shots:
     them.
     """
 
-    architecture: str
-    """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
-    window: Window
-    """Window of the record."""
-    fft_size: int
-    """FFT size N."""
+    waveform_settings: WaveformSettings
+    """Segments of a shot: chirp rates, carriers and times; slopes are numbers, shared by all
+    points."""
+    record_settings: RecordSettings
+    """Samples of a segment that are recorded, their window and FFT; sample rates are (n,)."""
+    receiver_filter: ReceiverFilter
+    """Poles and anti-alias filter of the receiver."""
+    target: TargetState
+    """Target on the beam's axis at the shot's start; range and radial velocity are (n,), and the
+    lines use ``doppler_ratio``."""
+    noise: NoiseBudget
+    """Noise at the ADC, by source."""
     bins_counted: str
     """Bins that count for false alarms: ``half``, those of the spectrum; ``all`` N of the FFT."""
     search_band: np.ndarray | None
@@ -145,40 +145,8 @@ class Shots:
     """Peaks that a segment reports: ``all`` crossings, or only the ``strongest``."""
     two_beat_assumption: str
     """Assumption that resolves two beats of real records: ``far`` or ``fast``."""
-    noise_shape: str
-    """Shape of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
-    [T]."""
-    segment_order: tuple[str, ...]
-    """Names of the segments that exist, in the order of time."""
-    segment_gap: np.ndarray
-    """Time from a segment's end to the next one's start [s]."""
     tnr: np.ndarray
     """Threshold-to-noise ratio."""
-    range: np.ndarray
-    """(n,): range of the target on the beam's axis [m]."""
-    radial_velocity: np.ndarray
-    """(n,): radial velocity of the target on the beam's axis [m/s]; the lines use
-    ``doppler_ratio``."""
-    acceleration: np.ndarray
-    """Rate at which the radial velocity grows [m/s^2]."""
-    approach_speed: np.ndarray
-    """Speed [m/s] at which the range along the beam falls (:func:`approach_speed`)."""
-    chirp_bandwidth: np.ndarray
-    """Bandwidth B of the up-chirp [Hz]."""
-    chirp_duration: np.ndarray
-    """Duration T of each segment [s]."""
-    chirp_slopes: tuple[float, ...]
-    """Chirp rates of the three segments over :attr:`chirp_rate`, signed."""
-    carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency of each segment that the delay turns into phase [Hz]."""
-    sample_rate: np.ndarray
-    """(n,): sample rate f_s [Hz]."""
-    acquisition_delay: np.ndarray
-    """Time from a segment's start to the start of its record [s]."""
-    detector_bandwidth: np.ndarray
-    """Bandwidth of the detector's pole [Hz]."""
-    amplifier_bandwidth: np.ndarray
-    """Bandwidth of the amplifier's pole [Hz]."""
     leakage_floor: np.ndarray
     """Stated value of :attr:`negligible_signal_ratio`; :data:`AUTOMATIC` if it follows from the
     tolerance."""
@@ -196,8 +164,6 @@ class Shots:
     """Noise variance at the ADC [V^2] of a current variance of 1 A^2."""
     shot_noise_variance_per_watt: np.ndarray
     """Variance at the ADC [V^2] of the shot noise of 1 W of light."""
-    noise_variances: dict[str, np.ndarray]
-    """Noise variance at the ADC [V^2], by source."""
     footprint_row: np.ndarray
     """(n,) int64: row of each point in the three arrays that follow, (rows, beamlets)."""
     relative_range_offset: np.ndarray
@@ -243,12 +209,6 @@ class Shots:
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
     pedestal_variance_under_lines: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
-    noise_variance_gain: np.ndarray | float = 1.0
-    """Factor on the noise variance by changes of the record after the threshold was set."""
-    complex_record: bool = False
-    """True if the record is I + iQ; its spectrum then has signed bins and no images."""
-    antialias_filter: dict[str, np.ndarray] = field(default_factory=dict)
-    """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
     image_gain: np.ndarray | float = 0.0
     """(n,): amplitude, 0..1, of the image of a line at its negative frequency, due to imbalance of
     I and Q."""
@@ -273,6 +233,111 @@ class Shots:
     """True if bins next to the detection are searched for groups of leaked signal."""
     looks: Looks = Looks()  # noqa: RUF009  # a tuple
     """Number of records of each segment, and their combination."""
+
+    @property
+    def architecture(self) -> str:
+        """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
+        return self.waveform_settings.architecture
+
+    @property
+    def segment_order(self) -> tuple[str, ...]:
+        """Names of the segments that exist, in the order of time."""
+        return self.waveform_settings.segment_order
+
+    @property
+    def segment_gap(self) -> np.ndarray:
+        """Time from a segment's end to the next one's start [s]."""
+        return self.waveform_settings.segment_gap
+
+    @property
+    def chirp_bandwidth(self) -> np.ndarray:
+        """Bandwidth B of the up-chirp [Hz]."""
+        return self.waveform_settings.chirp_bandwidth
+
+    @property
+    def chirp_duration(self) -> np.ndarray:
+        """Duration T of each segment [s]."""
+        return self.waveform_settings.chirp_duration
+
+    @property
+    def chirp_slopes(self) -> tuple[float, ...]:
+        """Chirp rates of the three segments over :attr:`chirp_rate`, signed."""
+        return self.waveform_settings.chirp_slopes
+
+    @property
+    def carriers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Frequency of each segment that the delay turns into phase [Hz]."""
+        return self.waveform_settings.carriers
+
+    @property
+    def window(self) -> Window:
+        """Window of the record."""
+        return self.record_settings.window
+
+    @property
+    def fft_size(self) -> int:
+        """FFT size N."""
+        return self.record_settings.fft_size
+
+    @property
+    def sample_rate(self) -> np.ndarray:
+        """(n,): sample rate f_s [Hz]."""
+        return self.record_settings.sample_rate
+
+    @property
+    def acquisition_delay(self) -> np.ndarray:
+        """Time from a segment's start to the start of its record [s]."""
+        return self.record_settings.acquisition_delay
+
+    @property
+    def complex_record(self) -> bool:
+        """True if the record is I + iQ; its spectrum then has signed bins and no images."""
+        return self.record_settings.is_complex
+
+    @property
+    def detector_bandwidth(self) -> np.ndarray:
+        """Bandwidth of the detector's pole [Hz]."""
+        return self.receiver_filter.detector_bandwidth
+
+    @property
+    def amplifier_bandwidth(self) -> np.ndarray:
+        """Bandwidth of the amplifier's pole [Hz]."""
+        return self.receiver_filter.amplifier_bandwidth
+
+    @property
+    def antialias_filter(self) -> dict[str, np.ndarray]:
+        """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
+        return self.receiver_filter.antialias_filter
+
+    @property
+    def noise_shape(self) -> str:
+        """Shape of the noise: ``receiver`` or ``white``."""
+        return self.receiver_filter.noise_shape
+
+    @property
+    def range(self) -> np.ndarray:
+        """(n,): range of the target on the beam's axis [m]."""
+        return self.target.range
+
+    @property
+    def radial_velocity(self) -> np.ndarray:
+        """(n,): radial velocity of the target on the beam's axis [m/s]."""
+        return self.target.radial_velocity
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """Rate at which the radial velocity grows [m/s^2]."""
+        return self.target.acceleration
+
+    @property
+    def approach_speed(self) -> np.ndarray:
+        """Speed [m/s] at which the range along the beam falls (:func:`approach_speed`)."""
+        return self.target.approach_speed
+
+    @property
+    def noise_variances(self) -> dict[str, np.ndarray]:
+        """Noise variance at the ADC [V^2], by source."""
+        return self.noise.variances
 
     @property
     def size(self) -> int:
@@ -310,12 +375,12 @@ class Shots:
     @property
     def chirp_rate(self) -> np.ndarray:
         """Chirp rate S = B/T [Hz/s]."""
-        return self.chirp_bandwidth / self.chirp_duration
+        return self.waveform_settings.chirp_rate
 
     @property
     def record_duration(self) -> np.ndarray:
         """Length of the record L/fs [s]."""
-        return self.window.length / self.sample_rate
+        return self.record_settings.duration
 
     @property
     def echo_record_times(self) -> dict[str, Any]:
@@ -358,10 +423,7 @@ class Shots:
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
         """Noise variance at the ADC without an echo, which sets the threshold [V^2], (n,)."""
-        variances = (
-            v for name, v in self.noise_variances.items() if name not in ECHO_NOISE_SOURCES
-        )
-        return np.asarray(sum(variances)) + np.zeros(self.size)
+        return self.noise.variance_without_echo + np.zeros(self.size)
 
     @cached_property
     def whitening_gain(self) -> np.ndarray:
@@ -379,12 +441,7 @@ class Shots:
     @property
     def beat_frequencies(self) -> tuple[np.ndarray, ...]:
         """Signed beat frequency [Hz] of the line on the beam's axis, by segment."""
-        return tuple(
-            s.carrier * s.doppler_ratio
-            - s.chirp_rate
-            * ((2 / SPEED_OF_LIGHT) * (self.range - s.range_decrease) * (1 + s.doppler_ratio))
-            for s in self.waveform_segments
-        )
+        return tuple(segment.beat_frequency(self.range) for segment in self.waveform_segments)
 
     def whitening_gain_at(
         self, beat_frequency: np.ndarray, bin_frequency: np.ndarray | None = None
@@ -405,32 +462,14 @@ class Shots:
             Amplitude gain. It includes the anti-alias filter and excludes the receiver's poles,
             which are applied to each line.
         """
-        if self.noise_shape == "white":
-            return np.ones(())
-        filters = {
-            "detector_bandwidth": self.detector_bandwidth,
-            "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
-        } | self.antialias_filter  # fmt: skip
-        density = receiver_chain.relative_noise_density(
-            beat_frequency if bin_frequency is None else bin_frequency, **filters
+        return self.receiver_filter.whitening_gain(
+            beat_frequency, self.noise.adc_noise_fraction, bin_frequency
         )
-        adc_fraction = (
-            self.noise_variances.get(ADC_NOISE_SOURCE, 0.0) / self.noise_variance_without_echo
-        )
-        gain = (density + (1 - density) * adc_fraction) ** -0.5
-        if self.antialias_filter:
-            gain = gain * np.sqrt(
-                receiver_chain.antialias_power_transmission(beat_frequency, **self.antialias_filter)
-            )
-        return np.asarray(gain)
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
         """Noise variance sigma_x^2 at the ADC [V^2], (n,)."""
-        echo_variances = (
-            v for name, v in self.noise_variances.items() if name in ECHO_NOISE_SOURCES
-        )
-        return (self.noise_variance_without_echo + sum(echo_variances)) * self.noise_variance_gain
+        return np.asarray(self.noise.variance + np.zeros(self.size))
 
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
@@ -505,11 +544,7 @@ class Shots:
     @cached_property
     def threshold(self) -> np.ndarray:
         """Threshold on |X| [V], (n,)."""
-        from sweep.model.detection import echo_detection
-
-        return echo_detection.threshold_from_tnr(
-            tnr=self.tnr, bin_deviation=self._noise_sigma_of(self.noise_variance_without_echo)
-        )
+        return threshold(self.tnr, self._noise_sigma_of(self.noise_variance_without_echo))
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
@@ -774,11 +809,7 @@ class Shots:
 
     def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
         """Return a bin's noise sigma per quadrature [V] for a noise variance at the ADC [V^2]."""
-        window_energy = np.asarray(self.window.energy)
-        mean_variance = variance / self.looks.n_coherent
-        return receiver_chain.bin_noise_sigma(
-            noise_variance=mean_variance, window_energy=window_energy
-        )
+        return self.record_settings.bin_noise_sigma(variance, self.looks)
 
     @cached_property
     def beamlet_table(self) -> np.ndarray:
@@ -795,30 +826,9 @@ class Shots:
 
     @cached_property
     def waveform_segments(self) -> tuple[waveform.WaveformSegment, ...]:
-        """Segments of the waveform.
-
-        Leakage is evaluated in up- and down-chirp only, as no output reports that of the Doppler
-        segment.
-        """
-        return tuple(
-            waveform.WaveformSegment(
-                name,
-                slope,
-                slope * self.chirp_rate,
-                carrier,
-                name != waveform.SEGMENT_NAMES[1],
-                self.approach_speed * start + 0.5 * self.acceleration * start * start,
-                self.doppler_ratio + doppler_ratio(self.acceleration * start),
-                start,
-            )
-            for name, slope, carrier, start in zip(
-                waveform.SEGMENT_NAMES,
-                self.chirp_slopes,
-                self.carriers,
-                self.segment_starts,
-                strict=True,
-            )
-        )
+        """Segments of the waveform, with range and velocity of the target at their starts."""
+        motion = LineMotion(self.doppler_ratio, self.segment_starts)
+        return self.waveform_settings.segments(self.target, motion)
 
     @property
     def motion_by_segment(self) -> dict[str, Any]:
@@ -905,19 +915,17 @@ class Shots:
     @property
     def has_segment(self) -> np.ndarray:
         """(3,) bool: existence of up, Doppler and down segment."""
-        return np.array([name in self.segment_order for name in waveform.SEGMENT_NAMES])
+        return self.waveform_settings.has_segment
 
     @property
     def scheduled_segment_starts(self) -> tuple[np.ndarray, ...]:
         """Times [s] from the shot's start to each segment's, by the waveform."""
-        return waveform.segment_starts(
-            self.segment_order, duration=self.chirp_duration, gap=self.segment_gap
-        )
+        return self.waveform_settings.segment_starts
 
     @property
     def look_period(self) -> np.ndarray:
         """Time [s] from one look to the next: the duration of the full waveform."""
-        return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
+        return self.waveform_settings.look_period
 
     def point_parameter_table(self) -> np.ndarray:
         """Return the numbers of each point that compiled code takes, as rows.
@@ -1167,29 +1175,23 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
     ground : Ground
         Ground that the beams meet.
     """
-    architecture, samples_iq = (
-        str(parameters[RECEIVER_PREFIX + "architecture"]),
-        str(parameters[RECORD_PATH]) == "complex",
-    )
-    echo_power_scale, beat_current_scale = echo_power_and_beat_current(architecture, parameters)
-    receiver_noise = receiver_chain.receiver_noise(
-        architecture, receiver_chain.receiver_parameters(parameters), samples_iq
-    )
+    budget = LinkBudget(parameters)
+    architecture, receiver_noise = budget.waveform.architecture, budget.receiver_noise
     footprint_row, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_line(
         n_points
     )
-    zeros, error_budget, looks = (
-        np.zeros(n_points),
-        ErrorBudget.from_parameters(parameters),
-        Looks.from_parameters(parameters),
-    )
+    zeros, error_budget = np.zeros(n_points), ErrorBudget.from_parameters(parameters)
+    sample_rate = budget.record.sample_rate + zeros
     return Shots(
-        architecture=architecture,
-        window=get_window(
-            canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"])),
-            int(parameters["record"]),
+        waveform_settings=replace(budget.waveform, chirp_slopes=waveform.chirp_slopes(parameters)),
+        record_settings=replace(budget.record, sample_rate=sample_rate),
+        receiver_filter=replace(budget.receiver_filter, sample_rate=sample_rate),
+        target=replace(
+            budget.target,
+            range=budget.target.range + zeros,
+            radial_velocity=budget.target.radial_velocity + zeros,
         ),
-        fft_size=int(parameters[PROCESSING_PREFIX + "fft_size"]),
+        noise=budget.noise,
         bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
         search_band=search_band_bins(parameters, n_points),
         noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
@@ -1197,43 +1199,22 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         shot_detection=str(parameters[waveform.SHOT_DETECTION_PATH]),
         reported_peaks=str(parameters[waveform.PEAKS_PATH]),
         two_beat_assumption=str(parameters[waveform.TWO_BEATS_PATH]),
-        noise_shape=str(parameters[RECEIVER_PREFIX + "noise_shape"]),
-        segment_order=waveform.existing_segments(
-            architecture, str(parameters[waveform.SEGMENT_ORDER_PATH])
-        ),
-        segment_gap=parameters[waveform.SEGMENT_GAP_PATH],
-        tnr=tnr_from_parameters(parameters),
-        range=parameters["target.range"] + zeros,
-        radial_velocity=parameters["target.radial_velocity"] + zeros,
-        acceleration=parameters["target.acceleration"],
-        approach_speed=approach_speed(parameters),
-        chirp_bandwidth=parameters[CHIRP_PREFIX + "bandwidth"],
-        chirp_duration=parameters[CHIRP_PREFIX + "duration"],
-        chirp_slopes=waveform.chirp_slopes(parameters),
-        carriers=waveform.segment_carriers(parameters),
-        sample_rate=parameters[PROCESSING_PREFIX + "sample_rate"] + zeros,
-        acquisition_delay=parameters[PROCESSING_PREFIX + "acquisition_delay"],
-        detector_bandwidth=parameters[RECEIVER_PREFIX + "detector_bandwidth"],
-        amplifier_bandwidth=parameters[RECEIVER_PREFIX + "amplifier_bandwidth"],
+        tnr=budget.tnr,
         leakage_floor=np.asarray(error_budget.leakage_floor, float),
         leakage_tolerance=error_budget.allowed_leakage,
         beamlets_error=parameters.get(BEAMLETS_ERROR_PATH, np.asarray(np.nan)),
-        line_error_tolerance=error_budget.allowed_line_error / math.sqrt(looks.n_power_averaged),
-        echo_power_scale=echo_power_scale,
-        beat_amplitude_scale=beat_current_scale * parameters[RECEIVER_PREFIX + "transimpedance"],
+        line_error_tolerance=error_budget.allowed_line_error
+        / math.sqrt(budget.looks.n_power_averaged),
+        echo_power_scale=budget.link_scales.echo_power,
+        beat_amplitude_scale=budget.link_scales.beat_amplitude,
         noise_variance_per_square_ampere=receiver_noise.variance_per_square_ampere,
         shot_noise_variance_per_watt=receiver_noise.shot_noise_variance_per_watt,
-        noise_variances=receiver_noise.variances,
         footprint_row=footprint_row,
         relative_range_offset=relative_range_offset,
         doppler_ratio_offset=doppler_ratio_offset,
         relative_amplitude=relative_amplitude(architecture, relative_echo),
         adds_powers=architecture != "direct",
-        antialias_filter=receiver_chain.antialias_filter_parameters(
-            receiver_chain.receiver_parameters(parameters)
-        ),
-        complex_record=samples_iq,
-        looks=looks,
+        looks=budget.looks,
     )
 
 
@@ -1241,116 +1222,6 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
 def window_energy_from_sample(window: Window) -> np.ndarray:
     """Return the sum of w^2 from each sample to the last, (L + 1,)."""
     return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
-
-
-def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the speed at which the range along the beam falls [m/s], (n,) or scalar.
-
-    It differs from the radial velocity if the beam slides over sloping ground.
-
-    Notes
-    -----
-    Let V = v d + u e, with d along the beam and e across it towards the near side. The range of a
-    plane of normal n at the grazing angle g then falls at V.n / d.n = v + u cot g.
-    """
-    if APPROACH_SPEED_PATH in parameters:
-        return parameters[APPROACH_SPEED_PATH]
-    transverse_velocity = parameters["target.transverse_velocity"]
-    if not np.any(transverse_velocity):
-        return parameters["target.radial_velocity"]
-    return np.asarray(
-        parameters["target.radial_velocity"]
-        + transverse_velocity / np.tan(parameters["target.grazing_angle"])
-    )
-
-
-def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Return the relative amplitude of the beat for a relative echo.
-
-    Parameters
-    ----------
-    architecture : str
-        Receiver architecture.
-    relative_echo : ndarray
-        Relative echo [1/sr].
-
-    Returns
-    -------
-    ndarray
-        Square root of the relative echo; with direct detection, where the beat is proportional to
-        power, the relative echo itself.
-    """
-    return relative_echo if architecture == "direct" else np.sqrt(relative_echo)
-
-
-def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
-    """Return the Doppler ratio beta = 2 v_r / c of a radial velocity [m/s]."""
-    return 2 * radial_velocity / SPEED_OF_LIGHT
-
-
-def echo_power_and_beat_current(
-    architecture: str, parameters: Mapping[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the echo power and beat current for a backscatter of 1/sr.
-
-    Returns
-    -------
-    echo_power : ndarray
-        Echo power [W] with the full beam at ``target.range``.
-    beat_current : ndarray
-        Amplitude of its beat photocurrent [A].
-
-    Notes
-    -----
-    The law is [T 4.4] without its factor 1/(2 pi), which belongs to the reflectance law. A
-    beamlet's echo is this power times its power fraction and its backscatter [1/sr], divided by the
-    range loss of :func:`sweep.model.beam.range_loss_coefficients`.
-    """
-    power_times_area = (
-        parameters[LASER_PREFIX + "power"]
-        * beam.effective_collecting_area(parameters)
-        * parameters[TELESCOPE_PREFIX + "optical_efficiency"]
-    )
-    echo_power = (
-        power_times_area * parameters["target.reflectance"] / parameters["target.range"] ** 2
-    )
-    return echo_power, beat_current(architecture, parameters, echo_power)
-
-
-def beat_current(
-    architecture: str, parameters: Mapping[str, np.ndarray], power: np.ndarray
-) -> np.ndarray:
-    """Return the amplitude of the beat photocurrent [A] of received light.
-
-    Parameters
-    ----------
-    architecture : str
-        Receiver architecture.
-    parameters : mapping
-        Parameters by dotted path, as arrays.
-    power : ndarray
-        Power P of the light [W].
-
-    Notes
-    -----
-    Coherent architectures: 2 M Re sqrt(eta P_lo P), with the heterodyne efficiency eta, a fraction
-    of power. Direct detection: m M Re P, hence 2 dB of SNR for each dB of light. [T 2.22] takes 2
-    Re^2 P^2 as the mean square current, which is the peak of a fully modulated echo. With the mean
-    echo power P the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
-    """
-    gain, responsivity = (
-        parameters[RECEIVER_PREFIX + "apd_gain"],
-        parameters[RECEIVER_PREFIX + "responsivity"],
-    )
-    if architecture == "direct":
-        return parameters[RECEIVER_PREFIX + "modulation_index"] * gain * responsivity * power
-    power_product = parameters[RECEIVER_PREFIX + "local_oscillator_power"] * power
-    return (
-        2
-        * gain
-        * responsivity
-        * np.sqrt(parameters[RECEIVER_PREFIX + "mixing_efficiency"] * power_product)
-    )
 
 
 _POINT_FIELD_LABELS = {

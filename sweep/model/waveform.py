@@ -89,6 +89,27 @@ class WaveformSegment(NamedTuple):
     start_time: np.ndarray | float
     """Time since the shot's start [s]; 0 if the target does not move between segments."""
 
+    def delay(self, range: np.ndarray | float) -> np.ndarray:
+        """Return the delay of the echo at the segment's start [s].
+
+        Parameters
+        ----------
+        range : ndarray or float
+            Range at the shot's start [m].
+        """
+        return np.asarray(2 / SPEED_OF_LIGHT * (range - self.range_decrease))
+
+    def beat_frequency(self, range: np.ndarray | float) -> np.ndarray:
+        """Return the signed beat frequency [Hz] of a line at a range [m] at the shot's start.
+
+        Notes
+        -----
+        f_seg beta - S tau (1 + beta), with the delay tau and the Doppler ratio beta at the
+        segment's start, and the segment's signed chirp rate S.
+        """
+        beat_of_delay = self.chirp_rate * (self.delay(range) * (1 + self.doppler_ratio))
+        return self.carrier * self.doppler_ratio - beat_of_delay
+
 
 class RangeVelocity(NamedTuple):
     """Range and radial velocity that the peaks of a shot report, (n,) each."""

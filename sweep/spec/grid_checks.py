@@ -32,7 +32,7 @@ from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
 from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
 from sweep.model.effects.sweep_error_table import fit_sweep_error
-from sweep.model.preparation import RECORD_PATH
+from sweep.model.link_budget import RECORD_PATH
 from sweep.model.waveform import SEARCH_BAND_PATHS, SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 from sweep.spec.axes import Axis, parameter_location
 from sweep.spec.fields import AUTO, OFF, ON, rules_by_path

@@ -68,8 +68,12 @@ def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words
         values[1 if values.shape[0] > 1 else 0] = value
     else:
         values = np.asarray(value)
+    if name == "range":
+        spoilt = replace(prepared, target=replace(prepared.target, range=values))
+    else:
+        spoilt = replace(prepared, **{name: values})
     with pytest.raises(UnsupportedShotError, match=words) as refused:
-        require_finite(replace(prepared, **{name: values}))
+        require_finite(spoilt)
     assert refused.value.point_index in (0, 1)
 
 

@@ -167,7 +167,12 @@ def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
 def test_a_triangle_loses_no_return_for_want_of_a_third_segment(order, table_4_1):
     """Two surfaces: the stronger up peak with the stronger down peak, and none unconfirmed."""
     shots = _surfaces(table_4_1, (300.0, 320.0), (1.0, 1.0), shares=(0.8, 0.2), power=0.5)
-    shots = dataclasses.replace(shots, segment_order=tuple(order.split()))
+    shots = dataclasses.replace(
+        shots,
+        waveform_settings=dataclasses.replace(
+            shots.waveform_settings, segment_order=tuple(order.split())
+        ),
+    )
     got = _drawn(shots)
     assert got.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
     np.testing.assert_allclose(got.range[0, 0, :2], [300.0, 320.0], atol=2 * RANGE_BIN)

@@ -255,7 +255,9 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         window=window, phases=phases, fft_size=4096, beamlets=7, range=30.0,
         radial_velocity=velocity,
     )  # fmt: skip
-    shots = replace(prepare_single_category(scene), complex_record=True, phase_errors=())
+    shots = prepare_single_category(scene)
+    record = replace(shots.record_settings, is_complex=True)
+    shots = replace(shots, record_settings=record, phase_errors=())
     w, half = window_samples(window, 4096), 2048
     found = segment_spectra.evaluate_segments(shots)
     for segment in range(3):

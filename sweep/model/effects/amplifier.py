@@ -44,7 +44,8 @@ from sweep.model.effects.effect import (
     add_noise_sources,
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, Shots
+from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX
+from sweep.model.preparation import Shots
 
 _INVERSION_PATH, _GAIN_PATH = LASER_PREFIX + "spontaneous_emission", LASER_PREFIX + "amplifier_gain"
 _AMPLIFIED_LIGHT_PATH, _ISOLATION_PATH = (

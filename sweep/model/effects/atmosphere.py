@@ -37,7 +37,8 @@ from sweep.model.effects.effect import (
     add_noise_sources,
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
+from sweep.model.link_budget import LASER_PREFIX, TELESCOPE_PREFIX
+from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
 _HEIGHT_DIFFERENCE_MIN = 1e-9

@@ -26,7 +26,7 @@ from sweep.model.effects import (
     speckle,
 )
 from sweep.model.effects.effect import Effect, Parameter
-from sweep.model.preparation import RECORD_PATH
+from sweep.model.link_budget import RECORD_PATH
 
 EFFECTS: tuple[Effect, ...] = (
     footprint.FOOTPRINT,

@@ -57,13 +57,8 @@ from sweep.model.effects.effect import (
     add_noise_sources,
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import (
-    LASER_PREFIX,
-    RECEIVER_PREFIX,
-    TELESCOPE_PREFIX,
-    Shots,
-    beat_current,
-)
+from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, beat_current
+from sweep.model.preparation import Shots
 from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 

@@ -19,7 +19,8 @@ import numpy as np
 from sweep.model.beamlets import NO_SPREAD
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
-from sweep.model.preparation import Shots, doppler_ratio
+from sweep.model.link_budget import doppler_ratio
+from sweep.model.preparation import Shots
 
 OMITTED_SHIFT_MAX_BINS = 0.1
 """Largest shift of lines [bins] for which the Doppler effect may be skipped; a larger shift counts

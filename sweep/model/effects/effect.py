@@ -211,4 +211,4 @@ class Effect:
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
     """Return shots with additional noise sources: variances at the ADC [V^2] by source."""
-    return replace(shots, noise_variances=shots.noise_variances | variances)
+    return replace(shots, noise=shots.noise.with_sources(**variances))

@@ -13,7 +13,8 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import image_and_leakage
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
-from sweep.model.preparation import CHIRP_PREFIX, Shots, relative_amplitude
+from sweep.model.link_budget import CHIRP_PREFIX, relative_amplitude
+from sweep.model.preparation import Shots
 
 
 def footprint_bound(points: PlannerInputs) -> ErrorBound | None:

@@ -40,7 +40,8 @@ from sweep.model.detection.looks import SINGLE_LOOK, Looks
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.window_response import window_response
-from sweep.model.preparation import PROCESSING_PREFIX, RECORD_PATH, Shots
+from sweep.model.link_budget import PROCESSING_PREFIX, RECORD_PATH
+from sweep.model.preparation import Shots
 from sweep.model.window import get_window
 
 _LN_10 = math.log(10)

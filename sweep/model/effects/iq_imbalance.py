@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import RECEIVER_PREFIX, Shots
+from sweep.model.link_budget import RECEIVER_PREFIX
+from sweep.model.preparation import Shots
 
 GAIN_IMBALANCE_PATH, PHASE_IMBALANCE_PATH = (
     RECEIVER_PREFIX + "iq_gain_imbalance",

@@ -46,7 +46,8 @@ from sweep.model.effects.planner_inputs import (
     PlannerInputs,
     magnitude_change_from_power,
 )
-from sweep.model.preparation import LASER_PREFIX, Shots, window_energy_from_sample
+from sweep.model.link_budget import LASER_PREFIX
+from sweep.model.preparation import Shots, window_energy_from_sample
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.window import Window, window_samples, zero_first_samples
 

@@ -18,13 +18,15 @@ from sweep.model.effects.effect import (
     add_noise_sources,
 )
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import (
+from sweep.model.link_budget import (
+    ADC_NOISE_SOURCE,
     LASER_PREFIX,
     PROCESSING_PREFIX,
     RECEIVER_PREFIX,
     TELESCOPE_PREFIX,
-    Shots,
+    adc_noise_variance,
 )
+from sweep.model.preparation import Shots
 
 # The echo's own shot noise is 2 q M^2 F Re P B_e of the total echo. At short range it is as large
 # as the local oscillator's. It explains the rise of false alarms below some 5 m that [T 4.2]
@@ -273,7 +275,7 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_BITS_PATH):
         return None
-    white_noise_ratio = points.quantisation_variance / points.receiver_noise_variance
+    white_noise_ratio = adc_noise_variance(points.parameters) / points.receiver_noise_variance
     density_min = np.finfo(float).tiny  # density where filters pass nothing
     relative_density = np.maximum(points.relative_noise_density, density_min)
     magnitude_factor = np.sqrt((1 + white_noise_ratio) / (1 + white_noise_ratio / relative_density))
@@ -290,13 +292,7 @@ def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
     -----
     Variance of :func:`sweep.model.receiver_chain.quantisation_variance`, which has the source.
     """
-    parameters, samples_iq = context.parameters, shots.complex_record
-    variance = receiver_chain.quantisation_variance(
-        full_scale=parameters[PROCESSING_PREFIX + "full_scale"],
-        bits=parameters[_BITS_PATH],
-        samples_iq=samples_iq,
-    )
-    return add_noise_sources(shots, quantisation=variance)
+    return add_noise_sources(shots, **{ADC_NOISE_SOURCE: adc_noise_variance(context.parameters)})
 
 
 QUANTISATION = Effect(

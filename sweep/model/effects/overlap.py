@@ -41,7 +41,6 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
 from sweep.model.effects.phase_errors import mean_phase_bound
@@ -151,17 +150,13 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     Notes
     -----
     n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s), limited to 0..L, as of
-    :func:`sweep.model.waveform.count_samples_before_echo`.
+    :meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`.
     """
     n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]
-        n_samples_before_echo[segment_index] = waveform.count_samples_before_echo(
-            delay=2 / SPEED_OF_LIGHT * (shots.range - segment.range_decrease),
-            doppler_ratio=segment.doppler_ratio,
-            record_start=shots.acquisition_delay,
-            sample_rate=shots.sample_rate,
-            length=shots.window.length,
+        n_samples_before_echo[segment_index] = shots.record_settings.count_samples_before_echo(
+            segment, shots.range
         )
     return (
         replace(shots, n_samples_before_echo=n_samples_before_echo)

@@ -64,7 +64,8 @@ from sweep.model.detection.looks import coherent_gain
 from sweep.model.effects.effect import ArrayOrFloat, Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import NO_PHASE_ERROR, PhaseErrorBound, PlannerInputs
 from sweep.model.effects.sweep_error_table import SweepErrorTable, fit_sweep_error
-from sweep.model.preparation import CHIRP_PREFIX, PhaseError, Shots
+from sweep.model.link_budget import CHIRP_PREFIX
+from sweep.model.preparation import PhaseError, Shots
 from sweep.model.window import Window, window_samples
 
 _N_NODES = 256

@@ -1,6 +1,8 @@
 """Link budget, lines and footprints of many points at once, for the error bounds of effects.
 
-The formulas are those by which shots are prepared, for arrays that broadcast over the points.
+The link budget is that of the shots (:mod:`sweep.model.link_budget`), for arrays that broadcast
+over the points. This module adds bounds over the lines of a footprint.
+
 Values are computed on first use. Arrays by segment have an additional first axis over the existing
 segments. All points share text parameters, and the parameters that
 :meth:`PlannerInputs.shared_integer` reads.
@@ -25,18 +27,16 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import Looks
 from sweep.model.effects.window_response import WindowResponse, window_response
 from sweep.model.ground import FootprintExtent, backscatter
-from sweep.model.preparation import (
-    CHIRP_PREFIX,
-    LASER_PREFIX,
-    PROCESSING_PREFIX,
-    RECEIVER_PREFIX,
-    RECORD_PATH,
-    approach_speed,
-    echo_power_and_beat_current,
+from sweep.model.link_budget import (
+    ADC_NOISE_SOURCE,
+    LineMotion,
+    LinkBudget,
+    adc_noise_variance,
+    doppler_ratio,
     relative_amplitude,
 )
-from sweep.model.threshold import tnr_from_parameters
-from sweep.model.window import Window, canonical_window_name, get_window, window_samples
+from sweep.model.waveform import WaveformSegment
+from sweep.model.window import Window, window_samples
 
 _CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
 """Half-widths t in standard deviations for Chebyshev's inequality, of which the best bound is
@@ -211,8 +211,8 @@ class PlannerInputs:
         self.parameters = {path: np.asarray(value) for path, value in parameters.items()}
         self.ndim = max((array.ndim for array in self.parameters.values()), default=0)
         self._given_extent, self.has_rotating_body = extent, has_rotating_body
-        self.architecture = self.option(RECEIVER_PREFIX + "architecture")
-        self.fft_size = self.shared_integer(PROCESSING_PREFIX + "fft_size")
+        self.budget = LinkBudget(self.parameters)
+        """Link budget of the points."""
         self.ignores_doppler = False
         """True if the Doppler effect is off."""
         self.ignores_segment_motion = False
@@ -228,35 +228,11 @@ class PlannerInputs:
                 n_beamlets,
                 ground.beamlet_pattern(self.parameters),
             )
-        is_direct = self.architecture == "direct"
-        self.segment_order = waveform.existing_segments(
-            self.architecture, self.option(waveform.SEGMENT_ORDER_PATH)
-        )
-        self.sample_rate = self[PROCESSING_PREFIX + "sample_rate"]
-        self.acquisition_delay = self[PROCESSING_PREFIX + "acquisition_delay"]
-        """Acquisition delay t_0 [s]."""
-        self.bin_width = self.sample_rate / self.fft_size
-        """Width of a bin fs/N [Hz]."""
-        self.chirp_rate = self[CHIRP_PREFIX + "bandwidth"] / self[CHIRP_PREFIX + "duration"]
-        self.range, self.radial_velocity = self["target.range"], self["target.radial_velocity"]
-        """Range [m] and radial velocity [m/s] on the beam's axis, positive when closing."""
-        self.delay = 2 / SPEED_OF_LIGHT * self.range
-        self.doppler_ratio = 2 * self.radial_velocity / SPEED_OF_LIGHT
-        """Doppler ratio 2 v_r / c."""
-        self.acceleration = self["target.acceleration"]
-        """Rate at which the radial velocity grows [m/s^2]."""
-        self.looks = Looks.from_parameters(parameters)
-        self.relative_chirp_rates: tuple[np.ndarray | float, ...] = (
-            1.0,
-            *(
-                np.asarray(parameters.get(path, waveform.WAVEFORM_DEFAULTS[path]), float)
-                for path in (waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH)
-            ),
-        )
-        """Chirp rates of up, Doppler and down segment over :attr:`chirp_rate`, signed."""
         self.existing_chirp_rates = self.stack_segments(
-            *self._of_existing_segments(self.relative_chirp_rates)
+            *self._of_existing_segments(self.budget.waveform.chirp_slopes)
         )
+        """Chirp rates of the existing segments over :attr:`chirp_rate`, signed."""
+        is_direct = self.architecture == "direct"
         is_coherent = self.option("footprint.phases") == "coherent"
         self.adds_amplitudes = is_coherent or is_direct
         self.adds_field_amplitudes = is_coherent and not is_direct
@@ -290,13 +266,55 @@ class PlannerInputs:
 
     # The instrument
 
-    @cached_property
+    @property
+    def architecture(self) -> str:
+        """Receiver architecture."""
+        return self.budget.waveform.architecture
+
+    @property
+    def segment_order(self) -> tuple[str, ...]:
+        """Names of the segments that exist, in the order of time."""
+        return self.budget.waveform.segment_order
+
+    @property
+    def chirp_rate(self) -> np.ndarray:
+        """Chirp rate of the up-chirp B/T [Hz/s]."""
+        return self.budget.waveform.chirp_rate
+
+    @property
+    def looks(self) -> Looks:
+        """Number of records of each segment, and their combination."""
+        return self.budget.looks
+
+    @property
+    def fft_size(self) -> int:
+        """FFT size N."""
+        return self.budget.record.fft_size
+
+    @property
+    def sample_rate(self) -> np.ndarray:
+        """Sample rate f_s [Hz]."""
+        return self.budget.record.sample_rate
+
+    @property
+    def acquisition_delay(self) -> np.ndarray:
+        """Time from a segment's start to the start of its record [s]."""
+        return self.budget.record.acquisition_delay
+
+    @property
+    def bin_width(self) -> np.ndarray:
+        """Width of a bin f_s/N [Hz]."""
+        return self.budget.record.bin_width
+
+    @property
+    def record_duration(self) -> np.ndarray:
+        """Length of the record L/f_s [s]."""
+        return self.budget.record.duration
+
+    @property
     def window(self) -> Window:
         """Window of the record, whose length all points share."""
-        length = waveform.record_length(self.parameters)
-        return get_window(
-            canonical_window_name(self.option(PROCESSING_PREFIX + "window")), int(length.flat[0])
-        )
+        return self.budget.record.window
 
     @cached_property
     def window_response(self) -> WindowResponse:
@@ -309,62 +327,29 @@ class PlannerInputs:
         return self.window_response.padding_factor
 
     @cached_property
-    def record_duration(self) -> np.ndarray:
-        """Length of the record L/fs [s]."""
-        return self.window.length / self.sample_rate
-
-    @cached_property
     def carriers(self) -> np.ndarray:
         """Frequency that the delay turns into phase [Hz], by segment."""
-        carriers = waveform.carrier_frequencies(
-            self.architecture,
-            wavelength=self[LASER_PREFIX + "wavelength"],
-            start_frequency=self[CHIRP_PREFIX + "start_frequency"],
-            bandwidth=self[CHIRP_PREFIX + "bandwidth"],
-            chirp_slopes=self.relative_chirp_rates,
-        )
-        return self.stack_segments(*self._of_existing_segments(carriers))
+        return self.stack_segments(*self._of_existing_segments(self.budget.waveform.carriers))
 
-    @cached_property
+    @property
     def receiver_noise(self) -> receiver_chain.ReceiverNoise:
-        """Noise at the ADC [V^2]."""
-        receiver_values = receiver_chain.receiver_parameters(self.parameters)
-        return receiver_chain.receiver_noise(
-            self.architecture, receiver_values, self.option(RECORD_PATH) == "complex"
-        )
+        """Noise of the receiver alone, at the ADC [V^2]."""
+        return self.budget.receiver_noise
 
-    @cached_property
-    def quantisation_variance(self) -> np.ndarray:
-        """Noise variance of the ADC's quantisation [V^2]."""
-        full_scale, bits = (self[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
-        samples_iq = self.option(RECORD_PATH) == "complex"
-        return receiver_chain.quantisation_variance(
-            full_scale=full_scale, bits=bits, samples_iq=samples_iq
-        )
-
-    @cached_property
+    @property
     def receiver_noise_variance(self) -> np.ndarray:
         """Noise variance of the receiver alone, at the ADC [V^2]."""
-        return np.asarray(sum(self.receiver_noise.variances.values()))
+        return self.budget.noise.variance_without_echo
 
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
-        """Noise sigma of a bin, per quadrature [V]."""
-        window_energy, mean_variance = (
-            np.asarray(self.window.energy),
-            self.receiver_noise_variance / self.looks.n_coherent,
-        )
-        return receiver_chain.bin_noise_sigma(
-            noise_variance=mean_variance, window_energy=window_energy
-        )
+        """Noise sigma of a bin by the receiver alone, per quadrature [V]."""
+        return self.budget.record.bin_noise_sigma(self.receiver_noise_variance, self.looks)
 
-    @cached_property
+    @property
     def threshold_ratio(self) -> np.ndarray:
         """Threshold over sigma."""
-        from sweep.model.detection import echo_detection
-
-        tnr = tnr_from_parameters(self.parameters)
-        return np.asarray(echo_detection.threshold_from_tnr(tnr=tnr, bin_deviation=np.asarray(1.0)))
+        return self.budget.threshold_ratio
 
     @property
     def noise_peak_ratio(self) -> float | None:
@@ -374,9 +359,39 @@ class PlannerInputs:
         """
         if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
-        return float(np.sqrt(2 * np.log(1e3 * self.shared_integer(PROCESSING_PREFIX + "fft_size"))))
+        return float(np.sqrt(2 * np.log(1e3 * self.fft_size)))
 
     # The target
+
+    @property
+    def range(self) -> np.ndarray:
+        """Range of the target on the beam's axis [m]."""
+        return self.budget.target.range
+
+    @property
+    def radial_velocity(self) -> np.ndarray:
+        """Radial velocity of the target on the beam's axis [m/s], positive when closing."""
+        return self.budget.target.radial_velocity
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """Rate at which the radial velocity grows [m/s^2]."""
+        return self.budget.target.acceleration
+
+    @property
+    def approach_speed(self) -> np.ndarray:
+        """Speed at which the range along the beam falls [m/s]."""
+        return self.budget.target.approach_speed
+
+    @cached_property
+    def delay(self) -> np.ndarray:
+        """Delay of the echo 2 R / c [s]."""
+        return self.budget.target.delay
+
+    @cached_property
+    def doppler_ratio(self) -> np.ndarray:
+        """Doppler ratio 2 v_r / c, also if the Doppler effect is off."""
+        return self.budget.target.doppler_ratio
 
     @cached_property
     def footprint_angles(self) -> beam.FootprintAngles:
@@ -418,15 +433,9 @@ class PlannerInputs:
         )
 
     @cached_property
-    def echo_and_beat_scales(self) -> tuple[np.ndarray, np.ndarray]:
-        """Echo power [W] for a relative echo of 1/sr; beat [V] for a relative amplitude of 1."""
-        echo_power, beat_current = echo_power_and_beat_current(self.architecture, self.parameters)
-        return echo_power, beat_current * self[RECEIVER_PREFIX + "transimpedance"]
-
-    @cached_property
     def beat_amplitude(self) -> np.ndarray:
         """Amplitude of the beat of the line on the axis [V], before the receiver's poles."""
-        return self.echo_and_beat_scales[1] * relative_amplitude(
+        return self.budget.link_scales.beat_amplitude * relative_amplitude(
             self.architecture, self.footprint_extent.axis_echo
         )
 
@@ -437,7 +446,7 @@ class PlannerInputs:
             self.footprint_extent.total_echo_ratio, 1.0
         )
         return (
-            self.echo_and_beat_scales[0]
+            self.budget.link_scales.echo_power
             * total_echo
             * self.receiver_noise.shot_noise_variance_per_watt
             / self.receiver_noise_variance
@@ -445,79 +454,62 @@ class PlannerInputs:
 
     # Lines
 
-    @cached_property
-    def approach_speed(self) -> np.ndarray:
-        """Speed at which the range along the beam falls [m/s]."""
-        return np.asarray(approach_speed(self.parameters))
-
     @property
     def look_period(self) -> np.ndarray:
         """Time from look to look [s]."""
-        return np.asarray(
-            len(self.segment_order)
-            * (self[CHIRP_PREFIX + "duration"] + self[waveform.SEGMENT_GAP_PATH])
-        )
+        return self.budget.waveform.look_period
 
     @property
     def middle_look_delay(self) -> np.ndarray | float:
         """Time from the first look to the middle one [s]."""
-        return 0.5 * (self.looks.number - 1) * self.look_period if self.looks.number > 1 else 0.0
+        return self.budget.waveform.middle_look_delay(self.looks)
 
     @cached_property
     def segment_starts(self) -> np.ndarray:
-        """Time from the shot's start to each segment's start, of the middle look [s]."""
-        segment_starts = waveform.segment_starts(
-            self.segment_order,
-            duration=self[CHIRP_PREFIX + "duration"],
-            gap=self[waveform.SEGMENT_GAP_PATH],
+        """Time from the shot's start to each segment's start, of the middle look [s].
+
+        Segments start at these times whether or not the motion between them is simulated.
+        """
+        starts = self.budget.waveform.middle_look_starts(self.looks)
+        return self.stack_segments(*self._of_existing_segments(starts))
+
+    @cached_property
+    def existing_segments(self) -> list[WaveformSegment]:
+        """Existing segments, with the motion that is not switched off."""
+        waveform_settings, target = self.budget.waveform, self.budget.target
+        motion = LineMotion(
+            doppler_ratio=0.0 if self.ignores_doppler else target.doppler_ratio,
+            segment_starts=(0.0, 0.0, 0.0)
+            if self.ignores_segment_motion
+            else waveform_settings.middle_look_starts(self.looks),
         )
-        return self.stack_segments(
-            *self._of_existing_segments(
-                [start + self.middle_look_delay for start in segment_starts]
-            )
-        )
+        return self._of_existing_segments(waveform_settings.segments(target, motion))
 
     @cached_property
     def doppler_ratio_growth(self) -> np.ndarray:
         """Growth of the Doppler ratio from the shot's start to each segment's."""
-        ratio_per_speed = 0.0 if self.ignores_segment_motion else 2 / SPEED_OF_LIGHT
-        return np.asarray(ratio_per_speed * self.acceleration * self.segment_starts)
+        return self.stack_segments(
+            *(doppler_ratio(self.acceleration * s.start_time) for s in self.existing_segments)
+        )
 
     @cached_property
     def beat_frequency(self) -> np.ndarray:
         """Signed beat of the line on the axis [Hz], by segment."""
-        doppler_ratio = self.doppler_ratio_growth + (
-            0.0 if self.ignores_doppler else self.doppler_ratio
-        )
-        delay = self.delay
-        if not self.ignores_segment_motion:
-            delay = (
-                delay
-                - (2 / SPEED_OF_LIGHT * self.approach_speed + self.doppler_ratio_growth / 2)
-                * self.segment_starts
-            )
-        beat = self.chirp_rate * delay * (1 + doppler_ratio)
-        return self.carriers * doppler_ratio - self.existing_chirp_rates * beat
+        return self.stack_segments(*(s.beat_frequency(self.range) for s in self.existing_segments))
 
     @cached_property
     def missing_samples(self) -> MissingSamples | None:
         """Samples of the record without an echo; None if echoes fill all records."""
         if self.ignores_overlap:
             return None
-        delay = self.delay
-        if not self.ignores_segment_motion:
-            delay = (
-                delay
-                - (2 / SPEED_OF_LIGHT * self.approach_speed + self.doppler_ratio_growth / 2)
-                * self.segment_starts
+        delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))
+        n_missing = np.stack(
+            np.broadcast_arrays(
+                *(
+                    self.budget.record.count_samples_before_echo(segment, self.range)
+                    for segment in self.existing_segments
+                )
             )
-        n_missing = waveform.count_samples_before_echo(
-            delay=delay,
-            doppler_ratio=self.doppler_ratio_growth
-            + (0.0 if self.ignores_doppler else self.doppler_ratio),
-            record_start=self.acquisition_delay,
-            sample_rate=self.sample_rate,
-            length=self.window.length,
         )
         latest_delay = delay * np.minimum(
             self.footprint_extent.range_offsets.extreme, 1e3
@@ -592,67 +584,32 @@ class PlannerInputs:
     @cached_property
     def transfer_gain(self) -> np.ndarray:
         """Receiver's gain |H| at the line relative to DC."""
-        bandwidths = [
-            self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
-        ]
-        detector_ratio, amplifier_ratio = (
-            (self.beat_frequency / bandwidth) ** 2 for bandwidth in bandwidths
-        )
-        gain = 1 / np.sqrt((1 + detector_ratio) * (1 + amplifier_ratio))
-        if self.antialias_filter:
-            gain = gain * np.sqrt(
-                receiver_chain.antialias_power_transmission(
-                    self.beat_frequency, **self.antialias_filter
-                )
-            )
-        return np.asarray(gain)
-
-    @cached_property
-    def antialias_filter(self) -> dict[str, np.ndarray]:
-        """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
-        return receiver_chain.antialias_filter_parameters(
-            receiver_chain.receiver_parameters(self.parameters)
-        )
+        return self.budget.receiver_filter.gain(self.beat_frequency)
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
         """Bound on the relative change of |H|^2 per bin [1/bin]."""
-        bandwidths = (
-            self[RECEIVER_PREFIX + f"{stage}_bandwidth"] for stage in ("detector", "amplifier")
-        )
+        receiver_filter = self.budget.receiver_filter
+        bandwidths = receiver_filter.detector_bandwidth, receiver_filter.amplifier_bandwidth
         return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.bin_width)
 
     @cached_property
     def line_signal_ratio(self) -> np.ndarray:
         """Magnitude over sigma of the line on the axis, if it lay on a bin, by segment."""
-        signal_ratio = (
-            self.beat_amplitude
-            * (0.5 * self.window.sum)
-            / self.bin_noise_sigma
-            * self.transfer_gain
+        receiver_filter, noise = self.budget.receiver_filter, self.budget.noise
+        # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
+        if receiver_filter.antialias_filter and receiver_filter.noise_shape != "white":
+            noise = noise.with_sources(**{ADC_NOISE_SOURCE: adc_noise_variance(self.parameters)})
+        sigma = self.budget.record.bin_noise_sigma(noise.variance_without_echo, self.looks)
+        gain = receiver_filter.pole_gain(self.beat_frequency) * receiver_filter.whitening_gain(
+            self.beat_frequency, noise.adc_noise_fraction
         )
-        if self.option(RECEIVER_PREFIX + "noise_shape") == "white":
-            return signal_ratio
-        relative_density = self.relative_noise_density
-        # Where filters pass almost no noise, the ADC's noise remains.
-        if self.antialias_filter:
-            relative_density = (
-                relative_density + self.quantisation_variance / self.receiver_noise_variance
-            )
-        return signal_ratio / np.sqrt(relative_density)
+        return self.beat_amplitude * (0.5 * self.window.sum) / sigma * gain
 
     @cached_property
     def relative_noise_density(self) -> np.ndarray | float:
         """Density of the receiver's noise at the line over its mean over all bins, by segment."""
-        if self.option(RECEIVER_PREFIX + "noise_shape") == "white":
-            return 1.0
-        pole_names = "detector_bandwidth", "amplifier_bandwidth"
-        filter_arguments = {
-            name: self[RECEIVER_PREFIX + name] for name in pole_names
-        } | self.antialias_filter
-        return receiver_chain.relative_noise_density(
-            self.beat_frequency, sample_rate=self.sample_rate, **filter_arguments
-        )
+        return self.budget.receiver_filter.relative_noise_density(self.beat_frequency)
 
     @cached_property
     def peak_ratio(self) -> np.ndarray:

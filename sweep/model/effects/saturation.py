@@ -27,12 +27,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from sweep.model import receiver_chain, waveform
+from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import amplifier, atmosphere, circulator_leak, noise_sources
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import PROCESSING_PREFIX, Shots
+from sweep.model.link_budget import PROCESSING_PREFIX
+from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
@@ -170,7 +171,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     return replace(
         shots,
         beat_amplitude_scale=shots.beat_amplitude_scale * gains.signal_gain,
-        noise_variance_gain=shots.noise_variance_gain * gains.noise_gain,
+        noise=replace(shots.noise, gain=shots.noise.gain * gains.noise_gain),
     )
 
 
@@ -191,18 +192,10 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
         for segment_index in np.flatnonzero(shots.has_segment)
     ]
     lowest_beat = np.min(np.abs(beat_frequencies), axis=0)
-    gain = receiver_chain.receiver_transfer(
-        lowest_beat,
-        detector_bandwidth=shots.detector_bandwidth,
-        amplifier_bandwidth=shots.amplifier_bandwidth,
-    )
-    if shots.antialias_filter:
-        gain = gain * np.sqrt(
-            receiver_chain.antialias_power_transmission(lowest_beat, **shots.antialias_filter)
-        )
+    gain = shots.receiver_filter.gain(lowest_beat)
     echo = shots.total_relative_echo
     echo = echo if shots.architecture == "direct" else np.sqrt(echo)
-    return np.asarray(shots.beat_amplitude_scale * echo * np.abs(gain))
+    return np.asarray(shots.beat_amplitude_scale * echo * gain)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:

@@ -34,7 +34,8 @@ from sweep.model import beam
 from sweep.model.effects.atmosphere import path_heights
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, ErrorBound, Parameter
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import LASER_PREFIX, TELESCOPE_PREFIX, Shots
+from sweep.model.link_budget import ECHO_NOISE_SOURCES, LASER_PREFIX, TELESCOPE_PREFIX
+from sweep.model.preparation import Shots
 
 _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Exponents of the distances to receiver and source in the integral over the path."""
@@ -391,16 +392,16 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
         str(parameters[_DISTRIBUTION_PATH]), legs, draw_addresses
     )
     beat_factor = power_factor if shots.architecture == "direct" else np.sqrt(power_factor)
-    noise_variances = shots.noise_variances
-    if "signal_shot" in noise_variances:
-        noise_variances = noise_variances | {
-            "signal_shot": noise_variances["signal_shot"] * power_factor
-        }
+    echo_variances = {
+        name: variance * power_factor
+        for name, variance in shots.noise.variances.items()
+        if name in ECHO_NOISE_SOURCES
+    }
     return replace(
         shots,
         echo_power_scale=shots.echo_power_scale * power_factor,
         beat_amplitude_scale=shots.beat_amplitude_scale * beat_factor,
-        noise_variances=noise_variances,
+        noise=shots.noise.with_sources(**echo_variances),
         pedestal_variance_under_lines=shots.pedestal_variance_under_lines * beat_factor**2,
         pedestal_variance_beside_lines=shots.pedestal_variance_beside_lines * beat_factor**2,
     )

@@ -35,7 +35,8 @@ from sweep.model.detection.looks import DRIFT_POSITIONS_MAX, LOOKS_NUMBER_PATH
 from sweep.model.effects.doppler import line_shift_bound
 from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.preparation import Shots, doppler_ratio
+from sweep.model.link_budget import doppler_ratio
+from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 LOOK_DRIFT_MAX_WINDOW_BINS = 0.25
@@ -79,23 +80,20 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     frequency at mid-chirp by which the beats underestimate the radial velocity, and the drift of
     lines per look.
     """
-    starts, n_looks = shots.scheduled_segment_starts, shots.looks.number
+    starts, looks = shots.scheduled_segment_starts, shots.looks
     middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
-    if n_looks > 1:
-        middle_look_delay = 0.5 * (n_looks - 1) * shots.look_period
-        starts, middle_time = (
-            tuple(start + middle_look_delay for start in starts),
-            middle_time + middle_look_delay,
-        )
     shots = replace(
         shots,
-        segment_starts=starts,
-        range_walk_time=shots.range_walk_time + middle_time,
+        segment_starts=shots.waveform_settings.middle_look_starts(looks),
+        range_walk_time=shots.range_walk_time
+        + (middle_time + shots.waveform_settings.middle_look_delay(looks)),
         velocity_bias_fraction=shots.chirp_rate
         * half_interval
         / (shots.carriers[0] + shots.chirp_bandwidth / 2),
     )
-    return replace(shots, line_drift_per_look=line_drift_per_look(shots)) if n_looks > 1 else shots
+    if looks.number == 1:
+        return shots
+    return replace(shots, line_drift_per_look=line_drift_per_look(shots))
 
 
 def line_drift_per_look(shots: Shots) -> np.ndarray:

@@ -896,8 +896,11 @@ def _add_drift_errors(
     if motion is not None:
         shots = replace(
             shots,
-            acceleration=motion.acceleration,
-            approach_speed=motion.approach_speed_at(shots.range),
+            target=replace(
+                shots.target,
+                acceleration=motion.acceleration,
+                approach_speed=motion.approach_speed_at(shots.range),
+            ),
         )
     bins_per_rate = shots.record_duration * shots.fft_size / shots.sample_rate
     drift_bins = np.array(

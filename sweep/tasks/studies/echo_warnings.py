@@ -19,14 +19,14 @@ from sweep.model.detection.estimators import ESTIMATOR_PREFIX
 from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
 from sweep.model.effects.planner_inputs import missing_sample_bounds
 from sweep.model.evaluation import MISREAD_TOLERANCE_BINS
-from sweep.model.preparation import (
+from sweep.model.link_budget import (
     CHIRP_PREFIX,
     LASER_PREFIX,
     PROCESSING_PREFIX,
     RECEIVER_PREFIX,
     RECORD_PATH,
-    split_by_category,
 )
+from sweep.model.preparation import split_by_category
 from sweep.model.window import canonical_window_name, get_window
 from sweep.tasks.studies.flight_study import FlightStudy
 

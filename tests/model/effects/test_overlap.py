@@ -9,7 +9,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import overlap, segment_motion
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.effects.phase_errors import chirp_drift_time
-from sweep.model.preparation import RECORD_PATH
+from sweep.model.link_budget import RECORD_PATH
 from sweep.model.sampling import samplers
 from sweep.model.sampling.philox import point_keys
 from sweep.model.spectrum import segment_spectra
