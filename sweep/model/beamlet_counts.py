@@ -54,13 +54,11 @@ from sweep.model.beamlets import (
     plane_moments,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.looks import Looks
 from sweep.model.effects.window_response import WindowResponse, window_response
 from sweep.model.error_budget import ErrorBudget
-from sweep.model.link_budget import CHIRP_PREFIX, LASER_PREFIX, PROCESSING_PREFIX, doppler_ratio
+from sweep.model.link_budget import LASER_PREFIX, LinkBudget, doppler_ratio
 from sweep.model.preparation import BEAMLETS_ERROR_PATH, Parameters, split_by_category
-from sweep.model.threshold import tnr_from_parameters
-from sweep.model.window import canonical_window_name, window_samples
+from sweep.model.window import window_samples
 
 BEAMLETS_PATH = "footprint.beamlets"
 """Path of the number of beamlets; 0 if it follows from the tolerance."""
@@ -260,35 +258,27 @@ def required_beamlets(
     error : ndarray (n,)
         Remaining error of the probabilities of detection, summed over the segments.
     """
-    pd_change_per_power, error_budget = (
-        _pd_change_per_power(parameters) + np.zeros(n_points),
-        ErrorBudget.from_parameters(parameters),
-    )
+    budget, error_budget = LinkBudget(parameters), ErrorBudget.from_parameters(parameters)
+    pd_change_per_power = _pd_change_per_power(budget) + np.zeros(n_points)
     power_tolerance = error_budget.allowed_beamlets_error / pd_change_per_power
-    window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
-    spread = _line_spread(parameters, n_points, error_budget.beamlets_max)
+    window_name = budget.record.window.name
+    spread = _line_spread(budget, n_points, error_budget.beamlets_max)
     n_lines, n_nodes, error = required_nodes(window_name, spread, power_tolerance, error_budget)
     pattern = np.where(n_lines == 1, "line", np.char.add(n_lines.astype(str), " lines"))
     return n_lines * n_nodes, pattern, np.minimum(error * pd_change_per_power, 1.0)
 
 
-def _pd_change_per_power(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
     """Return the largest change of pd, over all segments, per relative change of a bin's power."""
-    from sweep.model.detection import echo_detection
-
-    b = echo_detection.threshold_from_tnr(
-        tnr=tnr_from_parameters(parameters), bin_deviation=np.asarray(1.0)
-    )
-    b = Looks.from_parameters(parameters).amplitude_gain_max * b
+    b = budget.looks.amplitude_gain_max * budget.threshold_ratio
     a = 0.5 * (b + np.sqrt(b * b + 2))
     slope_max = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
     return np.asarray(_N_SEGMENTS * slope_max / 2)
 
 
-def _line_spread(
-    parameters: Mapping[str, np.ndarray], n_points: int, beamlets_max: int
-) -> LineSpreadBins:
+def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadBins:
     """Compute the spread of the lines of up, Doppler and down segment [bins of fs/L]."""
+    parameters = budget.parameters
     grazing_angle, radial_velocity = (
         parameters["target.grazing_angle"],
         np.asarray(parameters["target.radial_velocity"], float),
@@ -300,8 +290,8 @@ def _line_spread(
         position_angles / 4 / np.tan(grazing_angle),
         direction_angles / 4,
     )
-    bin_width = parameters[PROCESSING_PREFIX + "sample_rate"] / parameters["record"]
-    chirp_rate = parameters[CHIRP_PREFIX + "bandwidth"] / parameters[CHIRP_PREFIX + "duration"]
+    bin_width = budget.record.sample_rate / budget.record.window.length
+    chirp_rate = budget.waveform.chirp_rate
     range_moments, velocity_moments = plane_moments(
         transverse_velocity=transverse_velocity,
         radial_velocity=radial_velocity,
@@ -321,8 +311,7 @@ def _line_spread(
     )
     bins_per_range = beat_per_metre * parameters["target.range"] / bin_width
     carrier = (
-        SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"]
-        + parameters[CHIRP_PREFIX + "bandwidth"]
+        SPEED_OF_LIGHT / parameters[LASER_PREFIX + "wavelength"] + budget.waveform.chirp_bandwidth
     )
     bins_per_speed = bins_per_velocity(
         range=parameters["target.range"],
@@ -354,11 +343,11 @@ def _line_spread(
     # as segments differ in optical frequency, by ranges.
     starts = waveform.segment_starts(
         waveform.existing_segments("", str(parameters[waveform.SEGMENT_ORDER_PATH])),
-        duration=parameters[CHIRP_PREFIX + "duration"], gap=parameters[waveform.SEGMENT_GAP_PATH],
+        duration=budget.waveform.chirp_duration, gap=budget.waveform.segment_gap,
     )  # fmt: skip
     last_start_bins = np.maximum.reduce(starts) * bin_width
     delay = 2 / SPEED_OF_LIGHT * parameters["target.range"]
-    carrier_difference_cycles = _carrier_difference_max(parameters) * delay
+    carrier_difference_cycles = _carrier_difference_max(budget) * delay
     # The factor 2 is for sums over records, in which the ends hardly count.
     slope = np.vstack(
         [
@@ -387,20 +376,17 @@ def _line_spread(
     return LineSpreadBins(np.maximum(spread.deviation, phase_deviation), slope, quadratic)
 
 
-def _carrier_difference_max(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
     """Return the largest difference between segments of the optical frequency in mid-record [Hz].
 
     Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
-    chirp_rate = parameters[CHIRP_PREFIX + "bandwidth"] / parameters[CHIRP_PREFIX + "duration"]
-    record_duration = parameters["record"] / parameters[PROCESSING_PREFIX + "sample_rate"]
-    record_middle = parameters[PROCESSING_PREFIX + "acquisition_delay"] + record_duration / 2
-    time_since_echo = record_middle - 2 / SPEED_OF_LIGHT * parameters["target.range"]
+    settings = budget.waveform
+    record_middle = budget.record.acquisition_delay + budget.record.duration / 2
+    time_since_echo = record_middle - 2 / SPEED_OF_LIGHT * budget.parameters["target.range"]
     frequencies = [
-        carrier + chirp_slope * chirp_rate * time_since_echo
-        for carrier, chirp_slope in zip(
-            waveform.segment_carriers(parameters), waveform.chirp_slopes(parameters), strict=True
-        )
+        carrier + chirp_slope * settings.chirp_rate * time_since_echo
+        for carrier, chirp_slope in zip(settings.carriers, settings.chirp_slopes, strict=True)
     ]
     return np.max(frequencies, axis=0) - np.min(frequencies, axis=0)
 

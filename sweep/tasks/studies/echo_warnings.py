@@ -25,9 +25,9 @@ from sweep.model.link_budget import (
     PROCESSING_PREFIX,
     RECEIVER_PREFIX,
     RECORD_PATH,
+    LinkBudget,
 )
 from sweep.model.preparation import split_by_category
-from sweep.model.window import canonical_window_name, get_window
 from sweep.tasks.studies.flight_study import FlightStudy
 
 if TYPE_CHECKING:
@@ -186,14 +186,13 @@ def diagnose_echoes(
     relevant |= {"footprint.beamlets": 1}
     diagnosis = EchoDiagnosis(*np.zeros((2, n_points)), *np.zeros((5, n_points), bool))
     for index, p in split_by_category(relevant):
-        record_window = get_window(
-            canonical_window_name(str(p[PROCESSING_PREFIX + "window"])), int(p["record"])
-        )
+        record = LinkBudget(p).record
+        record_window = record.window
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
         first_echo_sample = waveform.count_samples_before_echo(
             delay=2 / SPEED_OF_LIGHT * range_, doppler_ratio=0.0,
-            record_start=p[PROCESSING_PREFIX + "acquisition_delay"],
-            sample_rate=p[PROCESSING_PREFIX + "sample_rate"], length=record_window.length,
+            record_start=record.acquisition_delay, sample_rate=record.sample_rate,
+            length=record_window.length,
         )  # fmt: skip
         diagnosis.range[index] = range_
         diagnosis.window_fraction_lost[index] = np.where(
@@ -220,25 +219,23 @@ def diagnose_echoes(
             p,
             range_,
             velocity,
-            record_window.length,
             None if footprint is None else footprint.select(index),
         )
         if str(p[LASER_PREFIX + "line_shape"]) == "lorentzian":
-            delay, record = (
-                2 / SPEED_OF_LIGHT * range_,
-                record_window.length / p[PROCESSING_PREFIX + "sample_rate"],
-            )
-            variance = 2 * np.pi * p[LASER_PREFIX + "line_width"] * np.minimum(delay, record)
-            diagnosis.has_phase_walk[index] = (delay > PHASE_WALK_DELAY_RATIO_MIN * record) & (
+            delay, duration = 2 / SPEED_OF_LIGHT * range_, record.duration
+            variance = 2 * np.pi * p[LASER_PREFIX + "line_width"] * np.minimum(delay, duration)
+            diagnosis.has_phase_walk[index] = (delay > PHASE_WALK_DELAY_RATIO_MIN * duration) & (
                 variance > PHASE_WALK_VARIANCE_MAX
             )
     return diagnosis
 
 
 def _crosses_spectrum_edge(
-    p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, record_length: int,
+    p: Mapping[str, Any],
+    range_: np.ndarray,
+    velocity: np.ndarray,
     footprint: FootprintDeviations | None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
     is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
     is_speckled &= str(p[RECEIVER_PREFIX + "architecture"]) != "direct"
@@ -249,24 +246,19 @@ def _crosses_spectrum_edge(
     ):
         return np.zeros(range_.shape, bool)
     footprint = FootprintDeviations.on_plane(p, range_) if footprint is None else footprint
-    chirp_rate, bin_width = (
-        p[CHIRP_PREFIX + "bandwidth"] / p[CHIRP_PREFIX + "duration"],
-        p[PROCESSING_PREFIX + "sample_rate"] / record_length,
-    )
-    segment_order = waveform.existing_segments(
-        str(p[RECEIVER_PREFIX + "architecture"]), str(p[waveform.SEGMENT_ORDER_PATH])
-    )
+    budget = LinkBudget(p)
+    settings, record = budget.waveform, budget.record
+    chirp_rate, record_length = settings.chirp_rate, record.window.length
+    bin_width = record.sample_rate / record_length
     crosses = np.zeros(range_.shape, bool)
-    segments = zip(
-        waveform.SEGMENT_NAMES, waveform.chirp_slopes(p), waveform.segment_carriers(p), strict=True
-    )
+    segments = zip(waveform.SEGMENT_NAMES, waveform.chirp_slopes(p), settings.carriers, strict=True)
     for name, slope, carrier in segments:
-        if name not in segment_order:
+        if name not in settings.segment_order:
             continue
         beat = waveform.beat_frequency(
             slope, carrier=carrier, chirp_rate=chirp_rate, range=range_, radial_velocity=velocity
         )
-        beat_over_nyquist = 2 * beat / p[PROCESSING_PREFIX + "sample_rate"]
+        beat_over_nyquist = 2 * beat / record.sample_rate
         distance_bins = np.abs(beat_over_nyquist - np.rint(beat_over_nyquist)) * record_length / 2
         spread_bins = 2 / SPEED_OF_LIGHT * carrier * footprint.radial_velocity
         spread_bins = (
@@ -285,13 +277,14 @@ def _is_misread(
 
     All three beats are read, or with an ``assumption`` up and down beat alone.
     """
-    carriers, slopes = waveform.segment_carriers(p), waveform.chirp_slopes(p)
-    chirp_rate = p[CHIRP_PREFIX + "bandwidth"] / p[CHIRP_PREFIX + "duration"]
-    sample_rate, is_signed = p[PROCESSING_PREFIX + "sample_rate"], str(p[RECORD_PATH]) == "complex"
-    bin_width = sample_rate / int(p[PROCESSING_PREFIX + "fft_size"])
-    segment_order = waveform.existing_segments(
-        str(p[RECEIVER_PREFIX + "architecture"]), str(p[waveform.SEGMENT_ORDER_PATH])
+    budget = LinkBudget(p)
+    settings, record, slopes = budget.waveform, budget.record, waveform.chirp_slopes(p)
+    carriers, chirp_rate, segment_order = (
+        settings.carriers,
+        settings.chirp_rate,
+        settings.segment_order,
     )
+    sample_rate, bin_width, is_signed = record.sample_rate, record.bin_width, record.is_complex
     if assumption is not None:
         segment_order = tuple(name for name in segment_order if name != "doppler")
     peaks = []
@@ -308,8 +301,8 @@ def _is_misread(
             doppler=peaks[1] if "doppler" in segment_order else None,
             down=peaks[2],
             carrier=carriers[0],
-            bandwidth=p[CHIRP_PREFIX + "bandwidth"],
-            duration=p[CHIRP_PREFIX + "duration"],
+            bandwidth=settings.chirp_bandwidth,
+            duration=settings.chirp_duration,
             sample_rate=sample_rate,
             bin_width=bin_width,
             has_signs=is_signed,
