@@ -503,14 +503,12 @@ class PlannerInputs:
         if self.ignores_overlap:
             return None
         delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))
-        n_missing = np.stack(
-            np.broadcast_arrays(
-                *(
-                    self.budget.record.count_samples_before_echo(segment, self.range)
-                    for segment in self.existing_segments
-                )
+        n_missing = self.stack_segments(
+            *(
+                self.budget.record.count_samples_before_echo(segment, self.range)
+                for segment in self.existing_segments
             )
-        )
+        ).astype(np.int64)
         latest_delay = delay * np.minimum(
             self.footprint_extent.range_offsets.extreme, 1e3
         )  # beyond the axis's
