@@ -330,8 +330,9 @@ sample rate. Range beats are positive, up to half the sample rate; Doppler shift
 up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Fraction of the sample rate by which 2 f_r may be below 0, as peaks rounded to bins may make it.
-"""
+"""Largest negative difference of the down and up peaks, 2 f_r with the range beat f_r, as a
+fraction of the sample rate, that is read as negative. Rounding of peaks to bins may make it
+negative."""
 
 
 def read_beats(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled

@@ -18,7 +18,7 @@ from sweep.analysis.answers.probability import confidence_attribute, pd_half_wid
 
 LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED = range(4)
 REASON_MEANINGS = "found never_reached never_lost not_computed"
-"""Names of the reasons, in the order of their numbers."""
+"""Names of the outcomes of a search for a limit, separated by spaces: CF `flag_meanings`."""
 
 _COMPLEMENT_ERROR_MAX = 1e-6
 """Largest deviation of pd + miss from 1 by rounding and by averaging."""

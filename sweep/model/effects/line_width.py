@@ -80,7 +80,7 @@ _N_PHASE_NODES = 256
 """Number of positions in the record at which the mean phase is subtracted."""
 
 _TINY = 1e-100
-"""Smallest fraction of a line's power, so that divisions are defined."""
+"""Lower limit of the fraction of power that stays in the line, as it is divided by."""
 
 _DENSEST_PEDESTAL_EXPONENT = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""

@@ -116,8 +116,8 @@ N_BOUND_POWERS = 5
 EDGE_LOG_POWER_STEP = 0.75
 """Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
 EDGE_LOG_POWER_DEPTH = 3.0
-"""Largest -ln(power) at which the probability that an echo's outermost bin crosses is computed;
-at lower powers that of this power is used."""
+"""Largest -ln(power) at which the probability that an echo's outermost bin crosses is computed.
+For weaker echoes the probability at this value is used."""
 
 LOG_RATE_STEP_MAX = 0.5
 """Largest step of ln(rate) between nodes; with larger steps the average errs by more than 1e-7."""

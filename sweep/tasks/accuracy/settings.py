@@ -100,7 +100,7 @@ class AccuracySetting:
 
     @property
     def has_line_effects_only(self) -> bool:
-        """True if only effects are simulated that the thesis's method can have.
+        """True if only effects are simulated that move or scale lines, as the thesis's method has.
 
         These are effects on lines, without changes within a record.
         """
