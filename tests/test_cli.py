@@ -9,10 +9,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from click.testing import CliRunner
+from dask.system import CPU_COUNT
 from figure_files import has_content
 
 from sweep.cli import main
@@ -20,8 +22,9 @@ from sweep.spec import GridSpec, load
 from sweep.tasks import driver
 from sweep.tasks.engine import progress
 from sweep.tasks.engine.journal import StoreLock
-from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions
-from sweep.tasks.studies.workload import SpecWorkload, estimate_cpu_seconds
+from sweep.tasks.engine.progress import ClusterError
+from sweep.tasks.engine.session import RunOptions
+from sweep.tasks.studies.workload import SpecWorkload
 
 STUDY = """\
 title: A small study
@@ -680,21 +683,33 @@ def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(h
     assert RunOptions().resolve_cluster(SpecWorkload(spec)).workers == (3, 3)
 
 
-def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwise(here):
-    little, large = yaml.safe_load(STUDY), yaml.safe_load(STUDY)
+def test_threads_compute_unless_something_needs_workers(here):
+    small, large = yaml.safe_load(STUDY), yaml.safe_load(STUDY)
     large["axes"]["target.range"]["number"] = 10**6
-    little, large = (GridSpec.from_mapping(mapping, base=here) for mapping in (little, large))
-    assert estimate_cpu_seconds(little) < SERIAL_CPU_SECONDS_MAX < estimate_cpu_seconds(large)
-    assert RunOptions().resolve_cluster(SpecWorkload(little)) is None
-    assert RunOptions().resolve_cluster(SpecWorkload(large)).kind == "local"
-    for said in ({"workers": 1}, {"processes": False}, {"block_timeout": 9.0},
-                 {"performance_report": "r.html"}, {"evaluate": print}):  # fmt: skip
-        assert RunOptions(**said).resolve_cluster(SpecWorkload(little)).kind == "local"
-    assert (
-        RunOptions(scheduler="tcp://10.0.0.5:8786").resolve_cluster(SpecWorkload(little)).kind
-        == "scheduler"
+    small, large = (
+        SpecWorkload(GridSpec.from_mapping(mapping, base=here)) for mapping in (small, large)
     )
-    assert RunOptions(scheduler="none").resolve_cluster(SpecWorkload(large)) is None
+    for workload in (small, large):
+        assert RunOptions().resolve_cluster(workload) is None
+        assert RunOptions().n_threads(workload) == CPU_COUNT
+        assert RunOptions(threads=3).n_threads(workload) == 3
+        assert RunOptions(scheduler="none").resolve_cluster(workload) is None
+        assert RunOptions(scheduler="none").n_threads(workload) == 1
+    for options in ({"workers": 1}, {"processes": False}, {"block_timeout": 9.0},
+                    {"performance_report": "r.html"}, {"evaluate": print}):  # fmt: skip
+        assert RunOptions(**options).resolve_cluster(small).kind == "local"
+    address = RunOptions(scheduler="tcp://10.0.0.5:8786")
+    assert address.resolve_cluster(small).kind == "scheduler"
+    with_code = SimpleNamespace(execution=small.execution, user_modules=("mine",))
+    assert RunOptions().resolve_cluster(with_code).kind == "local"
+
+
+@pytest.mark.parametrize(
+    "options", [{"workers": 2}, {"scheduler": "none"}, {"processes": False}, {"dashboard": True}]
+)
+def test_threads_and_an_option_of_workers_exclude_each_other(options):
+    with pytest.raises(ClusterError, match=rf"threads.* and {next(iter(options))}.*leave out one"):
+        RunOptions(threads=2, **options)
 
 
 def test_a_study_is_extended_by_the_file_of_a_larger_one(ran):

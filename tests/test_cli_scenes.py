@@ -4,13 +4,9 @@ import csv
 
 import pytest
 import xarray as xr
-import yaml
 from test_cli import STUDY, refused, sweep
 
-from sweep.spec import SceneSpec
-from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions
 from sweep.tasks.studies.eyepoint_study import build_world
-from sweep.tasks.studies.workload import SpecWorkload, estimate_cpu_seconds
 
 SCENE = (
     STUDY.split("target:")[0]
@@ -36,17 +32,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "descent.yaml").write_text(SCENE)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def test_a_small_flight_is_little_work_where_its_rays_are_counted(here):
-    counted = yaml.safe_load(SCENE)
-    by_tolerance = counted | {"footprint": {"speckle": "none"}}
-    of = [SceneSpec.from_mapping(each, base=here) for each in (counted, by_tolerance)]
-    assert (
-        RunOptions().resolve_cluster(SpecWorkload(of[0])) is None
-        and estimate_cpu_seconds(of[0]) < SERIAL_CPU_SECONDS_MAX
-    )
-    assert RunOptions().resolve_cluster(SpecWorkload(of[1])).kind == "local"
 
 
 def test_a_scene_is_planned_run_and_exported(here):

@@ -139,10 +139,15 @@ def parse_assignments(
 SPEC_ARGUMENT = click.argument("spec", type=LocalPathType(exists=True, dir_okay=False))
 STORE_ARGUMENT = click.argument("store", type=StoreLocationType())
 
+THREADS_OPTION = click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    help="Threads of this command that compute [one per core].",
+)
 WORKERS_OPTION = click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Workers to start [all cores, none for little work, or as --cluster says].",
+    help="Worker processes to start in the place of threads [none, or as --cluster says].",
 )
 SCHEDULER_OPTION = click.option(
     "--scheduler",
@@ -221,6 +226,7 @@ ALLOW_CODE_OPTION = click.option(
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a command with the options of all computing commands, passed on unchanged."""
     options = (
+        THREADS_OPTION,
         WORKERS_OPTION,
         SCHEDULER_OPTION,
         CLUSTER_OPTION,
@@ -587,10 +593,8 @@ def plan_rows(
     """Yield heading and text of each line of a study's plan."""
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.progress import duration_text
-    from sweep.tasks.engine.session import RunOptions
     from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
     from sweep.tasks.studies.study_plan import plan_study
-    from sweep.tasks.studies.workload import SpecWorkload
 
     if isinstance(spec, SceneSpec):
         refuse_flight_without_hits(spec)
@@ -611,18 +615,14 @@ def plan_rows(
     if not study_plan.scanners:
         yield "time a point", f"{1e6 * study_plan.seconds_per_point:.3g} us on one core"
     bound_text = "at most about" if getattr(spec.draws, "is_adaptive", False) else "about"
-    if RunOptions(workers=workers).resolve_cluster(SpecWorkload(spec)) is None:
-        yield (
-            "time",
-            f"{bound_text} {duration_text(study_plan.cpu_seconds)}, at once, without workers",
-        )
-    else:
-        yield (
-            "time",
-            f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
-            f"{counted(study_plan.n_workers, 'worker')}",
-        )
-    yield "memory", f"about {decimal(study_plan.worker_bytes)} a worker"
+    computing_unit = "worker" if study_plan.has_workers else "thread"
+    yield (
+        "time",
+        f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
+        f"{counted(study_plan.n_workers, computing_unit)}",
+    )
+    memory_share = " a worker" if study_plan.has_workers else ""
+    yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
     if reason := _excess_text(study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds):
         yield "question", f"sweep run asks first, or takes --yes: {reason}"
 

@@ -543,11 +543,16 @@ class Execution(SpecSection):
     """Execution of a study; no part of its identity, because it changes no result."""
 
     workers: int = declare.count(
-        "Worker processes; 0 for one a core", "4", "0", "100000", default=0
+        "Worker processes; 0 for threads of the command on all cores, unless something needs "
+        "processes",
+        "4",
+        "0",
+        "100000",
+        default=0,
     )
     threads: int = declare.count("Threads of one worker", "1", "1", "10000", default=1)
     scheduler: str = declare.text(
-        "'none' for a plain loop without Dask; empty for workers on this machine",
+        "'none' for a plain loop on one core; empty for threads or workers on this machine",
         "",
         pattern="(none)?",
         remedy="an address is no part of a spec, which a stranger may have written: "

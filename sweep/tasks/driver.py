@@ -68,6 +68,7 @@ from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.memory_limits import (
+    block_bytes_max,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_study,
@@ -423,7 +424,7 @@ def _run_into(
             creates_store = from_scratch or not already_exists
             if creates_store and backend.uses_running_scheduler:
                 backend.connect()  # checks the memory of its workers before the store is created
-            elif already_exists and from_scratch and not backend.is_serial:
+            elif already_exists and from_scratch and not backend.is_in_process:
                 backend.connect()  # without workers the unfinished store is not removed
             if creates_store:
                 create_store(
@@ -530,6 +531,7 @@ def _compute_missing(
     """
     backend.max_workers = study.n_blocks
     backend.check_memory = partial(refuse_too_large_study, study)
+    backend.bytes_per_thread = block_bytes_max(study)
     refuse_too_large_blocks(study, backend.memory)
     with (
         backend.interrupts,

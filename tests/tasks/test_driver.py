@@ -42,8 +42,12 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
 
 @pytest.mark.parametrize(
     "place",
-    [pytest.param({"workers": 3}, marks=pytest.mark.slow), {"workers": 2, "processes": False}],
-    ids=["3 processes", "2 threads"],
+    [
+        pytest.param({"workers": 3}, marks=pytest.mark.slow),
+        {"workers": 2, "processes": False},
+        {"threads": 3},
+    ],
+    ids=["3 processes", "2 workers in threads", "3 threads"],
 )
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
     undisturbed, tmp_path, place
@@ -70,7 +74,7 @@ ADAPTIVE = {
 @pytest.mark.parametrize("drawn", [FIXED, ADAPTIVE], ids=["a fixed number", "to an accuracy"])
 def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn):
     plain = run_serially(small_spec(**drawn), tmp_path / "plain.zarr")
-    threads = run_serially(small_spec(**drawn), tmp_path / "t.zarr", workers=2, processes=False)
+    threads = run_serially(small_spec(**drawn), tmp_path / "t.zarr", threads=2)
     assert file_digests(plain.store) == file_digests(threads.store)
     expected = xr.open_zarr(plain.store)
     if drawn is FIXED:

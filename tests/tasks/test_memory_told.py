@@ -17,13 +17,19 @@ from sweep.tasks.studies.study_plan import plan_study
 HUGE = {"instrument.processing.fft_size": [2**16, 2**30]}
 
 
+def set_machine_memory(monkeypatch, limit):
+    """Let this machine have so many bytes, and be asked for any number of them."""
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
+    monkeypatch.setattr(worker_memory, "SMALL_BYTES", 0)
+
+
 def runs(spec, path):
     return driver.run(spec, store=path, scheduler="none", progress=False)
 
 
 @pytest.mark.parametrize("use", [lambda spec, path: plan_study(spec), runs])
 def test_an_fft_that_no_machine_holds_is_refused(use, tmp_path, monkeypatch):
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
+    set_machine_memory(monkeypatch, 64 * 10**9)
     spec = small_spec(axes=HUGE)
     with pytest.raises(SpecError, match=r"fft_size: makes a point take about 268.4 GB.*64.0 GB"):
         use(spec, tmp_path / "huge.zarr")
@@ -60,7 +66,7 @@ def batch(memory):
     ],
 )  # fmt: skip
 def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_path, monkeypatch):
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
+    set_machine_memory(monkeypatch, 64 * 10**9)
     spec = small_spec(axes={"instrument.processing.fft_size": [2**16, 2**24]})  # 4.2 GB
     with pytest.raises(SpecError, match=rf"fft_size: makes a point take about 4.2 GB.*{told}"):
         driver.run(spec, store=tmp_path / "huge.zarr", progress=False, **options)
@@ -78,7 +84,7 @@ def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch
     spec = small_scene_spec()
     needed = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec)
     assert memory_limits.scene_bytes(spec) > 1000
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", needed - 1)
+    set_machine_memory(monkeypatch, needed - 1)
     for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
             use()
@@ -89,7 +95,7 @@ def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
     spec, whole = small_scene_spec(), small_scene_spec(draws={"number": 6, "returns": 3})
     runs(spec, tmp_path / "s.zarr")
     limit = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec) - 1
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
+    set_machine_memory(monkeypatch, limit)
     plain = {"scheduler": "none", "progress": False}
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
         driver.extend(tmp_path / "s.zarr", whole, to=tmp_path / "t.zarr", **plain)
@@ -106,7 +112,7 @@ def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, 
     from distributed import LocalCluster
 
     spec = small_scene_spec() if kind == "flight" else small_spec(axes=HUGE)
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**13)
+    set_machine_memory(monkeypatch, 10**13)
     if kind == "flight":  # a point fits into a worker, and the scene with it does not
         monkeypatch.setattr(memory_limits, "scene_bytes", lambda spec: 2 * 10**9)
     one = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
@@ -122,7 +128,7 @@ def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, 
 
 def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):
     spec = small_scene_spec(draws={"number": 10**7}, storage={"block_draws": 10**6})
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**8)
+    set_machine_memory(monkeypatch, 10**8)
     monkeypatch.setattr(memory_limits, "point_bytes_max", lambda spec: 0)
     for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"storage: makes a block take .* GB"):
@@ -175,7 +181,7 @@ def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monk
 
 def test_the_memory_of_a_plan_counts_a_point():
     spec = small_spec()
-    assert plan_study(spec).worker_bytes > memory_limits.point_bytes_max(spec) > 1e6
+    assert plan_study(spec).memory_bytes > memory_limits.point_bytes_max(spec) > 1e6
 
 
 @pytest.mark.parametrize(

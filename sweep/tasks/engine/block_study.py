@@ -297,10 +297,6 @@ class Workload(Protocol):
         """Workers, threads and scheduler that the spec asks for."""
 
     @property
-    def cpu_seconds(self) -> float:
-        """Estimated time of all blocks on one core [s]; infinite if unknown."""
-
-    @property
     def user_modules(self) -> tuple[str, ...]:
         """Names of the user's Python modules whose functions the blocks call."""
 

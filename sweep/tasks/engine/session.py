@@ -65,9 +65,10 @@ from sweep.tasks.engine.worker import (
     ReceiptVerifier,
     TaskResult,
     TaskSettings,
+    run_in_threads,
     run_serial,
 )
-from sweep.tasks.engine.worker_memory import WorkerMemory, serial_worker_memory, worker_memory
+from sweep.tasks.engine.worker_memory import WorkerMemory, process_memory, worker_memory
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -76,10 +77,6 @@ if TYPE_CHECKING:
 
 #: Value of the option `scheduler` that selects serial computation in this process.
 SERIAL_SCHEDULER = "none"
-
-#: Largest estimated time of a study on one core that is computed serially by default [s]: workers
-#: take some seconds to start.
-SERIAL_CPU_SECONDS_MAX = 10.0
 
 #: Number of failed blocks, without any success, after which a run stops.
 MAX_INITIAL_FAILURES = 20
@@ -109,11 +106,13 @@ class RunOptions:
     Parameters
     ----------
     client
-        Dask client to compute with. Without one, `scheduler` and `workers` select the backend. By
-        default little work is done serially in this process, and more of it by workers on all cores
-        of this machine.
+        Dask client to compute with. Without one, `threads`, `workers`, `scheduler` and `cluster`
+        select the backend. By default threads of this process compute on all cores. Studies that
+        call the user's Python functions, and options that need a scheduler, have worker processes.
+    threads
+        Number of threads of this process that compute blocks; one per core by default.
     workers, processes
-        Number of workers to start on this machine, and whether they are processes or threads.
+        Number of Dask workers to start on this machine, and whether they are processes or threads.
     scheduler
         Address of a Dask scheduler, or "none" for serial computation in this process.
     cluster
@@ -139,6 +138,7 @@ class RunOptions:
     """
 
     client: Client | None = None
+    threads: int | None = None
     workers: int | None = None
     processes: bool = True
     scheduler: str | None = None
@@ -153,9 +153,15 @@ class RunOptions:
     evaluate: BlockEvaluator | None = None
 
     def __post_init__(self) -> None:
-        is_integer = isinstance(self.workers, Integral) and not isinstance(self.workers, bool)
-        if self.workers is not None and not (is_integer and self.workers > 0):
-            raise ClusterError(f"workers must be a whole number above 0, not {self.workers!r}")
+        for name, number in (("workers", self.workers), ("threads", self.threads)):
+            is_integer = isinstance(number, Integral) and not isinstance(number, bool)
+            if number is not None and not (is_integer and number > 0):
+                raise ClusterError(f"{name} must be a whole number above 0, not {number!r}")
+        if self.threads is not None and (named := self._options_of_workers()):
+            raise ClusterError(
+                f"{option_text('threads')} computes in this process, and {option_text(named)} with "
+                "workers: leave out one"
+            )
         if self.scheduler not in (None, SERIAL_SCHEDULER) and not _is_address(self.scheduler):
             raise ClusterError(
                 f"{self.scheduler!r} is no address of a Dask scheduler: write e.g. "
@@ -180,7 +186,9 @@ class RunOptions:
         return cls(**options)
 
     def resolve_cluster(self, workload: Workload) -> AnyClusterConfig | None:
-        """Return the cluster of the options, or of the spec's `execution`; None to run serially.
+        """Return the cluster of the options, or of the spec's `execution`.
+
+        None if blocks are computed in this process.
 
         ClusterError if both a scheduler and a cluster are named, or a number of workers for a
         scheduler that runs already.
@@ -203,7 +211,7 @@ class RunOptions:
             raise ClusterError(
                 f"a plain loop has no dashboard: leave out {option_text('dashboard')}"
             )
-        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_serial(workload)):
+        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_threads(workload)):
             return None
         if scheduler is not None:
             if self.dashboard:
@@ -234,19 +242,41 @@ class RunOptions:
         scheduler = cluster.scheduler.model_copy(update={"dashboard": str(DASHBOARD_PORT)})
         return cluster.model_copy(update={"scheduler": scheduler})
 
-    def _prefers_serial(self, workload: Workload) -> bool:
-        """Return True if no option asks for workers, and the work is too little for them."""
-        asks_for_workers = (
-            self.workers or self.block_timeout or self.performance_report or self.evaluate
-        )
-        if (
-            asks_for_workers
-            or self.dashboard
-            or not self.processes
-            or workload.execution != Execution()
-        ):
-            return False
-        return not workload.user_modules and workload.cpu_seconds <= SERIAL_CPU_SECONDS_MAX
+    def _prefers_threads(self, workload: Workload) -> bool:
+        """Return True if no option asks for workers, and no user's Python code is called.
+
+        Python code would hold Python's global lock, so that threads would compute in turns.
+        """
+        if self.threads is not None:
+            return True
+        execution = workload.execution
+        needs_workers = self._options_of_workers() or self.evaluate or workload.user_modules
+        return not needs_workers and execution == Execution()
+
+    def _options_of_workers(self) -> str:
+        """Return the name of an option that only workers can serve; '' if none is set."""
+        is_set = {
+            "workers": self.workers is not None,
+            "client": self.client is not None,
+            "cluster": self.cluster is not None,
+            "scheduler": self.scheduler is not None,
+            "block_timeout": self.block_timeout is not None,
+            "performance_report": self.performance_report is not None,
+            "dashboard": self.dashboard,
+            "processes": not self.processes,
+        }
+        return next((name for name, value in is_set.items() if value), "")
+
+    def n_threads(self, workload: Workload) -> int:
+        """Return the number of threads of this process that compute blocks; 1 for a plain loop."""
+        scheduler = self.scheduler or (self.workers is None and workload.execution.scheduler)
+        if scheduler == SERIAL_SCHEDULER:
+            return 1
+        if self.threads is not None:
+            return int(self.threads)
+        from dask.system import CPU_COUNT  # respects the limits of containers
+
+        return int(CPU_COUNT)
 
 
 def _is_address(address: object) -> bool:
@@ -279,19 +309,31 @@ class ComputeBackend(ExitStack):
         self.interrupts = InterruptHandler(self.progress)
         self._cluster, self._workload = options.resolve_cluster(workload), workload
         self.memory = (
-            serial_worker_memory()
-            if self.is_serial
-            else worker_memory(options.client, self._cluster)
+            process_memory() if self.is_in_process else worker_memory(options.client, self._cluster)
         )
+        self.bytes_per_thread = 0.0
+        """Memory that a thread of this process takes for its block [bytes]; set by the caller."""
         self.check_memory: Callable[[WorkerMemory], None] = lambda memory: None
         """Raises a SpecError if the study exceeds the memory of a worker; set by the caller."""
         self.max_workers = 1  # number of blocks of the study, as further workers would be idle
         self._connection: ClusterConnection | None = None
 
     @property
-    def is_serial(self) -> bool:
-        """True if blocks are computed one after the other in this process."""
+    def is_in_process(self) -> bool:
+        """True if blocks are computed in this process, by threads or one after the other."""
         return self.options.client is None and self._cluster is None
+
+    def _n_threads(self) -> int:
+        """Return the number of threads that compute: as many as memory and blocks suffice for."""
+        n_threads = min(self.options.n_threads(self._workload), self.max_workers)
+        if n_threads == 1 or self.memory.has_room_for(n_threads * self.bytes_per_thread):
+            return max(n_threads, 1)
+        n_with_memory = max(int(self.memory.bytes_max / self.bytes_per_thread), 1)
+        self.progress.say(
+            f"memory suffices for {n_with_memory} of {n_threads} threads: a block takes up to "
+            f"{self.bytes_per_thread / 1e9:,.1f} GB"
+        )
+        return n_with_memory
 
     @property
     def uses_running_scheduler(self) -> bool:
@@ -355,15 +397,18 @@ class ComputeBackend(ExitStack):
             options.durable,
             tuple(user_code.module_digests(self._workload.user_modules).items()),
         )
-        if self.is_serial:
-            _logger.info("blocks are computed in this process, one after the other")
+        if self.is_in_process:
             if options.performance_report is not None:
                 self.progress.say(
                     "no performance report: a plain loop has no scheduler to tell of it"
                 )
-            return run_serial(
-                settings, block_queue, lambda: self.interrupts.is_stopping, verify_receipt
-            )
+            n_threads = self._n_threads()
+            in_process = settings, block_queue, lambda: self.interrupts.is_stopping, verify_receipt
+            if n_threads == 1:
+                _logger.info("blocks are computed in this process, one after the other")
+                return run_serial(*in_process)
+            _logger.info("blocks are computed by %s threads of this process", n_threads)
+            return run_in_threads(*in_process, n_threads)
         from sweep.tasks.engine.dispatcher import TaskDispatcher
 
         client, expected_slots, _ = self.connect()
@@ -589,7 +634,7 @@ class Session:
                 self._interrupts.is_computing = True  # a stop while workers start loses nothing
                 compile_thread = threading.Thread(target=self._compile_kernels, daemon=True)
                 activity = "loading the model" + (
-                    "" if self._backend.is_serial else ", reaching workers"
+                    "" if self._backend.is_in_process else ", reaching workers"
                 )
                 with show_activity(activity, self._progress):
                     compile_thread.start()  # while workers start, which is mostly waiting

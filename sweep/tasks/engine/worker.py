@@ -1,4 +1,4 @@
-"""Evaluation of blocks on a worker, and the queue of blocks that are not done.
+"""Evaluation of blocks on a worker or in this process, and the queue of blocks that are not done.
 
 A worker evaluates each block within its time limit, writes it, and returns a receipt.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import queue
 import socket
 import sys
 import threading
@@ -375,15 +376,100 @@ def run_serial(
     Reference implementation: every backend must write the same bytes.
     """
     while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
-        task_result = run_blocks(settings, task_blocks)
-        if not all(verify_receipt(receipt, False) for receipt in task_result.receipts):
-            task_result = TaskResult(
-                failures=[
-                    make_failure(block, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
-                    for block in task_blocks
-                ]
-            )
-        block_queue.requeue(list(task_result.checkpoint_points))
-        yield task_result
-        if task_result.worker_error is not None:
-            raise task_result.worker_error
+        yield _accept_result(
+            run_blocks(settings, task_blocks), task_blocks, block_queue, verify_receipt
+        )
+
+
+def run_in_threads(
+    settings: TaskSettings,
+    block_queue: BlockQueue,
+    is_stopping: Callable[[], bool],
+    verify_receipt: ReceiptVerifier,
+    n_threads: int,
+) -> Iterator[TaskResult]:
+    """Yield the results of blocks that threads of this process compute, as they arrive.
+
+    Compiled kernels release Python's global lock, so that the threads keep all cores busy. Each
+    thread takes one block at a time, and an empty result is yielded every `IDLE_POLL_SECONDS` while
+    none arrives.
+
+    Parameters
+    ----------
+    settings
+        Settings of the run.
+    block_queue
+        Blocks that are not done.
+    is_stopping
+        Returns True once the run is to stop. Blocks that run are then finished; no other begins.
+    verify_receipt
+        Tells whether the block of a receipt is in the store.
+    n_threads
+        Number of threads.
+
+    Raises
+    ------
+    StoreError, OSError, CodeError
+        If no block can be computed, or written to the store.
+    """
+    assigned_blocks: queue.SimpleQueue[list[int] | None] = queue.SimpleQueue()
+    finished_tasks: queue.SimpleQueue[tuple[list[int], TaskResult]] = queue.SimpleQueue()
+
+    def compute_assigned_blocks() -> None:
+        while (task_blocks := assigned_blocks.get()) is not None:
+            try:
+                task_result = run_blocks(settings, task_blocks)
+            except BaseException as error:  # else the run would wait for this thread for good
+                task_result = TaskResult(
+                    failures=[make_failure(block, error) for block in task_blocks]
+                )
+            finished_tasks.put((task_blocks, task_result))
+
+    # After a second Ctrl-C the command ends without waiting for them, hence daemon threads.
+    for _ in range(n_threads):
+        threading.Thread(target=compute_assigned_blocks, daemon=True).start()
+    n_in_flight = 0
+    try:
+        while True:
+            while n_in_flight < n_threads and not is_stopping():
+                if not (task_blocks := block_queue.take_blocks(1)):
+                    break
+                assigned_blocks.put(task_blocks)
+                n_in_flight += 1
+            if not n_in_flight:
+                return
+            try:
+                task_blocks, task_result = finished_tasks.get(timeout=IDLE_POLL_SECONDS)
+            except queue.Empty:
+                yield TaskResult(n_workers=n_threads)
+                continue
+            n_in_flight -= 1
+            task_result.n_workers = n_threads
+            yield _accept_result(task_result, task_blocks, block_queue, verify_receipt)
+    finally:
+        for _ in range(n_threads):
+            assigned_blocks.put(None)
+
+
+def _accept_result(
+    task_result: TaskResult,
+    task_blocks: list[int],
+    block_queue: BlockQueue,
+    verify_receipt: ReceiptVerifier,
+) -> TaskResult:
+    """Return the result of a task of this process, once its blocks are found in the store.
+
+    Failures replace the receipts of blocks that are not there. Unfinished blocks go back to the
+    queue. The error that prevents any block from being computed is raised.
+    """
+    if task_result.worker_error is not None:
+        raise task_result.worker_error
+    if not all(verify_receipt(receipt, False) for receipt in task_result.receipts):
+        task_result = TaskResult(
+            failures=[
+                make_failure(block, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
+                for block in task_blocks
+            ]
+        )
+    block_queue.requeue(list(task_result.checkpoint_points))
+    return task_result

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import CancelledError
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,38 +16,58 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-class WorkerMemory(NamedTuple):
+#: Memory that every machine has which runs this program [bytes]. The machine is not asked for so
+#: little, as asking it imports Dask, which takes longer than small studies do.
+SMALL_BYTES = 1e8
+
+
+@dataclass(frozen=True)
+class WorkerMemory:
     """Memory available to a process that computes blocks."""
 
-    bytes_max: float
-    """Largest memory that the process may use [bytes]; inf if unknown."""
+    find_bytes_max: Callable[[], float]
+    """Function that returns the largest memory which the process may use [bytes]."""
     process_name: str
     """Name of the process in messages, as the subject of a sentence: `this machine`."""
     workers_sharing: int = 1
     """Number of workers that share this machine's memory; 1 if each has a limit."""
 
+    @cached_property
+    def bytes_max(self) -> float:
+        """Largest memory that the process may use [bytes]; inf if unknown."""
+        return self.find_bytes_max()
 
-def serial_worker_memory() -> WorkerMemory:
-    """Return the memory available to serial computation in this process."""
-    # Imported here: errors of a spec are reported without the second that this import takes.
-    from distributed.system import MEMORY_LIMIT
+    def has_room_for(self, bytes_needed: float) -> bool:
+        """Return True if the process may use so much memory [bytes]."""
+        return bytes_needed < SMALL_BYTES or bytes_needed <= self.bytes_max
 
-    return WorkerMemory(MEMORY_LIMIT, "this machine")
+
+def process_memory() -> WorkerMemory:
+    """Return the memory available to computation in this process."""
+
+    def machine_limit() -> float:
+        from distributed.system import MEMORY_LIMIT
+
+        return float(MEMORY_LIMIT)
+
+    return WorkerMemory(machine_limit, "this machine")
 
 
 def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
     """Return the memory of the smallest worker of a client, or of a cluster to be started."""
     if client is not None:
-        return WorkerMemory(_least_memory_limit(client), "a worker of the client")
+        return WorkerMemory(lambda: _least_memory_limit(client), "a worker of the client")
     if isinstance(cluster, LocalClusterConfig):
         from sweep.tasks.engine.cluster_connection import cpu_count
         from sweep.tasks.engine.deploy.local_ssh import worker_memory_limit
 
         bounds = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
         workers_sharing = 1 if cluster.worker.memory else bounds.most
-        return WorkerMemory(worker_memory_limit(cluster, bounds), "each worker", workers_sharing)
+        return WorkerMemory(
+            lambda: worker_memory_limit(cluster, bounds), "each worker", workers_sharing
+        )
     bytes_max = getattr(getattr(cluster, "worker", None), "memory", None)
-    return WorkerMemory(bytes_max or np.inf, "each worker of the cluster")
+    return WorkerMemory(lambda: bytes_max or np.inf, "each worker of the cluster")
 
 
 def _least_memory_limit(client: Client) -> float:

@@ -44,6 +44,11 @@ def point_bytes_max(spec: GridSpec | SceneSpec) -> int:
     return fft_size_max(spec) * (BYTES_PER_DRAWN_BIN if draws_spectra else BYTES_PER_BIN)
 
 
+def block_bytes_max(study: GridStudy | FlightStudy) -> int:
+    """Return the peak memory of a thread that computes and writes one block [bytes]."""
+    return point_bytes_max(study.spec) + 2 * study.block_nbytes_max
+
+
 def scene_bytes(spec: SceneSpec) -> int:
     """Return the size of a scene's triangles and search trees, copied into each process [bytes]."""
     from sweep.tasks.studies.eyepoint_study import build_world
@@ -54,7 +59,7 @@ def scene_bytes(spec: SceneSpec) -> int:
 def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if one point needs more memory than a process has."""
     bytes_needed = point_bytes_max(spec)
-    if bytes_needed > worker_memory.bytes_max:
+    if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"makes a point take about {_gigabytes_text(bytes_needed)} of memory, "
             f"{_available_phrase(worker_memory)}"
@@ -75,7 +80,7 @@ def refuse_too_large_study(study: GridStudy | FlightStudy, worker_memory: Worker
 def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if a scene and one point need more memory than a process has."""
     bytes_needed = point_bytes_max(spec) + scene_bytes(spec)
-    if bytes_needed > worker_memory.bytes_max:
+    if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"takes about {_gigabytes_text(bytes_needed)} of memory in each process that computes, "
             f"{_available_phrase(worker_memory)}"
@@ -89,7 +94,7 @@ def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None
 def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if the results of one block need more memory than a process has."""
     bytes_needed = 2 * study.block_nbytes_max  # the results, and their encoded copy
-    if bytes_needed > worker_memory.bytes_max:
+    if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "
             f"{_available_phrase(worker_memory)}"

@@ -18,8 +18,8 @@ from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
 from sweep.model.outputs import SHOT_VARIABLES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.storage.locations import Location, eyepoints_path
-from sweep.tasks.engine import cluster_connection
-from sweep.tasks.engine.worker_memory import serial_worker_memory
+from sweep.tasks.engine.session import RunOptions
+from sweep.tasks.engine.worker_memory import process_memory
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import (
@@ -31,13 +31,14 @@ from sweep.tasks.studies.grid_study import (
     select_parameters,
 )
 from sweep.tasks.studies.memory_limits import (
-    point_bytes_max,
+    block_bytes_max,
     refuse_too_large_blocks,
     refuse_too_large_point,
     refuse_too_large_scene,
 )
 from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterValue
 from sweep.tasks.studies.study_loading import make_study
+from sweep.tasks.studies.workload import SpecWorkload
 
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
@@ -57,7 +58,7 @@ TIMED_DRAWS_MAX = 1000
 #: Largest number of draws of whole spectra that are measured.
 TIMED_SPECTRA_MAX = 10
 
-#: Time of a worker to start, and to write a chunk [s].
+#: Time of worker processes to start, and of a worker or thread to write a chunk [s].
 WORKER_START_SECONDS = 3.0
 CHUNK_WRITE_SECONDS = 2e-3
 
@@ -84,10 +85,13 @@ class StudyPlan:
     block_shape: dict[str, int]  # points along each axis; empty for a flight
     n_chunks: int
     nbytes: int  # size of all results before compression [bytes]
-    n_workers: int
-    seconds_per_point: float  # measured time of a point on one worker [s]
+    n_workers: int  # number of worker processes, or of threads of the command
+    has_workers: bool  # whether worker processes compute, in the place of threads
+    seconds_per_point: float  # measured time of a point on one core [s]
     wall_seconds: float  # estimated wall time of the study [s]
-    worker_bytes: int  # estimated memory of a worker [bytes]
+    memory_bytes: (
+        int  # estimated memory of each worker, or of this process with its threads [bytes]
+    )
     scanners: tuple[ScannerPlan, ...] = ()
     scene_reports: tuple[str, ...] = ()  # repairs of meshes when the scene was loaded
 
@@ -109,7 +113,8 @@ def plan_study(
     store_path
         Path of its store; eyepoints that exist there need not be cast.
     n_workers
-        Number of workers; by default that of the spec's `execution`, else all cores.
+        Number of worker processes; by default that of the spec's `execution`, else threads on all
+        cores compute, where the study allows it.
 
     Returns
     -------
@@ -121,9 +126,9 @@ def plan_study(
     SpecError
         If a point, a block or the scene needs more memory than this machine has.
     """
-    refuse_too_large_point(spec, serial_worker_memory())
+    refuse_too_large_point(spec, process_memory())
     study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
-    refuse_too_large_blocks(study, serial_worker_memory())
+    refuse_too_large_blocks(study, process_memory())
     scanners: tuple[ScannerPlan, ...] = ()
     scene_reports: tuple[str, ...] = ()
     block_shape = {}
@@ -138,7 +143,7 @@ def plan_study(
             grid.n_points * scanner_plan.seconds_per_draw
             for grid, scanner_plan in zip(study.grids, scanners, strict=True)
         )
-        refuse_too_large_scene(study.spec, serial_worker_memory())
+        refuse_too_large_scene(study.spec, process_memory())
         seconds_per_point, scene_reports = (
             (ray_seconds + draw_seconds) / study.n_points,
             eyepoints[0].world.mesh_reports,
@@ -146,7 +151,10 @@ def plan_study(
     else:
         seconds_per_point = measure_seconds_per_point(study)
         block_shape = dict(zip(study.grid.dims, study.grid.block_shape, strict=True))
-    n_workers = n_workers or spec.execution.workers or cluster_connection.cpu_count()
+    options = RunOptions(workers=n_workers)
+    has_workers = options.resolve_cluster(SpecWorkload(spec)) is not None
+    n_workers = n_workers or spec.execution.workers or options.n_threads(SpecWorkload(spec))
+    start_seconds = WORKER_START_SECONDS if has_workers else 0.0
     cpu_seconds = study.n_points * seconds_per_point + study.n_chunks * CHUNK_WRITE_SECONDS
     return StudyPlan(
         n_points=study.n_points,
@@ -155,12 +163,12 @@ def plan_study(
         n_chunks=study.n_chunks,
         nbytes=study.nbytes,
         n_workers=n_workers,
+        has_workers=has_workers,
         seconds_per_point=seconds_per_point,
-        wall_seconds=WORKER_START_SECONDS + cpu_seconds / min(n_workers, study.n_blocks),
-        # with the model loaded, the results of a block, and their encoded copy
-        worker_bytes=psutil.Process().memory_info().rss
-        + 2 * study.block_nbytes_max
-        + point_bytes_max(spec),
+        wall_seconds=start_seconds + cpu_seconds / min(n_workers, study.n_blocks),
+        # with the model loaded, and for each block at work its results and their encoded copy
+        memory_bytes=psutil.Process().memory_info().rss
+        + (1 if has_workers else min(n_workers, study.n_blocks)) * block_bytes_max(study),
         scanners=scanners,
         scene_reports=scene_reports,
     )
