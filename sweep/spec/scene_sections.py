@@ -450,8 +450,14 @@ class Interface(SpecSection):
 class SceneStorage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
-    block_shots: int = declare.count("Shots that one block holds at most", "4096", default=4096)
-    block_draws: int = declare.count("Draws that one block holds at most", "64", default=64)
+    block_shots: int = declare.count(
+        "Shots that one block holds at most; 0 for 256 to 4096, by the time that they take",
+        "4096", "0", default=0,
+    )  # fmt: skip
+    block_draws: int = declare.count(
+        "Draws that one block holds at most; 0 for up to 64, by the time that they take",
+        "64", "0", default=0,
+    )  # fmt: skip
 
 
 # The built scene: objects as bodies at which rays can be cast

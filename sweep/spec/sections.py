@@ -533,8 +533,8 @@ class Storage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
     block_points: int = declare.count(
-        "Points that one block holds at most; 0 for 65536, and more in studies so large that "
-        "their files would be too many to handle",
+        "Points that one block holds at most; 0 for 65536, fewer where so many take long, and more "
+        "in studies so large that their files would be too many to handle",
         "65536", "0", "1e9", default=0,
     )  # fmt: skip
 

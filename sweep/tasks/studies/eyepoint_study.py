@@ -27,7 +27,7 @@ from sweep.storage.store_format import MAP_GROUP
 from sweep.tasks.engine.block_study import BlockStudy
 from sweep.tasks.engine.blocks import FILL_VALUE_BY_KIND, ArrayLayout, BlockGrid, Results
 from sweep.tasks.studies.output_layouts import cf_attributes, make_output_layout
-from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE
+from sweep.tasks.studies.parameter_grid import DEFAULT_BLOCKS_MIN, SHOTS_PER_TILE
 
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 #: Largest numbers of shots and beamlets of a block, which contains complete cycles.
 BLOCK_SHOTS_MAX = 4096
 BLOCK_BEAMLETS_MAX = 1 << 20
+
+#: Number of beamlets above which rays are cut into several blocks, for all cores of a machine: they
+#: take some half a second.
+DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
 
 #: Largest number of beamlets that are cast at once, which bounds memory if cycles are long.
 RAYS_PER_CAST_MAX = 1 << 18
@@ -80,7 +84,10 @@ class EyepointStudy(BlockStudy):
         self.n_cycles = spec.number_of_cycles(scanner)
         self.shots_per_cycle = spec.shots_per_cycle(scanner)
         self.n_beamlets = n_beamlets or int(spec.parameters()["footprint.beamlets"])
-        shots_max = max(1, min(BLOCK_SHOTS_MAX, BLOCK_BEAMLETS_MAX // self.n_beamlets))
+        n_beamlets_in_all = self.n_cycles * self.shots_per_cycle * self.n_beamlets
+        beamlets_max = max(n_beamlets_in_all // DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_BEAMLETS_MIN)
+        beamlets_max = min(beamlets_max, BLOCK_BEAMLETS_MAX)
+        shots_max = max(1, min(BLOCK_SHOTS_MAX, beamlets_max // self.n_beamlets))
         cycles_per_block = min(self.n_cycles, max(1, shots_max // self.shots_per_cycle))
         self._grid = BlockGrid(
             ("cycle",),

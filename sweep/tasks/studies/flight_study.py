@@ -49,7 +49,11 @@ from sweep.tasks.studies.grid_study import (
     axis_coordinate_layouts,
 )
 from sweep.tasks.studies.output_layouts import make_output_layout
-from sweep.tasks.studies.parameter_grid import SHOTS_PER_TILE, ParameterGrid
+from sweep.tasks.studies.parameter_grid import (
+    SHOTS_PER_TILE,
+    ParameterGrid,
+    flight_block_size,
+)
 
 if TYPE_CHECKING:
     from sweep.model.effects.planning import EffectPlan
@@ -120,14 +124,20 @@ class ScannerGrid(ParameterGrid, BlockGrid):
         )
         self.n_draws = int(spec.draws.number)
         _refuse_too_many_shots(spec, self.n_cycles * self.shots_per_cycle)
-        cycles_per_block = max(1, int(spec.storage.block_shots) // self.shots_per_cycle)
+        block_shots, block_draws = flight_block_size(
+            spec,
+            math.prod(self.axes_shape),
+            self.n_cycles * self.shots_per_cycle,
+            self.n_draws,
+        )
+        cycles_per_block = max(1, block_shots // self.shots_per_cycle)
         BlockGrid.__init__(
             self,
             (*(axis.name for axis in spec.axes), "draw", "cycle"),
             (*self.axes_shape, self.n_draws, self.n_cycles),
             (
                 *(1 for _ in self.axes_shape),
-                min(self.n_draws, int(spec.storage.block_draws)),
+                min(self.n_draws, block_draws),
                 min(self.n_cycles, cycles_per_block),
             ),
             group=scanner,
@@ -139,7 +149,7 @@ class ScannerGrid(ParameterGrid, BlockGrid):
                 f"cuts {self.n_draws:,} draws of {self.n_cycles:,} cycles of {scanner} into "
                 f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_MAX:.0e}"
             )
-            size = f"{spec.storage.block_draws}"
+            size = f"{block_draws}"
             remedy = "raise it or storage.block_shots, or take fewer draws"
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 

@@ -43,12 +43,21 @@ BLOCK_CPU_SECONDS_MAX = 60.0
 DEFAULT_BLOCK_POINTS = 1 << 16
 DEFAULT_BLOCKS_MAX = 1 << 14
 
+#: Number of blocks into which studies are cut by default, so that all cores of a machine have work
+#: from the first second on; and least estimated time of such a block on one core [s].
+DEFAULT_BLOCKS_MIN = 32
+DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 
-def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
-    """Return an upper estimate of the time of any point of a study on one core [s].
+#: Largest default sizes of a flight's block.
+DEFAULT_BLOCK_SHOTS_MAX = 4096
+DEFAULT_BLOCK_DRAWS_MAX = 64
+
+
+def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
+    """Return an upper estimate of the time of one draw of any point or shot on one core [s].
 
     The constants were measured on one machine and rounded up, as the content of a block must not
-    depend on the machine. If draws continue until a tolerance is met, their limit counts.
+    depend on the machine.
     """
     worst_parameters = {
         path: value for path, value in spec.parameters().items() if not isinstance(value, str)
@@ -57,11 +66,59 @@ def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
         for member in axis.parameters:
             if isinstance(member.values, np.ndarray):
                 worst_parameters[member.path] = member.values.max()
-    draws = spec.draws
     seconds_per_draw = 4e-5 + 2e-7 * float(worst_parameters.get("footprint.beamlets", 0.0))
-    if draws.draws_whole_spectra:
+    if spec.draws.draws_whole_spectra:
         seconds_per_draw += 2e-7 * float(worst_parameters["instrument.processing.fft_size"])
-    return seconds_per_draw * max(draws.number, draws.limit, 1)
+    return seconds_per_draw
+
+
+def worst_cpu_seconds_per_point(spec: GridSpec) -> float:
+    """Return an upper estimate of the time of any point of a study on one core [s].
+
+    If draws continue until a tolerance is met, their limit counts.
+    """
+    return worst_cpu_seconds_per_draw(spec) * max(spec.draws.number, spec.draws.limit, 1)
+
+
+def default_block_cpu_seconds(study_cpu_seconds: float) -> float:
+    """Return the estimated time of a block on one core [s] by default, for that of its study."""
+    return max(study_cpu_seconds / DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_CPU_SECONDS_MIN)
+
+
+def flight_block_size(
+    spec: SceneSpec, n_axis_points: int, n_shots: int, n_draws: int
+) -> tuple[int, int]:
+    """Return the largest numbers of shots and of draws of a flight's block.
+
+    Both are those of the section `storage`. Where one is 0 there, blocks are cut for the work of
+    all cores: along the draws first, as the effects of 256 consecutive shots are planned together.
+
+    Parameters
+    ----------
+    spec
+        Flight.
+    n_axis_points
+        Number of points of the flight's axes.
+    n_shots
+        Number of shots of one scanner.
+    n_draws
+        Number of draws of each shot.
+    """
+    seconds_per_draw = worst_cpu_seconds_per_draw(spec)
+    draws_per_block = (
+        default_block_cpu_seconds(n_axis_points * n_shots * n_draws * seconds_per_draw)
+        / seconds_per_draw
+    )
+    block_draws = int(spec.storage.block_draws) or min(
+        max(int(draws_per_block / min(n_shots, SHOTS_PER_TILE)), 1),
+        n_draws,
+        DEFAULT_BLOCK_DRAWS_MAX,
+    )
+    block_shots = int(spec.storage.block_shots) or min(
+        max(int(draws_per_block / min(block_draws, n_draws)), SHOTS_PER_TILE),
+        DEFAULT_BLOCK_SHOTS_MAX,
+    )
+    return block_shots, block_draws
 
 
 def fit_block_shape(
@@ -81,17 +138,20 @@ def fit_block_shape(
     return tuple(shape)
 
 
-def default_block_points(n_points: int) -> int:
+def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
     """Return the default number of points per block of a study with `n_points` points."""
-    return max(DEFAULT_BLOCK_POINTS, -(-n_points // DEFAULT_BLOCKS_MAX))
+    block_cpu_seconds = default_block_cpu_seconds(n_points * cpu_seconds_per_point)
+    block_points = min(DEFAULT_BLOCK_POINTS, math.ceil(block_cpu_seconds / cpu_seconds_per_point))
+    return max(block_points, -(-n_points // DEFAULT_BLOCKS_MAX))
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
     """Return the largest number of points of a block: as specified, or less if points take long."""
-    requested_points = spec.storage.block_points or default_block_points(n_points)
-    return max(
-        1, min(requested_points, int(BLOCK_CPU_SECONDS_MAX / worst_cpu_seconds_per_point(spec)))
+    cpu_seconds_per_point = worst_cpu_seconds_per_point(spec)
+    requested_points = spec.storage.block_points or default_block_points(
+        n_points, cpu_seconds_per_point
     )
+    return max(1, min(requested_points, int(BLOCK_CPU_SECONDS_MAX / cpu_seconds_per_point)))
 
 
 class ParameterGrid:
