@@ -15,6 +15,7 @@ from sweep.tasks.studies.parameter_grid import (
     ParameterBlockGrid,
     default_block_points,
     fit_block_shape,
+    worst_cpu_seconds_per_draw,
     worst_cpu_seconds_per_point,
 )
 
@@ -148,13 +149,33 @@ def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
         grid.block_slices(grid.n_blocks)
 
 
-@pytest.mark.parametrize("points", [1, 10**6, 10**9, 10**10, 10**12])
-def test_files_stay_countable_however_large_a_study_is(points):
+@pytest.mark.parametrize("seconds_per_point", [1e-6, 4e-5, 0.1, 100.0])
+@pytest.mark.parametrize("points", [1, 32, 1000, 10**6, 10**9, 10**10, 10**12])
+def test_files_stay_countable_and_all_cores_have_blocks(points, seconds_per_point):
     """Blocks of a single axis: 25 arrays of them are less than half a million files."""
-    (size,) = fit_block_shape((points,), (False,), default_block_points(points))
-    assert -(-points // size) <= DEFAULT_BLOCKS_MAX
-    assert size >= min(points, DEFAULT_BLOCK_POINTS)
+    (size,) = fit_block_shape((points,), (False,), default_block_points(points, seconds_per_point))
+    n_blocks = -(-points // size)
+    assert n_blocks <= DEFAULT_BLOCKS_MAX
     assert points > DEFAULT_BLOCK_POINTS * DEFAULT_BLOCKS_MAX or size <= DEFAULT_BLOCK_POINTS
+    study_seconds = points * seconds_per_point
+    if study_seconds > 32 and points >= 32:  # blocks of a second and more
+        assert n_blocks >= 24  # of whole points, hence not always 32
+    assert n_blocks == 1 or (size + 1) * seconds_per_point > 0.5 or size == DEFAULT_BLOCK_POINTS
+
+
+@pytest.mark.parametrize("draws", [1, 20, 64, 10**4])
+@pytest.mark.parametrize("rate", ["0.1 Hz", "10 Hz", "1 kHz"])
+def test_a_flights_blocks_are_cut_for_all_cores(draws, rate):
+    """Of 3 to 30,000 shots: small flights are one block, large ones have work for many cores."""
+    scanners = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": rate}}
+    spec = small_scene_spec(scanners=scanners, draws={"number": draws}, storage={}, axes={})
+    (grid,) = FlightStudy(spec, parse_location("none.zarr")).grids
+    seconds = grid.n_points * worst_cpu_seconds_per_draw(spec)
+    assert (grid.n_blocks == 1) == (seconds < 0.5) or grid.n_points // draws <= 256
+    if seconds > 60:
+        assert grid.n_blocks >= 32 or grid.block_size(0) // grid.block_shape[-2] >= 4000
+    largest = max(grid.block_size(block) for block in range(min(grid.n_blocks, 50)))
+    assert largest * worst_cpu_seconds_per_draw(spec) < max(1.2 * seconds / 32, 1.0)
 
 
 SPECTRA = {"number": 1000, "method": "spectra"}
