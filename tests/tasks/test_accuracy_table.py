@@ -52,12 +52,14 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
     for row in draw_accuracy_rows(store):
         assert row.excess == pytest.approx(float(over[row.name].max()), rel=1e-12)
         assert (
-            row.tolerance_at_worst == 0
+            row.tolerance_at_worst_point == 0
             and row.draws_needed == math.inf
-            and row.samples_at_worst == 400
+            and row.samples_at_worst_point == 400
         )
-        assert row.n_met == int((over[row.name] <= 0).sum()) and row.n_points == 18
-        assert names_the_place(row.worst_label, dataset, over[row.name])
+        assert (
+            row.n_points_within_tolerance == int((over[row.name] <= 0).sum()) and row.n_points == 18
+        )
+        assert names_the_place(row.worst_point_label, dataset, over[row.name])
 
 
 def names_the_place(where, dataset, over):
@@ -72,8 +74,8 @@ def test_draws_that_are_said_to_do_about_do(tmp_path):
     axes, accuracy = {"target.range": ["2 km"]}, {"tolerance": 0.02}
     few = small_spec(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
     rows = draw_accuracy_rows(run_serially(few, tmp_path / "few.zarr").store)
-    assert [row.n_met for row in rows] == [0, 0, 0, 0] and {
-        row.samples_at_worst for row in rows
+    assert [row.n_points_within_tolerance for row in rows] == [0, 0, 0, 0] and {
+        row.samples_at_worst_point for row in rows
     } == {300}
     needed = int(max(row.draws_needed for row in rows))
     enough = small_spec(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
@@ -113,8 +115,13 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     )
     store = run_serially(spec, tmp_path / "wide.zarr").store
     (row,) = ray_accuracy_rows(store)
-    assert (row.n_points, row.n_met, row.samples_max, row.worst_error) == (3, 2, 4096, 1.0)
-    assert row.worst_label == "grazing_angle 0.5 deg"
+    assert (row.n_points, row.n_points_within_tolerance, row.samples_max, row.worst_error) == (
+        3,
+        2,
+        4096,
+        1.0,
+    )
+    assert row.worst_point_label == "grazing_angle 0.5 deg"
     said = CliRunner().invoke(main, ["status", str(store)]).output
     assert "What more beamlets may change" in said and "2 of 3" in said
     met = small_spec(

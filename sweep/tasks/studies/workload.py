@@ -12,7 +12,7 @@ from sweep.tasks.studies import study_loading, user_function_names
 from sweep.tasks.studies.parameter_grid import worst_cpu_seconds_per_point
 
 #: Upper estimate of the time of one core that a ray takes, and a draw of a shot [s].
-CPU_SECONDS_PER_RAY, CPU_SECONDS_PER_SHOT = 5e-6, 4e-4
+CPU_SECONDS_PER_RAY, CPU_SECONDS_PER_SHOT_DRAW = 5e-6, 4e-4
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class SpecWorkload:
         return estimate_cpu_seconds(self.spec)
 
     @property
-    def user_modules(self) -> tuple[str, ...]:
+    def user_module_names(self) -> tuple[str, ...]:
         """Names of the modules of the user's detectors and estimators."""
-        return user_function_names.user_modules(self.spec)
+        return user_function_names.user_module_names(self.spec)
 
     @property
     def read_study(self) -> StudyReader:
@@ -55,5 +55,5 @@ def estimate_cpu_seconds(spec: GridSpec | SceneSpec) -> float:
     rays_per_shot = float(spec.parameters()["footprint.beamlets"])
     return n_shots * (
         rays_per_shot * CPU_SECONDS_PER_RAY
-        + n_axis_points * int(spec.draws.number) * CPU_SECONDS_PER_SHOT
+        + n_axis_points * int(spec.draws.number) * CPU_SECONDS_PER_SHOT_DRAW
     )

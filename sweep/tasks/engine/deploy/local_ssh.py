@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PRELOAD_MODULE = "sweep.tasks.preload"
 
 #: Environment variables that limit libraries with threads of their own to one per worker slot.
-ONE_THREAD_VARIABLES = {
+SINGLE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -56,7 +56,7 @@ DASK_CONFIG: dict[str, Any] = {
 
 #: Settings of a scheduler without a dashboard. Dask starts its HTTP server anyway, but without
 #: pages; by default it shows workers, tasks and logs to all users of the machine.
-NO_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
+NO_HTTP_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 
 #: Time of pending work per worker thread above which an adaptive cluster adds a thread [s].
 ADAPTIVE_TARGET_DURATION = "1s"
@@ -68,7 +68,7 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
     }
-    return {**ONE_THREAD_VARIABLES, SAFE_PATH_VARIABLE: "1", **dask_variables, **user_variables}
+    return {**SINGLE_THREAD_VARIABLES, SAFE_PATH_VARIABLE: "1", **dask_variables, **user_variables}
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
@@ -125,14 +125,14 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
     return f"{LOOPBACK_ADDRESS}:{port}"
 
 
-WORKER_BYTES_MIN = 1 << 30
+WORKER_MEMORY_BYTES_MIN = 1 << 30
 
 #: Time after which a worker without a heartbeat is ended and restarted.
 WORKER_TTL = "2 minutes"
 
 
 @contextmanager
-def spawn_environment() -> Iterator[None]:
+def isolate_spawned_workers() -> Iterator[None]:
     """Context in which workers are started, and restarted, as processes.
 
     By default a spawned process imports from the working directory, and runs the script of its
@@ -182,7 +182,7 @@ def start_local_cluster(
         options["worker_dashboard_address"] = (
             f"{LOOPBACK_ADDRESS}:0"  # by default it listens on all networks
         )
-        options["worker_class"] = _worker_without_pages()
+        options["worker_class"] = _make_worker_class_without_pages()
     config_name = "distributed.nanny.pre-spawn-environ"
     environment_variables = {
         **dask.config.get(config_name),
@@ -196,7 +196,7 @@ def start_local_cluster(
             return LocalCluster(scheduler_kwargs=dashboard_options, **options)
 
 
-def _worker_without_pages() -> type:
+def _make_worker_class_without_pages() -> type:
     """Return a class of thread workers whose HTTP server, which Dask requires, has no page."""
     from distributed import Worker
 
@@ -226,7 +226,7 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
     return (
         int(requested_bytes)
         if requested_bytes
-        else max(WORKER_BYTES_MIN, int(0.9 * MEMORY_LIMIT / bounds.most))
+        else max(WORKER_MEMORY_BYTES_MIN, int(0.9 * MEMORY_LIMIT / bounds.most))
     )
 
 
