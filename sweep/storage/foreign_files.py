@@ -30,14 +30,14 @@ _JOURNAL_FILE_NAME_PATTERN = re.compile(
     r"(receipts|failures|sessions|template)\.jsonl|recipe\.json|partial|begun-\d+|"
     r"lock(\.guard|\.[0-9a-f]{32})?|clock-\d+-[0-9a-f]{8}"
 )
-"""Names of the files that sweep writes into a journal."""
+"""Pattern of the names of the files that sweep writes into a journal."""
 
 _DRAFT_FILE_NAME_PATTERN = re.compile(r".+\.[0-9a-f]{32}\.partial")
-"""Names of unfinished drafts."""
+"""Pattern of the names of files that were not written completely."""
 
 
 def is_ignorable_file(name: str) -> bool:
-    """Tell whether a file is one that operating systems and file managers leave in any folder.
+    """Tell from its name whether a file was left by an operating system or a file manager.
 
     >>> is_ignorable_file(".DS_Store"), is_ignorable_file("pd_up/.nfs000000000123")
     (True, True)
@@ -49,7 +49,7 @@ def is_ignorable_file(name: str) -> bool:
 
 
 def is_draft_file(name: str) -> bool:
-    """Tell whether a file is a draft that sweep did not finish writing."""
+    """Tell from its name whether a file is a draft that sweep did not finish writing."""
     return bool(_DRAFT_FILE_NAME_PATTERN.fullmatch(name))
 
 
@@ -89,7 +89,7 @@ def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
 def _iter_foreign_files(
     folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
 ) -> Iterator[str]:
-    """Yield foreign files and folders below a folder of a store."""
+    """Yield the paths, relative to the store, of foreign files and folders below a folder."""
     with os.scandir(folder) as entries:
         for entry in entries:
             name, is_folder = prefix + entry.name, entry.is_dir(follow_symlinks=False)

@@ -111,7 +111,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the key with further parts appended."""
+        """Return the path with further parts appended to its key."""
         return self / "/".join(others)
 
     @property
@@ -317,7 +317,10 @@ def _s3_endpoint_url() -> str:
 
 @contextmanager
 def translate_errors(location: object) -> Iterator[None]:
-    """Raise ObjectStoreError, with the remedy, for errors of an object store; ignore file paths."""
+    """Context manager that translates errors of an object store to ObjectStoreError.
+
+    The message states the remedy. If ``location`` is a path on disk, no error is translated.
+    """
     if not isinstance(location, ObjectPath):
         yield
         return
@@ -390,7 +393,7 @@ Location = Path | ObjectPath
 def parse_location(address: str | Location) -> Location:
     """Parse the address of a store: a path, ``s3://bucket/key``, ``gs://...`` or ``az://...``.
 
-    Raise ObjectStoreError for an address that is neither.
+    Raise ObjectStoreError for any other address.
     """
     if isinstance(address, ObjectPath):
         return address
@@ -578,7 +581,7 @@ def process_start_id(pid: int) -> int:
 
 
 def resolve_links(location: Location) -> Location:
-    """Follow symbolic links, so that the folder is renamed and not the link to it.
+    """Return a location with symbolic links resolved, so that renaming does not affect a link.
 
     Raise OSError if the links form a loop.
     """
@@ -704,7 +707,7 @@ def recover_interrupted_replace(location: Location) -> None:
 
 
 def store_fingerprint(location: Location) -> tuple[int, ...] | None:
-    """Return an identity of the store at a location that no other store ever has.
+    """Return a fingerprint of the store at a location; no other store ever has the same.
 
     It consists of device, inode, size and times of the store's root document. Return None in an
     object store, or if the document can't be opened.

@@ -74,7 +74,7 @@ class ArrayFileLayout(NamedTuple):
 
     @property
     def chunk_bytes_max(self) -> int:
-        """Size of an uncompressed chunk [bytes]; for strings the largest."""
+        """Size of an uncompressed chunk [bytes]; for strings the largest possible size."""
         if self.bytes_per_value:
             return self.values_per_chunk * self.bytes_per_value
         return 4 + self.values_per_chunk * (4 + STRING_BYTES_MAX)
@@ -96,7 +96,7 @@ class ArrayFileLayout(NamedTuple):
             self.check_chunk_decoded_size(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
-        """Yield the chunks in a file; of numeric chunks in a shard only the header."""
+        """Yield each chunk in a file; of a numeric chunk in a shard only the header."""
         if not self.chunks_per_shard:
             yield content
             return

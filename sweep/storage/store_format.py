@@ -133,7 +133,7 @@ class NotAStoreError(StoreError, ValueError):
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
-    """Return the checked attributes of a store; raise as :func:`read_root_metadata`."""
+    """Return the checked attributes of a store; raise errors as :func:`read_root_metadata`."""
     attributes: dict[str, Any] = read_root_metadata(path)["attributes"]
     return attributes
 
@@ -519,7 +519,7 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
 
 def open_size_checked_store(location: Location, study_id: str = "") -> Any:
-    """Open a store for Zarr or xarray, for lazy reading; raise as :func:`read_root_metadata`.
+    """Return a read-only Zarr store with size checks; raise errors as :func:`read_root_metadata`.
 
     If ``study_id`` is given, reads fail once the store is no longer that of this study.
     """
@@ -557,11 +557,11 @@ _LOG_LINE_END = b'"}\n'
 _RECEIPT_HEAD_PATTERN = re.compile(
     rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
 )
-"""Start of a receipt: block, and points and bytes, or its withdrawal."""
+"""Pattern of the start of a receipt: block, then points and bytes, or `withdrawn`."""
 
 _RECEIPT_TIME_PATTERN = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
 _RECEIPT_WORKER_PATTERN = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
-"""Host and process id of the worker in a receipt."""
+"""Pattern of host and process id of the worker in a receipt."""
 
 
 def encode_record(record: dict[str, Any]) -> bytes:

@@ -41,7 +41,7 @@ from sweep.storage.store_format import (
 #: Pattern of chunk names: the array, and the chunk's position in the grid of chunks.
 CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 
-#: Dimensions of flights along which blocks are divided; they come last in the order of blocks.
+#: Dimensions along which the shots of a flight are divided into blocks; they vary fastest.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
 #: Time that abandoned reads have to be cancelled when the program ends [s].
@@ -159,7 +159,7 @@ def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
 
 
 def _block_dim_names(node: dict[str, Any]) -> list[str]:
-    """Return the dimensions of an array, with `shot` as `cycle`: both are divided alike."""
+    """Return the dimension names of an array, with `cycle` for `shot`: blocks divide both alike."""
     return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
 
 
@@ -300,7 +300,10 @@ def open_verified_store(location: Location, study_id: str) -> Any:
 
 
 def open_verified_group(location: Location) -> zarr.Group:
-    """Open the arrays of a store for reading; raise as :func:`.store_format.read_root_metadata`."""
+    """Open a store as a Zarr group whose chunks are checked when they are read.
+
+    Errors are raised as by :func:`.store_format.read_root_metadata`.
+    """
     store = _wrap_in_verified_store(store_format.open_size_checked_store(location), location)
     return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
 

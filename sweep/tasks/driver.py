@@ -384,9 +384,10 @@ def _compute_into_path(
     from_scratch: bool,
     source_path: Location | None = None,
 ) -> Outcome:
-    """Compute a study into a path, or into a staging path if it is to replace a store there.
+    """Compute a study into a store at ``final_path``.
 
-    The staged store replaces the other one when it is complete.
+    If a store at that path is to be replaced, the new store is built at a staging path. It replaces
+    the old one when it is complete.
     """
     recover_interrupted_replace(final_path)
     working_path, recipe, durable = final_path, _spec_folder_entry(spec), backend.options.durable
@@ -485,7 +486,7 @@ def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy)
 
 
 def _spec_folder_entry(spec: AnySpec) -> dict[str, str]:
-    """Return the folder of a study's files, for the recipe of its store."""
+    """Return the entry of a recipe with the folder of a flight's files; empty for a grid."""
     return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
@@ -500,7 +501,10 @@ def _check_user_functions(spec: AnySpec) -> None:
 def _warn_of_changed_user_code(
     store_path: Location, spec: AnySpec, say: Callable[[str], None]
 ) -> None:
-    """Name the user's modules that changed since a store, or the one it extends, was begun."""
+    """Print a message for each user module whose file has changed since a store was begun.
+
+    If the store extends another one, the file is compared with that at the start of the other one.
+    """
     modules = user_module_names(spec)
     if not modules:
         return
@@ -534,7 +538,7 @@ def _compute_missing_blocks(
     backend: ComputeBackend,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    """Lock a store and compute its missing blocks; of a flight, its missing eyepoints first.
+    """Lock a store and compute its missing blocks, after the missing eyepoints of a flight.
 
     `prepare` creates the store if needed. It is called before the store is locked.
     """
@@ -567,7 +571,7 @@ def _compute_missing_blocks(
 
 
 def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Return True if all blocks are committed, and those of the eyepoint stores that exist."""
+    """Return True if all blocks of a flight, and of its existing eyepoint stores, are committed."""
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()
     ) and all(
@@ -641,9 +645,9 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
 def _acquire_eyepoint_lock(
     eyepoint_store_path: Location, eyepoints: EyepointStudy, backend: ComputeBackend
 ) -> StoreLock | None:
-    """Lock an eyepoint store, which is created if needed, after any other run has released it.
+    """Lock an eyepoint store once no other run holds its lock; create the store if needed.
 
-    None if the run is interrupted meanwhile.
+    Return None if the run is interrupted meanwhile.
     """
     has_announced_wait = False
     while not backend.interrupts.is_stopping:

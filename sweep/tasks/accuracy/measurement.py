@@ -63,10 +63,10 @@ TRIAL_TIME_FRACTION = 0.003
 """Fraction of the time limit per trial, large enough for a negligible overhead of calls."""
 
 TIMED_SEQUENCE_TIME_FACTOR = 2
-"""Time of a timed stretch of points as a multiple of that, so that overhead is negligible too."""
+"""Time of a sequence of points that is timed, as a multiple of the time of a trial."""
 
 FIRST_TIMED_SEQUENCE_DIVISOR = 8
-"""Divisor of the length of the stretches that find out which settings are slow."""
+"""Divisor of the length of the first sequences, which show what settings are slow."""
 
 FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
 """Fractions of the time limit at which the first round, and the time-domain comparison, end."""
@@ -280,7 +280,7 @@ class AccuracyMeasurement:
         )
 
     def _points_per_part(self) -> int:
-        """Return the number of points of a part of the sample, so that two or more parts fit in."""
+        """Return the number of points of a part of the sample; the time allows two parts."""
         setting_numbers, first_part = (
             range(len(self._settings)),
             self._sample.split_into_parts(1)[0],
@@ -301,7 +301,7 @@ class AccuracyMeasurement:
         return max(1, min(self._sample.size // parts_min, int(points_that_fit / (parts_min + 1))))
 
     def _plan_rounds(self, parts: list[np.ndarray]) -> int:
-        """Return the number of rounds that fit in; set the number of points to time per setting."""
+        """Return the number of rounds that the time allows; set the points to time per setting."""
         n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
         while (
             self._time_trial(0, parts[0]) < trial_seconds / 2
@@ -359,7 +359,10 @@ class AccuracyMeasurement:
         time_fraction: float,
         first_round: list[list[Trial]] | None = None,
     ) -> list[list[Trial]]:
-        """Try every setting on each part that time allows; slow ones only in the first round."""
+        """Try every setting on each part that time allows; slow settings only in the first round.
+
+        Return the trials by part and setting.
+        """
         trials_by_part: list[list[Trial]] = []
         for part in parts:
             if trials_by_part and self._elapsed_seconds > time_fraction * self._time_limit:
@@ -447,7 +450,7 @@ The first four are in the order of :func:`result_differences`.
 """
 
 N_PROMISED_ERRORS = 3
-"""Number of the first arrays whose errors a tolerance promises to bound."""
+"""Number of arrays in `ERROR_ARRAY_LONG_NAMES`, from the first on, that a tolerance bounds."""
 
 
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:

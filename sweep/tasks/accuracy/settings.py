@@ -43,7 +43,7 @@ TRIED_LINE_BEAMLET_COUNTS = (3, 9, 33, 163, 1234)
 """Numbers of beamlets in a line along the slope that a study over a plane might fix."""
 
 FIXED_EFFECTS_LINE_BEAMLET_COUNT = 163
-"""Number of them with fixed effects: enough for the widest footprints."""
+"""Number of beamlets in a line with fixed effects: enough for the widest footprints."""
 
 THESIS_BEAMLET_COUNT = 109
 """Number of beamlets in [T 3.3.1]."""
@@ -69,7 +69,7 @@ REFERENCE_DRAWS_FACTOR = 10
 """Number of draws of the reference over that of the longest setting."""
 
 TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
-"""Tolerances of pd until which points are drawn."""
+"""Tolerances of pd that end the draws of a point."""
 
 _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "accuracy.tolerance",
@@ -100,9 +100,9 @@ class AccuracySetting:
 
     @property
     def has_line_effects_only(self) -> bool:
-        """True if only effects are simulated that move or scale lines, as the thesis's method has.
+        """True if only effects are simulated that the thesis's method can simulate.
 
-        These are effects on lines, without changes within a record.
+        These move or scale a line as a whole, without changes within a record.
         """
         return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
 
@@ -200,7 +200,7 @@ def add_fixed_effect_settings(
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
-    """Add settings that simulate everywhere the effects that a tolerance needs anywhere.
+    """Add settings with fixed effects: at every point those that a tolerance needs at any point.
 
     ``tolerances`` of lines and leakage are tried with each set of effects; by default the
     tolerances of the sets.
@@ -238,7 +238,7 @@ def add_fixed_effect_settings(
 
 
 def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
-    """Return numbers of beamlets that a study with fixed effects might have, if none is given."""
+    """Return overrides of the number of beamlets for fixed effects; empty if the scene sets it."""
     if _fixed_beamlets_reason(spec):
         return {}
     if not isinstance(spec, SceneSpec):

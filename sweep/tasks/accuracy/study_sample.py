@@ -59,7 +59,7 @@ def _effect_flags_of_names(effect_names: Collection[str]) -> np.uint32:
 THESIS_EFFECT_FLAGS = _effect_flags_of_names(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
-"""Flags of the effects that the thesis's method can have."""
+"""Flags of the effects that the thesis's method can simulate: those that move or scale lines."""
 
 TIME_DOMAIN_EFFECT_FLAGS = ~_effect_flags_of_names(
     ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
@@ -96,7 +96,7 @@ class SampleResults(NamedTuple):
 
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
-    """Return the results in the outputs of points.
+    """Return the sample results of some points from the model's outputs.
 
     With ``n_draws`` the outputs are counts of so many draws, otherwise probabilities.
     """
@@ -176,7 +176,7 @@ class StudySample(ABC):
 
     @abstractmethod
     def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts of about `points_per_part` points."""
+        """Divide the sample into parts of about `points_per_part` points. Return their rows."""
 
     @abstractmethod
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
@@ -233,7 +233,7 @@ class StudySample(ABC):
 
     @cached_property
     def _thesis_effect_flags(self) -> np.uint32:
-        """Flags of the study's effects that the thesis's method can have."""
+        """Flags of the study's effects that the thesis's method can simulate."""
         return (
             _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_FLAGS
         )
@@ -457,7 +457,7 @@ class FlightSample(StudySample):
         ]
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part, timed with neighbouring tiles of `n_points` shots and their rays."""
+        """Compute the part, timed with neighbouring tiles up to `n_timed_points` shots."""
         point_indices = self.extend_to_complete_tiles(part, n_timed_points)
         trial = self._run_setting(setting, point_indices)
         rows_of_part = np.searchsorted(point_indices, part)
@@ -486,9 +486,9 @@ class FlightSample(StudySample):
         self._cast_eyepoints.clear()
 
     def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
-        """Return the rows of the tiles of some points, and of following tiles.
+        """Return the rows of the complete tiles of some points, and of tiles that follow.
 
-        As many tiles follow as have `n_shots` shots with the first.
+        Tiles are added until those from the first one on have at least `n_shots` shots.
         """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
@@ -598,10 +598,10 @@ class FlightSample(StudySample):
 
 
 def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
-    """Return the rows of the tiles of some rows, and of following tiles, cyclically.
+    """Return the rows of the complete tiles of some rows, and of tiles that follow, cyclically.
 
-    ``tile_of_row`` (n,) is the rising number of each row's tile. So many tiles follow that they
-    have `n_shots` shots with the first.
+    ``tile_of_row`` (n,) is the rising number of each row's tile. Tiles are added until those from
+    the first one on have at least `n_shots` shots.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
@@ -619,7 +619,7 @@ def _simulate_shot_statistics(
     shot_numbers: np.ndarray,
     effect_flags: np.ndarray,
 ) -> Results:
-    """Return statistics of shots by a function that finds peaks; nan of shots that hit nothing."""
+    """Return statistics of shots from the peaks that ``find_peaks`` finds; nan without a hit."""
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
         eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces

@@ -34,7 +34,7 @@ NO_RESULTS = PartialResults(np.zeros(0, np.int64), {})
 
 
 class EarlierResults(NamedTuple):
-    """Results of a block that exist before it is computed."""
+    """Results of a block from earlier tasks or another store: finished and unfinished points."""
 
     finished: PartialResults = NO_RESULTS  # points that need not be computed
     unfinished: PartialResults = NO_RESULTS  # points that are computed in part, to be continued
@@ -53,7 +53,7 @@ def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
 
 @dataclass
 class Deadline:
-    """End of the time for one task's work on a block; calling it tells whether that has passed."""
+    """Time at which a task stops work on a block; calling the object tells if it has passed."""
 
     end_time: float = float("inf")  # time by `time.monotonic` [s]
     has_passed: bool = False  # True if any call so far was after the deadline
@@ -146,14 +146,15 @@ class BlockStudy(StoreTemplate, ABC):
     def evaluate_until(
         self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
-        """Return what `evaluate` does, from a checkpoint on; `UnfinishedBlock` at the deadline.
+        """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Called in place of `evaluate` if `has_checkpoints`.
+        Raise `UnfinishedBlock` at the deadline. It is called in place of `evaluate` if
+        `has_checkpoints`.
         """
         raise NotImplementedError
 
     def pop_reused_point_count(self, block: int) -> int:
-        """Return how many points of a block that was evaluated came from another store, once."""
+        """Return the number of points of a computed block that another store had; forget it."""
         return 0
 
     def array_layouts(self) -> list[ArrayLayout]:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 Results = dict[str, np.ndarray]
+"""Arrays of results by the name of the output variable."""
 
 #: Fill value of an array by the kind of its dtype; the integers that are stored are not negative.
 FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
@@ -150,7 +151,7 @@ class BlockGrid:
         return chunk_slices(self.block_position(block), self.block_shape, self.shape)
 
     def actual_block_shape(self, block: int) -> tuple[int, ...]:
-        """Return the number of steps of a block along each dimension."""
+        """Return the number of grid steps of a block along each dimension, less at the edge."""
         return tuple(
             block_slice.stop - block_slice.start for block_slice in self.block_slices(block)
         )
@@ -182,7 +183,7 @@ class BlockGrid:
         return blocks, local_indices
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
-        """Return the indices in C order over the whole grid of points of a block.
+        """Return the indices, in C order over the whole grid, of some points of a block.
 
         `local_indices` (m,) are indices in C order over the block. Inverse of `locate_points`.
         """

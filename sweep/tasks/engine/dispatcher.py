@@ -175,7 +175,7 @@ class TaskDispatcher:
         self._has_reported_stall = False  # whether a stall was reported since the last response
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Yield results of tasks as they arrive; an empty one every `IDLE_POLL_SECONDS` meanwhile.
+        """Yield results of tasks as they arrive; an empty result after each `IDLE_POLL_SECONDS`.
 
         Once `is_stopping` returns True no more tasks are sent. The iteration ends when those in
         flight end, or at once if there is no worker. SchedulerLostError if the scheduler is gone;
@@ -439,7 +439,7 @@ class TaskDispatcher:
         return task_result
 
     def _requeue_blocks(self, blocks: list[int]) -> None:
-        """Put blocks back that are unfinished, or whose task was lost without their fault."""
+        """Put blocks back into the queue that are unfinished, or whose task was lost."""
         self._block_queue.requeue(blocks)
         self._resend_counts.update(blocks)
 
@@ -493,7 +493,7 @@ class TaskDispatcher:
 
 
 def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
-    """Return the result of a task that has ended; an empty one if its worker died with it."""
+    """Return the result of a task that has ended; an empty one if it was lost with its worker."""
     error: BaseException | None = None
     if future.status == "finished":
         try:

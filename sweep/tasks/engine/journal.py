@@ -77,13 +77,13 @@ LOG_FILE_NAMES = (RECEIPTS_FILE, FAILURE_LOG_FILE, SESSION_LOG_FILE)
 
 RECIPE_FILE = "recipe.json"
 
-#: Key of the path of the store that this one extends, and takes results from.
+#: Recipe key of the path of the store that this one extends, and takes results from.
 EXTENDED_STORE_KEY = "extends"
 
-#: Key of the digests of the user's modules at the start of the first run.
+#: Recipe key of the digests of the user's modules at the start of the first run.
 USER_MODULE_DIGESTS_KEY = "code"
 
-#: Key of the id of the study whose store this one will replace; its value is '' without one.
+#: Recipe key of the id of the study whose store this one will replace; '' without one.
 REPLACED_STUDY_ID_KEY = "replaces"
 
 #: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
@@ -148,7 +148,7 @@ class Journal:
         )
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write pending lines if it is time to, or if `force`. Return True if none is left."""
+        """Write pending lines that are due, or all if `force`. Return True if none is left."""
         is_flushed = [log.flush(force=force) for log in self._logs.values()]
         return all(is_flushed)
 
@@ -169,7 +169,7 @@ class Journal:
 
 
 def read_committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
-    """Return the digest of each block from its receipt, (blocks,) of bytes; empty without one."""
+    """Return the digest in the receipt of each block, (blocks,) of bytes; b'' without a receipt."""
     digest_by_block = np.zeros(n_blocks, dtype="S32")
     for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
         if 0 <= record["block"] < n_blocks:
@@ -190,7 +190,7 @@ def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
 
 
 def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
-    """Return the last failure of each block that failed for good and was not done since."""
+    """Return the last failure record of each block that failed permanently and is not done."""
     last_failures = {
         record["block"]: record
         for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG_FILE)
@@ -209,7 +209,7 @@ def last_run_start_time(store_path: Location) -> float:
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
-    """Write the recipe in one step."""
+    """Replace the recipe of a store atomically; ``facts`` are its entries."""
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
 
 
@@ -222,7 +222,7 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
 
 
 def remove_predecessors_from_recipe(store_path: Path) -> None:
-    """Remove from the recipe which store this one extends, and which it replaces."""
+    """Remove the entries of the extended and the replaced store from the recipe of a store."""
     facts = read_recipe(store_path)
     for name in (EXTENDED_STORE_KEY, REPLACED_STUDY_ID_KEY):
         facts.pop(name, None)
@@ -703,7 +703,7 @@ class _FileLock:
             os.close(guard_descriptor)
 
     def _remove_stale_lock(self, stale_json: str | None) -> None:
-        """Remove the lock of a dead holder, and put back any other that is there by now."""
+        """Remove the lock file of a dead holder; put back a newer one that was removed instead."""
         if stale_json is None:
             return
         aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
@@ -854,7 +854,7 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait until the last heartbeat of a holder elsewhere is too old, or a new one arrives.
+    """Wait until the heartbeat of a holder on another machine is too old, or a new one arrives.
 
     A job that is restarted on another node soon after it was killed thus need not be refused.
     """
@@ -919,7 +919,7 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of a holder elsewhere. Return the state of its lock if it is silent.
+        """Watch the heartbeat of a holder on another machine. Return its lock's state if silent.
 
         None if there is no such holder; BusyError if it lives.
         """

@@ -243,7 +243,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the list of a store's root attributes and of digests of its first objects."""
+    """Write the manifest of a store: its root attributes, and digests of objects by name."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -470,7 +470,7 @@ class Damage(NamedTuple):
 
 
 def read_manifest_digests(store_path: Location) -> dict[str, str]:
-    """Return the digests of the objects of the template, from the undamaged lines of their list."""
+    """Return the digests of the template's objects by name; skip damaged lines of the manifest."""
     return {
         record["object"]: record["digest"]
         for record in iter_records(store_path / MANIFEST_PATH)
@@ -479,7 +479,7 @@ def read_manifest_digests(store_path: Location) -> dict[str, str]:
 
 
 def find_template_damages(store_path: Location) -> list[Damage]:
-    """Return the damaged objects of the template, and the damaged lines of their list."""
+    """Return the damaged objects of the template, and the damaged lines of the manifest."""
     records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
     if not records:
         return [Damage(MANIFEST_PATH, "is missing or empty", repaired_by="repair")]

@@ -58,6 +58,10 @@ RESULTS_NOT_VISIBLE_MESSAGE = (
 )
 
 ReceiptVerifier = Callable[[Receipt, bool], bool]
+"""Function that returns True if the block of a receipt is in the store as seen from here.
+
+Its second argument tells whether to compare digests, and not only sizes.
+"""
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,10 @@ class FootprintDeviations(NamedTuple):
 
     @classmethod
     def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
-        """Return the deviations of footprints on a plane, from parameters of equal strings."""
+        """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
+
+        Text parameters in `p` are the same at all points.
+        """
         with np.errstate(all="ignore"):
             places, directions = beam.footprint_angles(p, range_)
             range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
@@ -510,7 +513,7 @@ def _fraction_text(mask: np.ndarray) -> str:
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Return the ranges of some points as text: 'from x on' if it holds for all others beyond.
+    """Return the ranges of the marked points as text: 'from x on' if all beyond are marked.
 
     Points that are ``is_absent`` are ignored.
     """

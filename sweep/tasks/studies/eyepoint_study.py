@@ -159,12 +159,12 @@ class EyepointStudy(BlockStudy):
         self.cast_cycles(np.arange(self.shots_per_cycle))
 
     def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
-        """Return the arrays of shots in complete cycles, and of the cycles, by shot number (n,)."""
+        """Cast the shots (n,) of complete cycles. Return the arrays of shots and of cycles."""
         shot_arrays = self.cast_shots(shot_numbers)
         return shot_arrays | self._cycle_arrays(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
-        """Return the arrays of any shots, by their numbers (n,)."""
+        """Cast any shots, given by numbers (n,). Return their arrays by name."""
         from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
@@ -323,7 +323,7 @@ def refine_rays(
 
 
 def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
-    """Return the map of heights around a flight and its hits, seen from above at its start."""
+    """Return the arrays of a map of heights around a flight and its hits, at its start."""
     world = build_world(spec)
     positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)

@@ -144,7 +144,7 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
 
 
 def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
-    """Return corners (n, 3) of all bodies; of a moving body, of a ball around it along its path."""
+    """Return corners (n, 3) [m] of boxes that contain all bodies, moving ones at all times."""
     corners = []
     for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin

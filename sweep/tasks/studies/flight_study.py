@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
     CloudSimulator = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
-    """Results of shots with some effects, by their eyepoints, numbers and flags."""
+    """Function of effect names, eyepoints, shot numbers and effect flags that returns results."""
 
 #: Domain of the keys of draws. The key of a shot is its number, so the draws of a flight are the
 #: same at every point of the axes and for every instrument.
@@ -144,7 +144,7 @@ class ScannerGrid(ParameterGrid, BlockGrid):
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension by their name; there may be very many."""
+        """Return the values along each dimension, by parameter path, or as `draw` and `cycle`."""
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
@@ -437,7 +437,10 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield results of shots in groups that are computed together; with more rays if needed."""
+        """Yield rows and results of shots in groups that are simulated together.
+
+        Shots that need more rays are cast and simulated again.
+        """
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
         ).iter_joint_groups():
@@ -690,7 +693,7 @@ class FlightStudy(ExtendableStudy):
 
 
 def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield rows and ranges of draws that are missing; rows that lack the same come together."""
+    """Yield groups of rows that lack the same draws, and a slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)

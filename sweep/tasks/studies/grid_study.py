@@ -375,7 +375,7 @@ BATCH_DIM = "batch"
 
 
 def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
-    """Return the arrays that blocks write, by sorted name, with their dimensions but the axes."""
+    """Return the output variables of blocks by sorted name; their dimensions omit the axes."""
     error_output = replace(
         EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -524,7 +524,7 @@ class GridStudy(ExtendableStudy):
         return self.evaluate(block, checkpoint_results, deadline)
 
     def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
-        """Return the points of a block from the smaller study: complete, or their first draws."""
+        """Return the results that the smaller study has of a block: final ones, or first draws."""
         if (reuse_source := self.reuse_source) is None:
             return EarlierResults()
         parts = []
@@ -793,7 +793,7 @@ def _simulate_draws(
     prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
-    """Draw points until all draws are made, the tolerance is met, or `should_stop`."""
+    """Draw points until all draws are made, the tolerance is met, or `should_stop` is True."""
     from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods
 

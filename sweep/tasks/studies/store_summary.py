@@ -56,7 +56,7 @@ class DetectionRow:
 
     label: str
     n_points: int
-    detected_fraction: float  # fraction of points with pd_shot above `DETECTED`
+    detected_fraction: float  # fraction of points with pd_shot above `DETECTED_PD_MIN`
     median_pd_shot: float  # median of pd_shot
     median_pd_doppler: float
 
@@ -182,7 +182,7 @@ def _format_value(value: object) -> str:
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Yield slices of arrays of equal chunks, and their values, for each committed block."""
+    """Yield the slices that each block wrote in arrays of equal chunks, and their values."""
     group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
@@ -226,7 +226,7 @@ class ScannerRow:
 
 
 def flight_summary(store: str | Location) -> list[ScannerRow]:
-    """Return a row for each scanner and point of the axes; for each scanner if there are many."""
+    """Return a row for each scanner and point of the axes; one per scanner if points are many."""
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, FlightStudy):
@@ -405,7 +405,7 @@ def _accuracy_rows(
     samples_array: str,
     tolerance: np.ndarray,
 ) -> list[AccuracyRow]:
-    """Return rows by the names of the arrays of errors, and of draws or rays."""
+    """Return a row for each array of errors; ``samples_array`` has numbers of draws or rays."""
     (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
     rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
     tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)

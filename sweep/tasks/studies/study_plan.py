@@ -219,7 +219,7 @@ class TimedRound(NamedTuple):
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Time rounds of increasing size, until one takes long enough or covers the study."""
+    """Time rounds of increasing size. Return the first that is long enough or covers the study."""
     from numba.core.event import install_recorder
 
     n_samples, start = 1, time.perf_counter()

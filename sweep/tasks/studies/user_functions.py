@@ -151,7 +151,10 @@ def _check_returned_array(
 
 
 def _test_user_function(role: str, name: str) -> None:
-    """Call a function with three spectra of a tone at bin 40.25 of 128 in weak noise."""
+    """Test a function on three spectra of a tone at bin 40.25 of 128 in weak noise.
+
+    CodeError if it fails.
+    """
     n_samples, generator = 256, np.random.default_rng(1)
     setting = SpectrumSettings(
         fft_size=n_samples,

@@ -11,13 +11,13 @@ from sweep.tasks.engine.block_study import StudyReader
 from sweep.tasks.studies import study_loading, user_function_names
 from sweep.tasks.studies.parameter_grid import worst_cpu_seconds_per_point
 
-#: Upper estimate of the time of one core that a ray takes, and a draw of a shot [s].
+#: Upper estimates of the time of a ray, and of one draw of a shot, on one core [s].
 CPU_SECONDS_PER_RAY, CPU_SECONDS_PER_SHOT_DRAW = 5e-6, 4e-4
 
 
 @dataclass(frozen=True)
 class SpecWorkload:
-    """:class:`sweep.tasks.engine.block_study.Workload` of the study that a spec declares."""
+    """Requirements of a spec's study on machines, as `block_study.Workload` declares them."""
 
     spec: GridSpec | SceneSpec
 
@@ -43,7 +43,10 @@ class SpecWorkload:
 
 
 def estimate_cpu_seconds(spec: GridSpec | SceneSpec) -> float:
-    """Time of one core that a study takes, about [s]; infinite if rays follow a tolerance."""
+    """Return the approximate time of a study on one core [s].
+
+    It is infinite if a tolerance sets the number of rays.
+    """
     n_axis_points = math.prod(int(axis.size) for axis in spec.axes)
     if isinstance(spec, GridSpec):
         return n_axis_points * worst_cpu_seconds_per_point(spec)

@@ -100,7 +100,10 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 
 
 def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
-    """Return a cluster with its least number of workers submitted; RuntimeError if rejected."""
+    """Start a cluster, and submit jobs for its least number of workers.
+
+    RuntimeError if the batch system rejects them.
+    """
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
     try:

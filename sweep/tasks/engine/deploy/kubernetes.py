@@ -84,7 +84,7 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 
 @contextmanager
 def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
-    """Return the address of a service: its own inside the cluster, a forwarded port outside."""
+    """Yield the address of a service: its own inside the cluster, a forwarded port outside."""
     if _is_resolvable_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"
         return

@@ -63,7 +63,7 @@ ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers: thread limits, safe path, and those given."""
+    """Return the environment variables of workers: thread limits, safe path, and the user's."""
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
@@ -74,7 +74,7 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 def make_security(cluster: ClusterConfig) -> Security | None:
     """Return the TLS security of client, scheduler and workers; None without certificates.
 
-    With it they refuse connections without a certificate.
+    Client, scheduler and workers then refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -95,7 +95,7 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
-    """Return the addresses of a scheduler of this process and of its dashboard, if any."""
+    """Return Dask's options for the addresses of a scheduler in this process and its dashboard."""
     options: dict[str, Any] = {
         "port": scheduler.port,
         "dashboard": shows_dashboard(scheduler),
@@ -133,7 +133,7 @@ WORKER_TTL = "2 minutes"
 
 @contextmanager
 def isolate_spawned_workers() -> Iterator[None]:
-    """Context in which workers are started, and restarted, as processes.
+    """Context manager in which worker processes start without the caller's script and folder.
 
     By default a spawned process imports from the working directory, and runs the script of its
     parent. Workers need neither: functions of the script are sent by value.
@@ -219,7 +219,10 @@ def dashboard_link(dask_cluster: Any) -> str:
 
 
 def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
-    """Return the memory at which Dask restarts a worker [bytes]; by default its share of 90 %."""
+    """Return the memory at which Dask restarts a worker [bytes].
+
+    By default it is an equal share of 90 % of the machine's memory.
+    """
     from distributed.system import MEMORY_LIMIT
 
     requested_bytes = cluster.worker.memory
@@ -252,7 +255,10 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return the workers to start on each machine, by its name, evenly distributed."""
+    """Return Dask's specification of the workers on each machine, by its name.
+
+    The workers are distributed evenly.
+    """
     from distributed.deploy.ssh import Worker
 
     hosts = cluster.hosts[:n_workers]
