@@ -477,13 +477,13 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     import numpy as np
     import xarray as xr
 
-    from sweep.tasks.studies.store_summary import draw_accuracy_rows
+    from sweep.tasks.studies.store_summary import accuracy_rows_of_draws
 
     (here / "drawn.yaml").write_text(STUDY + DRAWN)
     run = sweep("run", "drawn.yaml", "--scheduler", "none")
     told = sweep("status", "results/drawn.zarr")
     store = xr.open_zarr(here / "results" / "drawn.zarr")
-    rows = {row.name: row for row in draw_accuracy_rows(here / "results" / "drawn.zarr")}
+    rows = {row.name: row for row in accuracy_rows_of_draws(here / "results" / "drawn.zarr")}
     assert list(rows) == ["pd_up", "pd_doppler", "pd_down", "pd_shot"]
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]

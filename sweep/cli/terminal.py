@@ -457,9 +457,9 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
     """Print points without results, the uncertainty of draws, and the error of few beamlets."""
     from sweep.tasks.studies import study_loading
     from sweep.tasks.studies.store_summary import (
+        accuracy_rows_of_draws,
+        accuracy_rows_of_rays,
         count_unsupported_points,
-        draw_accuracy_rows,
-        ray_accuracy_rows,
     )
 
     n_unsupported, reason = count_unsupported_points(store, done_blocks)
@@ -469,7 +469,7 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
             f"{reason}"
         )
         echo_wrapped(f"warning: {message}", err=True)
-    if rows := draw_accuracy_rows(store, done_blocks):
+    if rows := accuracy_rows_of_draws(store, done_blocks):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
             + _sampled_share_text(rows[0].block_fraction),
@@ -490,7 +490,7 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
         )
     if reason := unchecked_beamlets_reason(study_loading.read_study(store)[1].spec):
         echo_wrapped(f"Not checked: {reason}.")
-    if rays := ray_accuracy_rows(store, done_blocks):
+    if rays := accuracy_rows_of_rays(store, done_blocks):
         ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
             f"What more {ray_noun} may change{_sampled_share_text(rays[0].block_fraction)}",
@@ -624,7 +624,7 @@ def plan_rows(
             f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
             f"{counted(study_plan.n_workers, 'worker')}",
         )
-    yield "memory", f"about {decimal(study_plan.worker_bytes)} a worker"
+    yield "memory", f"about {decimal(study_plan.worker_memory_bytes)} a worker"
     if reason := _excess_text(study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds):
         yield "question", f"sweep run asks first, or takes --yes: {reason}"
 

@@ -535,10 +535,10 @@ def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
 STAGING_SUFFIX = ".next"
 
 #: Age at which a draft of another host counts as abandoned [s].
-ABANDONED_DRAFT_AGE = 86400.0
+ABANDONED_DRAFT_AGE_SECONDS = 86400.0
 
 #: Largest lag of a file server's clock that is tolerated [s].
-CLOCK_SKEW_MAX = 60.0
+CLOCK_SKEW_SECONDS_MAX = 60.0
 
 _LEFTOVER_NAME_PATTERN = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
@@ -743,7 +743,7 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
 
     modified_time = draft_path.stat().st_mtime
     if leftover_match["host"] not in (None, socket.gethostname()):
-        return time.time() - modified_time < ABANDONED_DRAFT_AGE
+        return time.time() - modified_time < ABANDONED_DRAFT_AGE_SECONDS
     if leftover_match["start"]:
         return process_start_id(int(leftover_match["pid"])) in (
             int(leftover_match["start"]),
@@ -752,7 +752,7 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
     try:  # a process that started after the draft was made has reused its writer's id
         return (
             psutil.Process(int(leftover_match["pid"])).create_time()
-            < modified_time + CLOCK_SKEW_MAX
+            < modified_time + CLOCK_SKEW_SECONDS_MAX
         )
     except psutil.Error:
         return False

@@ -542,7 +542,7 @@ RECEIPTS_FILE = "receipts.jsonl"
 LOG_LINE_BYTES_MAX = 64 << 20
 
 #: Time for which lines are collected before they are written as one object [s].
-LOG_OBJECT_INTERVAL = 1.0
+LOG_OBJECT_INTERVAL_SECONDS = 1.0
 
 #: Number of objects of a log above which they are merged, and size of a merged object [bytes].
 LOG_OBJECTS_MAX = 64
@@ -695,13 +695,13 @@ class ObjectLog:
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines as one object if `LOG_OBJECT_INTERVAL` has passed since the last.
+        """Write the pending lines as one object, once `LOG_OBJECT_INTERVAL_SECONDS` have passed.
 
         With ``force`` write them now. Return True if no lines are pending any more.
         """
         if not self._pending_lines:
             return True
-        if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL and not force:
+        if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL_SECONDS and not force:
             return False
         log_object = self._path / _new_log_object_name(self._last_number + 1)
         log_object.write_bytes(b"".join(self._pending_lines))

@@ -45,7 +45,7 @@ CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
 #: Time that abandoned reads have to be cancelled when the program ends [s].
-PENDING_READS_TIMEOUT = 5.0
+PENDING_READS_TIMEOUT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4
 _SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
@@ -289,7 +289,9 @@ def _cancel_pending_reads() -> None:
 
     for loop in _loops_with_failed_reads:
         with suppress(Exception):
-            asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(PENDING_READS_TIMEOUT)
+            asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(
+                PENDING_READS_TIMEOUT_SECONDS
+            )
 
 
 def open_verified_store(location: Location, study_id: str) -> Any:

@@ -122,7 +122,7 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
         "from six_block_study import six_block_spec\n"
         "from sweep.storage import store_format\n"
         "from sweep.tasks.driver import run\n"
-        "store_format.LOG_OBJECT_INTERVAL = 0\n"
+        "store_format.LOG_OBJECT_INTERVAL_SECONDS = 0\n"
         "def evaluate(study, block):\n"
         "    time.sleep(60 * (block == 3))\n"
         "    return study.evaluate(block)\n"
@@ -297,7 +297,7 @@ def test_damage_is_found_and_mended(memory, undisturbed):
 
 
 def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
-    monkeypatch.setattr(store_format, "LOG_OBJECT_INTERVAL", 1e9)
+    monkeypatch.setattr(store_format, "LOG_OBJECT_INTERVAL_SECONDS", 1e9)
     outcome = run_serially(six_block_spec(), memory)
     assert outcome.complete and outcome.blocks_computed == N_BLOCKS
     log = parse_location(memory) / JOURNAL_DIR / "receipts.jsonl"

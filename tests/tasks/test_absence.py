@@ -48,7 +48,7 @@ class Told(Progress):
             self._at_first()
             self._at_first = lambda: None
 
-    def at_work(self, *, workers, stored):
+    def update_workers(self, *, workers, stored):
         self.work.append((workers, stored))
 
     def say(self, text):

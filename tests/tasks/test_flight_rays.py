@@ -23,7 +23,7 @@ from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import extend, run
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import eyepoint_study
-from sweep.tasks.studies.store_summary import ray_accuracy_rows
+from sweep.tasks.studies.store_summary import accuracy_rows_of_rays
 
 RAYS = ErrorBudget.ray_counts
 
@@ -130,7 +130,7 @@ def test_a_shot_with_more_rays_is_as_if_all_had_so_many(flown, tmp_path):
 
 def test_rays_given_by_hand_leave_nothing_that_is_told(flown):
     assert shots(flown["by hand"]).beamlets_error.isnull().all()
-    assert ray_accuracy_rows(flown["by hand"]) == []
+    assert accuracy_rows_of_rays(flown["by hand"]) == []
 
 
 def test_a_comparison_allows_what_is_told(flown):
@@ -147,7 +147,7 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     monkeypatch.setattr(ErrorBudget, "from_parameters", few)
     spec = facets(1e-3, draws={"number": 1})
     store = run_serially(spec, tmp_path / "most.zarr").store
-    (row,) = ray_accuracy_rows(store)
+    (row,) = accuracy_rows_of_rays(store)
     told, rays = shots(store).beamlets_error, shots(store).beamlets
     assert (row.name, row.samples_max, row.tolerance_at_worst_point) == ("three", 37, 1e-3)
     assert row.mean_samples == pytest.approx(float(rays.mean())) == 37

@@ -175,7 +175,7 @@ def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monk
 
 def test_the_memory_of_a_plan_counts_a_point():
     spec = small_spec()
-    assert plan_study(spec).worker_bytes > memory_limits.point_memory_bytes(spec) > 1e6
+    assert plan_study(spec).worker_memory_bytes > memory_limits.point_memory_bytes(spec) > 1e6
 
 
 @pytest.mark.parametrize(

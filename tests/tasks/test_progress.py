@@ -74,7 +74,7 @@ def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     bar = progress.ProgressBar()
     bar.begin(points=12_345_678, done=1_234_567, unit="points")
-    bar.at_work(workers=12, stored=3_100_000)
+    bar.update_workers(workers=12, stored=3_100_000)
     bar.advance(points=1_000, failed=3)
     bar.end()
     shown = capsys.readouterr().err

@@ -76,7 +76,7 @@ class Progress:
     def advance(self, *, points: float, failed: int) -> None:
         """Add newly computed points and failed blocks; both are 0 if only time has passed."""
 
-    def at_work(self, *, workers: int, stored: int) -> None:
+    def update_workers(self, *, workers: int, stored: int) -> None:
         """Update the number of workers and the size stored [bytes]; called before `advance`."""
 
     def say(self, text: str) -> None:
@@ -120,8 +120,8 @@ class _GuardedListener(Progress):
     def advance(self, **keywords: Any) -> None:
         self._call_listener("advance", **keywords)
 
-    def at_work(self, **keywords: Any) -> None:
-        self._call_listener("at_work", **keywords)
+    def update_workers(self, **keywords: Any) -> None:
+        self._call_listener("update_workers", **keywords)
 
     def say(self, text: str) -> None:
         self._call_listener("say", text)
@@ -198,7 +198,7 @@ class _CountingProgress(Progress):
     def _show_state(self, *, is_start: bool = False) -> None:
         """Show the present state."""
 
-    def at_work(self, *, workers: int, stored: int) -> None:
+    def update_workers(self, *, workers: int, stored: int) -> None:
         from rich.filesize import decimal
 
         count = f"{workers:,} worker{'' if workers == 1 else 's'}"

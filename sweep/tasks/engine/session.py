@@ -687,7 +687,7 @@ class Session:
             self._checkpoint_points[block] = saved_points
         self._flush_receipts()
         bytes_stored = self._bytes_before + int(self._receipt_totals["bytes"])
-        self._progress.at_work(workers=task_result.n_workers, stored=bytes_stored)
+        self._progress.update_workers(workers=task_result.n_workers, stored=bytes_stored)
         self._progress.advance(
             points=self._points_so_far() - points_before,
             failed=len(self._permanent_failures) - failures_before,

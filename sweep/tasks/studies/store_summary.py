@@ -341,7 +341,7 @@ class AccuracyRow:
             )
 
 
-def draw_accuracy_rows(
+def accuracy_rows_of_draws(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row for each probability with a promised accuracy.
@@ -362,7 +362,7 @@ def draw_accuracy_rows(
     ]
 
 
-def ray_accuracy_rows(
+def accuracy_rows_of_rays(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row for each scanner; for a grid one row if the most beamlets are too few."""

@@ -87,7 +87,7 @@ class StudyPlan:
     n_workers: int
     seconds_per_point: float  # measured time of a point on one worker [s]
     wall_seconds: float  # estimated wall time of the study [s]
-    worker_bytes: int  # estimated memory of a worker [bytes]
+    worker_memory_bytes: int  # estimated memory of a worker [bytes]
     scanners: tuple[ScannerPlan, ...] = ()
     scene_reports: tuple[str, ...] = ()  # repairs of meshes when the scene was loaded
 
@@ -158,7 +158,7 @@ def plan_study(
         seconds_per_point=seconds_per_point,
         wall_seconds=WORKER_START_SECONDS + cpu_seconds / min(n_workers, study.n_blocks),
         # with the model loaded, the results of a block, and their encoded copy
-        worker_bytes=psutil.Process().memory_info().rss
+        worker_memory_bytes=psutil.Process().memory_info().rss
         + 2 * study.block_nbytes_max
         + point_memory_bytes(spec),
         scanners=scanners,

@@ -13,7 +13,7 @@ from sweep.spec.cluster_config import KubernetesClusterConfig, WorkerBounds
 from sweep.tasks.engine.deploy import local_ssh
 from sweep.tasks.engine.progress import ClusterError
 
-API_VERSION = "kubernetes.dask.org/v1"
+DASK_OPERATOR_API_VERSION = "kubernetes.dask.org/v1"
 SCHEDULER_PORT = 8786
 
 #: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
@@ -50,7 +50,7 @@ def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> It
                 autoscaler_resource(cluster, bounds),
             ):
                 if declaration is not None:
-                    kubernetes_object = new_class(declaration["kind"], API_VERSION)(
+                    kubernetes_object = new_class(declaration["kind"], DASK_OPERATOR_API_VERSION)(
                         declaration, namespace=cluster.namespace
                     )
                     kubernetes_object.create()
@@ -125,7 +125,7 @@ def autoscaler_resource(
     if bounds.least == bounds.most:
         return None
     return {
-        "apiVersion": API_VERSION,
+        "apiVersion": DASK_OPERATOR_API_VERSION,
         "kind": "DaskAutoscaler",
         "metadata": {"name": cluster.name},
         "spec": {"cluster": cluster.name, "minimum": bounds.least, "maximum": bounds.most},
