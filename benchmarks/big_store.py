@@ -48,7 +48,10 @@ def make_store(path, spec):
     study_store.create_store(path, study)
     arrays, receipts = study_store.BlockWriter(path, study), []
     for block in range(study.n_blocks):
-        extent, parameters = study.grid.block_extent(block), study.grid.parameters(block)
+        extent, parameters = (
+            study.grid.actual_block_shape(block),
+            study.grid.parameters_of_block(block),
+        )
         deviates = pd_deviate(
             parameters["target.range"],
             parameters["target.grazing_angle"],
@@ -63,7 +66,7 @@ def make_store(path, spec):
             "effects": np.zeros(extent, "u4"),
         }
         arrays.write(block, results)
-        receipt = {"block": block, "points": study.block_size(block), "time": 0.0}
+        receipt = {"block": block, "points": study.count_block_points(block), "time": 0.0}
         receipts.append(json.dumps(receipt) + "\n")
     (Path(path) / ".sweep" / "receipts.jsonl").write_text("".join(receipts))
     return study.n_points * BYTES_PER_POINT

@@ -94,7 +94,7 @@ def evaluate_variant(
         for name, values in results.items():
             if name.rsplit("/", 1)[-1] in PROBABILITY_OUTPUTS:
                 values_by_name.setdefault(name, []).append(values.ravel())
-        progress.update(progress_task, advance=study.block_size(block))
+        progress.update(progress_task, advance=study.count_block_points(block))
     progress.remove_task(progress_task)
     return VariantResult(
         total, planning, {name: np.concatenate(parts) for name, parts in values_by_name.items()}

@@ -135,7 +135,7 @@ def sweep_contender(workers: int, folder: Path):
 
 def evaluate_millisecond_points(study, block):
     """A block's arrays a millisecond a point later; their values are those of no model."""
-    burn_cpu(POINT_SECONDS * study.block_size(block))
+    burn_cpu(POINT_SECONDS * study.count_block_points(block))
     return filled_block_arrays(study, block)
 
 
@@ -147,11 +147,11 @@ def evaluate_one_second_block(study, block):
 
 def filled_block_arrays(study, block: int) -> dict[str, np.ndarray]:
     """Arrays of the shapes and types that a block has, with numbers that don't compress away."""
-    values = np.arange(study.block_size(block), dtype=float)
+    values = np.arange(study.count_block_points(block), dtype=float)
     return {
         name: np.resize(
             values, [region_slice.stop - region_slice.start for region_slice in region]
-        ).astype(study.layout_by_name[name].dtype)
+        ).astype(study.output_layout_by_name[name].dtype)
         for name, region in study.chunk_regions(block).items()
     }
 

@@ -40,7 +40,7 @@ class OneArrayStudy:
     def __init__(self, n_blocks):
         self.n_blocks = n_blocks
 
-    def chunk_owners(self):
+    def chunk_owner_blocks(self):
         return {"array": np.arange(self.n_blocks)}
 
 
@@ -51,7 +51,8 @@ def make_receipt(block, points=65_536):
 
     return Receipt(
         block=block, points=points, bytes=3_000_000, digest="0" * 32, seconds=1.234567,
-        write_seconds=0.0123, host="node-0123", pid=12_345, versions=study_store.current_versions(),
+        write_seconds=0.0123, host="node-0123", pid=12_345,
+        versions=study_store.current_software_versions(),
     )  # fmt: skip
 
 
@@ -93,7 +94,7 @@ def time_call(function):
 def measure_blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
     from sweep.storage.store_format import read_receipt_totals
-    from sweep.tasks.engine.journal import Journal, scan_complete_blocks
+    from sweep.tasks.engine.journal import Journal, find_complete_blocks
     from sweep.tasks.engine.worker import BlockQueue
     from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
@@ -109,7 +110,7 @@ def measure_blocks(n_blocks, store):
     listing_seconds = float("nan")
     if n_blocks <= FILES_MAX:
         is_listed, _, listing_seconds = time_call(
-            lambda: scan_complete_blocks(
+            lambda: find_complete_blocks(
                 store, OneArrayStudy(n_blocks), receipts.points_by_block > 0
             )
         )

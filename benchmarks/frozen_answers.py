@@ -150,7 +150,7 @@ def study_answers(name: str, mapping: dict[str, Any]) -> dict[str, np.ndarray]:
                 load_mapping(mapping), store=str(store_path), scheduler="none", progress=False
             )
         if not outcome.complete:
-            sys.exit(f"{name}: {outcome.stopped or outcome.failures}")
+            sys.exit(f"{name}: {outcome.stop_reason or outcome.failures}")
         return {
             f"{name}/{key}": values
             for key, variable in sweep.open(store_path).data_vars.items()

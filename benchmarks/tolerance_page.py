@@ -21,7 +21,7 @@ from sweep.model.error_budget import ErrorBudget
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
 from sweep.tasks.accuracy.measurement import (
     N_PROMISED_ERRORS,
-    add_fixed_effects,
+    add_settings_with_fixed_effects,
     result_differences,
     tolerance_of_setting,
 )
@@ -31,12 +31,12 @@ from sweep.tasks.accuracy.settings import (
     AS_WRITTEN_KIND,
     FIXED_EFFECTS_KIND,
     REFERENCE_KIND,
-    REFERENCE_RAYS,
+    REFERENCE_RAYS_PER_SHOT,
     REFERENCE_RAYS_TOLERANCE,
     TRIED_TOLERANCES,
     AccuracySetting,
     SettingLadder,
-    build_ladder,
+    build_setting_ladder,
 )
 from sweep.tasks.accuracy.study_sample import (
     FlightSample,
@@ -103,7 +103,8 @@ RAYS_SECTION = f"""
 
 Each beamlet of a flight is a ray. If powers add, `footprint.beamlets: auto` casts few rays for
 every shot, and more for shots that need them. The rows show the number of rays of a shot, and
-the error against a reference. The reference has all effects on and {REFERENCE_RAYS:,} rays of every
+the error against a reference. The reference has all effects on and \
+{REFERENCE_RAYS_PER_SHOT:,} rays of every
 shot, or more until the estimated error is below {REFERENCE_RAYS_TOLERANCE:g},
 {ErrorBudget.ray_counts[-1]:,} at
 the most. A number given by an experiment has a row too, with all effects on. The last row of each
@@ -149,10 +150,10 @@ class ToleranceRow(NamedTuple):
 
 def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int) -> list[Trial]:
     """Rungs on all points of a sample: what they see, and the best of their times."""
-    parts = bench.split(bench.size)
+    parts = bench.split_into_parts(bench.size)
     for rung in rungs:  # compiles what there is to compile
         bench.try_setting(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
-    bench.drop_caches()
+    bench.clear_caches()
     trials_by_part: list[list[Trial]] = []
     for part in parts:
         best_by_rung: dict[int, Trial] = {}
@@ -176,7 +177,7 @@ def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int
                     key=lambda trial: trial.seconds_per_point,
                 )
         trials_by_part.append([best_by_rung[rung_number] for rung_number in sorted(best_by_rung)])
-        bench.drop_caches()
+        bench.clear_caches()
     return [merge_trials(trials) for trials in zip(*trials_by_part, strict=True)]
 
 
@@ -194,13 +195,13 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
     bench = (
         FlightSample(spec, POINTS) if is_flight else GridSample(spec, POINTS, random_points(spec))
     )
-    full_ladder = build_ladder(spec)
+    full_ladder = build_setting_ladder(spec)
     rung_by_tolerance = {
         tolerance_of_setting(rung): rung
         for rung in full_ladder.settings
         if rung.kind == ADAPTIVE_KIND
     }
-    full_ladder = add_fixed_effects(full_ladder, bench, TRIED_TOLERANCES)
+    full_ladder = add_settings_with_fixed_effects(full_ladder, bench, TRIED_TOLERANCES)
     fixed_rungs = [
         rung for rung in full_ladder.settings if rung.kind in (FIXED_EFFECTS_KIND, ALL_EFFECTS_KIND)
     ]
@@ -262,7 +263,10 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
                 label=label,
             )
         )
-    trial, label = trial_by_name[full_ladder.reference.name], f"{REFERENCE_RAYS:,} rays and more"
+    trial, label = (
+        trial_by_name[full_ladder.reference.name],
+        f"{REFERENCE_RAYS_PER_SHOT:,} rays and more",
+    )
     check_row = reference_check_row(bench, full_ladder, trial, label, CHECK_RAYS)
     return ExperimentResult(rows, [*ray_rows, check_row])
 
@@ -290,12 +294,12 @@ def reference_check_row(
     bench: StudySample, full_ladder: SettingLadder, timed_trial: Trial, label: str, more_rays: int
 ) -> ToleranceRow:
     """The reference's number of rays against more of them, at a part of the sample."""
-    reference, part = full_ladder.reference, bench.split(bench.size)[0]
+    reference, part = full_ladder.reference, bench.split_into_parts(bench.size)[0]
     finer = replace(
         reference, name=f"{more_rays} rays", overrides={**reference.overrides, BEAMLETS: more_rays}
     )
     reference_trial, finer_trial = (bench.try_setting(rung, part, 1) for rung in (reference, finer))
-    bench.drop_caches()
+    bench.clear_caches()
     return ToleranceRow(
         np.inf,
         result_differences(reference_trial.results, finer_trial.results),

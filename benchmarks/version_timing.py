@@ -189,7 +189,7 @@ def serve_runs() -> None:
             outcome = sweep.run(spec, store=f"{folder}/side.zarr", scheduler="none", progress=False)
             cpu_seconds = time.process_time() - start
         if not outcome.complete:
-            sys.exit(f"{line.strip()}: {outcome.stopped or outcome.failures}")
+            sys.exit(f"{line.strip()}: {outcome.stop_reason or outcome.failures}")
         print(json.dumps([cpu_seconds, outcome.points]), flush=True)
 
 

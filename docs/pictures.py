@@ -59,7 +59,7 @@ def draw(experiment: str) -> None:
         spec = sweep.load(EXPERIMENTS / f"{experiment}.yaml")
         outcome = sweep.run(spec, store=store, scheduler="none")
         if not outcome.complete:
-            sys.exit(f"{experiment} is not complete: {outcome.stopped}")
+            sys.exit(f"{experiment} is not complete: {outcome.stop_reason}")
         drawn = {
             path.name: path for path in study_figures.draw_figures(store, Path(folder) / "figures")
         }

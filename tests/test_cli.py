@@ -480,29 +480,31 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     import numpy as np
     import xarray as xr
 
-    from sweep.tasks.studies.store_summary import draw_accuracy_rows
+    from sweep.tasks.studies.store_summary import accuracy_rows_of_draws
 
     (here / "drawn.yaml").write_text(STUDY + DRAWN)
     run = sweep("run", "drawn.yaml", "--scheduler", "none")
     told = sweep("status", "results/drawn.zarr")
     store = xr.open_zarr(here / "results" / "drawn.zarr")
-    rows = {row.name: row for row in draw_accuracy_rows(here / "results" / "drawn.zarr")}
+    rows = {row.name: row for row in accuracy_rows_of_draws(here / "results" / "drawn.zarr")}
     assert list(rows) == ["pd_up", "pd_doppler", "pd_down", "pd_shot"]
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]
-        assert (row.n_points, row.n_met) == (80, int((widths <= 0.1).sum()))
+        assert (row.n_points, row.n_points_within_tolerance) == (80, int((widths <= 0.1).sum()))
         assert row.worst_error == widths.max() and row.excess == row.worst_error - 0.1
-        assert row.samples_at_worst == 60 and row.draws_needed == -(
+        assert row.samples_at_worst_point == 60 and row.draws_needed == -(
             -60 * (row.worst_error / 0.1) ** 2 // 1
         )
         worst = np.argwhere(widths.values == float(widths.max()))[0]
-        assert row.worst_label.startswith(f"range {float(store.range[worst[0]]):.4g} m, power ")
+        assert row.worst_point_label.startswith(
+            f"range {float(store.range[worst[0]]):.4g} m, power "
+        )
         for result in (run, told):
             assert (
-                f"{row.n_met} of 80" in result.stdout
+                f"{row.n_points_within_tolerance} of 80" in result.stdout
                 and f"{row.draws_needed:,.0f}" in result.stdout
             )
-    assert 0 < rows["pd_shot"].n_met < 80
+    assert 0 < rows["pd_shot"].n_points_within_tolerance < 80
     assert store.accuracy_missed.max() == max(row.excess for row in rows.values())
     promised = store.pd_shot_half_width.attrs
     assert (promised["tolerance"], promised["confidence"]) == (0.1, 0.95)
@@ -637,7 +639,7 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
 
 def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys, monkeypatch):
     with monkeypatch.context() as often:
-        often.setattr(progress, "LINE_INTERVAL", 0.0)
+        often.setattr(progress, "PROGRESS_LINE_INTERVAL_SECONDS", 0.0)
         _lines_of_progress(capsys)
     patient = progress.ProgressLines()
     patient.begin(points=100, done=0, unit="points")

@@ -57,33 +57,33 @@ def test_nothing_is_left_where_it_is_broken_off_at_once(here, monkeypatch):
     def broken(self):
         raise measurement.NothingMeasured
 
-    monkeypatch.setattr(measurement.Measurement, "run", broken)
+    monkeypatch.setattr(measurement.AccuracyMeasurement, "run", broken)
     result = sweep("accuracy", "small.yaml")
     assert result.exit_code == 3 and "nothing is kept" in result.stderr
     assert not (here / "results").exists()
 
 
 def test_what_is_kept_of_an_interrupted_measurement_is_told_with_exit_code_3(here, monkeypatch):
-    whole = measurement.Measurement.run
+    whole = measurement.AccuracyMeasurement.run
 
     def cut(self):
         found = whole(self)
         found.stop_reason = "interrupted"
         return found
 
-    monkeypatch.setattr(measurement.Measurement, "run", cut)
+    monkeypatch.setattr(measurement.AccuracyMeasurement, "run", cut)
     result = sweep("accuracy", "small.yaml", "--points", "3")
     assert result.exit_code == 3 and "(interrupted): 3 points" in result.stdout
     assert (here / "results" / "small_accuracy.png").exists()
 
 
 def test_a_study_that_was_run_into_its_place_meanwhile_is_left_alone(here, monkeypatch):
-    whole, store = measurement.Measurement.run, "results/small_accuracy.zarr"
+    whole, store = measurement.AccuracyMeasurement.run, "results/small_accuracy.zarr"
 
     def beside_another(self):
         assert sweep("run", "small.yaml", "--scheduler", "none", "--store", store).exit_code == 0
         return whole(self)
 
-    monkeypatch.setattr(measurement.Measurement, "run", beside_another)
+    monkeypatch.setattr(measurement.AccuracyMeasurement, "run", beside_another)
     refused(sweep("accuracy", "small.yaml", "--points", "3", "--overwrite"), "a study's results")
     assert "complete" in sweep("status", store).stdout

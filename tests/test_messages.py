@@ -207,10 +207,10 @@ def test_errors_of_the_command_suggest_commands_and_errors_in_python_suggest_cal
 
 def test_what_has_failed_before_is_tried_again_by_a_call_in_python(tmp_path):
     store = tmp_path / "a.zarr"
-    assert run_serially(small_spec(), store).why == ""
+    assert run_serially(small_spec(), store).incomplete_reason == ""
     run_serially(small_spec(seed=4), tmp_path / "b.zarr", scheduler="none", evaluate=fails)
     outcome = sweep.resume(tmp_path / "b.zarr", progress=False, scheduler="none")
-    assert outcome.why.endswith("retry_failed=True tries them again")
+    assert outcome.incomplete_reason.endswith("retry_failed=True tries them again")
 
 
 def test_functions_that_are_suggested_exist():

@@ -132,7 +132,7 @@ def evaluate(study, block):
 if __name__ == "__main__":
     where = {"workers": 2} if sys.argv[4] == "workers" else {"scheduler": "none"}
     outcome = sweep.run(small_spec(), store=sys.argv[1], evaluate=evaluate, **where)
-    Path(sys.argv[2]).write_text(f"{outcome.blocks_done} {outcome.stopped}")
+    Path(sys.argv[2]).write_text(f"{outcome.blocks_done} {outcome.stop_reason}")
 """
 
 

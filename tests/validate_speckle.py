@@ -156,7 +156,7 @@ def random_valid_spec(seed: int, spec_number: int) -> RandomSpec:
 def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
     study = GridStudy(GridSpec.from_mapping(with_units(mapping)))
-    shots = prepare_single_category(study.grid.parameters(0), COMPARED_EFFECTS)
+    shots = prepare_single_category(study.grid.parameters_of_block(0), COMPARED_EFFECTS)
     magnitude = np.nanmax(evaluate_segments(shots)[[0, 2], 2, 0])
     mapping["instrument"]["laser"]["power"] = (
         ratio * first_value(shots.threshold) / magnitude
@@ -169,7 +169,7 @@ def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     }
     if np.isnan(stored["pd_shot"]):
         raise UnsupportedShotError("beyond the model")
-    parameters = study.grid.parameters(0)
+    parameters = study.grid.parameters_of_block(0)
     return RandomSpec(
         mapping, spec, parameters, prepare_single_category(parameters, COMPARED_EFFECTS), stored
     )

@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from sweep.analysis import canvas, labels
 from sweep.analysis.datasets import ACCURACY_KIND, read_attributes_of_kind
 from sweep.analysis.tables import PageTable, TablePage
-from sweep.storage.locations import Location, output_dir
+from sweep.storage.locations import Location, derived_files_dir
 from sweep.storage.store_format import OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
@@ -670,7 +670,7 @@ def write_sheet_and_tables(
     """Write the figure as NAME.png (or pdf, svg) and the tables as NAME.txt; return both paths."""
     dataset, settings = open_accuracy_store(store)
     stem = store.name.removesuffix(".zarr")
-    folder = output_dir(store) if directory is None else directory
+    folder = derived_files_dir(store) if directory is None else directory
     table_path = folder / f"{stem}.txt"
     picture_path = canvas.save_sheet(
         draw_accuracy_sheet(dataset, settings), folder / f"{stem}.{picture_format}"

@@ -27,10 +27,10 @@ from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
 from sweep.storage.locations import JOURNAL_DIR, Location, parse_location
 from sweep.storage.store_format import (
-    MAP_GROUP,
     OPEN_ZARR_KWARGS,
+    TERRAIN_MAP_GROUP,
     NotAStoreError,
-    format_versions,
+    format_software_versions,
     iter_records,
     read_receipt_totals,
 )
@@ -167,7 +167,9 @@ def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
         STUDY_ID: xr.DataArray(study_id, attrs=id_attributes),
         marker_name([study_id]): xr.DataArray(True, attrs=marker_attributes),
     })  # fmt: skip
-    return dataset.assign_attrs({name: format_versions(v) for name, v in dataset.attrs.items()})
+    return dataset.assign_attrs(
+        {name: format_software_versions(v) for name, v in dataset.attrs.items()}
+    )
 
 
 def open_scene(path: str | Location) -> xr.DataTree:
@@ -209,7 +211,7 @@ def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.
     groups = {name: group.to_dataset(inherit=False) for name, group in whole_tree.children.items()}
     root = whole_tree.to_dataset()
     if _OLD_MAP_NAMES.keys() <= root.variables.keys():  # a store of an earlier version
-        groups[MAP_GROUP] = root[list(_OLD_MAP_NAMES)].rename(_OLD_MAP_NAMES)
+        groups[TERRAIN_MAP_GROUP] = root[list(_OLD_MAP_NAMES)].rename(_OLD_MAP_NAMES)
         root = root.drop_vars(list(_OLD_MAP_NAMES))
     for name in attributes["scanners"]:
         groups[name] = _add_study_id(_load_coordinates(groups[name]), attributes["study_id"])
@@ -266,7 +268,7 @@ def refuse_lost_coordinates(store_path: Location) -> None:
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in coordinate_paths:
             with suppress(OSError):
-                if store_format.has_digest(store_path, [name], record["digest"]):
+                if store_format.objects_match_digest(store_path, [name], record["digest"]):
                     continue
             raise NotAStoreError(
                 f"{store_path} has lost {name}, of a coordinate: "
@@ -318,10 +320,12 @@ def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> d
     receipts = read_receipt_totals(store_path, n_blocks)
     sessions = iter_records(store_path / JOURNAL_DIR / "sessions.jsonl")
     start_times = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
-    start_times += [receipts.first_time] if receipts.n_committed_blocks and not start_times else []
+    start_times += (
+        [receipts.first_receipt_time] if receipts.n_committed_blocks and not start_times else []
+    )
     return {
         "started": _format_utc(min(start_times)) if start_times else "",
-        "finished": _format_utc(receipts.last_time)
+        "finished": _format_utc(receipts.last_receipt_time)
         if receipts.n_committed_blocks >= n_blocks
         else "",
         "points": n_points,

@@ -61,7 +61,7 @@ from sweep.spec.figure_sections import (
     SceneFigure,
     ShotSpectraFigure,
 )
-from sweep.storage.locations import Location, output_dir, parse_location
+from sweep.storage.locations import Location, derived_files_dir, parse_location
 
 LONG_AXIS_VALUES_MIN = 8
 """Least number of values of an axis that can be a side of a surface."""
@@ -194,7 +194,9 @@ def draw_figures(
             store, None if directory is None else Path(directory), picture_format
         )
     stem = store.name.removesuffix(".zarr")
-    directory = output_dir(store) / f"{stem}-figures" if directory is None else Path(directory)
+    directory = (
+        derived_files_dir(store) / f"{stem}-figures" if directory is None else Path(directory)
+    )
     if kind == SCENE_KIND:
         results: Any = SceneResults.from_store(store)
     else:

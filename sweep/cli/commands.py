@@ -43,7 +43,7 @@ from sweep.cli.terminal import (
 )
 from sweep.messages import PrintableStream, suggest_shell_commands
 from sweep.storage.locations import Location
-from sweep.tasks.engine.text_streams import forgiving_output
+from sweep.tasks.engine.text_streams import silence_failing_output
 
 #: Errors of a path that can't be used: no permission, no space, or an obstacle at the path.
 UNUSABLE_PATH_ERRNOS = {
@@ -128,7 +128,7 @@ class CommandGroup(click.Group):
         prints the traceback of an error after this function.
         """
         try:
-            with forgiving_output():
+            with silence_failing_output():
                 _make_output_printable()
                 with suggest_shell_commands():
                     return super().main(*args, **options)
@@ -259,13 +259,13 @@ def run(
       sweep run experiments/range_angle.yaml --resume --cluster deploy/slurm.yaml
     """  # noqa: D301
     from sweep.spec import load
-    from sweep.storage.locations import is_free
+    from sweep.storage.locations import can_create_store
     from sweep.tasks import driver
 
     if overwrite and resuming:
         raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
     study_spec, path = load(spec), store or _default_store(spec)
-    if is_free(path) or not resuming:  # else the user confirmed when the study began
+    if can_create_store(path) or not resuming:  # else the user confirmed when the study began
         confirm_large_study(study_spec, path, yes=yes)
     outcome = driver.run(study_spec, store=path, overwrite=overwrite, resume=resuming, **options)
     print_outcome_and_exit(outcome, shorten_path(path))
@@ -669,7 +669,7 @@ def spectra(
     from sweep.analysis.shot_spectra import select_shot_parameters
     from sweep.spec import GridSpec, load
     from sweep.tasks.engine.progress import show_activity
-    from sweep.tasks.studies.spectra_export import point_spectra as draw_spectra
+    from sweep.tasks.studies.spectra_export import draw_point_spectra as draw_spectra
     from sweep.tasks.studies.spectra_export import write_spectra
     from sweep.tasks.studies.study_loading import read_study
 

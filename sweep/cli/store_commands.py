@@ -20,11 +20,11 @@ from sweep.cli.terminal import (
     shorten_path,
 )
 from sweep.messages import counted, escape_to_one_line, shell_command
-from sweep.storage.locations import Location, file_sizes_below, output_dir
+from sweep.storage.locations import Location, derived_files_dir, file_sizes_below
 
 if TYPE_CHECKING:
     from sweep.analysis.answers.comparison import OpenedStore
-    from sweep.tasks.studies.store_verification import Report
+    from sweep.tasks.studies.store_verification import VerificationReport
 
 EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
 """Exit codes of verify for a damaged store, and of compare for different results."""
@@ -40,34 +40,40 @@ def status(store: Location) -> None:
 
     For a study with draws, a table has the number of points within accuracy.tolerance.
     """
-    from sweep.tasks.engine.progress import amount_text, duration_text
+    from sweep.tasks.engine.progress import duration_text, point_count_text
     from sweep.tasks.studies.store_summary import status as read_status
 
     store_status = read_status(store)
-    time_left = duration_text(store_status.left) if store_status.rate else "unknown"
+    time_left = (
+        duration_text(store_status.seconds_left) if store_status.points_per_second else "unknown"
+    )
     click.echo(
         f"{escape_to_one_line(store_status.title or store)}\nstudy "
         f"{escape_to_one_line(store_status.study_id)}"
     )
     points_begun_text = (
-        f", {amount_text(store_status.points_begun)} more begun"
-        if store_status.points_begun
+        f", {point_count_text(store_status.points_in_unfinished_blocks)} more begun"
+        if store_status.points_in_unfinished_blocks
         else ""
     )
     draws_text = f", {counted(store_status.draws_done, 'draw')}" if store_status.draws_done else ""
     echo_wrapped(
-        f"{store_status.points_done:,} of {store_status.points:,} {store_status.unit}, "
+        f"{store_status.points_done:,} of {store_status.points:,} {store_status.points_noun}, "
         f"{store_status.blocks_done:,} of {counted(store_status.blocks, 'block')}"
-        f"{points_begun_text}{draws_text}, {decimal(store_status.bytes)} stored"
+        f"{points_begun_text}{draws_text}, {decimal(store_status.bytes_stored)} stored"
     )
-    if store_status.rate:
-        rate_text = f"{float(f'{store_status.rate:.3g}'):,.12g} {store_status.unit}/s"
-        click.echo(f"{rate_text} in the last run, by {counted(store_status.workers, 'worker')}")
-    if store_status.holder_lives and store_status.holder:
+    if store_status.points_per_second:
+        rate_text = (
+            f"{float(f'{store_status.points_per_second:.3g}'):,.12g} {store_status.points_noun}/s"
+        )
+        click.echo(
+            f"{rate_text} in the last run, by {counted(store_status.workers_in_last_run, 'worker')}"
+        )
+    if store_status.is_lock_holder_alive and store_status.lock_holder:
         echo_wrapped(
-            f"running: process {escape_to_one_line(store_status.holder.pid)} on "
-            f"{escape_to_one_line(store_status.holder.host)}, {time_left} left, "
-            f"last heartbeat {duration_text(store_status.heartbeat)} ago"
+            f"running: process {escape_to_one_line(store_status.lock_holder.pid)} on "
+            f"{escape_to_one_line(store_status.lock_holder.host)}, {time_left} left, "
+            f"last heartbeat {duration_text(store_status.heartbeat_age)} ago"
         )
     elif store_status.complete:
         click.echo("complete")
@@ -84,19 +90,19 @@ def status(store: Location) -> None:
         retry_command = shell_command("resume", store, retry_failed=True)
         click.echo(f"{retry_command}  tries failed blocks again.")
     if store_status.blocks_done:
-        print_accuracy(store, store_status.done)
+        print_accuracy(store, store_status.done_blocks)
 
 
 def _print_pending_replacement(store: Location) -> None:
     """Print that a store is being extended or replaced, if so."""
     from sweep.storage.locations import resolve_links
-    from sweep.tasks.engine.journal import EXTENDS_KEY, read_recipe
+    from sweep.tasks.engine.journal import EXTENDED_STORE_KEY, read_recipe
     from sweep.tasks.engine.progress import StoreError
-    from sweep.tasks.engine.study_store import pending_replacement
+    from sweep.tasks.engine.study_store import find_pending_replacement
 
     try:
-        if staging_store := pending_replacement(resolve_links(store)):
-            action = "extended" if EXTENDS_KEY in read_recipe(staging_store) else "replaced"
+        if staging_store := find_pending_replacement(resolve_links(store)):
+            action = "extended" if EXTENDED_STORE_KEY in read_recipe(staging_store) else "replaced"
             click.echo(
                 f"being {action}: {shell_command('status', staging_store)}  says how far that is."
             )
@@ -141,7 +147,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
     reports = verify_stores(store, repair=repair, spec=load(spec_file) if spec_file else None)
     for report in reports:
         _print_verify_report(report)
-    if not all(report.sound for report in reports):
+    if not all(report.is_undamaged for report in reports):
         _print_verify_remedies(store, reports)
         sys.exit(EXIT_DAMAGED)
     if not all(report.complete for report in reports):
@@ -176,40 +182,40 @@ def finalize(store: Location, output: Location | None) -> None:
     )
 
 
-def _print_verify_report(report: Report) -> None:
+def _print_verify_report(report: VerificationReport) -> None:
     """Print restored, damaged and foreign objects of a store, and its number of sound blocks."""
     store = shorten_path(report.store)
-    for name in report.restored:
+    for name in report.restored_objects:
         click.echo(f"{store}: {name} put back")
     for damage in report.damages[:LISTED_OBJECTS_MAX]:
         block = f"block {damage.block}: " if damage.block >= 0 else ""
-        echo_wrapped(f"{store}: {block}{damage.object} {damage.what}", err=True)
+        echo_wrapped(f"{store}: {block}{damage.object_name} {damage.description}", err=True)
     if len(report.damages) > LISTED_OBJECTS_MAX:
         click.echo(f"and {len(report.damages) - LISTED_OBJECTS_MAX:,} more", err=True)
-    if report.foreign:
-        listed_names = ", ".join(report.foreign[:LISTED_OBJECTS_MAX])
-        omitted_text = f" and {len(report.foreign) - LISTED_OBJECTS_MAX:,} more"
+    if report.foreign_objects:
+        listed_names = ", ".join(report.foreign_objects[:LISTED_OBJECTS_MAX])
+        omitted_text = f" and {len(report.foreign_objects) - LISTED_OBJECTS_MAX:,} more"
         echo_wrapped(
             f"{store}: not sweep's, and left alone: {listed_names}"
-            f"{omitted_text if len(report.foreign) > LISTED_OBJECTS_MAX else ''}"
+            f"{omitted_text if len(report.foreign_objects) > LISTED_OBJECTS_MAX else ''}"
         )
     if report.blocks:
         echo_wrapped(
-            f"{store}: {report.whole:,} of {counted(report.blocks, 'block')} committed "
+            f"{store}: {report.undamaged_blocks:,} of {counted(report.blocks, 'block')} committed "
             "and undamaged"
         )
 
 
-def _print_verify_remedies(store: Location, reports: list[Report]) -> None:
+def _print_verify_remedies(store: Location, reports: list[VerificationReport]) -> None:
     """Print the commands that repair the reported damage."""
     for report in reports:
-        if report.unmarked:
+        if report.withdrawal_error:
             echo_wrapped(
-                f"Damaged blocks are not marked for resume: {report.unmarked}. "
+                f"Damaged blocks are not marked for resume: {report.withdrawal_error}. "
                 "Verify again when that is settled.",
                 err=True,
             )
-    remedies = {damage.mended_by for report in reports for damage in report.damages}
+    remedies = {damage.repaired_by for report in reports for damage in report.damages}
     if "repair" in remedies:
         repair_command = shell_command("verify", store, repair=True)
         click.echo(f"{repair_command}  puts back what is not results.", err=True)
@@ -244,7 +250,7 @@ def report(store: Location, output: Path | None) -> None:
     from sweep.tasks.studies.study_loading import read_study
 
     read_study(store)
-    file = output or output_dir(store) / f"{store.name.removesuffix('.zarr')}-report.html"
+    file = output or derived_files_dir(store) / f"{store.name.removesuffix('.zarr')}-report.html"
     with show_activity("making the page"):
         write_report(store, file)
     click.echo(f"{shorten_path(file)}: {file.stat().st_size / 1e6:.1f} MB")

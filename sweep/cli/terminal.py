@@ -316,11 +316,11 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
             print_inconsistencies(outcome.store)
         except Exception as error:  # without the tables the study is still computed
             echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
-    for scanner, rays in outcome.rays.items():
+    for scanner, rays in outcome.rays_by_scanner.items():
         rays_text = f"{counted(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {rays_text}")
     echo_wrapped(
-        f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
+        f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.points_noun}, "
         f"computed {outcome.blocks_computed:,} of {counted(outcome.blocks, 'block')} "
         f"in {duration_text(outcome.seconds)}"
     )
@@ -332,8 +332,10 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
     for failure in outcome.failures[:5]:
         echo_wrapped(f"block {failure.block} failed: {failure.error}", err=True)
     blocks_left = outcome.blocks - outcome.blocks_done
-    n_failed = len(outcome.failures) + outcome.left_out
-    reason = outcome.stopped or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
+    n_failed = len(outcome.failures) + outcome.blocks_skipped
+    reason = (
+        outcome.stop_reason or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
+    )
     click.echo(
         f"Incomplete, {blocks_left:,} of {counted(outcome.blocks, 'block')} left: {reason}.",
         err=True,
@@ -400,7 +402,7 @@ def _sampled_share_text(block_share: float) -> str:
 
 def _print_scene_summary(store: Location) -> None:
     """Print the table of shots and points by scanner."""
-    from sweep.tasks.studies.store_summary import scene_summary
+    from sweep.tasks.studies.store_summary import flight_summary
 
     print_table(
         "Shots and points by scanner",
@@ -414,7 +416,7 @@ def _print_scene_summary(store: Location) -> None:
                 f"{row.false_points:,}",
                 f"{100 * row.solved_cycles / row.n_cycles:.1f} %" if row.n_cycles else "-",
             ]
-            for row in scene_summary(store)
+            for row in flight_summary(store)
         ],
     )
 
@@ -461,9 +463,9 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
     """Print points without results, the uncertainty of draws, and the error of few beamlets."""
     from sweep.tasks.studies import study_loading
     from sweep.tasks.studies.store_summary import (
+        accuracy_rows_of_draws,
+        accuracy_rows_of_rays,
         count_unsupported_points,
-        draw_accuracy_rows,
-        ray_accuracy_rows,
     )
 
     n_unsupported, reason = count_unsupported_points(store, done_blocks)
@@ -473,7 +475,7 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
             f"{reason}"
         )
         echo_wrapped(f"warning: {message}", err=True)
-    if rows := draw_accuracy_rows(store, done_blocks):
+    if rows := accuracy_rows_of_draws(store, done_blocks):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
             + _sampled_share_text(rows[0].block_fraction),
@@ -481,12 +483,12 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
             [
                 [
                     row.name,
-                    f"{row.n_met:,} of {row.n_points:,}",
+                    f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
                     f"{row.excess:.2g}",
-                    f"{row.samples_at_worst:,}",
+                    f"{row.samples_at_worst_point:,}",
                     f"{row.draws_needed:,.0f}" if row.draws_needed < float("inf") else "-",
-                    row.worst_label,
+                    row.worst_point_label,
                 ]
                 for row in rows
             ],
@@ -494,7 +496,7 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
         )
     if reason := unchecked_beamlets_reason(study_loading.read_study(store)[1].spec):
         echo_wrapped(f"Not checked: {reason}.")
-    if rays := ray_accuracy_rows(store, done_blocks):
+    if rays := accuracy_rows_of_rays(store, done_blocks):
         ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
             f"What more {ray_noun} may change{_sampled_share_text(rays[0].block_fraction)}",
@@ -503,10 +505,10 @@ def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> No
                 [
                     row.name,
                     f"{row.mean_samples:,.0f}, at most {row.samples_max:,}",
-                    f"{row.n_met:,} of {row.n_points:,}",
+                    f"{row.n_points_within_tolerance:,} of {row.n_points:,}",
                     f"{row.worst_error:.3g}",
                     f"{row.excess:.2g}",
-                    row.worst_label,
+                    row.worst_point_label,
                 ]
                 for row in rays
             ],
@@ -649,14 +651,14 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
             f"{counted(scanner_plan.n_shots, 'shot')}, "
             + (
                 "eyepoints are there already"
-                if scanner_plan.is_cast
+                if scanner_plan.has_eyepoints
                 else f"{counted(scanner_plan.n_rays, 'ray')} at "
                 f"{1e6 * scanner_plan.seconds_per_ray:.3g} us on one core"
             ),
         )
         yield "", f"{1e6 * scanner_plan.seconds_per_draw:,.0f} us a shot and draw on one core"
     scene_coverage = sample_coverage(spec)
-    for scanner in scene_coverage.scanners:
+    for scanner in scene_coverage.scanner_hits:
         yield "hits", f"{scanner.name}: {scanner.hits_text()}"
     yield "extents", scene_coverage.extents_text()
     n_axis_points = math.prod(int(axis.size) for axis in spec.axes)
@@ -739,9 +741,9 @@ def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
 
     Raise SceneError for a flight whose beams never hit the scene.
     """
-    from sweep.tasks.studies.study_warnings import spec_warnings
+    from sweep.tasks.studies.study_warnings import iter_spec_warnings
 
-    for warning in spec_warnings(spec):
+    for warning in iter_spec_warnings(spec):
         echo_wrapped(f"warning: {warning}", err=True)
     for sentence in spec.unstated_error_sentences():
         echo_wrapped(f"note: {sentence}", err=True)
@@ -788,7 +790,7 @@ def _effect_cells(row: EffectRow) -> list[str]:
         if row.change_bound == 0 and row.mode == "on"
         else "everywhere"
         if row.simulated_fraction == 1
-        else row.simulated_at or f"nowhere; most at {row.largest_change_at}",
+        else row.simulated_region or f"nowhere; most at {row.largest_change_region}",
     ]
 
 

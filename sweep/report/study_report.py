@@ -46,7 +46,7 @@ from sweep.report.html_page import (
 from sweep.spec import GridSpec, SceneSpec, SlicesFigure, SurfaceFigure
 from sweep.spec.noise_alarms import alarm_probabilities
 from sweep.spec.sections import parameter_rules
-from sweep.storage.locations import Location, atomic_path, parse_location
+from sweep.storage.locations import Location, parse_location, write_path_atomically
 from sweep.storage.store_format import parse_software_versions
 
 PAGE_LIMITS = ChartSizeLimits(
@@ -110,7 +110,7 @@ def write_report(store: str | Location, file: str | Path) -> Path:
         read_attributes_of_kind(store, GRID_KIND)  # raises an error that names its kind
     page = _scene_report(store) if kind == SCENE_KIND else _grid_report(store)
     html = render_html(page)
-    with atomic_path(file, replace=True) as draft_path:
+    with write_path_atomically(file, replace=True) as draft_path:
         draft_path.write_text(html, encoding="utf-8")
     return file
 

@@ -20,46 +20,48 @@ from sweep.safe_json import parse_json
 from sweep.storage.size_checks import METADATA_BYTES_MAX
 
 #: Patterns of files that operating systems and file managers leave in any folder.
-LITTER_PATTERNS = (
+IGNORABLE_FILE_PATTERNS = (
     ".DS_Store", "._*", ".snakemake_timestamp", ".nfs*", ".fuse_hidden*", ".directory",
     "Thumbs.db", "desktop.ini",
 )  # fmt: skip
 
 _JOURNAL_DIR = ".sweep"
-_JOURNAL_FILE_NAME = re.compile(
+_JOURNAL_FILE_NAME_PATTERN = re.compile(
     r"(receipts|failures|sessions|template)\.jsonl|recipe\.json|partial|begun-\d+|"
     r"lock(\.guard|\.[0-9a-f]{32})?|clock-\d+-[0-9a-f]{8}"
 )
-"""Names of the files that sweep writes into a journal."""
+"""Pattern of the names of the files that sweep writes into a journal."""
 
-_DRAFT_NAME = re.compile(r".+\.[0-9a-f]{32}\.partial")
-"""Names of unfinished drafts."""
+_DRAFT_FILE_NAME_PATTERN = re.compile(r".+\.[0-9a-f]{32}\.partial")
+"""Pattern of the names of files that were not written completely."""
 
 
-def is_litter(name: str) -> bool:
-    """Tell whether a file is one that operating systems and file managers leave in any folder.
+def is_ignorable_file(name: str) -> bool:
+    """Tell from its name whether a file was left by an operating system or a file manager.
 
-    >>> is_litter(".DS_Store"), is_litter("pd_up/.nfs000000000123"), is_litter("notes.txt")
-    (True, True, False)
+    >>> is_ignorable_file(".DS_Store"), is_ignorable_file("pd_up/.nfs000000000123")
+    (True, True)
+    >>> is_ignorable_file("notes.txt")
+    False
     """
     base_name = name.rstrip("/").rpartition("/")[2]
-    return any(fnmatch(base_name, pattern) for pattern in LITTER_PATTERNS)
+    return any(fnmatch(base_name, pattern) for pattern in IGNORABLE_FILE_PATTERNS)
 
 
-def is_draft(name: str) -> bool:
-    """Tell whether a file is a draft that sweep did not finish writing."""
-    return bool(_DRAFT_NAME.fullmatch(name))
+def is_draft_file(name: str) -> bool:
+    """Tell from its name whether a file is a draft that sweep did not finish writing."""
+    return bool(_DRAFT_FILE_NAME_PATTERN.fullmatch(name))
 
 
 def list_foreign_files(store: Path) -> list[str]:
     """List foreign files and folders of a store, by relative path; folders end in a slash."""
-    node_names = _node_names(store)
+    node_names = _read_node_names(store)
     return sorted(
         _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
     )
 
 
-def _node_names(store: Path) -> set[str]:
+def _read_node_names(store: Path) -> set[str]:
     """Return the names of a store's arrays and groups, as far as its documents can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -87,7 +89,7 @@ def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
 def _iter_foreign_files(
     folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
 ) -> Iterator[str]:
-    """Yield foreign files and folders below a folder of a store."""
+    """Yield the paths, relative to the store, of foreign files and folders below a folder."""
     with os.scandir(folder) as entries:
         for entry in entries:
             name, is_folder = prefix + entry.name, entry.is_dir(follow_symlinks=False)
@@ -100,14 +102,14 @@ def _iter_foreign_files(
                     Path(entry.path), f"{name}/", node_names, known_folders
                 )
                 yield from nested_foreign_files if is_folder else ()
-            elif is_folder or not (entry.name == "zarr.json" or is_draft(entry.name)):
+            elif is_folder or not (entry.name == "zarr.json" or is_draft_file(entry.name)):
                 yield f"{name}/" if is_folder else name
 
 
 def _iter_foreign_journal_files(folder: str) -> Iterator[str]:
     with os.scandir(folder) as entries:
         for entry in entries:
-            if not (_JOURNAL_FILE_NAME.fullmatch(entry.name) or is_draft(entry.name)):
+            if not (_JOURNAL_FILE_NAME_PATTERN.fullmatch(entry.name) or is_draft_file(entry.name)):
                 slash = "/" if entry.is_dir(follow_symlinks=False) else ""
                 yield f"{_JOURNAL_DIR}/{entry.name}{slash}"
 
@@ -132,7 +134,7 @@ def move_foreign_files(old_store: Path, new_store: Path) -> None:
     if not old_store.is_dir() or old_store.is_symlink():
         return
     for name in list_foreign_files(old_store):
-        if is_litter(name):
+        if is_ignorable_file(name):
             continue
         target = new_store / name
         suffix_number = 1

@@ -82,7 +82,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 #: Error texts of the library for a truncated response body and a truncated listing.
-_CUT = ("body error", "invalid list response")
+_TRUNCATED_RESPONSE_TEXTS = ("body error", "invalid list response")
 
 _clients: dict[str, Any] = {}
 _clients_lock = threading.RLock()
@@ -111,7 +111,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the key with further parts appended."""
+        """Return the path with further parts appended to its key."""
         return self / "/".join(others)
 
     @property
@@ -142,9 +142,13 @@ class ObjectPath:
             if self.bucket_url not in _clients:
                 with translate_errors(self):
                     if not self.bucket_url.startswith("memory:"):
-                        first_client = _connect(self.bucket_url, FIRST_CONTACT_RETRY_CONFIG)
-                        _ask_twice(lambda: first_client.list_with_delimiter(self.key or None))
-                    _clients[self.bucket_url] = _connect(self.bucket_url, RETRY_CONFIG)
+                        first_client = _connect_to_bucket(
+                            self.bucket_url, FIRST_CONTACT_RETRY_CONFIG
+                        )
+                        _retry_if_truncated(
+                            lambda: first_client.list_with_delimiter(self.key or None)
+                        )
+                    _clients[self.bucket_url] = _connect_to_bucket(self.bucket_url, RETRY_CONFIG)
             return _clients[self.bucket_url]
 
     def _head_object(self) -> Any:
@@ -209,23 +213,23 @@ class ObjectPath:
                             last, is_repeated = entry["path"], False
                     return
                 except BaseError as error:
-                    if is_repeated or not _is_cut(error):
+                    if is_repeated or not _is_truncated_response(error):
                         raise
                     is_repeated = True  # list again, from the last key that was received
 
-    def _child_names(self) -> list[str]:
+    def _list_child_names(self) -> list[str]:
         with translate_errors(self):
-            listing = _ask_twice(lambda: self.client.list_with_delimiter(self.key or None))
+            listing = _retry_if_truncated(lambda: self.client.list_with_delimiter(self.key or None))
         paths = [*listing["common_prefixes"], *(entry["path"] for entry in listing["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def is_dir(self) -> bool:
         """Tell whether any keys lie under this one."""
-        return bool(self._child_names())
+        return bool(self._list_child_names())
 
     def glob(self, pattern: str) -> list[ObjectPath]:
         """Return the direct children of this key whose name matches a pattern."""
-        return [self / name for name in self._child_names() if fnmatch(name, pattern)]
+        return [self / name for name in self._list_child_names() if fnmatch(name, pattern)]
 
     def read_with_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the content of the object and its version tag, or None if it does not exist."""
@@ -235,17 +239,17 @@ class ObjectPath:
             return bytes(response.bytes()), _object_version(response.meta)
 
         with translate_errors(self), suppress(FileNotFoundError):
-            return _ask_twice(ask)
+            return _retry_if_truncated(ask)
         return None
 
-    def refuse_cut(self, content: bytes) -> None:
+    def refuse_truncated_content(self, content: bytes) -> None:
         """Raise ObjectStoreError if a response's content is shorter than the object.
 
         A proxy may send a truncated body with a matching content length, so the client can't
         notice.
         """
         if len(content) < self.size():
-            raise ObjectStoreError(errno.EIO, _cut_in_words(self.bucket_url), str(self))
+            raise ObjectStoreError(errno.EIO, _truncation_message(self.bucket_url), str(self))
 
     def put_if_unchanged(
         self, content: bytes, expected_version: ObjectVersion | None
@@ -264,28 +268,28 @@ class ObjectPath:
         return None
 
 
-def _ask_twice(ask: Callable[[], Result]) -> Result:
+def _retry_if_truncated(ask: Callable[[], Result]) -> Result:
     """Return the response of a request, which is repeated once if the response is truncated."""
     from obstore.exceptions import BaseError
 
     try:
         return ask()
     except BaseError as error:
-        if not _is_cut(error):
+        if not _is_truncated_response(error):
             raise
         return ask()
 
 
-def _is_cut(error: Exception) -> bool:
+def _is_truncated_response(error: Exception) -> bool:
     """Tell whether an error means that the body or the listing of a response was truncated."""
-    return any(words in str(error) for words in _CUT)
+    return any(words in str(error) for words in _TRUNCATED_RESPONSE_TEXTS)
 
 
 def _object_version(meta: Any) -> ObjectVersion:
     return {field: meta[field] for field in ("e_tag", "version") if meta[field] is not None}
 
 
-def _connect(bucket_url: str, retry_config: Any) -> Any:
+def _connect_to_bucket(bucket_url: str, retry_config: Any) -> Any:
     """Return the client of a bucket, with credentials and endpoint from the environment."""
     from obstore.store import MemoryStore, from_url
 
@@ -294,26 +298,29 @@ def _connect(bucket_url: str, retry_config: Any) -> Any:
     allow_http = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     options: Any = {
         **CLIENT_OPTIONS,
-        "allow_http": allow_http or _s3_endpoint().startswith("http:"),
+        "allow_http": allow_http or _s3_endpoint_url().startswith("http:"),
     }
     return from_url(bucket_url, client_options=options, retry_config=retry_config)
 
 
-def _cut_in_words(bucket_url: str) -> str:
-    return f"{_service(bucket_url)} cuts its answers short: try again, or look at the network"
+def _truncation_message(bucket_url: str) -> str:
+    return f"{_service_name(bucket_url)} cuts its answers short: try again, or look at the network"
 
 
-def _service(bucket_url: str) -> str:
-    return _s3_endpoint() or f"the service of {bucket_url.split(':')[0]}://"
+def _service_name(bucket_url: str) -> str:
+    return _s3_endpoint_url() or f"the service of {bucket_url.split(':')[0]}://"
 
 
-def _s3_endpoint() -> str:
+def _s3_endpoint_url() -> str:
     return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
 
 
 @contextmanager
 def translate_errors(location: object) -> Iterator[None]:
-    """Raise ObjectStoreError, with the remedy, for errors of an object store; ignore file paths."""
+    """Context manager that translates errors of an object store to ObjectStoreError.
+
+    The message states the remedy. If ``location`` is a path on disk, no error is translated.
+    """
     if not isinstance(location, ObjectPath):
         yield
         return
@@ -341,7 +348,7 @@ def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
 
     ``bucket_url``: scheme and bucket that the message names.
     """
-    bucket, service = bucket_url.partition("://")[2], _service(bucket_url)
+    bucket, service = bucket_url.partition("://")[2], _service_name(bucket_url)
     error_summary = error_text.partition("\n\nDebug source")[0]
     status_match = re.search(
         r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", error_summary
@@ -368,8 +375,8 @@ def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
             errno.ETIMEDOUT,
             f"{service} does not answer in time: try again, or look at the network",
         )
-    if any(words in error_text for words in _CUT):
-        return errno.EIO, _cut_in_words(bucket_url)
+    if any(words in error_text for words in _TRUNCATED_RESPONSE_TEXTS):
+        return errno.EIO, _truncation_message(bucket_url)
     if "error sending request" in error_text or "onnect" in error_summary:
         return errno.ECONNREFUSED, (
             f"{service} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
@@ -386,7 +393,7 @@ Location = Path | ObjectPath
 def parse_location(address: str | Location) -> Location:
     """Parse the address of a store: a path, ``s3://bucket/key``, ``gs://...`` or ``az://...``.
 
-    Raise ObjectStoreError for an address that is neither.
+    Raise ObjectStoreError for any other address.
     """
     if isinstance(address, ObjectPath):
         return address
@@ -471,7 +478,7 @@ def file_sizes_below(location: Location) -> dict[str, int]:
     return {name: (location / name).lstat().st_size for name in iter_names_below(location)}
 
 
-def output_dir(location: Location) -> Path:
+def derived_files_dir(location: Location) -> Path:
     """Return the folder for files derived from a store.
 
     It is the folder of a store on disk, and the current folder for one in an object store.
@@ -528,19 +535,19 @@ def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
 STAGING_SUFFIX = ".next"
 
 #: Age at which a draft of another host counts as abandoned [s].
-ABANDONED_DRAFT_AGE = 86400.0
+ABANDONED_DRAFT_AGE_SECONDS = 86400.0
 
 #: Largest lag of a file server's clock that is tolerated [s].
-CLOCK_SKEW_MAX = 60.0
+CLOCK_SKEW_SECONDS_MAX = 60.0
 
-_LEFTOVER_NAME = re.compile(
+_LEFTOVER_NAME_PATTERN = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
     r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
 """Hidden names that dead processes leave; earlier versions wrote no host, or no start id."""
 
 #: Start id of a process that exists, but is hidden from other users.
-HIDDEN_PROCESS = -1
+HIDDEN_PROCESS_START_ID = -1
 
 
 PID_MAX = 2**31 - 1
@@ -552,7 +559,7 @@ def process_start_id(pid: int) -> int:
 
     The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
     other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
-    `HIDDEN_PROCESS` if it is hidden from this user.
+    `HIDDEN_PROCESS_START_ID` if it is hidden from this user.
     """
     import psutil
 
@@ -562,19 +569,19 @@ def process_start_id(pid: int) -> int:
         try:
             stat_line = Path(f"/proc/{pid}/stat").read_bytes()
         except OSError:
-            return HIDDEN_PROCESS if psutil.pid_exists(pid) else 0
+            return HIDDEN_PROCESS_START_ID if psutil.pid_exists(pid) else 0
         state, *fields = stat_line.rpartition(b")")[2].split()
         return 0 if state in (b"Z", b"X") else int(fields[18])
     try:
         return int(100 * psutil.Process(pid).create_time())
     except psutil.AccessDenied:
-        return HIDDEN_PROCESS
+        return HIDDEN_PROCESS_START_ID
     except psutil.Error:
         return 0
 
 
 def resolve_links(location: Location) -> Location:
-    """Follow symbolic links, so that the folder is renamed and not the link to it.
+    """Return a location with symbolic links resolved, so that renaming does not affect a link.
 
     Raise OSError if the links form a loop.
     """
@@ -591,7 +598,7 @@ def resolve_links(location: Location) -> Location:
     return resolved
 
 
-def eyepoints_path(store: Location, geometry_id: str) -> Location:
+def eyepoint_store_location(store: Location, geometry_id: str) -> Location:
     """Return the path of a geometry's eyepoint store, in a folder next to the study's store."""
     return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
@@ -607,7 +614,7 @@ def final_path_for(path: Path) -> Path:
     return path.with_name(staging_match[1]) if staging_match else path
 
 
-def is_free(location: Location) -> bool:
+def can_create_store(location: Location) -> bool:
     """Tell whether a store can be created at a location: it is missing, or an empty folder."""
     if isinstance(location, ObjectPath):
         return not location.exists()
@@ -619,7 +626,7 @@ def is_free(location: Location) -> bool:
 
 
 @contextmanager
-def atomic_path(path: Path, *, replace: bool = False) -> Iterator[Path]:
+def write_path_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a hidden path for a new file or folder, and rename it to ``path`` at the end.
 
     With ``replace``, whatever is at ``path`` is replaced.
@@ -694,13 +701,13 @@ def recover_interrupted_replace(location: Location) -> None:
         path = resolve_links(location)
         assert isinstance(path, Path)
         for name in os.listdir(path.parent):
-            if leftover_match := _LEFTOVER_NAME.fullmatch(name):
+            if leftover_match := _LEFTOVER_NAME_PATTERN.fullmatch(name):
                 with suppress(OSError):
                     _recover_leftover(path.parent / name, leftover_match)
 
 
-def store_identity(location: Location) -> tuple[int, ...] | None:
-    """Return an identity of the store at a location that no other store ever has.
+def store_fingerprint(location: Location) -> tuple[int, ...] | None:
+    """Return a fingerprint of the store at a location; no other store ever has the same.
 
     It consists of device, inode, size and times of the store's root document. Return None in an
     object store, or if the document can't be opened.
@@ -736,16 +743,16 @@ def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
 
     modified_time = draft_path.stat().st_mtime
     if leftover_match["host"] not in (None, socket.gethostname()):
-        return time.time() - modified_time < ABANDONED_DRAFT_AGE
+        return time.time() - modified_time < ABANDONED_DRAFT_AGE_SECONDS
     if leftover_match["start"]:
         return process_start_id(int(leftover_match["pid"])) in (
             int(leftover_match["start"]),
-            HIDDEN_PROCESS,
+            HIDDEN_PROCESS_START_ID,
         )
     try:  # a process that started after the draft was made has reused its writer's id
         return (
             psutil.Process(int(leftover_match["pid"])).create_time()
-            < modified_time + CLOCK_SKEW_MAX
+            < modified_time + CLOCK_SKEW_SECONDS_MAX
         )
     except psutil.Error:
         return False
@@ -757,7 +764,7 @@ def _hidden_path(path: Path, state: str) -> Path:
     unique_tag = f"{socket.gethostname()}-{process_tag}-{uuid.uuid4().hex[:8]}"
     name = (
         leftover_match["name"]
-        if (leftover_match := _LEFTOVER_NAME.fullmatch(path.name))
+        if (leftover_match := _LEFTOVER_NAME_PATTERN.fullmatch(path.name))
         else path.name
     )
     return path.with_name(f".{name}.{state}-{unique_tag}")
@@ -772,11 +779,11 @@ def _remove_tree(path: Path) -> None:
 
 
 #: Message for a disk that has free space, but no free inode for another file.
-NO_INODES_TEXT = "No inodes left on device"
+NO_FREE_INODES_MESSAGE = "No inodes left on device"
 
 
 #: Remedy for a store that can't be written, by errno.
-REMEDY_BY_ERRNO = {
+WRITE_REMEDY_BY_ERRNO = {
     errno.ENOSPC: "make room on its disk",
     errno.EDQUOT: "make room in your quota",
     errno.EMFILE: "raise the limit of open files, `ulimit -n`",
@@ -793,19 +800,19 @@ def os_error_reason(error: OSError, path: object) -> str:
     The system reports "no space" also if a disk has space, but no free inode for another file.
     """
     reason_text = error.strerror or str(error)
-    if error.errno == errno.ENOSPC and isinstance(path, Path) and _lacks_inodes(path):
-        return NO_INODES_TEXT
+    if error.errno == errno.ENOSPC and isinstance(path, Path) and _has_no_free_inodes(path):
+        return NO_FREE_INODES_MESSAGE
     return reason_text
 
 
-def write_remedy(error: OSError, place: object, otherwise: str) -> str:
+def remedy_for_write_error(error: OSError, place: object, otherwise: str) -> str:
     """Return the remedy for a path that can't be written; ``otherwise`` if the error has none."""
-    if NO_INODES_TEXT in (error.strerror, os_error_reason(error, place)):
+    if NO_FREE_INODES_MESSAGE in (error.strerror, os_error_reason(error, place)):
         return "remove files from its disk, or have one with more inodes"
-    return REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)
+    return WRITE_REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)
 
 
-def _lacks_inodes(path: Path) -> bool:
+def _has_no_free_inodes(path: Path) -> bool:
     """Tell whether the disk of a path, which need not exist, has no free inodes."""
     while not path.exists() and path != path.parent:
         path = path.parent

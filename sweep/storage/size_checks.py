@@ -35,7 +35,7 @@ ARRAY_FILE_BYTES_MAX = (1 << 31) + (1 << 25)
 
 _CHECKSUM_BYTES = 4
 _SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
-_EMPTY_INDEX_ENTRY = 2**64 - 1
+_EMPTY_SHARD_INDEX_ENTRY = 2**64 - 1
 _ZSTD_HEADER_BYTES_MAX = 18  # largest header of a zstd frame
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ZSTD_CODEC = Zstd()
@@ -74,7 +74,7 @@ class ArrayFileLayout(NamedTuple):
 
     @property
     def chunk_bytes_max(self) -> int:
-        """Size of an uncompressed chunk [bytes]; for strings the largest."""
+        """Size of an uncompressed chunk [bytes]; for strings the largest possible size."""
         if self.bytes_per_value:
             return self.values_per_chunk * self.bytes_per_value
         return 4 + self.values_per_chunk * (4 + STRING_BYTES_MAX)
@@ -90,13 +90,13 @@ class ArrayFileLayout(NamedTuple):
             + _CHECKSUM_BYTES
         )
 
-    def check_file(self, content: bytes, path_in_messages: str) -> None:
+    def check_file_decoded_sizes(self, content: bytes, path_in_messages: str) -> None:
         """Raise RefusedFileError if a chunk of a file would not decode to its expected size."""
         for chunk in self._iter_chunks(content):
-            self.check_chunk(chunk, path_in_messages)
+            self.check_chunk_decoded_size(chunk, path_in_messages)
 
     def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
-        """Yield the chunks in a file; of numeric chunks in a shard only the header."""
+        """Yield each chunk in a file; of a numeric chunk in a shard only the header."""
         if not self.chunks_per_shard:
             yield content
             return
@@ -106,11 +106,11 @@ class ArrayFileLayout(NamedTuple):
         index = np.frombuffer(
             content[index_end - self.chunks_per_shard * _SHARD_INDEX_ENTRY_BYTES : index_end], "<u8"
         ).reshape(-1, 2)
-        for offset, length in index[index[:, 0] != _EMPTY_INDEX_ENTRY].tolist():
+        for offset, length in index[index[:, 0] != _EMPTY_SHARD_INDEX_ENTRY].tolist():
             bytes_needed = min(length, _ZSTD_HEADER_BYTES_MAX) if self.bytes_per_value else length
             yield content[offset : offset + bytes_needed]
 
-    def check_chunk(self, content: bytes, path_in_messages: str) -> None:
+    def check_chunk_decoded_size(self, content: bytes, path_in_messages: str) -> None:
         """Raise RefusedFileError if a compressed chunk would not decode to its expected size.
 
         Content that is no zstd frame is left to the codecs, which refuse it.
@@ -172,7 +172,7 @@ def zstd_content_bytes(frame: bytes) -> int | None:
     return content_bytes + 256 if size_field_bytes == 2 else content_bytes
 
 
-class StoreFileLimits:
+class StoreFileSizeLimits:
     """File names of a store and their largest sizes, derived from its checked root document."""
 
     def __init__(self, root_metadata: Mapping[str, Any]) -> None:
@@ -192,7 +192,7 @@ class StoreFileLimits:
         layout = self.array_layout(file_name)
         return METADATA_BYTES_MAX if layout is None else layout.file_bytes_max
 
-    def check_content(
+    def check_decoded_size(
         self, file_name: str, content: bytes, path_in_messages: str, *, is_single_chunk: bool
     ) -> None:
         """Raise RefusedFileError if content would not decode to its expected size.
@@ -200,9 +200,11 @@ class StoreFileLimits:
         ``is_single_chunk``: the content is one chunk of a shard, not a whole file.
         """
         if layout := self.array_layout(file_name):
-            (layout.check_chunk if is_single_chunk else layout.check_file)(
-                content, path_in_messages
-            )
+            (
+                layout.check_chunk_decoded_size
+                if is_single_chunk
+                else layout.check_file_decoded_sizes
+            )(content, path_in_messages)
 
 
 class SingleWriterLocalStore(LocalStore):
@@ -217,7 +219,7 @@ class SingleWriterLocalStore(LocalStore):
 class SizeCheckedLocalStore(LocalStore):
     """Read-only store on disk that raises for files that are not regular or have a wrong size."""
 
-    def __init__(self, root: Path, limits: StoreFileLimits) -> None:
+    def __init__(self, root: Path, limits: StoreFileSizeLimits) -> None:
         super().__init__(root, read_only=True)
         self._limits = limits
 
@@ -234,7 +236,7 @@ class SizeCheckedLocalStore(LocalStore):
             content = read_below(self.root, key, bytes_max, _to_slice(byte_range))
             if byte_range is None or isinstance(byte_range, RangeByteRequest):
                 path_in_messages = f"{self.root}/{key}"
-                self._limits.check_content(
+                self._limits.check_decoded_size(
                     key, content, path_in_messages, is_single_chunk=byte_range is not None
                 )
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
@@ -282,7 +284,7 @@ def _to_slice(byte_range: Any) -> slice:
 class SizeCheckedObjectStore(ObjectStore[Any]):
     """Read-only store in an object store that raises for objects of a wrong size."""
 
-    def __init__(self, client: Any, key_prefix: str, limits: StoreFileLimits) -> None:
+    def __init__(self, client: Any, key_prefix: str, limits: StoreFileSizeLimits) -> None:
         super().__init__(client, read_only=True)
         self._key_prefix, self._limits = key_prefix, limits
 
@@ -310,7 +312,7 @@ class SizeCheckedObjectStore(ObjectStore[Any]):
             check_size(response.meta["size"], bytes_max, key)
             buffer = prototype.buffer.from_bytes(await response.bytes_async())
         if buffer is not None and (byte_range is None or isinstance(byte_range, RangeByteRequest)):
-            self._limits.check_content(
+            self._limits.check_decoded_size(
                 file_name, buffer.to_bytes(), key, is_single_chunk=byte_range is not None
             )
         return buffer

@@ -49,14 +49,14 @@ from sweep.storage.locations import (
     map_concurrently,
     read_object,
     recover_interrupted_replace,
-    store_identity,
+    store_fingerprint,
 )
 from sweep.storage.size_checks import (
     ARRAY_FILE_BYTES_MAX,
     METADATA_BYTES_MAX,
     SizeCheckedLocalStore,
     SizeCheckedObjectStore,
-    StoreFileLimits,
+    StoreFileSizeLimits,
 )
 
 #: Manifest: journal file with the digest of each object that a store has before any results.
@@ -85,7 +85,7 @@ _ATTRIBUTES_BY_STORE_KIND = {
 _COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
 """Required attributes of every store."""
 
-_STUDY_ID = re.compile(r"[0-9a-f]{32}")
+_STUDY_ID_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 _NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
 """Types of the attributes that are not text."""
@@ -97,16 +97,16 @@ _ARRAY_ATTRIBUTE_TYPES = {
 }  # fmt: skip
 """Permitted attributes of arrays, with types. xarray interprets others, such as `scale_factor`."""
 
-_FILL_VALUES_BY_TYPE: dict[str, tuple[Any, ...]] = {
+_FILL_VALUES_BY_DATA_TYPE: dict[str, tuple[Any, ...]] = {
     "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
     "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
 }  # fmt: skip
 """Permitted data types of arrays, with the permitted fill values of each."""
 
-MAP_GROUP = "scene_map"
+TERRAIN_MAP_GROUP = "scene_map"
 """Name of the group with the terrain map of a flight."""
 
-_VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+_VALID_NAME_PATTERN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 """Valid names of groups, arrays and dimensions."""
 
 _CHECKSUM_CODEC = {"name": "crc32c"}
@@ -133,7 +133,7 @@ class NotAStoreError(StoreError, ValueError):
 
 
 def read_attributes(path: Location) -> dict[str, Any]:
-    """Return the checked attributes of a store; raise as :func:`read_root_metadata`."""
+    """Return the checked attributes of a store; raise errors as :func:`read_root_metadata`."""
     attributes: dict[str, Any] = read_root_metadata(path)["attributes"]
     return attributes
 
@@ -156,8 +156,8 @@ def read_root_metadata(path: Location) -> dict[str, Any]:
         if declared_format != (3, "group", "inline"):
             raise ValueError("its root is another")
         for name, node in nodes.items():
-            _check_node(name, node)
-        _check_dimensions(nodes)
+            _check_node_metadata(name, node)
+        _check_dimension_lengths(nodes)
         flags_arrays = [f"{name}/flags" for name in attributes.get("scanners", ())]
         required_arrays = ["effects"] if attributes["kind"] == "grid" else flags_arrays
         if missing_arrays := [name for name in required_arrays if name not in nodes]:
@@ -186,20 +186,20 @@ def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
         *_ATTRIBUTES_BY_STORE_KIND.get(str(checked_attributes.get("kind")), ("no known kind",)),
     )
     attributes_as_text = checked_attributes | {
-        "software": format_versions(checked_attributes.get("software"))
+        "software": format_software_versions(checked_attributes.get("software"))
     }
     if any(
         type(attributes_as_text.get(name)) is not _NON_STRING_ATTRIBUTE_TYPES.get(name, str)
         for name in required
     ):
         raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
-    if not _STUDY_ID.fullmatch(checked_attributes["study_id"]):
+    if not _STUDY_ID_PATTERN.fullmatch(checked_attributes["study_id"]):
         why = f"its study_id is {checked_attributes['study_id'][:40]!r}, and no digest"
         raise NotAStoreError(f"{path} is not as sweep writes stores: {why}{repair_hint(path)}")
     return checked_attributes
 
 
-def format_versions(software: Any) -> Any:
+def format_software_versions(software: Any) -> Any:
     """Return software versions as text, ``numba 0.60, numpy 2.1``; return non-mappings unchanged.
 
     Attributes that are text, numbers or lists of both can be written to any file format. Stores of
@@ -212,7 +212,7 @@ def format_versions(software: Any) -> Any:
 
 def parse_software_versions(attributes: Mapping[Any, Any]) -> dict[str, str]:
     """Return the versions of the software that created a store, by name."""
-    text = str(format_versions(attributes["software"]))
+    text = str(format_software_versions(attributes["software"]))
     return dict(part.rsplit(" ", 1) for part in text.split(", ") if " " in part)
 
 
@@ -260,7 +260,7 @@ def _read_root_document(path: Location) -> dict[str, Any]:
         raise NotAStoreError(f"{path} is {description}{_nearby_stores_hint(path)}")
     run_suggestion = suggestion("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
     description = "is not a Zarr store of sweep's"
-    if names := _first_names_text(path):
+    if names := _first_file_names_text(path):
         raise NotAStoreError(
             f"{path} {description}, and has files in it ({names}): name another place, as "
             f"{run_suggestion} computes "
@@ -272,18 +272,20 @@ def _read_root_document(path: Location) -> dict[str, Any]:
     )
 
 
-_NAMES_SHOWN_MAX = 3
+_FILE_NAMES_IN_MESSAGE_MAX = 3
 """Largest number of file names in an error message."""
 
 
-def _first_names_text(path: Location) -> str:
+def _first_file_names_text(path: Location) -> str:
     """Return the names of the first files and folders in a folder, as text; '' if it has none."""
     if not isinstance(path, Path) or not path.is_dir():
         return ""
     with suppress(OSError), os.scandir(path) as entries:
-        names = sorted(entry.name for entry in islice(entries, _NAMES_SHOWN_MAX + 1))
-        names_text = ", ".join(escape_to_one_line(name) for name in names[:_NAMES_SHOWN_MAX])
-        return f"{names_text}, ..." if len(names) > _NAMES_SHOWN_MAX else names_text
+        names = sorted(entry.name for entry in islice(entries, _FILE_NAMES_IN_MESSAGE_MAX + 1))
+        names_text = ", ".join(
+            escape_to_one_line(name) for name in names[:_FILE_NAMES_IN_MESSAGE_MAX]
+        )
+        return f"{names_text}, ..." if len(names) > _FILE_NAMES_IN_MESSAGE_MAX else names_text
     return ""
 
 
@@ -297,7 +299,7 @@ def _read_json(path: Location, name: str) -> Any:
         return parse_json(read_object(path, name, METADATA_BYTES_MAX))
 
 
-def has_digest(
+def objects_match_digest(
     path: Location,
     object_names: list[str],
     expected_digest: str,
@@ -352,15 +354,15 @@ def _nearby_stores_hint(path: Location) -> str:
     return f"; stores near it: {listed_names}" if names else ""
 
 
-def _check_node(node_name: str, node: dict[str, Any]) -> None:
+def _check_node_metadata(node_name: str, node: dict[str, Any]) -> None:
     """Raise ValueError if a group or array is declared otherwise than this program declares it."""
-    if not all(map(_VALID_NAME.fullmatch, node_name.split("/"))):
+    if not all(map(_VALID_NAME_PATTERN.fullmatch, node_name.split("/"))):
         raise ValueError(f"an array has the name {node_name!r:.60}")
     if node["zarr_format"] != 3:
         raise ValueError(f"{node_name} is of the Zarr format {node['zarr_format']!r:.20}")
     if node["node_type"] == "group":
         attributes = node["attributes"]
-        if node_name != MAP_GROUP:
+        if node_name != TERRAIN_MAP_GROUP:
             # The id becomes part of a path, so it must not contain a slash.
             if not re.fullmatch("[0-9a-f]{32}", attributes["geometry_id"]):
                 raise ValueError(f"the group {node_name} has no eyepoints")
@@ -381,7 +383,9 @@ def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, 
     invalid.
     """
     data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
-    if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_TYPE.get(data_type, ()):
+    if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_DATA_TYPE.get(
+        data_type, ()
+    ):
         raise ValueError(
             f"{node_name} has values of the type {data_type!r:.40}, {fill_value!r:.40} where "
             "missing"
@@ -403,7 +407,7 @@ def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, 
         sharding = {"chunk_shape": chunk_shape, "codecs": codecs, **_SHARD_INDEX_CONFIGURATION}
         codecs = [{"name": "sharding_indexed", "configuration": sharding}]
     dims = node.get("dimension_names", [])
-    _check_shape(node_name, node["shape"], file_shape, chunk_shape, dims, value_bytes)
+    _check_array_shape(node_name, node["shape"], file_shape, chunk_shape, dims, value_bytes)
     return {
         "shape": node["shape"],
         "data_type": data_type,
@@ -419,7 +423,7 @@ def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, 
     }
 
 
-def _check_shape(
+def _check_array_shape(
     node_name: str,
     shape: list[int],
     file_shape: list[int],
@@ -434,7 +438,7 @@ def _check_shape(
         or any(type(length) is not int for length in (*shape, *chunk_lengths))
         or any(length < 0 for length in shape)
         or any(length < 1 for length in chunk_lengths)
-        or not all(map(_VALID_NAME.fullmatch, dims))
+        or not all(map(_VALID_NAME_PATTERN.fullmatch, dims))
         or math.prod(file_shape) * value_bytes > UNCOMPRESSED_FILE_BYTES_MAX
         or math.prod(
             -(-array_length // chunk_length)
@@ -445,7 +449,7 @@ def _check_shape(
         raise ValueError(f"the shape, chunks and dimensions of {node_name} don't go together")
 
 
-def _check_dimensions(nodes: Mapping[str, Any]) -> None:
+def _check_dimension_lengths(nodes: Mapping[str, Any]) -> None:
     """Raise ValueError if the arrays of a group disagree on the length of a dimension."""
     lengths: dict[tuple[str, str], int] = {}
     for node_name, node in nodes.items():
@@ -462,11 +466,11 @@ def _check_journal_files(path: Location) -> None:
 
     A link may lead out of the store, and a pipe may never end.
     """
-    for name, problem in irregular_journal_files(path).items():
+    for name, problem in find_irregular_journal_files(path).items():
         raise NotAStoreError(f"{path}/{name} {problem}: remove it")
 
 
-def irregular_journal_files(path: Location) -> dict[str, str]:
+def find_irregular_journal_files(path: Location) -> dict[str, str]:
     """Return links, pipes and devices in a store's journal: their kind in words, by name."""
     if not isinstance(path, Path) or not (path / JOURNAL_DIR).is_dir():
         return {}
@@ -490,7 +494,7 @@ class StoreReplacedError(PrintableError, ValueError):
 class StudyBoundLocalStore(SizeCheckedLocalStore):
     """Store on disk that refuses every read once another study's store has its path."""
 
-    def __init__(self, root: Path, limits: StoreFileLimits, study_id: str) -> None:
+    def __init__(self, root: Path, limits: StoreFileSizeLimits, study_id: str) -> None:
         super().__init__(root, limits)
         self._study_id = study_id
         self._last_identity: tuple[int, ...] | None = None
@@ -504,7 +508,7 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
     def _check_same_study(self) -> None:
         """Raise StoreReplacedError if the store at the path has another study id."""
-        identity = store_identity(self.root)
+        identity = store_fingerprint(self.root)
         if identity is None or identity != self._last_identity:  # repaired or replaced
             if read_study_id(self.root) != self._study_id:
                 raise StoreReplacedError(
@@ -515,11 +519,11 @@ class StudyBoundLocalStore(SizeCheckedLocalStore):
 
 
 def open_size_checked_store(location: Location, study_id: str = "") -> Any:
-    """Open a store for Zarr or xarray, for lazy reading; raise as :func:`read_root_metadata`.
+    """Return a read-only Zarr store with size checks; raise errors as :func:`read_root_metadata`.
 
     If ``study_id`` is given, reads fail once the store is no longer that of this study.
     """
-    limits = StoreFileLimits(read_root_metadata(location))
+    limits = StoreFileSizeLimits(read_root_metadata(location))
     if isinstance(location, ObjectPath):
         return StorePath(
             SizeCheckedObjectStore(location.client, location.key, limits), location.key
@@ -538,7 +542,7 @@ RECEIPTS_FILE = "receipts.jsonl"
 LOG_LINE_BYTES_MAX = 64 << 20
 
 #: Time for which lines are collected before they are written as one object [s].
-LOG_OBJECT_INTERVAL = 1.0
+LOG_OBJECT_INTERVAL_SECONDS = 1.0
 
 #: Number of objects of a log above which they are merged, and size of a merged object [bytes].
 LOG_OBJECTS_MAX = 64
@@ -548,16 +552,16 @@ MERGED_LOG_OBJECT_BYTES = 16 << 20
 _NO_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
 
 _DIGEST_FIELD = b',"sum":"'
-_LINE_END = b'"}\n'
+_LOG_LINE_END = b'"}\n'
 
-_RECEIPT_HEAD = re.compile(
+_RECEIPT_HEAD_PATTERN = re.compile(
     rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
 )
-"""Start of a receipt: block, and points and bytes, or its withdrawal."""
+"""Pattern of the start of a receipt: block, then points and bytes, or `withdrawn`."""
 
-_RECEIPT_TIME = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
-_RECEIPT_WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
-"""Host and process id of the worker in a receipt."""
+_RECEIPT_TIME_PATTERN = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
+_RECEIPT_WORKER_PATTERN = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
+"""Pattern of host and process id of the worker in a receipt."""
 
 
 def encode_record(record: dict[str, Any]) -> bytes:
@@ -567,12 +571,12 @@ def encode_record(record: dict[str, Any]) -> bytes:
 
 def append_line_digest(line_body: bytes) -> bytes:
     """Return a log line: the encoded fields without the closing brace, and their digest."""
-    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LINE_END
+    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LOG_LINE_END
 
 
 def decode_record(line: bytes) -> dict[str, Any] | None:
     """Return the record of a log line, or None if any byte of the line has changed."""
-    line_body = verified_body(line)
+    line_body = verified_line_body(line)
     if line_body is None:
         return None
     try:
@@ -582,13 +586,15 @@ def decode_record(line: bytes) -> dict[str, Any] | None:
     return record if isinstance(record, dict) else None
 
 
-def verified_body(line: bytes) -> bytes | None:
+def verified_line_body(line: bytes) -> bytes | None:
     """Return the encoded fields of a line without the closing brace, or None if it is damaged.
 
     The fields are not parsed; the digest is checked.
     """
     line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD)
-    return line_body if digest_field and line_end == _line_digest(line_body) + _LINE_END else None
+    return (
+        line_body if digest_field and line_end == _line_digest(line_body) + _LOG_LINE_END else None
+    )
 
 
 def _line_digest(body: bytes) -> bytes:
@@ -689,13 +695,13 @@ class ObjectLog:
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write the pending lines as one object if `LOG_OBJECT_INTERVAL` has passed since the last.
+        """Write the pending lines as one object, once `LOG_OBJECT_INTERVAL_SECONDS` have passed.
 
         With ``force`` write them now. Return True if no lines are pending any more.
         """
         if not self._pending_lines:
             return True
-        if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL and not force:
+        if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL_SECONDS and not force:
             return False
         log_object = self._path / _new_log_object_name(self._last_number + 1)
         log_object.write_bytes(b"".join(self._pending_lines))
@@ -788,7 +794,7 @@ def _read_log_object(log_object: ObjectPath) -> bytes:
         content = log_object.read_bytes()
         if content.endswith(b"\n"):
             return content
-    log_object.refuse_cut(content)  # else undamaged lines would count as damaged
+    log_object.refuse_truncated_content(content)  # else undamaged lines would count as damaged
     return content
 
 
@@ -833,10 +839,10 @@ class ReceiptTotals:
     points_by_block: np.ndarray
     #: Stored size of each committed block [bytes], 0 if its receipt lacks it; (blocks,) int64.
     bytes_by_block: np.ndarray
-    first_time: float = np.inf  # time of the first receipt [s since the epoch]
-    last_time: float = -np.inf  # time of the last receipt [s since the epoch]
+    first_receipt_time: float = np.inf  # time of the first receipt [s since the epoch]
+    last_receipt_time: float = -np.inf  # time of the last receipt [s since the epoch]
     recent_points: int = 0  # number of points committed at or after `since`
-    workers: set[bytes] = field(default_factory=set)  # host and process id of their workers
+    recent_workers: set[bytes] = field(default_factory=set)  # host and process id of their workers
 
     @property
     def n_committed_blocks(self) -> int:
@@ -851,15 +857,15 @@ def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf
     """
     totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):
-        line_body = verified_body(line)
-        head = line_body and _RECEIPT_HEAD.match(line_body)
+        line_body = verified_line_body(line)
+        head = line_body and _RECEIPT_HEAD_PATTERN.match(line_body)
         if not line_body or not head or (block := int(head[1])) >= n_blocks:
             continue
         totals.points_by_block[block], totals.bytes_by_block[block] = (
             int(head[2] or 0),
             int(head[3] or 0),
         )
-        if head[2] and (time_match := _RECEIPT_TIME.search(line_body, len(line_body) - 40)):
+        if head[2] and (time_match := _RECEIPT_TIME_PATTERN.search(line_body, len(line_body) - 40)):
             _add_receipt_time(totals, line_body, int(head[2]), float(time_match[1]), since)
     return totals
 
@@ -868,11 +874,11 @@ def _add_receipt_time(
     totals: ReceiptTotals, line_body: bytes, points: int, receipt_time: float, since: float
 ) -> None:
     """Add time, recent points and worker of a receipt to the totals, in place."""
-    totals.first_time, totals.last_time = (
-        min(totals.first_time, receipt_time),
-        max(totals.last_time, receipt_time),
+    totals.first_receipt_time, totals.last_receipt_time = (
+        min(totals.first_receipt_time, receipt_time),
+        max(totals.last_receipt_time, receipt_time),
     )
     if receipt_time >= since:
         totals.recent_points += points
-        if worker := _RECEIPT_WORKER.search(line_body):
-            totals.workers.add(worker[0])
+        if worker := _RECEIPT_WORKER_PATTERN.search(line_body):
+            totals.recent_workers.add(worker[0])

@@ -39,24 +39,24 @@ from sweep.storage.store_format import (
 )
 
 #: Pattern of chunk names: the array, and the chunk's position in the grid of chunks.
-CHUNK_NAME = re.compile(r"(.+)/c((?:/\d+)*)")
+CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 
-#: Dimensions of flights along which blocks are divided; they come last in the order of blocks.
+#: Dimensions along which the shots of a flight are divided into blocks; they vary fastest.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
 #: Time that abandoned reads have to be cancelled when the program ends [s].
-PENDING_READS_TIMEOUT = 5.0
+PENDING_READS_TIMEOUT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4
 _SHARD_INDEX_ENTRY_BYTES = 16  # uint64 offset and length of a chunk in a shard
-_EMPTY_INDEX_ENTRY = 2**64 - 1
+_EMPTY_SHARD_INDEX_ENTRY = 2**64 - 1
 
 
 class DamagedChunkError(ValueError):
     """Error of a chunk that is missing, or has changed since it was written."""
 
 
-def chunk_damage(content: bytes) -> str:
+def describe_chunk_damage(content: bytes) -> str:
     """Return the damage of a chunk in words, '' if its CRC32C at the end matches."""
     if not content:
         return "is empty"
@@ -64,14 +64,14 @@ def chunk_damage(content: bytes) -> str:
     return "" if content[-_CHECKSUM_BYTES:] == checksum else "fails its checksum"
 
 
-def shard_damage(content: bytes, n_chunks: int) -> str:
+def describe_shard_damage(content: bytes, n_chunks: int) -> str:
     """Return the damage of a shard in words, '' if the checksums of its index and chunks match."""
     index_bytes = n_chunks * _SHARD_INDEX_ENTRY_BYTES + _CHECKSUM_BYTES
-    if damage := chunk_damage(content[-index_bytes:]):
+    if damage := describe_chunk_damage(content[-index_bytes:]):
         return damage
     index = np.frombuffer(content[-index_bytes:-_CHECKSUM_BYTES], "<u8").reshape(-1, 2)
-    for offset, length in index[index[:, 0] != _EMPTY_INDEX_ENTRY].tolist():
-        if chunk_damage(content[offset : offset + length]):
+    for offset, length in index[index[:, 0] != _EMPTY_SHARD_INDEX_ENTRY].tolist():
+        if describe_chunk_damage(content[offset : offset + length]):
             return "fails a checksum"
     return ""
 
@@ -105,7 +105,7 @@ class ChunkBlockMap:
         for name, node in self._arrays.items():
             if name.rpartition("/")[0] != group or self._is_in_template(name, node):
                 continue
-            array_chunks_by_dim = {dim: n for dim, n in _chunk_counts(node).items() if n > 1}
+            array_chunks_by_dim = {dim: n for dim, n in _chunk_counts_by_dim(node).items() if n > 1}
             chunks_by_dim = (
                 array_chunks_by_dim
                 if len(array_chunks_by_dim) > len(chunks_by_dim)
@@ -118,7 +118,7 @@ class ChunkBlockMap:
 
     def block_of_chunk(self, chunk_name: str) -> int:
         """Return the number of the block that writes a chunk, or -1 if no block does."""
-        name_match = CHUNK_NAME.fullmatch(chunk_name)
+        name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         block_grid = self._block_grids.get(name_match[1].rpartition("/")[0]) if name_match else None
         if (
@@ -129,7 +129,9 @@ class ChunkBlockMap:
         ):
             return -1
         first_block, chunks_by_dim = block_grid
-        position = dict(zip(_block_dims(node), map(int, name_match[2].split("/")[1:]), strict=True))
+        position = dict(
+            zip(_block_dim_names(node), map(int, name_match[2].split("/")[1:]), strict=True)
+        )
         index = 0
         for dim, count in chunks_by_dim.items():
             index = index * count + position.get(dim, 0)
@@ -137,7 +139,7 @@ class ChunkBlockMap:
 
     def chunks_per_shard(self, chunk_name: str) -> int:
         """Return the capacity of a chunk's shard file [chunks]; 0 if the file is a single chunk."""
-        name_match = CHUNK_NAME.fullmatch(chunk_name)
+        name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":
             return 0
@@ -149,15 +151,15 @@ class ChunkBlockMap:
         )
 
 
-def _chunk_counts(node: dict[str, Any]) -> dict[str, int]:
+def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
     """Return the number of chunks of an array along each dimension."""
     chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
-    lengths_by_dim = zip(_block_dims(node), node["shape"], chunk_shape, strict=True)
+    lengths_by_dim = zip(_block_dim_names(node), node["shape"], chunk_shape, strict=True)
     return {dim: -(-length // chunk_length) for dim, length, chunk_length in lengths_by_dim}
 
 
-def _block_dims(node: dict[str, Any]) -> list[str]:
-    """Return the dimensions of an array, with `shot` as `cycle`: both are divided alike."""
+def _block_dim_names(node: dict[str, Any]) -> list[str]:
+    """Return the dimension names of an array, with `cycle` for `shot`: blocks divide both alike."""
     return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
 
 
@@ -195,16 +197,16 @@ class VerifiedStore(WrapperStore[Any]):
         """Return the bytes of a file; check a chunk, and read a damaged one a second time."""
         content = await self._fetch(key, prototype, byte_range)
         name = key.removeprefix(self._prefix).lstrip("/")
-        if not CHUNK_NAME.fullmatch(name) or not (
-            damage := self._find_damage(name, content, byte_range)
+        if not CHUNK_NAME_PATTERN.fullmatch(name) or not (
+            damage := self._describe_damage(name, content, byte_range)
         ):
             return content
         # Read again: the response may be truncated, or another process may be writing the chunk.
         complete_content = await self._fetch(key, prototype, None)
-        if damage := self._find_damage(name, complete_content, None):
+        if damage := self._describe_damage(name, complete_content, None):
             if isinstance(self._location, ObjectPath) and complete_content is not None:
-                refuse_cut = (self._location / name).refuse_cut
-                await asyncio.to_thread(refuse_cut, complete_content.to_bytes())
+                refuse_truncated_content = (self._location / name).refuse_truncated_content
+                await asyncio.to_thread(refuse_truncated_content, complete_content.to_bytes())
             raise DamagedChunkError(self._damage_message(name, damage))
         return await self._fetch(key, prototype, byte_range)
 
@@ -221,15 +223,17 @@ class VerifiedStore(WrapperStore[Any]):
         """Return the checked bytes of parts of files."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
-    def _find_damage(self, name: str, content: Any, byte_range: Any) -> str:
+    def _describe_damage(self, name: str, content: Any, byte_range: Any) -> str:
         """Return the damage of a chunk in words; '' if it is sound or not yet computed."""
         if content is None:
-            return "is missing" if self._should_exist(name) else ""
+            return "is missing" if self._should_chunk_exist(name) else ""
         if byte_range is None and (n_chunks := self._block_map.chunks_per_shard(name)):
-            return shard_damage(content.to_bytes(), n_chunks)
-        return chunk_damage(content.to_bytes())  # a chunk, a chunk of a shard, or a shard index
+            return describe_shard_damage(content.to_bytes(), n_chunks)
+        return describe_chunk_damage(
+            content.to_bytes()
+        )  # a chunk, a chunk of a shard, or a shard index
 
-    def _should_exist(self, name: str) -> bool:
+    def _should_chunk_exist(self, name: str) -> bool:
         """Tell whether a chunk must exist: it was made with the store, or its block is done."""
         block_map = self._block_map
         if block_map.is_packed or name in block_map.template_objects:
@@ -285,7 +289,9 @@ def _cancel_pending_reads() -> None:
 
     for loop in _loops_with_failed_reads:
         with suppress(Exception):
-            asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(PENDING_READS_TIMEOUT)
+            asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(
+                PENDING_READS_TIMEOUT_SECONDS
+            )
 
 
 def open_verified_store(location: Location, study_id: str) -> Any:
@@ -295,8 +301,11 @@ def open_verified_store(location: Location, study_id: str) -> Any:
     )
 
 
-def open_array_group(location: Location) -> zarr.Group:
-    """Open the arrays of a store for reading; raise as :func:`.store_format.read_root_metadata`."""
+def open_verified_group(location: Location) -> zarr.Group:
+    """Open a store as a Zarr group whose chunks are checked when they are read.
+
+    Errors are raised as by :func:`.store_format.read_root_metadata`.
+    """
     store = _wrap_in_verified_store(store_format.open_size_checked_store(location), location)
     return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
 

@@ -19,9 +19,9 @@ from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
     Location,
-    eyepoints_path,
+    can_create_store,
+    eyepoint_store_location,
     final_path_for,
-    is_free,
     parse_location,
     recover_interrupted_replace,
     replace_path,
@@ -31,15 +31,15 @@ from sweep.storage.locations import (
 from sweep.storage.store_format import read_attributes, read_study_id
 from sweep.tasks.engine import user_code
 from sweep.tasks.engine.journal import (
-    EXTENDS_KEY,
-    REPLACES_KEY,
-    USER_CODE_KEY,
+    EXTENDED_STORE_KEY,
+    REPLACED_STUDY_ID_KEY,
+    USER_MODULE_DIGESTS_KEY,
     StoreLock,
     blocks_with_receipt,
     committed_blocks,
     read_recipe,
     refuse_damaged_recipe,
-    remove_recipe_predecessors,
+    remove_predecessors_from_recipe,
     wait_for_stale_lock,
     write_recipe,
 )
@@ -54,7 +54,7 @@ from sweep.tasks.engine.progress import (
 from sweep.tasks.engine.session import ComputeBackend, RunOptions, Session, SessionOutcome
 from sweep.tasks.engine.study_store import (
     create_store,
-    pending_replacement,
+    find_pending_replacement,
     refuse_damaged_template,
     refuse_foreign_files,
     refuse_other_versions,
@@ -80,7 +80,7 @@ from sweep.tasks.studies.study_loading import (
     refuse_other_study,
     reusable_points_text,
 )
-from sweep.tasks.studies.user_function_names import user_functions, user_modules
+from sweep.tasks.studies.user_function_names import iter_user_functions, user_module_names
 from sweep.tasks.studies.workload import SpecWorkload
 
 #: Interval at which a run checks whether another run has cast its rays [s].
@@ -91,14 +91,16 @@ EYEPOINT_LOCK_POLL_SECONDS = 0.5
 class Outcome(SessionOutcome):
     """Result of a run."""
 
-    rays: Mapping[str, int] = field(default_factory=dict)  # rays cast in this run, by scanner
+    rays_by_scanner: Mapping[str, int] = field(
+        default_factory=dict
+    )  # rays cast in this run, by scanner
 
     @classmethod
-    def of_session(
+    def from_session_outcome(
         cls, outcome: SessionOutcome, rays_by_scanner: Mapping[str, int] | None = None
     ) -> Outcome:
         """Return the outcome of a run: that of its last session, and the rays cast before it."""
-        return cls(**vars(outcome), rays=rays_by_scanner or {})
+        return cls(**vars(outcome), rays_by_scanner=rays_by_scanner or {})
 
 
 def run(
@@ -150,9 +152,10 @@ def run(
         raise ValueError("overwrite begins anew, and resume goes on: give one of them")
     _check_spec_type(spec)
     _check_user_functions(spec)
-    if resume and (not is_free(final_path) or pending_replacement(final_path)):
+    if resume and (not can_create_store(final_path) or find_pending_replacement(final_path)):
         wait_for_stale_lock(
-            pending_replacement(final_path) or final_path, make_progress(run_options.progress).say
+            find_pending_replacement(final_path) or final_path,
+            make_progress(run_options.progress).say,
         )
         return _resume(final_path, spec, run_options)
     backend, study = _make_backend(run_options, spec), study_loading.make_study(spec, final_path)
@@ -162,7 +165,9 @@ def run(
     from sweep.tasks.studies.study_warnings import issue_study_warnings  # the model's kernels
 
     issue_study_warnings(study, backend.progress.say)
-    return _run_into(final_path, spec, backend, replace_existing=overwrite, from_scratch=True)
+    return _compute_into_path(
+        final_path, spec, backend, replace_existing=overwrite, from_scratch=True
+    )
 
 
 def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any) -> Outcome:
@@ -195,7 +200,7 @@ def resume(store: str | Location, *, spec: AnySpec | None = None, **options: Any
 def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions) -> Outcome:
     """Resume the store at a path without links, as :func:`resume`."""
     final_path = final_path_for(final_path) if isinstance(final_path, Path) else final_path
-    working_path = pending_replacement(final_path) or final_path
+    working_path = find_pending_replacement(final_path) or final_path
     attributes, study = _read_resumable_study(working_path)
     if spec is not None:
         refuse_other_study(working_path, attributes, study.spec, spec)
@@ -207,9 +212,9 @@ def _resume(final_path: Location, spec: AnySpec | None, run_options: RunOptions)
         study = study_loading.make_study(spec, working_path)  # with the folder of the spec's files
     backend = _make_backend(run_options, study.spec)
     if working_path == final_path:
-        return _compute_missing(working_path, study, backend)
-    source = read_recipe(working_path).get(EXTENDS_KEY)
-    return _run_into(
+        return _compute_missing_blocks(working_path, study, backend)
+    source = read_recipe(working_path).get(EXTENDED_STORE_KEY)
+    return _compute_into_path(
         final_path,
         study.spec,
         backend,
@@ -273,17 +278,17 @@ def extend(
     _refuse_altered_store(source_path, attributes, source_study)
     if target_spec.id == attributes["study_id"]:
         backend.progress.say(f"nothing to extend: {source_path} holds this very study")
-        return _compute_missing(source_path, source_study, backend)
+        return _compute_missing_blocks(source_path, source_study, backend)
     refuse_not_larger_study(source_path, source_study.spec, target_spec)
     final_path = source_path if to is None else resolve_links(parse_location(to))
     if not overwrite:
-        pending_replacement(final_path)
+        find_pending_replacement(final_path)
     target_study = study_loading.make_study(target_spec, final_path)
     _check_memory(target_study, backend)
     from sweep.tasks.studies.study_warnings import issue_study_warnings  # the model's kernels
 
     issue_study_warnings(target_study, backend.progress.say)
-    return _run_into(
+    return _compute_into_path(
         final_path,
         target_spec,
         backend,
@@ -351,10 +356,10 @@ def _refuse_altered_store(
 def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy) -> None:
     """Raise a StoreError if something is at a path, or is being prepared for it."""
     staging_path, remedy = (
-        pending_replacement(store_path),
+        find_pending_replacement(store_path),
         f"{suggestion('resume', store_path)} goes on with it",
     )
-    if not is_free(store_path):
+    if not can_create_store(store_path):
         attributes, stored_study = _read_resumable_study(store_path)
         refuse_other_study(store_path, attributes, stored_study.spec, study.spec)
         n_blocks_done = int(np.count_nonzero(blocks_with_receipt(store_path, study)))
@@ -371,7 +376,7 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
     raise StoreError(f"{problem}: {remedy}, {option_text('overwrite')} begins anew")
 
 
-def _run_into(
+def _compute_into_path(
     final_path: Location,
     spec: AnySpec,
     backend: ComputeBackend,
@@ -380,14 +385,15 @@ def _run_into(
     from_scratch: bool,
     source_path: Location | None = None,
 ) -> Outcome:
-    """Compute a study into a path, or into a staging path if it is to replace a store there.
+    """Compute a study into a store at ``final_path``.
 
-    The staged store replaces the other one when it is complete.
+    If a store at that path is to be replaced, the new store is built at a staging path. It replaces
+    the old one when it is complete.
     """
     recover_interrupted_replace(final_path)
-    working_path, recipe, durable = final_path, _recipe_facts(spec), backend.options.durable
+    working_path, recipe, durable = final_path, _spec_folder_entry(spec), backend.options.durable
     with ExitStack() as stack:
-        if replace_existing and not is_free(final_path):
+        if replace_existing and not can_create_store(final_path):
             refuse_to_replace(final_path)
             if from_scratch and final_path != source_path:
                 refuse_foreign_files(final_path)
@@ -395,13 +401,13 @@ def _run_into(
         if (
             replace_existing
             and isinstance(final_path, Path)
-            and (not is_free(final_path) or staging_path_for(final_path).exists())
+            and (not can_create_store(final_path) or staging_path_for(final_path).exists())
         ):
             working_path = staging_path_for(final_path)
-            recipe[REPLACES_KEY] = read_study_id(final_path)
+            recipe[REPLACED_STUDY_ID_KEY] = read_study_id(final_path)
         if source_path is not None:
-            recipe[EXTENDS_KEY] = str(source_path)
-        already_exists = not is_free(working_path)
+            recipe[EXTENDED_STORE_KEY] = str(source_path)
+        already_exists = not can_create_store(working_path)
         study = study_loading.make_study(spec, working_path, source_path)
         if already_exists and from_scratch:
             StoreLock(
@@ -443,7 +449,7 @@ def _run_into(
                 )
 
         try:
-            outcome = _compute_missing(working_path, study, backend, prepare)
+            outcome = _compute_missing_blocks(working_path, study, backend, prepare)
         except ClusterError:
             if not already_exists:
                 remove_store(
@@ -467,7 +473,7 @@ def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
         if durable:
             sync_to_disk(staging_path)
         replace_path(staging_path, final_path)
-        remove_recipe_predecessors(
+        remove_predecessors_from_recipe(
             final_path
         )  # the store at the final path no longer extends or replaces another
 
@@ -475,18 +481,19 @@ def _replace_with_staged_store(final_path: Path, *, durable: bool) -> None:
 def _eyepoint_stores_exist(store_path: Location, study: GridStudy | FlightStudy) -> bool:
     """Return True if the eyepoint stores of all scanners exist, complete or not."""
     return isinstance(study, FlightStudy) and all(
-        eyepoints_path(store_path, eyepoints.id).exists() for eyepoints in study.eyepoint_studies()
+        eyepoint_store_location(store_path, eyepoints.id).exists()
+        for eyepoints in study.eyepoint_studies()
     )
 
 
-def _recipe_facts(spec: AnySpec) -> dict[str, str]:
-    """Return the folder of a study's files, for the recipe of its store."""
+def _spec_folder_entry(spec: AnySpec) -> dict[str, str]:
+    """Return the entry of a recipe with the folder of a flight's files; empty for a grid."""
     return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
 def _check_user_functions(spec: AnySpec) -> None:
     """Import and test the functions that a study names, if any; CodeError if one fails."""
-    if any(user_functions(spec)):
+    if any(iter_user_functions(spec)):
         from sweep.tasks.studies.user_functions import check_user_functions  # the model's kernels
 
         check_user_functions(spec)
@@ -495,8 +502,11 @@ def _check_user_functions(spec: AnySpec) -> None:
 def _warn_of_changed_user_code(
     store_path: Location, spec: AnySpec, say: Callable[[str], None]
 ) -> None:
-    """Name the user's modules that changed since a store, or the one it extends, was begun."""
-    modules = user_modules(spec)
+    """Print a message for each user module whose file has changed since a store was begun.
+
+    If the store extends another one, the file is compared with that at the start of the other one.
+    """
+    modules = user_module_names(spec)
     if not modules:
         return
     current_digests = {
@@ -504,12 +514,16 @@ def _warn_of_changed_user_code(
     }
     recipe = read_recipe(store_path)
     source_recipe = (
-        read_recipe(parse_location(recipe[EXTENDS_KEY])) if EXTENDS_KEY in recipe else {}
+        read_recipe(parse_location(recipe[EXTENDED_STORE_KEY]))
+        if EXTENDED_STORE_KEY in recipe
+        else {}
     )
     recorded_digests = (
-        current_digests | source_recipe.get(USER_CODE_KEY, {}) | recipe.get(USER_CODE_KEY, {})
+        current_digests
+        | source_recipe.get(USER_MODULE_DIGESTS_KEY, {})
+        | recipe.get(USER_MODULE_DIGESTS_KEY, {})
     )
-    write_recipe(store_path, **recipe | {USER_CODE_KEY: recorded_digests})
+    write_recipe(store_path, **recipe | {USER_MODULE_DIGESTS_KEY: recorded_digests})
     for module_name in current_digests:
         if recorded_digests[module_name] != current_digests[module_name]:
             say(
@@ -519,13 +533,13 @@ def _warn_of_changed_user_code(
             )
 
 
-def _compute_missing(
+def _compute_missing_blocks(
     store_path: Location,
     study: GridStudy | FlightStudy,
     backend: ComputeBackend,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    """Lock a store and compute its missing blocks; of a flight, its missing eyepoints first.
+    """Lock a store and compute its missing blocks, after the missing eyepoints of a flight.
 
     `prepare` creates the store if needed. It is called before the store is locked.
     """
@@ -544,26 +558,28 @@ def _compute_missing(
         _warn_of_changed_user_code(store_path, study.spec, backend.progress.say)
         session = Session(store_path, study, backend, lock)
         if isinstance(study, GridStudy):
-            return Outcome.of_session(session.run())
-        write_recipe(store_path, **read_recipe(store_path) | _recipe_facts(study.spec))
-        if _is_complete(store_path, study):
-            return Outcome.of_session(session.run())
+            return Outcome.from_session_outcome(session.run())
+        write_recipe(store_path, **read_recipe(store_path) | _spec_folder_entry(study.spec))
+        if _is_flight_complete(store_path, study):
+            return Outcome.from_session_outcome(session.run())
         rays_by_scanner, stop_reason = _cast_missing_eyepoints(study, backend)
         if (
             any(rays_by_scanner.values()) and not stop_reason
         ):  # the next stage counts the same shots from zero
             backend.progress.say("all rays are cast; simulating shots")
-        return Outcome.of_session(session.run(prior_stop_reason=stop_reason), rays_by_scanner)
+        return Outcome.from_session_outcome(
+            session.run(prior_stop_reason=stop_reason), rays_by_scanner
+        )
 
 
-def _is_complete(store_path: Location, study: FlightStudy) -> bool:
-    """Return True if all blocks are committed, and those of the eyepoint stores that exist."""
+def _is_flight_complete(store_path: Location, study: FlightStudy) -> bool:
+    """Return True if all blocks of a flight, and of its existing eyepoint stores, are committed."""
     return bool(
         blocks_with_receipt(store_path, study).all() and committed_blocks(store_path, study).all()
     ) and all(
         _is_eyepoint_store_complete(eyepoint_store_path, eyepoints)
         for eyepoints in study.eyepoint_studies()
-        if (eyepoint_store_path := eyepoints_path(store_path, eyepoints.id)).exists()
+        if (eyepoint_store_path := eyepoint_store_location(store_path, eyepoints.id)).exists()
     )
 
 
@@ -577,7 +593,7 @@ def _cast_missing_eyepoints(
     rays_by_scanner: dict[str, int] = {}
     for eyepoints in study.eyepoint_studies():
         eyepoint_store_path, scanner = (
-            eyepoints_path(study.store_path, eyepoints.id),
+            eyepoint_store_location(study.store_path, eyepoints.id),
             eyepoints.scanner,
         )
         rays_by_scanner[scanner] = 0
@@ -598,18 +614,21 @@ def _cast_missing_eyepoints(
             )
             spec = eyepoints.spec
             write_recipe(
-                eyepoint_store_path, spec=spec.to_json(), scanner=scanner, **_recipe_facts(spec)
+                eyepoint_store_path,
+                spec=spec.to_json(),
+                scanner=scanner,
+                **_spec_folder_entry(spec),
             )
             outcome = Session(eyepoint_store_path, eyepoints, backend, lock).run()
         rays_by_scanner[scanner] = eyepoints.count_rays(outcome.points_computed)
         if not outcome.complete:
-            return rays_by_scanner, f"eyepoints of '{scanner}': {outcome.why}"
+            return rays_by_scanner, f"eyepoints of '{scanner}': {outcome.incomplete_reason}"
     return rays_by_scanner, ""
 
 
 def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: EyepointStudy) -> bool:
     """Return True if an eyepoint store exists with all of its blocks."""
-    if is_free(eyepoint_store_path):
+    if can_create_store(eyepoint_store_path):
         return False
     attributes = read_attributes(eyepoint_store_path)
     if attributes["study_id"] != eyepoints.id:
@@ -628,14 +647,14 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
 def _acquire_eyepoint_lock(
     eyepoint_store_path: Location, eyepoints: EyepointStudy, backend: ComputeBackend
 ) -> StoreLock | None:
-    """Lock an eyepoint store, which is created if needed, after any other run has released it.
+    """Lock an eyepoint store once no other run holds its lock; create the store if needed.
 
-    None if the run is interrupted meanwhile.
+    Return None if the run is interrupted meanwhile.
     """
     has_announced_wait = False
     while not backend.interrupts.is_stopping:
         try:
-            if is_free(eyepoint_store_path):
+            if can_create_store(eyepoint_store_path):
                 create_store(eyepoint_store_path, eyepoints, durable=backend.options.durable)
             return StoreLock(eyepoint_store_path, backend.progress.say)
         except BusyError as error:

@@ -135,7 +135,7 @@ def played_pbs(here, monkeypatch):
         (programs / name).write_text(text.format(directory=here))
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
-    monkeypatch.setattr(jobqueue, "RESUBMIT_PAUSE", 0.2)
+    monkeypatch.setattr(jobqueue, "RESUBMIT_PAUSE_SECONDS", 0.2)
     yield here
     for pid in here.glob("job-*.pid"):
         subprocess.run([programs / "qdel", pid.stem.removeprefix("job-")], check=True)

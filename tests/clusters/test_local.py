@@ -57,7 +57,7 @@ def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):
     monkeypatch.setattr(local_ssh, "WORKER_TTL", "1 s")  # ten heartbeats at least
-    monkeypatch.setattr(dispatcher, "LEASE_SECONDS", 1.0)
+    monkeypatch.setattr(dispatcher, "WORKER_SILENCE_SECONDS", 1.0)
     pid = tmp_path / "pid"
 
     def evaluate(study, block):
@@ -93,8 +93,8 @@ class Ending(Progress):
 
 
 def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(session, "NO_WORKER_WARNING_AFTER", 1.0)
-    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    monkeypatch.setattr(session, "NO_WORKER_WARNING_SECONDS", 1.0)
+    monkeypatch.setattr(dispatcher, "WORKER_THREADS_REFRESH_SECONDS", 0.1)
     clusters, start = [], local_ssh.start_local_cluster
 
     def started(*given, **options):

@@ -80,7 +80,7 @@ def wait_for(condition, child) -> None:
 
 def workers(store) -> set[bytes]:
     """Processes that committed blocks."""
-    return read_receipt_totals(store, BLOCKS, since=0.0).workers
+    return read_receipt_totals(store, BLOCKS, since=0.0).recent_workers
 
 
 def test_a_study_in_a_job_ends_as_in_a_plain_loop(here, environment, undisturbed):

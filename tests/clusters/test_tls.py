@@ -80,7 +80,7 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
     from distributed import Security
 
     described = local(security=security, scheduler={"dashboard": "127.0.0.1:0"})
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 2.0)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 2.0)
     with cluster_connection.connect_cluster(
         described, max_workers=9, processes=True, say=lambda _: None
     ) as reached:
@@ -120,7 +120,7 @@ def refuses(address: str, security) -> None:
 def test_a_client_that_could_not_connect_is_gone_before_another_is_made(monkeypatch):
     from distributed import Client
 
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.2)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.2)
     gone, deleted = [], Client.__del__
     monkeypatch.setattr(Client, "__del__", lambda self: (gone.append(self.id), deleted(self)))
     with pytest.raises(ClusterError, match="no Dask scheduler answers") as refused:

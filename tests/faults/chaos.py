@@ -533,7 +533,7 @@ def kill_and_resume(
             outcomes.kills.update(kill.moment for kill in study.kills_done())
             if scenario.command in ("extend", "overwrite"):  # there is the old one, or the new one
                 (report,) = verify(study.store, progress=False)
-                outcomes.lost += not (report.sound and report.complete)
+                outcomes.lost += not (report.is_undamaged and report.complete)
     study.kills = []
     _run_leg(study, replace(scenario, cluster=""), outcomes, None)
     if scenario.command == "repair":
@@ -584,7 +584,7 @@ def check_store(
         report for path in {arena.store, resulting_store} for report in verify(path, progress=False)
     ]
     has_no_leftovers = set(arena.store.parent.iterdir()) == {arena.store, resulting_store}
-    is_intact = all(report.sound and report.complete for report in reports)
+    is_intact = all(report.is_undamaged and report.complete for report in reports)
     outcomes.different += not (
         file_digests(resulting_store) == file_digests(undisturbed)
         and has_no_leftovers
@@ -599,7 +599,7 @@ def prepare_parent_process() -> None:
     study = GridStudy(small_spec())
     study.compile_kernels()
     study.evaluate(0)
-    dispatcher.LEASE_SECONDS = 3.0
+    dispatcher.WORKER_SILENCE_SECONDS = 3.0
     dask.config.set({
         "distributed.worker.multiprocessing-method": "fork",
         "distributed.comm.timeouts.connect": "5s",

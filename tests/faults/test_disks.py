@@ -34,7 +34,7 @@ def mount(*options: str) -> bool:
 
 def committed_is_whole(store) -> None:
     (report,) = verify(store, progress=False)
-    assert report.sound and report.whole == len(set(receipt_blocks(store))) < 12
+    assert report.is_undamaged and report.undamaged_blocks == len(set(receipt_blocks(store))) < 12
 
 
 @pytest.mark.parametrize(
@@ -45,12 +45,12 @@ def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undistu
     assert mount("-o", f"remount,size={size}", str(disk))
     outcome = run(small_spec(), store=store, progress=False, **place)
     assert not outcome.complete
-    assert "No space left on device" in outcome.stopped and "make room" in outcome.stopped
+    assert "No space left on device" in outcome.stop_reason and "make room" in outcome.stop_reason
     committed_is_whole(store)
     before = receipt_blocks(store)
     assert len(before) == outcome.blocks_done
     again = resume(store, progress=False, **place)
-    assert not again.complete and "make room" in again.stopped
+    assert not again.complete and "make room" in again.stop_reason
     assert mount("-o", "remount,size=16M", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
     assert receipt_blocks(store)[: len(before)] == before and sorted(receipt_blocks(store)) == list(
@@ -69,8 +69,8 @@ def test_a_disk_without_inodes_is_not_told_as_a_full_one(disk):
     store = disk / "small.zarr"
     assert mount("-o", "remount,size=16M,nr_inodes=300", str(disk))
     outcome = run(small_spec(), store=store, progress=False, scheduler="none")
-    assert not outcome.complete and "No space left" not in outcome.stopped
-    assert "(No inodes left on device): remove files from its disk" in outcome.stopped
+    assert not outcome.complete and "No space left" not in outcome.stop_reason
+    assert "(No inodes left on device): remove files from its disk" in outcome.stop_reason
     committed_is_whole(store)
     other = disk / "other.zarr"
     with pytest.raises(StoreError, match=r"can't be made: No inodes left on device; remove f"):
@@ -99,7 +99,7 @@ def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, un
     evaluate = at_block(5, lambda: mount("-o", "remount,ro", str(disk)) or pytest.fail("busy"))
     outcome = run(small_spec(), store=store, progress=False, scheduler="none", evaluate=evaluate)
     assert outcome.blocks_done == 5
-    assert "Read-only file system" in outcome.stopped and "for writing" in outcome.stopped
+    assert "Read-only file system" in outcome.stop_reason and "for writing" in outcome.stop_reason
     committed_is_whole(store)
     assert not status(store).complete  # with the lock that could not be given up
     with pytest.raises(StoreError, match="can't be locked: Read-only file system"):
@@ -116,7 +116,7 @@ def test_a_folder_that_vanishes_stops_a_study_that_goes_on_when_it_is_back(
     store, elsewhere = tmp_path / "small.zarr", tmp_path / "elsewhere.zarr"
     evaluate = at_block(5, lambda: shutil.move(store, elsewhere))
     outcome = run(small_spec(), store=store, progress=False, evaluate=evaluate, **place)
-    assert "small.zarr is no longer there" in outcome.stopped and not outcome.complete
+    assert "small.zarr is no longer there" in outcome.stop_reason and not outcome.complete
     with pytest.raises(StoreError, match=r"there is no store|not a Zarr store"):
         resume(store, progress=False, scheduler="none")
     shutil.rmtree(store, ignore_errors=True)  # what another worker was at meanwhile

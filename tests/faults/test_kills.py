@@ -39,7 +39,7 @@ if __name__ == "__main__":
     store, log, slow = sys.argv[1:]
     evaluate = make_logging_evaluate(Path(log), float(slow))
     outcome = run(small_spec(), store=store, evaluate=evaluate, progress=False, workers=2)
-    print(outcome.stopped)
+    print(outcome.stop_reason)
 """
 
 ENVIRONMENT = {
@@ -92,7 +92,7 @@ def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     store = tmp_path / "small.zarr"
     committed = receipt_blocks(store)
     assert 0 < len(committed) < BLOCKS
-    assert not status(store).holder_lives
+    assert not status(store).is_lock_holder_alive
     log = tmp_path / "resumed"
     outcome = resume(store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log))
     assert outcome.complete
@@ -132,7 +132,7 @@ def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp
     with process(sys.executable, "-c", REPAIRS, str(store)) as repairs:
         assert repairs.communicate()[0] == "3\n"
     (report,) = verify(store, repair=True, progress=False)
-    assert report.sound
+    assert report.is_undamaged
     assert resume(store, progress=False, scheduler="none").complete
     assert file_digests(store) == undisturbed
 

@@ -9,7 +9,7 @@ from small_flights import small_scene_spec
 from small_studies import file_digests, receipt_blocks
 from test_kills import process, wait_for
 
-from sweep.storage.locations import eyepoints_path
+from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import resume, run
 
 CLIENT = """
@@ -18,7 +18,7 @@ from small_flights import small_scene_spec
 from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.driver import run
 
-eyepoint_study.BLOCK_SHOTS_MAX = 24
+eyepoint_study.SHOTS_PER_BLOCK_MAX = 24
 
 def slowly(study, block):
     time.sleep(0.1)
@@ -33,7 +33,7 @@ def plain(tmp_path_factory):
     """Files of the study and of its eyepoints, run as a plain loop."""
     store = tmp_path_factory.mktemp("plain") / "scene.zarr"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sweep.tasks.studies.eyepoint_study.BLOCK_SHOTS_MAX", 24)
+        patch.setattr("sweep.tasks.studies.eyepoint_study.SHOTS_PER_BLOCK_MAX", 24)
         run(small_scene_spec(), store=store, scheduler="none", progress=False)
     return file_digests(store.parent)
 
@@ -43,7 +43,7 @@ def plain(tmp_path_factory):
 def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()
-    eyepoints = eyepoints_path(store, small_scene_spec().geometry_id("three"))
+    eyepoints = eyepoint_store_location(store, small_scene_spec().geometry_id("three"))
     watched = eyepoints if stage == "casting" else store
     script = tmp_path / "client.py"
     script.write_text(CLIENT)
@@ -53,9 +53,9 @@ def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage)
         client.wait()
     before = {path: receipt_blocks(path) for path in (eyepoints, store)}
     assert before[store] == [] if stage == "casting" else len(before[store]) >= 3
-    monkeypatch.setattr("sweep.tasks.studies.eyepoint_study.BLOCK_SHOTS_MAX", 24)
+    monkeypatch.setattr("sweep.tasks.studies.eyepoint_study.SHOTS_PER_BLOCK_MAX", 24)
     outcome = resume(store, progress=False, scheduler="none")
-    assert outcome.complete and (outcome.rays["three"] == 0) == (stage == "looking")
+    assert outcome.complete and (outcome.rays_by_scanner["three"] == 0) == (stage == "looking")
     for path, committed in before.items():
         after = receipt_blocks(path)
         assert after[: len(committed)] == committed and len(set(after)) == len(after)

@@ -88,7 +88,7 @@ def _undefined_statistics(study: FlightStudy, tile: FlightBlock) -> set[str]:
     )
     if "doppler" not in existing_segments(architecture, order):
         undefined.add("pd_doppler")
-    if study.ray_accuracy is None:
+    if study.ray_error_budget is None:
         undefined.add("beamlets_error")
     is_threshold = parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) == FIXED_THRESHOLD
     has_probabilities = is_threshold and parameters.get(PEAKS_PATH) != STRONGEST_PEAK

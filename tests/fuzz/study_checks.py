@@ -113,12 +113,14 @@ def check_mistake(mistake: Mistake) -> None:
 
 def check_results(spec: GridSpec, study: GridStudy, results: Results, block: int) -> None:
     """Results of a block: all there, of the right shape, and numbers that can be."""
-    extent = study.grid.block_extent(block)
+    extent = study.grid.actual_block_shape(block)
     assert set(results) == set(study.chunk_positions(block)), "outputs are missing, or too many"
-    parameters = study.grid.parameters(block)
+    parameters = study.grid.parameters_of_block(block)
     no_doppler = np.asarray(parameters["instrument.receiver.architecture"]) == "direct"
     no_doppler = no_doppler | (np.char.find(parameters["instrument.chirp.segments"], "doppler") < 0)
-    no_doppler = np.broadcast_to(no_doppler, (study.grid.block_size(block),)).reshape(extent)
+    no_doppler = np.broadcast_to(no_doppler, (study.grid.count_block_points(block),)).reshape(
+        extent
+    )
     for name, values in results.items():
         assert values.shape[: len(extent)] == extent, f"{name} has the shape {values.shape}"
         if name.startswith(PROBABILITY_PREFIXES):

@@ -17,11 +17,11 @@ from sweep.cli import main
 from sweep.messages import suggest_shell_commands
 from sweep.regular_files import RefusedFileError
 from sweep.report import study_report
-from sweep.storage.locations import eyepoints_path, parse_location
+from sweep.storage.locations import eyepoint_store_location, parse_location
 from sweep.storage.verified_store import (
     ChunkBlockMap,
     DamagedChunkError,
-    open_array_group,
+    open_verified_group,
     open_verified_store,
 )
 from sweep.tasks.engine.study_store import chunk_names_of_block
@@ -180,10 +180,10 @@ def test_each_chunk_has_the_block_that_writes_it(request, kind):
 def test_eyepoints_are_told_with_the_study_that_has_them(flight, tmp_path):
     place = shutil.copytree(flight.parent, tmp_path / "flight")
     attributes = sweep.open_scene(place / flight.name)["three"].attrs
-    path = eyepoints_path(place / flight.name, attributes["geometry_id"])
+    path = eyepoint_store_location(place / flight.name, attributes["geometry_id"])
     flip(path / "time/c/0")
     with pytest.raises(DamagedChunkError, match=r"block 0: time/c/0 .*study that uses them"):
-        open_array_group(path)["time"][...]
+        open_verified_group(path)["time"][...]
 
 
 def test_a_packed_copy_tells_of_a_chunk_in_a_file_of_several(grid, tmp_path):

@@ -82,7 +82,7 @@ def test_the_bytes_are_those_of_a_store_on_disk_whatever_the_network_does(
     assert remote_tree(place) == file_digests(undisturbed)
     assert sorted(receipts(place)) == list(range(N_BLOCKS))
     assert read_lock_holder(parse_location(place)) is None
-    assert all(report.complete and report.sound for report in verify(place, progress=False))
+    assert all(report.complete and report.is_undamaged for report in verify(place, progress=False))
 
 
 def test_what_is_stored_opens_as_from_disk_and_says_how_far_it_is(memory, undisturbed):
@@ -122,7 +122,7 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
         "from six_block_study import six_block_spec\n"
         "from sweep.storage import store_format\n"
         "from sweep.tasks.driver import run\n"
-        "store_format.LOG_OBJECT_INTERVAL = 0\n"
+        "store_format.LOG_OBJECT_INTERVAL_SECONDS = 0\n"
         "def evaluate(study, block):\n"
         "    time.sleep(60 * (block == 3))\n"
         "    return study.evaluate(block)\n"
@@ -140,10 +140,10 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
             time.sleep(0.1)
         with pytest.raises(StoreError, match=f"is being written by process {child.pid}"):
             resume(place, scheduler="none", progress=False)
-        assert status(place).holder_lives
+        assert status(place).is_lock_holder_alive
         child.send_signal(signal.SIGKILL)
         child.wait()
-        assert not status(place).holder_lives
+        assert not status(place).is_lock_holder_alive
         assert receipts(place) == [0, 1, 2]
         outcome = resume(
             place,
@@ -174,7 +174,7 @@ def test_a_store_that_goes_away_ends_a_run_in_words_and_is_resumed(
     outcome = run(
         six_block_spec(), store=place, scheduler="none", progress=False, evaluate=fails_later
     )
-    assert not outcome.complete and "keeps failing (503" in outcome.stopped
+    assert not outcome.complete and "keeps failing (503" in outcome.stop_reason
     faults.fate = lambda *_: PASS_ON
     done = receipts(place)
     assert outcome.blocks_done == len(done) <= 3
@@ -289,7 +289,7 @@ def test_damage_is_found_and_mended(memory, undisturbed):
     chunk.write_bytes(b"x" + chunk.read_bytes()[1:])
     (parse_location(memory) / "range" / "zarr.json").unlink()
     (report,) = verify(memory, repair=True, progress=False)
-    assert report.restored == ("range/zarr.json",)
+    assert report.restored_objects == ("range/zarr.json",)
     assert {damage.block for damage in report.damages} == {2}
     outcome = resume(memory, scheduler="none", progress=False)
     assert outcome.complete and outcome.blocks_computed == 1
@@ -297,7 +297,7 @@ def test_damage_is_found_and_mended(memory, undisturbed):
 
 
 def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
-    monkeypatch.setattr(store_format, "LOG_OBJECT_INTERVAL", 1e9)
+    monkeypatch.setattr(store_format, "LOG_OBJECT_INTERVAL_SECONDS", 1e9)
     outcome = run_serially(six_block_spec(), memory)
     assert outcome.complete and outcome.blocks_computed == N_BLOCKS
     log = parse_location(memory) / JOURNAL_DIR / "receipts.jsonl"
@@ -362,7 +362,7 @@ def test_a_body_that_is_cut_is_read_once_more(faults, read_only_place, part, fat
     assert np.isfinite(dataset.pd_shot.compute()).all() and cut
     cut.clear()
     (report,) = verify(read_only_place, progress=False)
-    assert cut and report.sound and report.complete
+    assert cut and report.is_undamaged and report.complete
     assert dataset.blocks_committed == dataset.blocks
 
 
@@ -402,7 +402,7 @@ def test_a_lock_whose_answers_are_cut_is_read_once_more(faults, place, fate):
     faults.fate = one_in(3, fate, is_lock)
     outcome = run_serially(six_block_spec(), place)
     assert faults.seen[fate] > 2
-    assert outcome.complete and not outcome.stopped
+    assert outcome.complete and not outcome.stop_reason
 
 
 @pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])

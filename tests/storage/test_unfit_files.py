@@ -118,8 +118,8 @@ def test_verify_tells_what_stands_in_a_files_place(theirs, spoil, name):
     spoil(theirs / name)
     (report,) = verify(theirs, progress=False)
     (damage,) = report.damages
-    assert damage.object == name and damage.what.startswith(KINDS[spoil])
-    assert report.whole == (1 if name == CHUNK else 2)
+    assert damage.object_name == name and damage.description.startswith(KINDS[spoil])
+    assert report.undamaged_blocks == (1 if name == CHUNK else 2)
 
 
 @pytest.mark.parametrize("spoil", KINDS, ids=lambda kind: kind.__name__)
@@ -169,7 +169,7 @@ def test_a_folder_behind_a_link_is_no_part_of_a_store(theirs, tmp_path, folder):
     shutil.move(theirs / folder, tmp_path / "outside")
     (theirs / folder).symlink_to(tmp_path / "outside")
     reports = verify(theirs, progress=False)
-    named = {damage.object for report in reports for damage in report.damages}
+    named = {damage.object_name for report in reports for damage in report.damages}
     assert {f"{folder.partition('/')[0]}/c/0/0/0", COORDINATE} & named
     with pytest.raises((RefusedFileError, NotAStoreError)):
         sweep.open(theirs).pd_up.compute()
@@ -178,7 +178,7 @@ def test_a_folder_behind_a_link_is_no_part_of_a_store(theirs, tmp_path, folder):
 def test_a_store_that_is_itself_reached_through_links_is_read(made, tmp_path):
     (tmp_path / "folder").symlink_to(made.parent)
     (tmp_path / "link.zarr").symlink_to(tmp_path / "folder" / made.name)
-    assert verify(tmp_path / "link.zarr", progress=False)[0].sound
+    assert verify(tmp_path / "link.zarr", progress=False)[0].is_undamaged
     assert sweep.open(tmp_path / "link.zarr").pd_up.notnull().all()
 
 
@@ -203,7 +203,9 @@ def test_a_log_without_end_is_read_in_parts_and_mended(theirs, made):
         log.seek(0, os.SEEK_END)
         log.write(b"\n" + whole)
     (report,) = verify(theirs, progress=False)
-    assert report.whole == 2 and report.damages[0].object.startswith(".sweep/receipts")
+    assert report.undamaged_blocks == 2 and report.damages[0].object_name.startswith(
+        ".sweep/receipts"
+    )
     assert resume(theirs, progress=False, scheduler="none").blocks_computed == 0
     assert receipts.read_bytes() == whole + whole
 
@@ -248,7 +250,7 @@ def test_a_chunk_that_would_not_decode_to_its_size_is_not_decoded(theirs, bomb, 
         sweep.open(theirs).pd_up.compute()
     result = CliRunner().invoke(main, ["compare", str(theirs), str(theirs)], catch_exceptions=False)
     assert result.exit_code == 2 and why in result.output
-    assert not verify(theirs, progress=False)[0].sound
+    assert not verify(theirs, progress=False)[0].is_undamaged
 
 
 @pytest.mark.parametrize(("bomb", "why"), BOMBS.values(), ids=BOMBS)
@@ -450,4 +452,4 @@ def test_a_folder_whose_name_is_no_text_holds_stores_as_any(tmp_path, monkeypatc
         store, small_spec(axes=axes), to=folder / "b.zarr", progress=False, scheduler="none"
     )
     assert grown.complete and resume(folder / "b.zarr", progress=False, scheduler="none").complete
-    assert verify(folder / "b.zarr", progress=False)[0].sound
+    assert verify(folder / "b.zarr", progress=False)[0].is_undamaged

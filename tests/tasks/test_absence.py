@@ -48,7 +48,7 @@ class Told(Progress):
             self._at_first()
             self._at_first = lambda: None
 
-    def at_work(self, *, workers, stored):
+    def update_workers(self, *, workers, stored):
         self.work.append((workers, stored))
 
     def say(self, text):
@@ -59,8 +59,8 @@ class Told(Progress):
 @pytest.fixture
 def without_workers(monkeypatch):
     """A cluster that has none, looked at often."""
-    monkeypatch.setattr(session, "NO_WORKER_WARNING_AFTER", 0.2)
-    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    monkeypatch.setattr(session, "NO_WORKER_WARNING_SECONDS", 0.2)
+    monkeypatch.setattr(dispatcher, "WORKER_THREADS_REFRESH_SECONDS", 0.1)
     monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.1)
     with thread_cluster_client(0) as client:
         yield client
@@ -94,7 +94,7 @@ def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_
 def test_one_ctrl_c_stops_a_run_that_no_worker_will_end(tmp_path, without_workers):
     told = Told(lambda: os.kill(os.getpid(), signal.SIGINT) if len(told.lines) == 1 else None)
     outcome = run(small_spec(), store=tmp_path / "s.zarr", client=without_workers, progress=told)
-    assert outcome.stopped == "interrupted" and outcome.blocks_done == 0
+    assert outcome.stop_reason == "interrupted" and outcome.blocks_done == 0
     assert told.lines[0].startswith("no worker yet (")
 
 
@@ -104,7 +104,7 @@ def test_word_of_absent_workers_comes_ever_less_often(monkeypatch):
     absence, said = session.NoWorkerMonitor(), []
     for clock[0] in range(1000):
         workers = 1 if 300 <= clock[0] < 310 else 0
-        if absence.message(workers):
+        if absence.warning_text(workers):
             said.append(clock[0])
     assert said == [20, 40, 80, 160, 329, 349, 389, 469, 629, 949]
 
@@ -113,17 +113,17 @@ def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(
     clock = [0.0]
     monkeypatch.setattr(session.time, "monotonic", lambda: clock[0])
     absence = session.NoWorkerMonitor()
-    assert absence.message(0) == absence.message(0, has_receipts=True) == ""
-    clock[0] = session.NO_WORKER_WARNING_AFTER + 1
-    assert absence.message(0).startswith("no worker is left (")
+    assert absence.warning_text(0) == absence.warning_text(0, has_receipts=True) == ""
+    clock[0] = session.NO_WORKER_WARNING_SECONDS + 1
+    assert absence.warning_text(0).startswith("no worker is left (")
 
 
 @pytest.fixture
 def two_workers(monkeypatch):
     """A client of a cluster with two workers, whose silence is soon noticed."""
-    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    monkeypatch.setattr(dispatcher, "WORKER_THREADS_REFRESH_SECONDS", 0.1)
     monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.1)
-    monkeypatch.setattr(dispatcher, "LEASE_SECONDS", 1.0)
+    monkeypatch.setattr(dispatcher, "WORKER_SILENCE_SECONDS", 1.0)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),  # of a scheduler that is gone
         thread_cluster_client(2) as client,
@@ -164,7 +164,7 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
     assert len(receipt_blocks(outcome.store)) == len(set(receipt_blocks(outcome.store)))
     assert 3 in receipt_blocks(outcome.store)  # it ran as the run was interrupted
     if interrupted:
-        assert outcome.stopped == "interrupted"
+        assert outcome.stop_reason == "interrupted"
         assert resume(outcome.store, scheduler="none", progress=False).complete
     else:
         assert outcome.complete and outcome.blocks_computed == 12
@@ -176,7 +176,7 @@ def test_a_client_closed_before_is_told_in_words_where_blocks_are_left(undisturb
     with thread_cluster_client(1) as client:
         (client if lost == "client" else client.cluster).close()
         outcome = run(small_spec(), store=tmp_path / "s.zarr", client=client, progress=False)
-        assert outcome.stopped == "the scheduler is gone (the client is closed)"
+        assert outcome.stop_reason == "the scheduler is gone (the client is closed)"
         assert outcome.blocks_done == 0
         whole = resume(copy_store(undisturbed, tmp_path), client=client, progress=False)
     assert whole.complete and not whole.blocks_computed
@@ -210,7 +210,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path,
     told = Told(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
     path = tmp_path / "s.zarr"
     outcome = run(small_spec(), store=path, client=two_workers, progress=told, evaluate=slowly)
-    assert outcome.stopped.startswith("the scheduler is gone") and outcome.blocks_done < 12
+    assert outcome.stop_reason.startswith("the scheduler is gone") and outcome.blocks_done < 12
     assert resume(path, scheduler="none", progress=False).complete
     assert file_digests(path) == file_digests(undisturbed)
 
@@ -249,7 +249,7 @@ UNFIT = [
 def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
     undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
 ):
-    monkeypatch.setattr(dispatcher, "FILE_VISIBILITY_DELAY_MAX", 0.5)
+    monkeypatch.setattr(dispatcher, "FILE_VISIBILITY_SECONDS_MAX", 0.5)
     path = copy_store(undisturbed, tmp_path)
     (path / ".sweep" / "receipts.jsonl").unlink()
     held = GridStudy(small_spec())
@@ -269,7 +269,7 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
         time.sleep(0.02)  # so that both get some
         return study.evaluate(block)
 
-    monkeypatch.setattr(worker, "block_writer_of_store", study)
+    monkeypatch.setattr(worker, "get_block_writer", study)
     told, outcome = Told(lambda: None), None
     options = {"client": two_workers, "progress": told, "evaluate": evaluate}
     try:
@@ -282,7 +282,7 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
     )
     assert said in lines[0] and len(lines) == 1
     if all_unfit:
-        assert outcome is None or (not outcome.blocks_done and said in outcome.stopped)
+        assert outcome is None or (not outcome.blocks_done and said in outcome.stop_reason)
     else:
         assert outcome.complete and not outcome.failures
         assert file_digests(path) == file_digests(undisturbed)
@@ -304,7 +304,7 @@ def test_an_asynchronous_client_is_refused_in_words(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
     compiled = threading.Event()
-    monkeypatch.setattr(progress, "ACTIVITY_SILENT_SECONDS", 0.1)
+    monkeypatch.setattr(progress, "ACTIVITY_SHOWN_AFTER_SECONDS", 0.1)
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda self: compiled.wait(60))
     told = Told(lambda: os.kill(os.getpid(), number) if len(told.lines) == 1 else None)
     begun = time.monotonic()
@@ -313,11 +313,11 @@ def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
     finally:
         compiled.set()
     assert told.lines[0].startswith("loading the model") and time.monotonic() - begun < 50
-    assert outcome.stopped == "interrupted" and outcome.blocks_done == 0
+    assert outcome.stop_reason == "interrupted" and outcome.blocks_done == 0
 
 
 def test_an_address_at_which_no_scheduler_answers_is_told_in_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 1.0)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 1.0)
     begun = time.monotonic()
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:1: Timed out trying"):
         run(small_spec(), store=tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1", progress=False)
@@ -343,7 +343,7 @@ def test_an_only_worker_that_does_not_see_the_folder_is_named(tmp_path, monkeypa
     def unseen(path, study_id, read_study):
         raise NotAStoreError(f"there is no store at {path}")
 
-    monkeypatch.setattr(worker, "block_writer_of_store", unseen)
+    monkeypatch.setattr(worker, "get_block_writer", unseen)
     with Client(processes=False, n_workers=1, dashboard_address=None) as client:
         words = r"no worker is left: inproc://.* on .*: there is no store at .*same path"
         with pytest.raises(StoreError, match=words):

@@ -18,7 +18,7 @@ from sweep.tasks.accuracy.study_sample import (
     GridSample,
     SampleResults,
     halton_sample,
-    rows_of_whole_tiles,
+    rows_of_complete_tiles,
 )
 from sweep.tasks.engine import progress, study_store
 from sweep.tasks.studies import eyepoint_study, flight_study
@@ -77,7 +77,7 @@ def test_overrides_are_put_onto_the_spec_and_leave_it_alone():
 
 
 def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
-    ladder = settings.build_ladder(small_spec())
+    ladder = settings.build_setting_ladder(small_spec())
     kinds = [rung.kind for rung in ladder.settings]
     assert kinds[0] == settings.AS_WRITTEN_KIND and kinds[-1] == settings.REFERENCE_KIND
     adaptive = [rung for rung in ladder.settings if rung.kind == settings.ADAPTIVE_KIND]
@@ -89,7 +89,7 @@ def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
         if rung.kind in (settings.BEAMLETS_KIND, settings.LINE_PATTERN_KIND)
     ]
     numbers = [rung.overrides["footprint.beamlets"] for rung in fixed]
-    assert numbers == [*settings.TRIED_BEAMLETS, *settings.TRIED_LINE_BEAMLETS]
+    assert numbers == [*settings.TRIED_BEAMLET_COUNTS, *settings.TRIED_LINE_BEAMLET_COUNTS]
     assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)
     finest = ladder.reference.apply_to(small_spec())
     modes = finest.effect_modes()
@@ -102,13 +102,15 @@ def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
         ({"footprint": COHERENT}, "coherent"),
         ({"axes": {"footprint.beamlets": [7, 19]}}, "axis"),
     ):
-        ladder = settings.build_ladder(small_spec(**changes))
+        ladder = settings.build_setting_ladder(small_spec(**changes))
         assert not any("footprint.beamlets" in rung.overrides for rung in ladder.settings)
         (note,) = ladder.notes
         assert why in note
     assert (
         "axis"
-        in settings.build_ladder(small_spec(axes={"accuracy.tolerance": [0.1, 0.01]})).notes[0]
+        in settings.build_setting_ladder(
+            small_spec(axes={"accuracy.tolerance": [0.1, 0.01]})
+        ).notes[0]
     )
 
 
@@ -119,7 +121,7 @@ def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
         1e-6: frozenset(EFFECT_NAMES[:2]),
     }
     ladder = settings.add_fixed_effect_settings(
-        settings.build_ladder(small_spec()), small_spec(), sets
+        settings.build_setting_ladder(small_spec()), small_spec(), sets
     )
     fixed = [rung for rung in ladder.settings if rung.kind == settings.FIXED_EFFECTS_KIND]
     assert [rung.name for rung in fixed] == [
@@ -135,13 +137,13 @@ def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
 
 def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
     spec = small_spec(draws={"number": 20}, target=STUDY_MAPPING["target"] | {"roughness": "10 um"})
-    ladder = settings.build_ladder(spec)
+    ladder = settings.build_setting_ladder(spec)
     names = [rung.name for rung in ladder.settings]
     assert {"10 draws, mean", "100 draws, counts", "1000 draws, noise"} <= set(names)
     reference = ladder.reference.apply_to(spec)
     assert reference.seed != spec.seed and reference.draws.number == 10000
     assert reference.effect_modes()["speckle"] == "on"
-    many = settings.build_ladder(small_spec(draws={"number": 10**9}))
+    many = settings.build_setting_ladder(small_spec(draws={"number": 10**9}))
     assert many.settings[0].apply_to(spec).draws.number == 10000
     assert "10000 of the 1000000000 draws" in many.notes[1]
 
@@ -214,7 +216,7 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
 def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
     bench = GridSample(small_spec(footprint=COHERENT, storage={"block_points": 24}), 8)
     rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
-    grid = bench.study_with(rung).grid
+    grid = bench.study_with_setting(rung).grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
     for number in bench.point_indices:
         beside = bench._points_computed_next(rung, number, 30)
@@ -260,9 +262,9 @@ def test_a_tolerance_on_an_axis_stands_beside_that_of_the_settings(tmp_path):
 
 @pytest.mark.slow
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
-    monkeypatch.setattr(settings, "TRIED_BEAMLETS", (1, 37))
-    monkeypatch.setattr(settings, "TRIED_LINE_BEAMLETS", (33,))
-    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLETS", 7)
+    monkeypatch.setattr(settings, "TRIED_BEAMLET_COUNTS", (1, 37))
+    monkeypatch.setattr(settings, "TRIED_LINE_BEAMLET_COUNTS", (33,))
+    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLET_COUNT", 7)
     spec = small_spec(footprint={"beamlets": 7, "speckle": "none"}, accuracy={"line_error": 1e-9})
     measured(spec, store_path=tmp_path / "a.zarr", n_points=6, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load()
@@ -273,7 +275,7 @@ def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
 
 
 def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
-    monkeypatch.setattr(settings, "TRIED_DRAWS", (20, 80))
+    monkeypatch.setattr(settings, "TRIED_DRAW_COUNTS", (20, 80))
     monkeypatch.setattr(settings, "REFERENCE_DRAWS_FACTOR", 5)
     spec = small_spec(
         draws={"number": 20},
@@ -292,12 +294,14 @@ def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
 
 
 def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
-    monkeypatch.setattr(settings, "TRIED_BEAMLETS", (1, 19))
-    monkeypatch.setattr(settings, "REFERENCE_RAYS", 61)
-    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLETS", 7)
+    monkeypatch.setattr(settings, "TRIED_BEAMLET_COUNTS", (1, 19))
+    monkeypatch.setattr(settings, "REFERENCE_RAYS_PER_SHOT", 61)
+    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLET_COUNT", 7)
     store = tmp_path / "flight.zarr"
     assert (
-        settings.build_ladder(small_scene_spec()).settings[1].overrides["footprint.beamlets"]
+        settings.build_setting_ladder(small_scene_spec())
+        .settings[1]
+        .overrides["footprint.beamlets"]
         == "auto"
     )
     short = {"path": SCENE_MAPPING["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
@@ -320,10 +324,10 @@ def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch
     for module in (benches, flight_study, eyepoint_study):
         monkeypatch.setattr(module, "SHOTS_PER_TILE", 32)
     bench = FlightSample(small_scene_spec(footprint={"beamlets": 7, "speckle": "none"}), 400)
-    parts = bench.split(64)
+    parts = bench.split_into_parts(64)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
     shots = [bench.flight_block_and_shots(part) for part in parts]
-    assert len({place for place, _ in shots[:4]}) == len(bench.split(bench.size)) == 4
+    assert len({place for place, _ in shots[:4]}) == len(bench.split_into_parts(bench.size)) == 4
     assert len(parts) > 4
     tiles = [{(place, tile) for tile in (own // 32).tolist()} for place, own in shots]
     assert sum(map(len, tiles)) == len(set().union(*tiles)) and max(map(len, tiles)) == 2
@@ -337,10 +341,10 @@ def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch
 
 def test_shots_are_timed_with_so_many_that_follow_round_the_end():
     tile = np.arange(256 * 4 + 100) // 256
-    rows = rows_of_whole_tiles(tile, np.arange(768, 1024), 600)
+    rows = rows_of_complete_tiles(tile, np.arange(768, 1024), 600)
     assert np.array_equal(np.unique(tile[rows]), [0, 3, 4]) and len(rows) == 612
-    assert np.array_equal(rows_of_whole_tiles(tile, np.arange(300, 400), 1), np.arange(256, 512))
-    assert len(rows_of_whole_tiles(tile, np.arange(1), 10_000)) == len(tile)
+    assert np.array_equal(rows_of_complete_tiles(tile, np.arange(300, 400), 1), np.arange(256, 512))
+    assert len(rows_of_complete_tiles(tile, np.arange(1), 10_000)) == len(tile)
 
 
 @pytest.mark.parametrize("rays", [7, "auto"])
@@ -353,10 +357,10 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     )
     bench = FlightSample(spec, 10_000)
     rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
-    part = bench.split(1)[0]
+    part = bench.split_into_parts(1)[0]
     seen = bench.try_setting(rung, part, 1).results
-    place, numbers = bench.flight_block_and_shots(bench.extend_to_whole_tiles(part, 1))
-    study = bench.study_with(rung)
+    place, numbers = bench.flight_block_and_shots(bench.extend_to_complete_tiles(part, 1))
+    study = bench.study_with_setting(rung)
     caster = next(e for e in study.eyepoint_studies() if e.scanner == place.scanner)
     from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
@@ -456,7 +460,9 @@ def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
     """A ladder of trials a part, two parts a round."""
     bench = GridSample(small_spec(footprint=COHERENT), 8)
     asked = Broken(0)
-    tried = measurement.Measurement(bench, time_limit=60.0, progress=asked, interrupts=asked)
+    tried = measurement.AccuracyMeasurement(
+        bench, time_limit=60.0, progress=asked, interrupts=asked
+    )
     asked.left = int(trials * len(tried._setting_ladder.settings)) if kept else 3
     if not kept:
         with pytest.raises(measurement.NothingMeasured):
@@ -472,6 +478,6 @@ def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
 @pytest.mark.parametrize("law", ["off", "auto"])
 def test_segments_that_begin_at_one_range_are_the_reference_s_law_too(law):
     """The thesis's law is no omission that the reference would have to make good."""
-    reference = settings.build_ladder(small_spec(effects={"segment_motion": law})).reference
+    reference = settings.build_setting_ladder(small_spec(effects={"segment_motion": law})).reference
     assert ("effects.segment_motion" in reference.overrides) == (law == "auto")
     assert "effects.range_walk" in reference.overrides

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 from sweep.cli import main
-from sweep.tasks.studies.store_summary import draw_accuracy_rows, ray_accuracy_rows
+from sweep.tasks.studies.store_summary import accuracy_rows_of_draws, accuracy_rows_of_rays
 
 ROUGH = {
     "target": STUDY_MAPPING["target"] | {"roughness": "10 um"},
@@ -49,15 +49,17 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
     dataset = xr.open_zarr(store)
     over = {name: dataset[f"{name}_half_width"] - dataset.tolerance
             for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot")}  # fmt: skip
-    for row in draw_accuracy_rows(store):
+    for row in accuracy_rows_of_draws(store):
         assert row.excess == pytest.approx(float(over[row.name].max()), rel=1e-12)
         assert (
-            row.tolerance_at_worst == 0
+            row.tolerance_at_worst_point == 0
             and row.draws_needed == math.inf
-            and row.samples_at_worst == 400
+            and row.samples_at_worst_point == 400
         )
-        assert row.n_met == int((over[row.name] <= 0).sum()) and row.n_points == 18
-        assert names_the_place(row.worst_label, dataset, over[row.name])
+        assert (
+            row.n_points_within_tolerance == int((over[row.name] <= 0).sum()) and row.n_points == 18
+        )
+        assert names_the_place(row.worst_point_label, dataset, over[row.name])
 
 
 def names_the_place(where, dataset, over):
@@ -71,13 +73,13 @@ def test_draws_that_are_said_to_do_about_do(tmp_path):
     """A fixed number is told as well, and as many again as are said to be needed meet it."""
     axes, accuracy = {"target.range": ["2 km"]}, {"tolerance": 0.02}
     few = small_spec(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
-    rows = draw_accuracy_rows(run_serially(few, tmp_path / "few.zarr").store)
-    assert [row.n_met for row in rows] == [0, 0, 0, 0] and {
-        row.samples_at_worst for row in rows
+    rows = accuracy_rows_of_draws(run_serially(few, tmp_path / "few.zarr").store)
+    assert [row.n_points_within_tolerance for row in rows] == [0, 0, 0, 0] and {
+        row.samples_at_worst_point for row in rows
     } == {300}
     needed = int(max(row.draws_needed for row in rows))
     enough = small_spec(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
-    for row in draw_accuracy_rows(run_serially(enough, tmp_path / "enough.zarr").store):
+    for row in accuracy_rows_of_draws(run_serially(enough, tmp_path / "enough.zarr").store):
         assert row.worst_error < 0.022
 
 
@@ -93,12 +95,15 @@ def test_blocks_that_are_not_computed_are_not_told(tmp_path):
     outcome = run(spec, store=tmp_path / "half.zarr", scheduler="none", progress=False,
                   evaluate=broken)  # fmt: skip
     assert outcome.blocks_done == 1
-    assert {row.n_points for row in draw_accuracy_rows(outcome.store)} == {1}
+    assert {row.n_points for row in accuracy_rows_of_draws(outcome.store)} == {1}
     assert xr.open_zarr(outcome.store).n_draws.values[1] == -1
 
 
 def test_a_study_without_draws_has_none(tmp_path):
-    assert draw_accuracy_rows(run_serially(small_spec(axes={}), tmp_path / "none.zarr").store) == []
+    assert (
+        accuracy_rows_of_draws(run_serially(small_spec(axes={}), tmp_path / "none.zarr").store)
+        == []
+    )
 
 
 def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_path):
@@ -112,15 +117,20 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
         target=STUDY_MAPPING["target"] | {"range": "10 km"},
     )
     store = run_serially(spec, tmp_path / "wide.zarr").store
-    (row,) = ray_accuracy_rows(store)
-    assert (row.n_points, row.n_met, row.samples_max, row.worst_error) == (3, 2, 4096, 1.0)
-    assert row.worst_label == "grazing_angle 0.5 deg"
+    (row,) = accuracy_rows_of_rays(store)
+    assert (row.n_points, row.n_points_within_tolerance, row.samples_max, row.worst_error) == (
+        3,
+        2,
+        4096,
+        1.0,
+    )
+    assert row.worst_point_label == "grazing_angle 0.5 deg"
     said = CliRunner().invoke(main, ["status", str(store)]).output
     assert "What more beamlets may change" in said and "2 of 3" in said
     met = small_spec(
         footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={}
     )
-    assert ray_accuracy_rows(run_serially(met, tmp_path / "met.zarr").store) == []
+    assert accuracy_rows_of_rays(run_serially(met, tmp_path / "met.zarr").store) == []
 
 
 def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
@@ -132,10 +142,10 @@ def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
     store = run_serially(
         small_spec(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l"
     )
-    whole = draw_accuracy_rows(store.store)
+    whole = accuracy_rows_of_draws(store.store)
     assert {row.block_fraction for row in whole} == {1.0} and {row.n_points for row in whole} == {8}
     monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 2)
-    rows = draw_accuracy_rows(store.store)
+    rows = accuracy_rows_of_draws(store.store)
     assert {row.block_fraction for row in rows} == {2 / 8} and {row.n_points for row in rows} == {2}
     assert all(row.worst_error <= all_.worst_error for row, all_ in zip(rows, whole, strict=True))
     said = CliRunner().invoke(main, ["status", str(store.store)]).output

@@ -14,7 +14,7 @@ from sweep.model.sampling import samplers
 from sweep.storage.locations import ObjectPath
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine import journal, progress, worker
-from sweep.tasks.engine.block_study import PartialResults, ReusedResults
+from sweep.tasks.engine.block_study import EarlierResults, PartialResults
 from sweep.tasks.engine.journal import Checkpoint
 from sweep.tasks.engine.progress import Progress, StoreError
 from sweep.tasks.studies.grid_study import GridStudy
@@ -54,7 +54,7 @@ def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
     assign(samplers, "NOISE_DRAWS_PER_STEP", piece)
     assign(samplers, "DRAWS_PER_BATCH", rows)
     assign(samplers, "SPECTRUM_SAMPLES_PER_STEP", samples)
-    assign(worker, "CHECKPOINT_INTERVAL", seconds)
+    assign(worker, "CHECKPOINT_INTERVAL_SECONDS", seconds)
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def interrupted(spec, store, pieces=2, place=PLACES[0]):
     """A run that is told to stop, once, as soon as some pieces of a block are there."""
     told = Told(lambda told: len(told.points) == 1 + pieces and os.kill(os.getpid(), signal.SIGINT))
     outcome = run(spec, store=store, progress=told, **place)
-    assert outcome.stopped == "interrupted" and not outcome.complete
+    assert outcome.stop_reason == "interrupted" and not outcome.complete
     return told
 
 
@@ -158,15 +158,15 @@ def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(
     store = tmp_path / "stopped.zarr"
     interrupted(drawn(), store, place=place)
     assert len(saved) == 2 and left(store) == ["begun-0"] and receipt_blocks(store) == []
-    assert status(store).points_begun == saved[-1] and status(store).points_done == 0
-    assert verify(store)[0].sound and not verify(store)[0].complete
+    assert status(store).points_in_unfinished_blocks == saved[-1] and status(store).points_done == 0
+    assert verify(store)[0].is_undamaged and not verify(store)[0].complete
     with pytest.raises(StoreError, match="lacks 1 block"):
         pack_store(store, tmp_path / "packed.zarr")
     told = Told()
     assert resume(store, progress=told, **place).complete
     assert told.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
     assert file_digests(store) == whole("fixed") and left(store) == []
-    assert status(store).points_begun == 0
+    assert status(store).points_in_unfinished_blocks == 0
 
 
 KILLED = """
@@ -197,7 +197,7 @@ def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
         [sys.executable, "-c", KILLED, str(store), kind], env={**os.environ, "PYTHONPATH": here}
     )
     assert killed.returncode == -signal.SIGKILL and left(store) == ["begun-0"]
-    before = status(store).points_begun * drawn(kind).draws.number
+    before = status(store).points_in_unfinished_blocks * drawn(kind).draws.number
     monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: None)  # it draws once
     taken, real = [], samplers.Sampler.draw
 
@@ -241,7 +241,7 @@ def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved
     store = tmp_path / "damaged.zarr"
     interrupted(drawn(), store)
     damage(store / ".sweep" / "begun-0")
-    assert status(store).points_begun == 0
+    assert status(store).points_in_unfinished_blocks == 0
     saved.clear()
     assert quiet_resume(store).complete
     assert saved[0] < 0.5 and file_digests(store) == whole("fixed") and left(store) == []
@@ -255,24 +255,27 @@ def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(plac
     )
     assert (
         journal.read_checkpoint(store, "one", 7) == Checkpoint()
-        and journal.checkpoint_points(store, "one") == {}
+        and journal.read_checkpoint_points(store, "one") == {}
     )
     for points in (0.5, 0.25):  # less than there is takes no place
         journal.write_checkpoint(
-            store, "one", 7, Checkpoint(ReusedResults(begun=part), points, 1.5)
+            store, "one", 7, Checkpoint(EarlierResults(unfinished=part), points, 1.5)
         )
     found = journal.read_checkpoint(store, "one", 7)
-    assert (found.points, found.seconds) == (0.5, 1.5) and not found.results.done.local_indices.size
-    np.testing.assert_array_equal(found.results.begun.local_indices, part.local_indices)
+    assert (found.points, found.seconds) == (
+        0.5,
+        1.5,
+    ) and not found.results.finished.local_indices.size
+    np.testing.assert_array_equal(found.results.unfinished.local_indices, part.local_indices)
     for name, values in part.results.items():
-        np.testing.assert_array_equal(found.results.begun.results[name], values)
+        np.testing.assert_array_equal(found.results.unfinished.results[name], values)
     assert (
-        journal.checkpoint_points(store, "one") == {7: 0.5}
-        and journal.checkpoint_points(store, "two") == {}
+        journal.read_checkpoint_points(store, "one") == {7: 0.5}
+        and journal.read_checkpoint_points(store, "two") == {}
     )
     journal.delete_checkpoints(store, 7)
     journal.delete_checkpoints(store, 7)
-    assert journal.checkpoint_points(store, "one") == {}
+    assert journal.read_checkpoint_points(store, "one") == {}
 
 
 def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
@@ -314,7 +317,7 @@ def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
 
 
 def test_lines_tell_the_part_of_a_point(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_INTERVAL", -1.0)
+    monkeypatch.setattr(progress, "PROGRESS_LINE_INTERVAL_SECONDS", -1.0)
     lines = progress.ProgressLines()
     lines.begin(points=2, done=0, unit="points")
     for part in (0.31, 0.69, 1.0):

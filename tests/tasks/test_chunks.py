@@ -8,14 +8,14 @@ import zarr
 
 from sweep.storage import locations
 from sweep.tasks.engine.blocks import ArrayLayout
-from sweep.tasks.engine.study_store import CODECS, encode_chunk
+from sweep.tasks.engine.study_store import CHUNK_CODECS, encode_chunk
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
 
 def array_at(path, shape, chunk, dtype, fill):
     made = zarr.create_array(
-        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, compressors=CODECS
+        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, compressors=CHUNK_CODECS
     )
     return made.with_config({"write_empty_chunks": True})
 

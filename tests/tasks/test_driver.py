@@ -128,7 +128,7 @@ def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
     outcome = run(
         small_spec(), store=path, progress=progress, evaluate=make_logging_evaluate(log), **place
     )
-    assert not outcome.complete and outcome.stopped == "interrupted"
+    assert not outcome.complete and outcome.stop_reason == "interrupted"
     assert 3 <= outcome.blocks_done < 12
     assert len(logged_blocks(log)) == outcome.blocks_done  # what was begun was committed
     assert any("stopping" in text for text in progress.said)
@@ -158,7 +158,7 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     assert recorded[2]["error"] == "ValueError: nothing good comes of block 2"
     assert "Traceback" in recorded[7]["traceback"]
     again = resume(path, progress=False, scheduler="none")
-    assert not again.complete and again.left_out == 2 and again.blocks_computed == 0
+    assert not again.complete and again.blocks_skipped == 2 and again.blocks_computed == 0
     assert set(status(path).failures) == {2, 7}
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert status(path).failures == {}
@@ -188,7 +188,7 @@ def test_a_study_of_which_every_block_fails_is_given_up_early(tmp_path):
         evaluate=make_failing_evaluate(set(range(72)), log),
     )
     assert len(outcome.failures) == session.MAX_INITIAL_FAILURES
-    assert "all failed" in outcome.stopped
+    assert "all failed" in outcome.stop_reason
 
 
 def full_disk(study, block):
@@ -202,7 +202,7 @@ def full_disk(study, block):
 def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(undisturbed, tmp_path, place):
     path = tmp_path / "small.zarr"
     outcome = run(small_spec(), store=path, progress=False, evaluate=full_disk, **place)
-    assert "No space left" in outcome.stopped and not outcome.complete
+    assert "No space left" in outcome.stop_reason and not outcome.complete
     assert set(receipt_blocks(path)) <= {0, 1, 2}
     assert resume(path, progress=False, scheduler="none").complete
     assert file_digests(path) == file_digests(undisturbed)

@@ -7,7 +7,7 @@ import pytest
 
 from sweep.cli.terminal import _effect_cells
 from sweep.tasks.studies import study_plan
-from sweep.tasks.studies.study_plan import EffectRow, reproducible_share
+from sweep.tasks.studies.study_plan import EffectRow, reproducible_time_fraction
 
 
 def _clocks(with_it, without):
@@ -17,12 +17,14 @@ def _clocks(with_it, without):
 
 
 def test_times_that_repeat_give_the_share_of_the_effect():
-    share = reproducible_share([_clocks([0.2], [0.15])])
+    share = reproducible_time_fraction([_clocks([0.2], [0.15])])
     assert share == pytest.approx(0.25)
-    assert reproducible_share([_clocks([0.01], [0.005]), _clocks([0.03], [0.025])]) == (
+    assert reproducible_time_fraction([_clocks([0.01], [0.005]), _clocks([0.03], [0.025])]) == (
         pytest.approx(0.25)
     )
-    assert reproducible_share([_clocks([0.2, 0.201, 0.199], [0.15])]) == pytest.approx(0.25, 0.05)
+    assert reproducible_time_fraction([_clocks([0.2, 0.201, 0.199], [0.15])]) == pytest.approx(
+        0.25, 0.05
+    )
 
 
 @pytest.mark.parametrize(
@@ -35,8 +37,8 @@ def test_times_that_repeat_give_the_share_of_the_effect():
     ],
 )
 def test_times_that_disagree_give_no_share(with_it, without):
-    assert math.isnan(reproducible_share([_clocks(with_it, without)]))
-    assert math.isnan(reproducible_share([]))
+    assert math.isnan(reproducible_time_fraction([_clocks(with_it, without)]))
+    assert math.isnan(reproducible_time_fraction([]))
 
 
 def test_long_work_is_measured_a_few_times_only(monkeypatch):
@@ -47,9 +49,11 @@ def test_long_work_is_measured_a_few_times_only(monkeypatch):
     def clock(seconds):
         return lambda: next(readings) * 0 + seconds
 
-    share = reproducible_share([(clock(2.0), clock(1.0)), (clock(math.nan), clock(math.nan))])
+    share = reproducible_time_fraction(
+        [(clock(2.0), clock(1.0)), (clock(math.nan), clock(math.nan))]
+    )
     assert share == 0.5
-    assert next(readings) == 2 + 2 * study_plan.COST_ROUNDS_MIN
+    assert next(readings) == 2 + 2 * study_plan.EFFECT_COST_ROUNDS_MIN
 
 
 @pytest.mark.parametrize(
@@ -65,9 +69,9 @@ def test_a_plan_says_what_is_known_of_a_cost(share, cost, text):
         name="image",
         mode="auto",
         simulated_fraction=share,
-        simulated_at="",
+        simulated_region="",
         change_bound=0.1,
-        largest_change_at="the point",
+        largest_change_region="the point",
         time_fraction=cost,
     )
     assert _effect_cells(row)[2] == text

@@ -17,9 +17,9 @@ from sweep.model.effects.catalogue import (
     unpack_effect_flags,
 )
 from sweep.tasks.studies import study_plan as planned
-from sweep.tasks.studies.flight_study import _tile_runs
+from sweep.tasks.studies.flight_study import _find_tile_runs
 from sweep.tasks.studies.grid_study import (
-    TILE_POINTS_MAX,
+    POINTS_PER_TILE_MAX,
     EffectPlanner,
     GridStudy,
     SelectedEffects,
@@ -53,7 +53,7 @@ def whole(spec):
 @pytest.mark.parametrize("tiles", [[7], [3, 3, 3], [0, 1, 2], [2, 2, 5, 5, 5, 9], [4, 9, 9]])
 def test_stretches_of_a_tile_lie_between_their_edges(tiles):
     tiles = np.array(tiles)
-    edges, tile = _tile_runs(tiles)
+    edges, tile = _find_tile_runs(tiles)
     starts = np.flatnonzero(np.diff(tiles, prepend=tiles[0] - 1))
     assert edges.tolist() == [*starts, tiles.size]
     assert (tiles[edges[:-1]][tile] == tiles).all()
@@ -62,7 +62,7 @@ def test_stretches_of_a_tile_lie_between_their_edges(tiles):
 def test_tiles_are_alike_on_all_sides_and_hold_no_two_words():
     assert fit_tile_shape((10000, 90), (False, False)) == (32, 32)
     assert fit_tile_shape((10000, 7), (False, False)) == (146, 7)
-    assert fit_tile_shape((3, 10000), (True, False)) == (1, TILE_POINTS_MAX)
+    assert fit_tile_shape((3, 10000), (True, False)) == (1, POINTS_PER_TILE_MAX)
     assert fit_tile_shape((), ()) == ()
 
 
@@ -72,8 +72,8 @@ def test_every_point_lies_in_one_tile_that_has_its_parameters():
     tiles = TileGrid(grid)
     for block in range(0, grid.n_blocks, 7):
         numbers, place = tiles.tiles_of_block(block)
-        points = grid.parameters(block)
-        assert place.size == grid.block_size(block)
+        points = grid.parameters_of_block(block)
+        assert place.size == grid.count_block_points(block)
         for alike in tiles.group_tiles(numbers):
             within = np.flatnonzero(np.isin(place, alike.requested_indices))
             window = alike.parameters["instrument.processing.window"]
@@ -97,7 +97,7 @@ def test_few_points_tell_what_all_of_a_tile_call_for():
     selection = EffectPlanner(spec, ParameterBlockGrid(spec))
     tiles = np.arange(selection.tiles.n_blocks)
     kept = np.zeros((len(EFFECT_NAMES), tiles.size), bool)
-    for chosen, plan in selection.iter_plans(tiles):
+    for chosen, plan in selection.iter_tile_plans(tiles):
         kept[:, chosen] = plan.is_kept
     for alike in selection.tiles.group_tiles(tiles):
         whole = selection._plan_group(alike)
@@ -189,9 +189,9 @@ def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
 def test_a_plan_is_made_once_for_a_tile(monkeypatch):
     spec = small_spec(axes=WIDE, storage={"block_points": 100})
     selection, planned = EffectPlanner(spec, ParameterBlockGrid(spec)), []
-    plans = selection.iter_plans
+    plans = selection.iter_tile_plans
     monkeypatch.setattr(
-        selection, "iter_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
+        selection, "iter_tile_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
     )
     for block in range(ParameterBlockGrid(spec).n_blocks):
         selection.select_for_block(block)
@@ -206,9 +206,9 @@ def test_some_points_of_a_block_have_the_effects_that_they_have_among_all(monkey
         EffectPlanner(spec, ParameterBlockGrid(spec)),
         [],
     )
-    plans = selection.iter_plans
+    plans = selection.iter_tile_plans
     monkeypatch.setattr(
-        selection, "iter_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
+        selection, "iter_tile_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
     )
     points = np.array([7, 0, 2000, 7, 4199])
     found, among = selection.select_for_block(0, points), whole.select_for_block(0).subset(points)
@@ -229,7 +229,7 @@ def test_a_plan_plans_the_effects_of_few_points_of_a_large_block(monkeypatch):
     of_block = study.effect_planner.select_for_block
 
     def noted(block, points=None):
-        looked.append(study.grid.block_size(block) if points is None else len(points))
+        looked.append(study.grid.count_block_points(block) if points is None else len(points))
         return of_block(block, points)
 
     monkeypatch.setattr(study.effect_planner, "select_for_block", noted)

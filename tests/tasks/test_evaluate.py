@@ -27,7 +27,7 @@ def points(**draws):
     spec = small_spec(draws=draws, axes={"target.range": {"linear": ["1 km", "9 km"], "number": 5}})
     grid = ParameterBlockGrid(spec)
     rough = {"target.roughness": 1e-5, "target.pointing_jitter": 1e-5}
-    return spec, grid.parameters(0) | rough, grid.block_size(0)
+    return spec, grid.parameters_of_block(0) | rough, grid.count_block_points(0)
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])

@@ -101,7 +101,7 @@ def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     assert not [file.name for file in tmp_path.iterdir() if file.name != store.name]
     assert not (store / ".sweep" / "recipe.json").exists()
     assert file_digests(store) == at_once(spec, tmp_path)
-    assert all(report.sound and report.complete for report in verify(store))
+    assert all(report.is_undamaged and report.complete for report in verify(store))
 
 
 few = st.lists(st.sampled_from([0.05, 0.25, 0.5, 0.75, 1.0]), min_size=1, max_size=3, unique=True)
@@ -319,7 +319,9 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undist
     log = store / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
     assert larger(store, spec, to=store, overwrite=True).complete  # its own place, though named
-    assert sum(computed) == 108 - sum(GridStudy(small_spec()).block_size(b) for b in range(5))
+    assert sum(computed) == 108 - sum(
+        GridStudy(small_spec()).count_block_points(b) for b in range(5)
+    )
     assert file_digests(store) == at_once(spec, tmp_path)
 
 
@@ -333,7 +335,7 @@ def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name)
     outcome = larger(store, spec)
     assert outcome.complete
     size = next(
-        GridStudy(small_spec()).block_size(b)
+        GridStudy(small_spec()).count_block_points(b)
         for b in range(12)
         if GridStudy(small_spec()).chunk_positions(b)[name] == (0, 1, 0)
     )
@@ -426,7 +428,7 @@ def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, 
     path, spec = copy_store(undisturbed, tmp_path), small_spec(axes=APPENDED)
     for _ in range(2):
         outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
-        assert outcome.stopped == "interrupted" and outcome.store == staging_path_for(path)
+        assert outcome.stop_reason == "interrupted" and outcome.store == staging_path_for(path)
         assert file_digests(path) == file_digests(undisturbed)
     told = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
     assert told.exit_code == 0 and f"{path}: 108 of 108 points" in told.stdout
@@ -513,7 +515,7 @@ def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
     assert list(tmp_path.iterdir()) == [path]
     taken = 72 if how == "extend" else 0
     done = (
-        sum(map(grid.block_size, range(3))) * (1 - taken / 108)
+        sum(map(grid.count_block_points, range(3))) * (1 - taken / 108)
         if moment == "three blocks"
         else 108 - taken
     )

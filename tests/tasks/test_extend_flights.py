@@ -132,7 +132,7 @@ def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
     spec = flight(**changes)
     outcome = larger(here, spec)
     assert outcome.complete and outcome.store == here
-    assert outcome.rays == {"three": 0, "line": 0}
+    assert outcome.rays_by_scanner == {"three": 0, "line": 0}
     assert computed.shots == outcome.points_computed == SHOTS * new
     assert computed.cycles == CYCLES * new
     assert sorted(file.name for file in here.parent.iterdir()) == ["eyepoints", here.name]
@@ -151,7 +151,12 @@ def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(here, computed
     spec = flight(scanners={"four": cone, **SMALLER["scanners"]})
     outcome = larger(here, spec)
     assert outcome.complete and computed.shots == shots_of(spec, "four") * 3 * 2
-    assert outcome.rays["four"] > 0 == outcome.rays["three"] == outcome.rays["line"]
+    assert (
+        outcome.rays_by_scanner["four"]
+        > 0
+        == outcome.rays_by_scanner["three"]
+        == outcome.rays_by_scanner["line"]
+    )
     assert file_digests(here) == at_once(spec, here)
 
 
@@ -175,7 +180,7 @@ def test_as_it_is_typed(here, monkeypatch):
     assert f"{here.name}: {whole} of {whole} shots" in told.stdout
     again = CliRunner().invoke(main, ["extend", here.name, "--set", change])
     assert again.exit_code == 0 and "nothing to extend" in again.stderr
-    assert all(report.sound and report.complete for report in verify(here))
+    assert all(report.is_undamaged and report.complete for report in verify(here))
 
 
 #: Errors that are numbers, and do not follow the tolerance.

@@ -19,11 +19,11 @@ from sweep.model.beamlet_counts import initial_ray_count
 from sweep.model.error_budget import ErrorBudget
 from sweep.report.study_report import accuracy_sentences
 from sweep.spec import GridSpec, SceneSpec
-from sweep.storage.locations import eyepoints_path
+from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import extend, run
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import eyepoint_study
-from sweep.tasks.studies.store_summary import ray_accuracy_rows
+from sweep.tasks.studies.store_summary import accuracy_rows_of_rays
 
 RAYS = ErrorBudget.ray_counts
 
@@ -130,7 +130,7 @@ def test_a_shot_with_more_rays_is_as_if_all_had_so_many(flown, tmp_path):
 
 def test_rays_given_by_hand_leave_nothing_that_is_told(flown):
     assert shots(flown["by hand"]).beamlets_error.isnull().all()
-    assert ray_accuracy_rows(flown["by hand"]) == []
+    assert accuracy_rows_of_rays(flown["by hand"]) == []
 
 
 def test_a_comparison_allows_what_is_told(flown):
@@ -147,16 +147,22 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     monkeypatch.setattr(ErrorBudget, "from_parameters", few)
     spec = facets(1e-3, draws={"number": 1})
     store = run_serially(spec, tmp_path / "most.zarr").store
-    (row,) = ray_accuracy_rows(store)
+    (row,) = accuracy_rows_of_rays(store)
     told, rays = shots(store).beamlets_error, shots(store).beamlets
-    assert (row.name, row.samples_max, row.tolerance_at_worst) == ("three", 37, 1e-3)
+    assert (row.name, row.samples_max, row.tolerance_at_worst_point) == ("three", 37, 1e-3)
     assert row.mean_samples == pytest.approx(float(rays.mean())) == 37
-    assert row.n_points == told.size and row.n_met == (told <= 1e-3).sum() < row.n_points
+    assert (
+        row.n_points == told.size
+        and row.n_points_within_tolerance == (told <= 1e-3).sum() < row.n_points
+    )
     assert row.worst_error == told.max() and row.excess == pytest.approx(row.worst_error - 1e-3)
     shot = int(told.values[0].argmax())
-    assert row.worst_label == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
+    assert row.worst_point_label == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
     said = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "What more rays may change" in said and f"{row.n_met} of {row.n_points}" in said
+    assert (
+        "What more rays may change" in said
+        and f"{row.n_points_within_tolerance} of {row.n_points}" in said
+    )
     spec_file = tmp_path / "most.yaml"
     spec_file.write_text(json.dumps(spec.to_yaml_mapping()))
     said = CliRunner().invoke(main, ["plan", str(spec_file)]).output
@@ -192,8 +198,10 @@ def test_a_tighter_tolerance_casts_its_own_rays(flown, tmp_path):
     coarse, fine = (facets(accuracy={"tolerance": t, **close}) for t in (1e-2, 1e-3))
     store = run_serially(coarse, tmp_path / "flight.zarr").store
     outcome = extend(store, fine, progress=False, scheduler="none")
-    assert outcome.complete and outcome.rays["three"] > 37 * fine.number_of_cycles("three")
-    assert eyepoints_path(store, fine.geometry_id("three")).exists()
+    assert outcome.complete and outcome.rays_by_scanner["three"] > 37 * fine.number_of_cycles(
+        "three"
+    )
+    assert eyepoint_store_location(store, fine.geometry_id("three")).exists()
     assert file_digests(store) == file_digests(run_serially(fine, tmp_path / "fine.zarr").store)
 
 

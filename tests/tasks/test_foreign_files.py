@@ -24,7 +24,7 @@ from small_studies import (
 from sweep.cli import main
 from sweep.storage import locations
 from sweep.storage.foreign_files import list_foreign_files
-from sweep.storage.locations import is_free, recover_interrupted_replace, staging_path_for
+from sweep.storage.locations import can_create_store, recover_interrupted_replace, staging_path_for
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine import journal
 from sweep.tasks.engine.progress import StoreError
@@ -82,8 +82,8 @@ def test_verify_tells_of_them_and_is_content(undisturbed, tmp_path):
     put(store)
     (store / "elsewhere").symlink_to(tmp_path)
     (report,) = verify(store, progress=False)
-    assert report.sound and report.complete
-    assert list(report.foreign) == sorted([*TOLD, "elsewhere"])
+    assert report.is_undamaged and report.complete
+    assert list(report.foreign_objects) == sorted([*TOLD, "elsewhere"])
     result = CliRunner().invoke(main, ["verify", str(store)], catch_exceptions=False)
     assert result.exit_code == 0 and "not sweep's, and left alone: .sweep/todo.txt" in result.output
     assert resume(store, progress=False, scheduler="none").complete
@@ -119,7 +119,7 @@ def test_one_in_the_way_of_a_new_array_gets_a_name_of_its_own(undisturbed, tmp_p
     assert extend(store, small_spec(axes=axes), progress=False, scheduler="none").complete
     assert (store / "reflectance" / "zarr.json").exists()
     assert (store / "reflectance.1").read_text() == MINE["reflectance"]
-    assert verify(store, progress=False)[0].sound
+    assert verify(store, progress=False)[0].is_undamaged
 
 
 def test_those_that_come_while_a_store_is_extended_are_carried_over(undisturbed, larger, tmp_path):
@@ -165,7 +165,7 @@ def test_a_kill_at_any_renaming_loses_none(undisturbed, tmp_path, monkeypatch, n
     recover_interrupted_replace(store)
     assert kept(store) == MINE
     assert os.listdir(tmp_path) == [store.name]
-    assert verify(store, progress=False)[0].sound
+    assert verify(store, progress=False)[0].is_undamaged
 
 
 def test_overwriting_refuses_and_names_them(undisturbed, tmp_path):
@@ -228,7 +228,9 @@ def test_a_folder_with_anything_in_it_is_not(tmp_path):
     for overwrite in (False, True):
         with pytest.raises(StoreError, match="not a Zarr store"):
             run_serially(small_spec(), tmp_path / "a.zarr", overwrite=overwrite, scheduler="none")
-    assert not is_free(tmp_path / "a.zarr" / "notes.txt") and is_free(tmp_path / "b" / "c")
+    assert not can_create_store(tmp_path / "a.zarr" / "notes.txt") and can_create_store(
+        tmp_path / "b" / "c"
+    )
     assert (tmp_path / "a.zarr" / "notes.txt").read_text() == "mine"
 
 
@@ -295,8 +297,8 @@ def test_run_with_resume_waits_for_a_driver_killed_elsewhere(
     undisturbed, tmp_path, monkeypatch, lives
 ):
     """As of a job that is started again on another node, seconds after it was killed."""
-    monkeypatch.setattr(journal, "HEARTBEAT_AGE_MAX", 2.0)
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.5)
+    monkeypatch.setattr(journal, "HEARTBEAT_AGE_SECONDS_MAX", 2.0)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 0.5)
     store = copy_store(undisturbed, tmp_path)
     lock = store / ".sweep" / "lock"
     lock.write_text(json.dumps({"host": "elsewhere", "pid": 1, "start": 1, "token": "t"}))

@@ -10,8 +10,8 @@ from sweep.storage.locations import parse_location
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import canonical_point_rows
 from sweep.tasks.studies.parameter_grid import (
+    BLOCKS_OF_DEFAULT_SIZE_MAX,
     DEFAULT_BLOCK_POINTS,
-    DEFAULT_BLOCKS_MAX,
     ParameterBlockGrid,
     default_block_points,
     fit_block_shape,
@@ -30,11 +30,13 @@ def points_of(grid: ParameterBlockGrid) -> np.ndarray:
 def test_blocks_hold_every_point_once(block_points):
     grid = ParameterBlockGrid(small_spec(storage={"block_points": block_points}))
     assert sorted(points_of(grid)) == list(range(grid.n_points)) == list(range(72))
-    assert max(grid.block_size(i) for i in range(grid.n_blocks)) <= block_points
-    assert sum(grid.block_size(i) for i in range(grid.n_blocks)) == grid.n_points
+    assert max(grid.count_block_points(i) for i in range(grid.n_blocks)) <= block_points
+    assert sum(grid.count_block_points(i) for i in range(grid.n_blocks)) == grid.n_points
     marked = np.zeros(grid.n_blocks, bool)
     marked[::2] = True
-    assert grid.count_points(marked) == sum(grid.block_size(i) for i in range(0, grid.n_blocks, 2))
+    assert grid.count_points_in_blocks(marked) == sum(
+        grid.count_block_points(i) for i in range(0, grid.n_blocks, 2)
+    )
 
 
 def test_a_block_keeps_radiometric_axes_whole_before_geometric_ones():
@@ -51,7 +53,7 @@ def test_parameters_of_a_block_are_those_of_its_points_in_c_order():
     by_name = {m.path: np.asarray(m.values) for axis in spec.axes for m in axis.parameters}
     whole = np.meshgrid(*by_name.values(), indexing="ij")
     for i in range(grid.n_blocks):
-        parameters = grid.parameters(i)
+        parameters = grid.parameters_of_block(i)
         for path, values in zip(by_name, whole, strict=True):
             np.testing.assert_array_equal(parameters[path], values[grid.block_slices(i)].ravel())
         assert parameters["target.reflectance"] == 0.02
@@ -68,7 +70,7 @@ def test_members_of_a_zipped_axis_run_together():
     }
     grid = ParameterBlockGrid(small_spec(axes=axes, storage={"block_points": 5}))
     assert grid.dims == ("cut",)
-    parameters = grid.parameters(0)
+    parameters = grid.parameters_of_block(0)
     np.testing.assert_allclose(parameters["target.range"], [1e3, 2e3, 3e3, 3e3, 3e3])
     degrees = np.degrees(parameters["target.grazing_angle"])
     np.testing.assert_allclose(degrees, [15, 15, 30, 60, 90])
@@ -76,14 +78,19 @@ def test_members_of_a_zipped_axis_run_together():
 
 def test_a_study_without_axes_is_one_point_in_one_block():
     grid = ParameterBlockGrid(small_spec(axes={}))
-    assert (grid.n_points, grid.n_blocks, grid.block_slices(0), grid.block_size(0)) == (1, 1, (), 1)
-    assert canonical_point_rows(grid.parameters(0), 1).shape[0] == 1
+    assert (grid.n_points, grid.n_blocks, grid.block_slices(0), grid.count_block_points(0)) == (
+        1,
+        1,
+        (),
+        1,
+    )
+    assert canonical_point_rows(grid.parameters_of_block(0), 1).shape[0] == 1
 
 
 def test_geometry_order_brings_equal_geometry_together_and_drops_nothing():
     grid = ParameterBlockGrid(small_spec(storage={"block_points": 36}))
-    order, parameters = grid.geometry_order(0), grid.parameters(0)
-    assert sorted(order) == list(range(grid.block_size(0)))
+    order, parameters = grid.geometry_order(0), grid.parameters_of_block(0)
+    assert sorted(order) == list(range(grid.count_block_points(0)))
     ranges = parameters["target.range"][order]
     angles = parameters["target.grazing_angle"][order]
     changes = np.count_nonzero((np.diff(ranges) != 0) | (np.diff(angles) != 0))
@@ -94,7 +101,7 @@ def rows_by_point(grid: ParameterBlockGrid) -> dict[tuple, bytes]:
     """Canonical row of each point, by range, angle and power."""
     rows = {}
     for i in range(grid.n_blocks):
-        p, n = grid.parameters(i), grid.block_size(i)
+        p, n = grid.parameters_of_block(i), grid.count_block_points(i)
         names = ("target.range", "target.grazing_angle", "instrument.laser.power")
         columns = [np.broadcast_to(p[name], (n,)) for name in names]
         for key, row in zip(zip(*columns, strict=True), canonical_point_rows(p, n), strict=True):
@@ -139,7 +146,7 @@ def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
     tracemalloc.start()
     grid = ParameterBlockGrid(spec)
     assert math.prod(grid.shape) == grid.n_blocks == 10_000_000
-    last = grid.parameters(grid.n_blocks - 1)
+    last = grid.parameters_of_block(grid.n_blocks - 1)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert last["target.range"] == pytest.approx(10e3)
@@ -155,8 +162,10 @@ def test_files_stay_countable_and_all_cores_have_blocks(points, seconds_per_poin
     """Blocks of a single axis: 25 arrays of them are less than half a million files."""
     (size,) = fit_block_shape((points,), (False,), default_block_points(points, seconds_per_point))
     n_blocks = -(-points // size)
-    assert n_blocks <= DEFAULT_BLOCKS_MAX
-    assert points > DEFAULT_BLOCK_POINTS * DEFAULT_BLOCKS_MAX or size <= DEFAULT_BLOCK_POINTS
+    assert n_blocks <= BLOCKS_OF_DEFAULT_SIZE_MAX
+    assert (
+        points > DEFAULT_BLOCK_POINTS * BLOCKS_OF_DEFAULT_SIZE_MAX or size <= DEFAULT_BLOCK_POINTS
+    )
     study_seconds = points * seconds_per_point
     if study_seconds > 32 and points >= 32:  # blocks of a second and more
         assert n_blocks >= 24  # of whole points, hence not always 32
@@ -167,14 +176,14 @@ def test_files_stay_countable_and_all_cores_have_blocks(points, seconds_per_poin
 @pytest.mark.parametrize("rate", ["0.1 Hz", "10 Hz", "1 kHz"])
 def test_a_flights_blocks_are_cut_for_all_cores(draws, rate):
     """Of 3 to 30,000 shots: small flights are one block, large ones have work for many cores."""
-    scanners = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": rate}}
-    spec = small_scene_spec(scanners=scanners, draws={"number": draws}, storage={}, axes={})
+    scanner_hits = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": rate}}
+    spec = small_scene_spec(scanner_hits=scanner_hits, draws={"number": draws}, storage={}, axes={})
     (grid,) = FlightStudy(spec, parse_location("none.zarr")).grids
     seconds = grid.n_points * worst_cpu_seconds_per_draw(spec)
     assert (grid.n_blocks == 1) == (seconds < 0.5) or grid.n_points // draws <= 256
     if seconds > 60:
-        assert grid.n_blocks >= 32 or grid.block_size(0) // grid.block_shape[-2] >= 4000
-    largest = max(grid.block_size(block) for block in range(min(grid.n_blocks, 50)))
+        assert grid.n_blocks >= 32 or grid.count_block_points(0) // grid.block_shape[-2] >= 4000
+    largest = max(grid.count_block_points(block) for block in range(min(grid.n_blocks, 50)))
     assert largest * worst_cpu_seconds_per_draw(spec) < max(1.2 * seconds / 32, 1.0)
 
 

@@ -51,7 +51,7 @@ def long(study, block):
 
 with suggest_shell_commands() if as_what == "command" else nullcontext():
     outcome = sweep.run(small_spec(), store=store, scheduler="none", evaluate=long)
-print(outcome.blocks_done, outcome.stopped, flush=True)
+print(outcome.blocks_done, outcome.stop_reason, flush=True)
 sys.exit(0 if outcome.complete else 3)
 """
 
@@ -164,7 +164,7 @@ class Listener(Progress):
 
 
 def test_after_sigterm_a_block_that_does_not_end_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(interrupts, "TERMINATION_SECONDS_MAX", 1.0)
+    monkeypatch.setattr(interrupts, "SIGTERM_GRACE_SECONDS", 1.0)
     begun = []
 
     def long(study, block):
@@ -177,7 +177,7 @@ def test_after_sigterm_a_block_that_does_not_end_is_stopped(tmp_path, monkeypatc
 
     outcome = run_serially(small_spec(), tmp_path / "store.zarr", scheduler="none", evaluate=long)
     assert time.monotonic() - begun[0] < 5
-    assert outcome.stopped == "stopped at once" and outcome.blocks_done == 2
+    assert outcome.stop_reason == "stopped at once" and outcome.blocks_done == 2
     assert_goes_on(tmp_path / "store.zarr")
 
 
@@ -189,7 +189,7 @@ def test_what_ends_soon_after_sigterm_is_committed(tmp_path):
         return study.evaluate(block)
 
     outcome = run_serially(small_spec(), tmp_path / "store.zarr", scheduler="none", evaluate=soon)
-    assert outcome.stopped == "interrupted" and outcome.blocks_done == 2
+    assert outcome.stop_reason == "interrupted" and outcome.blocks_done == 2
     assert_goes_on(tmp_path / "store.zarr")
 
 
@@ -224,7 +224,7 @@ def test_signals_of_others_leave_a_run_alone(tmp_path):
 
 def test_sigterm_while_workers_start_has_a_deadline_too(tmp_path, monkeypatch):
     """As of a worker whose imports hang, which its nanny starts again and again."""
-    monkeypatch.setattr(interrupts, "TERMINATION_SECONDS_MAX", 0.5)
+    monkeypatch.setattr(interrupts, "SIGTERM_GRACE_SECONDS", 0.5)
 
     def hang(backend, *_):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -234,7 +234,7 @@ def test_sigterm_while_workers_start_has_a_deadline_too(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ComputeBackend, "iter_results", hang)
     outcome = run_serially(small_spec(), tmp_path / "s.zarr")
-    assert outcome.stopped == "stopped at once" and not outcome.complete
+    assert outcome.stop_reason == "stopped at once" and not outcome.complete
     assert outcome.seconds < 8
     monkeypatch.undo()
     assert sweep.resume(outcome.store, scheduler="none", progress=False).complete

@@ -72,10 +72,10 @@ def test_a_receipt_that_was_withdrawn_leaves_its_block_to_be_done_again(tmp_path
     opened = Journal(tmp_path)
     opened.commit(receipt(1))
     opened.commit(receipt(2))
-    opened.withdraw(1, "a chunk is damaged")
-    assert journal.committed_digests(tmp_path, 4).tolist() == [b"", b"", b"ab", b""]
+    opened.withdraw_receipt(1, "a chunk is damaged")
+    assert journal.read_committed_digests(tmp_path, 4).tolist() == [b"", b"", b"ab", b""]
     opened.commit(receipt(1))
-    assert journal.committed_digests(tmp_path, 4).tolist() == [b"", b"ab", b"ab", b""]
+    assert journal.read_committed_digests(tmp_path, 4).tolist() == [b"", b"ab", b"ab", b""]
 
 
 def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
@@ -83,10 +83,10 @@ def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
     for block in (1, 2):
         opened.record_failure(Failure(block=block, error="e", traceback="t", host="h", pid=1))
     opened.commit(receipt(1))
-    assert list(journal.permanently_failed(tmp_path, 4)) == [2]
-    assert list(journal.permanently_failed(tmp_path, 2)) == []
-    opened.withdraw(1, "a chunk is damaged")
-    assert list(journal.permanently_failed(tmp_path, 4)) == [2]
+    assert list(journal.read_permanent_failures(tmp_path, 4)) == [2]
+    assert list(journal.read_permanent_failures(tmp_path, 2)) == []
+    opened.withdraw_receipt(1, "a chunk is damaged")
+    assert list(journal.read_permanent_failures(tmp_path, 4)) == [2]
 
 
 def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch):
@@ -102,12 +102,12 @@ def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch)
 
 def test_runs_are_recorded_with_their_times(tmp_path):
     opened = Journal(tmp_path)
-    assert journal.last_run_start(tmp_path) == float("inf")
+    assert journal.last_run_start_time(tmp_path) == float("inf")
     opened.record_run_event("begun", pid=5)
     opened.record_run_event("ended", blocks=3)
-    begun, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG)
+    begun, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG_FILE)
     assert begun["event"] == "begun" and begun["pid"] == 5 and ended["blocks"] == 3
-    assert journal.last_run_start(tmp_path) == begun["time"] > 0
+    assert journal.last_run_start_time(tmp_path) == begun["time"] > 0
 
 
 @pytest.mark.parametrize(("n_blocks", "points"), [(2, [5, 0]), (3, [5, 0, 7]), (4, [5, 0, 7, 0])])

@@ -16,7 +16,7 @@ from small_studies import (
 from sweep.storage.locations import parse_location
 from sweep.tasks.driver import resume
 from sweep.tasks.engine import journal, session
-from sweep.tasks.engine.journal import ChunkScan, existing_chunks, scan_complete_blocks
+from sweep.tasks.engine.journal import ChunkScan, find_complete_blocks, find_existing_chunks
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
@@ -36,7 +36,7 @@ STUDIES = {
 def test_the_owner_of_a_chunk_is_the_block_that_writes_it(tmp_path, name):
     """By the chunks of every block, one by one: all of them owned, and by no other."""
     study = STUDIES[name](tmp_path / "some.zarr")
-    owners = study.chunk_owners()
+    owners = study.chunk_owner_blocks()
     left = {array: np.full(owner.shape, -1) for array, owner in owners.items()}
     for block in range(study.n_blocks):
         for array, position in study.chunk_positions(block).items():
@@ -48,15 +48,15 @@ def test_the_owner_of_a_chunk_is_the_block_that_writes_it(tmp_path, name):
 def test_a_block_is_whole_where_all_of_its_chunks_are_and_hold_something(undisturbed, tmp_path):
     store, study = copy_store(undisturbed, tmp_path), GridStudy(small_spec())
     every = np.ones(12, bool)
-    assert scan_complete_blocks(store, study, every).all()
+    assert find_complete_blocks(store, study, every).all()
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     (store / "pd_shot" / "c" / "0" / "7" / "0").write_bytes(b"")
     (store / "pd_shot" / "c" / "0" / "notes").write_bytes(b"not a chunk")
     (store / "pd_shot" / "c" / "0" / "99").mkdir()
-    assert np.flatnonzero(~scan_complete_blocks(store, study, every)).tolist() == [5, 7]
-    assert not scan_complete_blocks(store, study, ~every).any()
+    assert np.flatnonzero(~find_complete_blocks(store, study, every)).tolist() == [5, 7]
+    assert not find_complete_blocks(store, study, ~every).any()
     but_five = np.arange(12) != 5
-    assert np.flatnonzero(but_five & ~scan_complete_blocks(store, study, but_five)).tolist() == [7]
+    assert np.flatnonzero(but_five & ~find_complete_blocks(store, study, but_five)).tolist() == [7]
 
 
 def test_folders_and_object_stores_are_listed_alike(tmp_path):
@@ -73,39 +73,41 @@ def test_folders_and_object_stores_are_listed_alike(tmp_path):
         (there / name).write_bytes(content)
     expected = [[False, True], [False, False], [False, True]]
     assert (
-        existing_chunks(here, (3, 2)).tolist()
-        == existing_chunks(there, (3, 2)).tolist()
+        find_existing_chunks(here, (3, 2)).tolist()
+        == find_existing_chunks(there, (3, 2)).tolist()
         == expected
     )
     (tmp_path / "scalar").write_bytes(b"four")
-    assert existing_chunks(tmp_path / "scalar", ()) and not existing_chunks(tmp_path / "none", ())
+    assert find_existing_chunks(tmp_path / "scalar", ()) and not find_existing_chunks(
+        tmp_path / "none", ()
+    )
 
 
 def test_status_says_what_there_is_of_a_run(tmp_path):
     outcome = run_serially(small_spec(draws={"number": 20, "batch": 10}), tmp_path / "small.zarr")
     found = status(outcome.store)
-    assert found.draws_done == 72 * 20 and found.workers == 1
-    assert found.rate > 0 and found.left == 0
-    assert found.heartbeat == float("inf")
+    assert found.draws_done == 72 * 20 and found.workers_in_last_run == 1
+    assert found.points_per_second > 0 and found.seconds_left == 0
+    assert found.heartbeat_age == float("inf")
     chunks = [
         file.stat().st_size
-        for name in GridStudy(small_spec(draws={"number": 20, "batch": 10})).chunk_owners()
+        for name in GridStudy(small_spec(draws={"number": 20, "batch": 10})).chunk_owner_blocks()
         for file in (outcome.store / name / "c").rglob("*")
         if file.is_file()
     ]
-    assert found.bytes == sum(chunks)
+    assert found.bytes_stored == sum(chunks)
 
 
 def slow_to_look(monkeypatch, seconds):
     """Folders that show what they hold only after some time, and a run that waits for nothing."""
-    there = journal.existing_chunks
+    there = journal.find_existing_chunks
 
     def late(folder, shape):
         time.sleep(seconds)
         return there(folder, shape)
 
-    monkeypatch.setattr(journal, "existing_chunks", late)
-    monkeypatch.setattr(session, "CHUNK_SCAN_TIMEOUT", 0.01)
+    monkeypatch.setattr(journal, "find_existing_chunks", late)
+    monkeypatch.setattr(session, "CHUNK_SCAN_TIMEOUT_SECONDS", 0.01)
 
 
 @pytest.mark.parametrize("to_do", ["nothing", "a block"])

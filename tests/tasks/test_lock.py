@@ -80,7 +80,7 @@ def test_a_lock_of_a_number_that_no_process_can_have_is_taken_over(tmp_path, pid
 
 @pytest.mark.parametrize(("age", "live"), [(0.0, True), (60.0, True), (600.0, False)])
 def test_on_another_host_the_heartbeat_decides(tmp_path, monkeypatch, age, live):
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.1)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 0.1)
     put(tmp_path, LockHolder(host="elsewhere", pid=1, start=1, token="t"), age=age)
     if live:
         with pytest.raises(StoreError, match="process 1 on elsewhere"):
@@ -90,7 +90,7 @@ def test_on_another_host_the_heartbeat_decides(tmp_path, monkeypatch, age, live)
 
 
 def test_a_held_lock_beats(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.02)
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL_SECONDS", 0.02)
     held = StoreLock(tmp_path)
     path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     os.utime(path, (0, 0))
@@ -144,7 +144,7 @@ def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
 
     study_path = tmp_path / "small.zarr"
     outcome = run_serially(small_spec(), study_path, scheduler="none", evaluate=evaluate)
-    assert outcome.stopped == "another process took the store's lock"
+    assert outcome.stop_reason == "another process took the store's lock"
     assert receipt_blocks(study_path) == [0, 1, 2, 3]
     assert read_lock_holder(study_path) == other
     with pytest.raises(StoreError, match="process 1 on elsewhere"):
@@ -257,7 +257,7 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
     tmp_path, monkeypatch, kind, age
 ):
     """The clock of the file server may have been set: an age that it gives proves nothing."""
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 1.0)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 1.0)
     elsewhere(tmp_path, age=age)
     stop = threading.Event()
 
@@ -285,8 +285,8 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
 
 
 def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 1.0)
-    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.1)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 1.0)
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL_SECONDS", 0.1)
     monkeypatch.setattr(journal, "heartbeat_age", lambda path: 1e6)
     monkeypatch.setattr(LockHolder, "is_on_this_machine", False)
     store = parse_location(f"memory://bucket/{time.time_ns()}/s.zarr")
@@ -299,23 +299,23 @@ def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
 
 
 def test_a_lock_that_changes_hands_while_it_is_watched_is_not_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.5)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 0.5)
     elsewhere(tmp_path, age=600.0)
-    mark = journal._FileLock.heartbeat_mark
+    mark = journal._FileLock.heartbeat_version
 
     def overtaken(self):
         marked = mark(self)
         put(tmp_path, LockHolder(host="third", pid=3, start=1, token="u"), age=600.0)
         return marked
 
-    monkeypatch.setattr(journal._FileLock, "heartbeat_mark", overtaken)
+    monkeypatch.setattr(journal._FileLock, "heartbeat_version", overtaken)
     with pytest.raises(BusyError):
         StoreLock(tmp_path, lambda text: None)
     assert read_lock_holder(tmp_path).host == "third"
 
 
 def test_a_lock_of_another_version_is_judged_by_its_heartbeat(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.2)
+    monkeypatch.setattr(journal, "HEARTBEAT_WATCH_SECONDS", 0.2)
     path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     path.parent.mkdir()
     for text in (
@@ -452,7 +452,7 @@ def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch
 
 
 def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.02)
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL_SECONDS", 0.02)
     monkeypatch.setattr(journal, "_issued_warnings", set())
     beats, beat = [], journal._FileLock.send_heartbeat
 

@@ -82,8 +82,8 @@ def test_workers_without_a_limit_take_any_study(limits):
 
 def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch):
     spec = small_scene_spec()
-    needed = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec)
-    assert memory_limits.scene_bytes(spec) > 1000
+    needed = memory_limits.point_memory_bytes(spec) + memory_limits.scene_memory_bytes(spec)
+    assert memory_limits.scene_memory_bytes(spec) > 1000
     set_machine_memory(monkeypatch, needed - 1)
     for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
@@ -94,7 +94,7 @@ def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch
 def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
     spec, whole = small_scene_spec(), small_scene_spec(draws={"number": 6, "returns": 3})
     runs(spec, tmp_path / "s.zarr")
-    limit = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec) - 1
+    limit = memory_limits.point_memory_bytes(spec) + memory_limits.scene_memory_bytes(spec) - 1
     set_machine_memory(monkeypatch, limit)
     plain = {"scheduler": "none", "progress": False}
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
@@ -114,7 +114,7 @@ def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, 
     spec = small_scene_spec() if kind == "flight" else small_spec(axes=HUGE)
     set_machine_memory(monkeypatch, 10**13)
     if kind == "flight":  # a point fits into a worker, and the scene with it does not
-        monkeypatch.setattr(memory_limits, "scene_bytes", lambda spec: 2 * 10**9)
+        monkeypatch.setattr(memory_limits, "scene_memory_bytes", lambda spec: 2 * 10**9)
     one = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
     with (
         LocalCluster(**one, memory_limit="1 GB", protocol="tcp") as cluster,
@@ -129,7 +129,7 @@ def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, 
 def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):
     spec = small_scene_spec(draws={"number": 10**7}, storage={"block_draws": 10**6})
     set_machine_memory(monkeypatch, 10**8)
-    monkeypatch.setattr(memory_limits, "point_bytes_max", lambda spec: 0)
+    monkeypatch.setattr(memory_limits, "point_memory_bytes", lambda spec: 0)
     for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"storage: makes a block take .* GB"):
             use()
@@ -181,7 +181,7 @@ def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monk
 
 def test_the_memory_of_a_plan_counts_a_point():
     spec = small_spec()
-    assert plan_study(spec).memory_bytes > memory_limits.point_bytes_max(spec) > 1e6
+    assert plan_study(spec).memory_bytes > memory_limits.point_memory_bytes(spec) > 1e6
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from sweep.storage.locations import file_sizes_below
 from sweep.tasks.driver import resume
 from sweep.tasks.engine.blocks import ArrayLayout
 from sweep.tasks.engine.progress import StoreError
-from sweep.tasks.studies.store_summary import scene_summary, status
-from sweep.tasks.studies.store_verification import pack_store, shard_shape, verify
+from sweep.tasks.studies.store_summary import flight_summary, status
+from sweep.tasks.studies.store_verification import pack_store, shard_shape_of_array, verify
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_a_copy_does_not_name_the_machine_that_made_it(undisturbed, packed):
 
 def test_what_reads_stores_reads_the_copy_and_what_writes_them_refuses_it(packed):
     found = status(packed)
-    assert found.complete and found.bytes == sum(file_sizes_below(packed).values())
+    assert found.complete and found.bytes_stored == sum(file_sizes_below(packed).values())
     with pytest.raises(StoreError, match="nothing to resume"):
         resume(packed, progress=False)
     with pytest.raises(StoreError, match="nothing to resume"):
@@ -64,13 +64,13 @@ def test_a_flipped_bit_in_a_copy_is_found(packed, tmp_path):
     import shutil
 
     copy = shutil.copytree(packed, tmp_path / "copy.zarr")
-    assert all(report.sound for report in verify(copy, progress=False))
+    assert all(report.is_undamaged for report in verify(copy, progress=False))
     (chunk,) = (copy / "pd_shot" / "c").rglob("0/0/0")
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
     (report,) = verify(copy, progress=False)
-    assert [damage.object for damage in report.damages] == ["pd_shot/c/0/0/0"]
+    assert [damage.object_name for damage in report.damages] == ["pd_shot/c/0/0/0"]
 
 
 def test_what_is_not_complete_or_in_the_way_is_refused(undisturbed, packed, tmp_path):
@@ -107,7 +107,7 @@ def test_the_copy_goes_to_an_object_store_too(undisturbed, tmp_path):
     np.testing.assert_array_equal(
         sweep.open(there).pd_shot.values, sweep.open(undisturbed).pd_shot.values
     )
-    assert all(report.sound for report in verify(there, progress=False))
+    assert all(report.is_undamaged for report in verify(there, progress=False))
 
 
 def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
@@ -116,8 +116,8 @@ def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
     assert told.exit_code == 0, told.output
     copy = tmp_path / "scene_final.zarr"
     assert len(file_sizes_below(copy)) < len(file_sizes_below(made)) / 2
-    assert scene_summary(copy)[0].n_shots > 0
-    for one, other in zip(scene_summary(made), scene_summary(copy), strict=True):
+    assert flight_summary(copy)[0].n_shots > 0
+    for one, other in zip(flight_summary(made), flight_summary(copy), strict=True):
         assert (one.n_shots, one.shots_with_true_return, one.false_points) == (
             other.n_shots,
             other.shots_with_true_return,
@@ -141,4 +141,4 @@ def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
 def test_a_file_is_whole_chunks_and_no_larger_than_it_may_be(shape, chunks, expected):
     dims = ("x", "y")[: len(shape)]
     layout = ArrayLayout(name="a", shape=shape, chunks=chunks, dims=dims, dtype="float64")
-    assert shard_shape(layout) == expected
+    assert shard_shape_of_array(layout) == expected

@@ -59,7 +59,7 @@ def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path
     assert failure.error == "BlockTimeoutError: took longer than the 2 s that a block may take"
     assert "time.sleep(0.01)" in failure.traceback  # where it was
     assert logged_blocks(log).count(4) == 2
-    assert resume(path, progress=False, scheduler="none").left_out == 1
+    assert resume(path, progress=False, scheduler="none").blocks_skipped == 1
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert file_digests(path) == file_digests(undisturbed)
 
@@ -217,4 +217,4 @@ def test_what_cannot_be_synced_is_not_committed(undisturbed, tmp_path, monkeypat
 
     monkeypatch.setattr(study_store, "sync_to_disk", broken)
     outcome = resume(path, progress=False, scheduler="none", durable=True)
-    assert outcome.blocks_computed == 0 and "Input/output error" in outcome.stopped
+    assert outcome.blocks_computed == 0 and "Input/output error" in outcome.stop_reason

@@ -34,8 +34,8 @@ class Told(progress.Progress):
 @pytest.fixture
 def at_once(monkeypatch):
     """No time that passes before something is said, and little between lines."""
-    monkeypatch.setattr(progress, "ACTIVITY_SILENT_SECONDS", 0.01)
-    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.01)
+    monkeypatch.setattr(progress, "ACTIVITY_SHOWN_AFTER_SECONDS", 0.01)
+    monkeypatch.setattr(progress, "PROGRESS_LINE_INTERVAL_SECONDS", 0.01)
 
 
 def compiling():
@@ -74,7 +74,7 @@ def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     bar = progress.ProgressBar()
     bar.begin(points=12_345_678, done=1_234_567, unit="points")
-    bar.at_work(workers=12, stored=3_100_000)
+    bar.update_workers(workers=12, stored=3_100_000)
     bar.advance(points=1_000, failed=3)
     bar.end()
     shown = capsys.readouterr().err
@@ -99,7 +99,7 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
         (("shot", "small.yaml"), "sweep.analysis.shot_spectra.write_shot_report"),
         (
             ("spectra", "small.yaml", "-o", "s.npz"),
-            "sweep.tasks.studies.spectra_export.point_spectra",
+            "sweep.tasks.studies.spectra_export.draw_point_spectra",
         ),
         (("figures", "small.zarr"), "sweep.analysis.study_figures.draw_figures"),
         (("export", "small.zarr", "s.csv"), "sweep.analysis.scene_results.point_export.export"),

@@ -16,7 +16,7 @@ from sweep.tasks.driver import resume, run
 from sweep.tasks.engine import cluster_connection
 from sweep.tasks.engine.journal import StoreLock
 from sweep.tasks.engine.progress import ClusterError, StoreError
-from sweep.tasks.engine.study_store import current_versions
+from sweep.tasks.engine.study_store import current_software_versions
 from sweep.tasks.studies.store_summary import status
 
 
@@ -50,7 +50,10 @@ def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tm
 @pytest.mark.parametrize(
     ("changes", "shown"),
     [
-        ({"software": {**current_versions(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
+        (
+            {"software": {**current_software_versions(), "numpy": "1.0"}},
+            "numpy: 1.0 in the store, ",
+        ),
         ({"model_version": "0.0"}, "model: 0.0 in the store, "),
         ({"study_id": "0" * 32}, "attributes were changed"),
         ({"layout": 99}, "laid out as version 99"),
@@ -114,9 +117,9 @@ def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(undis
         resume(store, progress=False, scheduler="none")
     with pytest.raises(StoreError, match="is being written by process"):
         run_serially(small_spec(), store, scheduler="none", overwrite=True)
-    assert status(store).holder_lives
+    assert status(store).is_lock_holder_alive
     held.release()
-    assert status(store).holder is None
+    assert status(store).lock_holder is None
 
 
 def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monkeypatch):
@@ -136,7 +139,7 @@ def refusing_on_workers(path, attributes, model_version, *, reader):
 
 
 def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.5)
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:9"):
         run(
             small_spec(),

@@ -51,7 +51,7 @@ def begun(store, tmp_path):
 def test_overwriting_without_a_cluster_takes_nothing_away(
     undisturbed, tmp_path, monkeypatch, under_way
 ):
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.5)
     store = copy_store(undisturbed, tmp_path)
     if under_way:
         begun(store, tmp_path)
@@ -107,7 +107,7 @@ def test_an_extension_of_what_was_removed_by_hand_is_refused(undisturbed, tmp_pa
 
 
 def test_an_extension_that_is_refused_leaves_nothing(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT_SECONDS", 0.5)
     store = copy_store(undisturbed, tmp_path)
     lock = StoreLock(store)
     with pytest.raises(StoreError, match="is being written by process"):

@@ -27,7 +27,7 @@ from sweep.model.outputs import (
     SHOT_STATISTIC_VARIABLES,
     SHOT_VARIABLES,
 )
-from sweep.storage.locations import eyepoints_path
+from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine.journal import StoreLock
 from sweep.tasks.engine.progress import Progress, StoreError
@@ -35,20 +35,20 @@ from sweep.tasks.engine.study_store import create_store
 from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
 from sweep.tasks.studies.flight_study import FlightStudy
-from sweep.tasks.studies.store_summary import scene_summary, status
+from sweep.tasks.studies.store_summary import flight_summary, status
 from sweep.tasks.studies.study_plan import plan_study
 
 
 @pytest.fixture(autouse=True)
 def small_eyepoint_blocks(monkeypatch):
     """Several blocks of eyepoints a scanner, where the study itself is small."""
-    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS_MAX", 96)
+    monkeypatch.setattr(eyepoint_study, "SHOTS_PER_BLOCK_MAX", 96)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(eyepoint_study, "BLOCK_SHOTS_MAX", 96)
+        patch.setattr(eyepoint_study, "SHOTS_PER_BLOCK_MAX", 96)
         outcome = run_serially(
             small_scene_spec(), tmp_path_factory.mktemp("undisturbed") / "scene.zarr"
         )
@@ -99,10 +99,10 @@ def test_a_study_holds_every_array_that_the_model_names(undisturbed):
 
 
 def test_rays_are_counted_as_they_are_cast(undisturbed):
-    assert undisturbed.rays == {"three": 222 * 7 + 74, "line": 148 * 7 + 148}
+    assert undisturbed.rays_by_scanner == {"three": 222 * 7 + 74, "line": 148 * 7 + 148}
     plain = FlightStudy(small_scene_spec(), undisturbed.store)
     for eyepoints in plain.eyepoint_studies():
-        store = eyepoints_path(undisturbed.store, eyepoints.id)
+        store = eyepoint_store_location(undisturbed.store, eyepoints.id)
         assert sorted(receipt_blocks(store)) == list(range(eyepoints.n_blocks))
         assert eyepoints.n_blocks > 1
 
@@ -158,7 +158,7 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
         "sweep.model.pointcloud.eyepoints.observe_eyepoints", lambda *a, **k: looks.append(a)
     )
     outcome = run_serially(other, tmp_path / "darker.zarr")
-    assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not looks
+    assert outcome.complete and outcome.rays_by_scanner == {"three": 0, "line": 0} and not looks
     dark, bright = opened(outcome.store)["three"], opened(undisturbed.store)["three"]
     assert (dark.snr_up.isel(power=1) < bright.snr_up.isel(power=1)).all()
     assert dark.beam_range.equals(bright.beam_range)
@@ -185,8 +185,8 @@ def test_an_interrupted_study_resumes_to_the_same_bytes(undisturbed, tmp_path, p
         small_scene_spec(), store=path, scheduler="none", progress=StopUnder(points),
         evaluate=make_logging_evaluate(log),
     )  # fmt: skip
-    assert not outcome.complete and outcome.stopped
-    assert ("eyepoints" in outcome.stopped) == (points == 60)
+    assert not outcome.complete and outcome.stop_reason
+    assert ("eyepoints" in outcome.stop_reason) == (points == 60)
     assert status(path).blocks_done == outcome.blocks_done
     assert resume(
         path, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
@@ -210,18 +210,20 @@ def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scene.zarr"
     (path / "three" / "flags" / "c" / "1" / "1" / "0" / "0").unlink()
-    eyepoints = eyepoints_path(path, small_scene_spec().geometry_id("three"))
+    eyepoints = eyepoint_store_location(path, small_scene_spec().geometry_id("three"))
     (eyepoints / "offset" / "c" / "1" / "0").unlink()
     outcome = resume(path, progress=False, scheduler="none")
     assert outcome.complete and outcome.blocks_computed == 1
-    assert outcome.rays == {"three": 96 * 7 + 32, "line": 0}
+    assert outcome.rays_by_scanner == {"three": 96 * 7 + 32, "line": 0}
     assert file_digests(tmp_path / "copy") == file_digests(undisturbed.store.parent)
 
 
 def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent / "eyepoints", tmp_path / "eyepoints")
     spec = small_scene_spec()
-    one, other = (eyepoints_path(tmp_path / "x.zarr", spec.geometry_id(n)) for n in spec.scanners)
+    one, other = (
+        eyepoint_store_location(tmp_path / "x.zarr", spec.geometry_id(n)) for n in spec.scanners
+    )
     shutil.rmtree(one)
     os.rename(other, one)
     with pytest.raises(StoreError, match="holds other eyepoints than its name says"):
@@ -238,7 +240,7 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
 def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
     path = tmp_path / "scene.zarr"
     study = EyepointStudy(small_scene_spec(), "three")
-    theirs = eyepoints_path(path, study.id)
+    theirs = eyepoint_store_location(path, study.id)
     lock = StoreLock(create_store(theirs, study))
 
     class Other(Progress):
@@ -247,20 +249,20 @@ def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_pa
         def say(self, text):
             if "waiting for rays" in text:
                 if whole:
-                    cast = eyepoints_path(undisturbed.store, study.id)
+                    cast = eyepoint_store_location(undisturbed.store, study.id)
                     shutil.copytree(cast, theirs, dirs_exist_ok=True)
                 lock.release()
 
     outcome = run(small_scene_spec(), store=path, scheduler="none", progress=Other())
     assert outcome.complete
-    assert outcome.rays == undisturbed.rays | ({"three": 0} if whole else {})
+    assert outcome.rays_by_scanner == undisturbed.rays_by_scanner | ({"three": 0} if whole else {})
     assert file_digests(tmp_path) == file_digests(undisturbed.store.parent)
 
 
 def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
     found = plan_study(small_scene_spec(), store_path=tmp_path / "none.zarr", n_workers=2)
-    assert {s.name: s.n_rays for s in found.scanners} == undisturbed.rays
-    assert found.n_blocks == undisturbed.blocks and not found.scanners[0].is_cast
+    assert {s.name: s.n_rays for s in found.scanners} == undisturbed.rays_by_scanner
+    assert found.n_blocks == undisturbed.blocks and not found.scanners[0].has_eyepoints
     chunks = [p for p in undisturbed.store.rglob("c/**/*") if p.is_file()]
     known = [p for p in chunks if "scene_map" in str(p) or "power" in str(p)]
     assert found.n_chunks == len(chunks) - len(known)
@@ -268,12 +270,12 @@ def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
         array.nbytes for group, child in opened(undisturbed.store).children.items()
         for array in child.data_vars.values() if group != "scene_map"
     )  # fmt: skip
-    assert plan_study(small_scene_spec(), store_path=undisturbed.store).scanners[0].is_cast
+    assert plan_study(small_scene_spec(), store_path=undisturbed.store).scanners[0].has_eyepoints
 
 
 def test_the_summary_counts_what_the_arrays_hold(undisturbed):
     found = opened(undisturbed.store)
-    rows = {row.label: row for row in scene_summary(undisturbed.store)}
+    rows = {row.label: row for row in flight_summary(undisturbed.store)}
     assert len(rows) == 4
     weak = rows["three, power 0.01 W"]
     flags = found["three"].flags.values[0]
@@ -307,7 +309,7 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
     for chunk in (store / "three" / "velocity_status" / "c").rglob("*"):
         if chunk.is_file() and chunk.parts[-3:] != ("0", "0", "0"):
             chunk.unlink()
-    rows = {row.label: row for row in scene_summary(store)}
+    rows = {row.label: row for row in flight_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
     assert (weak.n_shots, weak.n_cycles) == (120 * 3, 40 * 3)
     status = opened(undisturbed.store)["three"].velocity_status.values[0, :40, :3]

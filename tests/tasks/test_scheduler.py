@@ -11,7 +11,7 @@ from sweep.tasks.engine.dispatcher import (
     TASKS_PER_SECOND_MAX,
     TaskDispatcher,
     ThroughputEstimator,
-    WorkerSlots,
+    WorkerThreadCount,
     _InFlightTask,
     task_key,
 )
@@ -63,7 +63,7 @@ def test_ten_million_blocks_are_handed_out_without_being_listed():
 
 
 def pace(seconds_a_block: float) -> ThroughputEstimator:
-    return ThroughputEstimator(n_blocks=100, seconds=100 * seconds_a_block)
+    return ThroughputEstimator(n_blocks=100, work_seconds=100 * seconds_a_block)
 
 
 def test_the_first_tasks_have_a_block_each():
@@ -91,7 +91,7 @@ def test_tasks_grow_short_towards_the_end():
 
 def test_a_pace_learns_from_answers():
     found = ThroughputEstimator(10, 1000.0)
-    found.update(TaskResult(receipts=[receipt(i) for i in range(5)]))
+    found.add_task_result(TaskResult(receipts=[receipt(i) for i in range(5)]))
     assert found == ThroughputEstimator(15, 1005.0)
 
 
@@ -103,9 +103,9 @@ class Client:
 
 
 def test_workers_that_may_come_are_counted_so_that_their_coming_is_asked_for():
-    assert WorkerSlots(Client()).current_count() == 2
-    assert WorkerSlots(Client(), expected_slots=40).current_count() == 40
-    assert WorkerSlots(Client(), expected_slots=1).current_count() == 2
+    assert WorkerThreadCount(Client()).current_count() == 2
+    assert WorkerThreadCount(Client(), expected_worker_threads=40).current_count() == 40
+    assert WorkerThreadCount(Client(), expected_worker_threads=1).current_count() == 2
 
 
 def test_the_same_work_has_the_same_key_and_other_work_another():

@@ -26,7 +26,7 @@ def impatient(monkeypatch):
     """A client of one worker, whose stalls are told after half a second."""
     RELEASED.clear()
     monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.05)
-    monkeypatch.setattr(dispatcher, "STALL_SECONDS", 0.5)
+    monkeypatch.setattr(dispatcher, "STALL_REPORT_SECONDS", 0.5)
     with thread_cluster_client(1) as client:
         yield client
 

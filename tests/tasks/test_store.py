@@ -82,14 +82,14 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     for name, values in results.items():
         stored = dataset[name].values[study.grid.block_slices(3)]
         assert stored.tobytes() == np.ascontiguousarray(values).tobytes()
-    assert int(dataset.pd_shot.notnull().sum()) == study.block_size(3)
+    assert int(dataset.pd_shot.notnull().sum()) == study.count_block_points(3)
 
 
 def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, study):
     layouts = {layout.name: layout for layout in study.array_layouts()}
     results = {
         name: np.full(
-            study.grid.block_extent(1), layouts[name].fill_value, dtype=layouts[name].dtype
+            study.grid.actual_block_shape(1), layouts[name].fill_value, dtype=layouts[name].dtype
         )
         for name in study.chunk_positions(1)
     }

@@ -22,7 +22,7 @@ from sweep.tasks.engine.progress import CodeError, TaskError
 from sweep.tasks.studies import study_plan as planned
 from sweep.tasks.studies import user_functions
 from sweep.tasks.studies.study_plan import plan_study
-from sweep.tasks.studies.user_function_names import user_modules
+from sweep.tasks.studies.user_function_names import user_module_names
 
 CODE = """
     import numpy as np
@@ -68,10 +68,10 @@ def mine(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(user_code.ALLOWED_MODULES_VARIABLE, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    user_functions.checked_function.cache_clear()
+    user_functions.load_checked_function.cache_clear()
     yield name
     sys.modules.pop(name, None)
-    user_functions.checked_function.cache_clear()
+    user_functions.load_checked_function.cache_clear()
 
 
 SHORT = {"fft_size": "2^9", "acquisition_delay": "34 us"}
@@ -143,7 +143,7 @@ def test_opening_a_store_runs_nothing(mine, tmp_path):
     assert status(tmp_path / "a.zarr").complete
     assert read_study(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
     assert runs(mine, tmp_path) == ran and mine not in sys.modules
-    user_functions.checked_function.cache_clear()
+    user_functions.load_checked_function.cache_clear()
     with pytest.raises(CodeError, match="not allowed"):
         sweep.resume(tmp_path / "a.zarr", progress=False)
 
@@ -229,7 +229,7 @@ def test_code_that_fails_in_a_block_is_told_with_its_file_line_and_name(mine, tm
     (tmp_path / f"{mine}.py").write_text(textwrap.dedent(FAILS_LATER))
     spec = study(f"{mine}:detect")
     outcome = run_serially(spec, tmp_path / "a.zarr", scheduler="none", allow_code=[mine])
-    assert not outcome.stopped and outcome.failures  # the disk has room
+    assert not outcome.stop_reason and outcome.failures  # the disk has room
     for failure in outcome.failures:
         assert f"{mine}:detect fails with OSError: [Errno 28]" in failure.error
         assert f"{mine}.py:7, in detect" in failure.error
@@ -252,16 +252,16 @@ def elsewhere(function, *arguments):
 def test_what_a_run_allows_its_workers_allow_too_if_they_have_the_same_file(mine, tmp_path):
     spec = study(f"{mine}:detect")
     user_code.allow_modules([mine])
-    ((module, digest),) = user_code.module_digests(user_modules(spec)).items()
+    ((module, digest),) = user_code.module_digests(user_module_names(spec)).items()
     assert module == mine and len(digest) == 32
     refused = elsewhere(user_functions.check_user_functions, spec)
     assert refused.returncode and b"its module is not allowed" in refused.stderr
-    assert elsewhere(user_code.allow_same_module, module, digest).returncode == 0
+    assert elsewhere(user_code.allow_identical_module, module, digest).returncode == 0
     (tmp_path / f"{mine}.py").write_text("detect = 3")
-    other = elsewhere(user_code.allow_same_module, module, digest)
+    other = elsewhere(user_code.allow_identical_module, module, digest)
     assert other.returncode and b"is not the same file on" in other.stderr
     (tmp_path / f"{mine}.py").unlink()
-    lost = elsewhere(user_code.allow_same_module, module, digest)
+    lost = elsewhere(user_code.allow_identical_module, module, digest)
     assert lost.returncode and f"put {mine}.py into the folder".encode() in lost.stderr
 
 

@@ -25,7 +25,7 @@ import sweep
 from sweep.analysis.datasets import NotAStoreError
 from sweep.cli import main
 from sweep.spec import load
-from sweep.storage.locations import eyepoints_path
+from sweep.storage.locations import eyepoint_store_location
 from sweep.tasks.driver import resume, run
 from sweep.tasks.engine import journal
 from sweep.tasks.engine.journal import StoreLock
@@ -54,7 +54,7 @@ def tiny(tmp_path_factory):
 def damages(store: Path, **options) -> list[str]:
     """Objects that are found damaged; a number of a line and a count of chunks are left out."""
     reports = verify(store, progress=False, **options)
-    return [damage.object for report in reports for damage in report.damages]
+    return [damage.object_name for report in reports for damage in report.damages]
 
 
 def files(store: Path) -> list[Path]:
@@ -95,7 +95,7 @@ def look_only(store: Path, monkeypatch) -> None:
 def unmarked(store: Path) -> list[str]:
     """What is found damaged in the one store."""
     (report,) = verify(store, progress=False)
-    return [damage.object for damage in report.damages]
+    return [damage.object_name for damage in report.damages]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch, 
             file.write_bytes(wrong)
             assert found_where(store, file), file
         file.unlink()
-        assert file.name in journal.LOG_NAMES or found_where(store, file), file
+        assert file.name in journal.LOG_FILE_NAMES or found_where(store, file), file
         file.write_bytes(content)
 
 
@@ -142,10 +142,10 @@ def test_whole_lines_cut_off_the_receipts_leave_their_blocks_to_be_done(tiny, tm
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes().splitlines(keepends=True)[0])
     (report,) = verify(store, progress=False)
-    assert report.sound and not report.complete and report.whole == 1
+    assert report.is_undamaged and not report.complete and report.undamaged_blocks == 1
     receipts.unlink()
     (report,) = verify(store, progress=False)
-    assert report.sound and report.whole == 0
+    assert report.is_undamaged and report.undamaged_blocks == 0
 
 
 def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, tmp_path):
@@ -155,22 +155,22 @@ def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, 
     (store / "pd_shot" / "c" / "0" / "2" / "0").unlink()
     (store / "pd_up" / "c" / "0" / "2" / "0").write_bytes(b"")
     (report,) = verify(store, progress=False)
-    assert [(d.block, d.object, d.what) for d in report.damages] == [
+    assert [(d.block, d.object_name, d.description) for d in report.damages] == [
         (2, "pd_shot/c/0/2/0", "is missing"),
         (2, "pd_up/c/0/2/0", "is empty"),
         (5, "pd_up/c/0/5/0", "fails its checksum"),
         (6, "pd_shot/c/0/6/0", "fails its checksum"),
     ]
-    assert (report.whole, report.blocks, report.unmarked) == (9, 12, "")
+    assert (report.undamaged_blocks, report.blocks, report.withdrawal_error) == (9, 12, "")
     (again,) = verify(store, progress=False)
-    assert again.sound and again.whole == 9
+    assert again.is_undamaged and again.undamaged_blocks == 9
     assert resume(
         store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
     ).complete
     assert logged_blocks(log) == [2, 5, 6]
     assert file_digests(store) == file_digests(undisturbed)
     (mended,) = verify(store, progress=False)
-    assert mended.sound and mended.complete
+    assert mended.is_undamaged and mended.complete
 
 
 def flip(file: Path) -> None:
@@ -225,7 +225,7 @@ def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path
     shutil.copy(chunks / "2" / "0", chunks / "5" / "0")
     (report,) = verify(store, progress=False)
     assert [damage.block for damage in report.damages] == [5]
-    assert "not the one that was committed" in report.damages[0].what
+    assert "not the one that was committed" in report.damages[0].description
 
 
 def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp_path):
@@ -257,7 +257,7 @@ def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, dama
     with pytest.raises(StoreError, match=r"sweep.verify\(.*, repair=True\)"):
         resume(store, progress=False, scheduler="none")
     (report,) = verify(store, progress=False, repair=True)
-    assert report.sound and report.complete and list(report.restored) == [name]
+    assert report.is_undamaged and report.complete and list(report.restored_objects) == [name]
     assert file_contents(store) == before
     assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
 
@@ -297,7 +297,7 @@ def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
             verify(store, progress=False, repair=True, spec=small_spec(**other))
     assert file_contents(store) == after
     (report,) = verify(store, progress=False, repair=True, spec=small_spec())
-    assert report.sound and report.complete
+    assert report.is_undamaged and report.complete
     assert file_contents(store) == before
 
 
@@ -326,8 +326,10 @@ def test_a_directory_that_sweep_did_not_make_is_not_written_over(tmp_path, conte
 def test_eyepoints_that_no_longer_say_what_they_are_are_mended_by_the_flight(flight, tmp_path):
     directory = shutil.copytree(flight.parent, tmp_path / "copy")
     store = directory / flight.name
-    lose_what_it_holds(eyepoints_path(store, small_scene_spec().geometry_id("line")), "gone")
-    assert all(report.sound for report in verify(store, progress=False, repair=True))
+    lose_what_it_holds(
+        eyepoint_store_location(store, small_scene_spec().geometry_id("line")), "gone"
+    )
+    assert all(report.is_undamaged for report in verify(store, progress=False, repair=True))
     assert file_digests(directory) == file_digests(flight.parent)
 
 
@@ -340,7 +342,7 @@ def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
     (store / "pd_up/c/0/5/0.1234.partial").write_bytes(b"of a writer that was killed")
     (store / ".sweep" / "receipts.jsonl").write_bytes(b"")  # blocks are no surplus without them
     (report,) = verify(store, progress=False)
-    assert sorted(damage.object for damage in report.damages) == sorted(surplus)
+    assert sorted(damage.object_name for damage in report.damages) == sorted(surplus)
     told = CliRunner().invoke(main, ["verify", str(store), "--repair"])
     assert told.exit_code == 1 and "range/c/1 is no part of the store" in told.output
     assert "sweep resume" not in told.output and (store / "range/c/1").exists()
@@ -352,7 +354,7 @@ def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
     store = copy_store(undisturbed, tmp_path)
     flip(store / "range" / "c" / "0")
     before = file_contents(store)
-    monkeypatch.setattr("sweep.tasks.engine.study_store.CODECS", "auto")
+    monkeypatch.setattr("sweep.tasks.engine.study_store.CHUNK_CODECS", "auto")
     with pytest.raises(StoreError, match="can't be made again as it was on this machine"):
         verify(store, progress=False, repair=True)
     assert file_contents(store) == before
@@ -368,7 +370,7 @@ def test_a_store_that_is_being_written_is_looked_at_and_not_touched(undisturbed,
     (report,) = verify(store, progress=False)
     held.release()
     assert [damage.block for damage in report.damages] == [5]
-    assert "is being written by process" in report.unmarked
+    assert "is being written by process" in report.withdrawal_error
     assert file_contents(store).items() <= before.items()
 
 
@@ -376,22 +378,22 @@ def test_a_store_that_is_being_written_is_looked_at_and_not_touched(undisturbed,
 def test_a_flights_store_and_its_eyepoints_are_verified_and_mended(flight, tmp_path, whose):
     directory = shutil.copytree(flight.parent, tmp_path / "copy")
     store = directory / flight.name
-    eyepoints = eyepoints_path(store, small_scene_spec().geometry_id("line"))
+    eyepoints = eyepoint_store_location(store, small_scene_spec().geometry_id("line"))
     damaged = store if whose == "the flight's" else eyepoints
-    assert [report.sound for report in verify(store, progress=False)] == [True] * 3
+    assert [report.is_undamaged for report in verify(store, progress=False)] == [True] * 3
     chunk = next(file for file in files(damaged) if file.parent.parent.name == "c")
     flip(chunk)
     flip(damaged / "zarr.json")
     flip(damaged / ".sweep" / "recipe.json")
     found = {report.store: report for report in verify(store, progress=False)}
-    assert [path for path, report in found.items() if not report.sound] == [damaged]
-    assert {d.object for d in found[damaged].damages} == {
+    assert [path for path, report in found.items() if not report.is_undamaged] == [damaged]
+    assert {d.object_name for d in found[damaged].damages} == {
         "zarr.json", ".sweep/recipe.json line 1", str(chunk.relative_to(damaged)),
     }  # fmt: skip
     verify(store, progress=False, repair=True)
     outcome = resume(store, spec=small_scene_spec(), progress=False, scheduler="none")
-    assert (outcome.complete and sum(outcome.rays.values()) > 0) or damaged == store
-    assert all(r.sound and r.complete for r in verify(store, progress=False))
+    assert (outcome.complete and sum(outcome.rays_by_scanner.values()) > 0) or damaged == store
+    assert all(r.is_undamaged and r.complete for r in verify(store, progress=False))
     assert file_digests(directory) == file_digests(flight.parent)
 
 
@@ -447,6 +449,6 @@ def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
 
     verify(undisturbed, progress=Watching())
     assert told == []
-    monkeypatch.setattr("sweep.tasks.studies.store_verification.BLOCKS_PER_BATCH", 5)
+    monkeypatch.setattr("sweep.tasks.studies.store_verification.BLOCKS_PER_READ_BATCH", 5)
     verify(undisturbed, progress=Watching())
     assert told == [(12, 0, "blocks"), 5, 5, 2, "end"]

@@ -33,7 +33,7 @@ from sweep.analysis.scene_results.recordings import (
     to_shown_units,
 )
 from sweep.model.pointcloud.pairing import TRUE_FLAG
-from sweep.storage.store_format import MAP_GROUP
+from sweep.storage.store_format import TERRAIN_MAP_GROUP
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
 """Azimuth (from north towards east) and elevation of the light that shades the ground [deg]."""
@@ -56,9 +56,11 @@ class HeightMap:
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
         """Return the map of a store, or None if it has no map or an empty one."""
-        if MAP_GROUP not in tree.children:
+        if TERRAIN_MAP_GROUP not in tree.children:
             return None
-        x, y, height = (np.asarray(tree[MAP_GROUP][name].values) for name in ("x", "y", "height"))
+        x, y, height = (
+            np.asarray(tree[TERRAIN_MAP_GROUP][name].values) for name in ("x", "y", "height")
+        )
         return cls(x, y, height) if np.isfinite(height).any() else None
 
     def crop(

@@ -23,7 +23,7 @@ from sweep.messages import STORE_PLACEHOLDER, suggestion
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.scene_sections import Interface
-from sweep.storage.locations import Location, atomic_path
+from sweep.storage.locations import Location, write_path_atomically
 
 MEASURED_QUANTITIES = ("range", "radial_velocity")
 """Quantities that a unit reports."""
@@ -106,7 +106,7 @@ def reports(
     shot_columns = _read_shots(recording, draw, ranges)
     report_columns = make_reports(shot_columns, results.spec.interface_with(interface or {}))
     if file is not None:
-        with atomic_path(Path(file), replace=True) as draft_path:
+        with write_path_atomically(Path(file), replace=True) as draft_path:
             headers = {
                 name: labels.column_label(name, u) for name, (u, _) in REPORT_COLUMNS.items()
             }

@@ -26,7 +26,7 @@ from sweep.model.outputs import CLOSING_SIGN_NOTE
 from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
-from sweep.storage.locations import Location, atomic_path
+from sweep.storage.locations import Location, write_path_atomically
 
 POINT_DTYPE = np.dtype(
     [
@@ -370,7 +370,7 @@ def export(
         recording, draw, ranges, origin,
         float(attributes.get("time_origin", 0.0)), str(attributes.get("projection", "")),
     )  # fmt: skip
-    with atomic_path(file, replace=True) as draft_path:
+    with write_path_atomically(file, replace=True) as draft_path:
         return WRITER_BY_SUFFIX[file.suffix.lower()](
             table, draft_path, _file_remarks(results, table, axis_position)
         )

@@ -25,7 +25,12 @@ from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import suggest_similar_name
-from sweep.storage.locations import PACKED_ATTRIBUTE, Location, eyepoints_path, parse_location
+from sweep.storage.locations import (
+    PACKED_ATTRIBUTE,
+    Location,
+    eyepoint_store_location,
+    parse_location,
+)
 from sweep.storage.store_format import OPEN_ZARR_KWARGS, NotAStoreError
 from sweep.storage.verified_store import open_verified_store
 from sweep.units import QuantityError
@@ -629,7 +634,7 @@ def read_eyepoints(
     store_path: Location, scanner_dataset: xr.Dataset, shot_indices: np.ndarray
 ) -> Eyepoints:
     """Read the eyepoints of shots from which a scanner's point cloud was computed."""
-    eyepoints_store = eyepoints_path(store_path, str(scanner_dataset.attrs["geometry_id"]))
+    eyepoints_store = eyepoint_store_location(store_path, str(scanner_dataset.attrs["geometry_id"]))
     if not eyepoints_store.exists():
         raise NotAStoreError(
             f"the eyepoints of the study are not at {eyepoints_store}: they are kept beside its "

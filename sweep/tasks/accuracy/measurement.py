@@ -19,7 +19,7 @@ from sweep.messages import option_name, option_text
 from sweep.model import VERSION
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
-from sweep.storage.locations import Location, is_free, resolve_links
+from sweep.storage.locations import Location, can_create_store, resolve_links
 from sweep.tasks.accuracy.settings import (
     ADAPTIVE_KIND,
     ALL_EFFECTS_KIND,
@@ -28,7 +28,7 @@ from sweep.tasks.accuracy.settings import (
     AccuracySetting,
     SettingLadder,
     add_fixed_effect_settings,
-    build_ladder,
+    build_setting_ladder,
 )
 from sweep.tasks.accuracy.study_sample import (
     FlightSample,
@@ -51,9 +51,9 @@ from sweep.tasks.engine.progress import (
     show_activity,
 )
 from sweep.tasks.studies.output_layouts import cf_attributes
-from sweep.tasks.studies.study_loading import ACCURACY_KIND, make_study
+from sweep.tasks.studies.study_loading import ACCURACY_STORE_KIND, make_study
 
-SAMPLE_POINTS, TIME_LIMIT_SECONDS = 200, 60.0
+DEFAULT_SAMPLE_POINTS, DEFAULT_TIME_LIMIT_SECONDS = 200, 60.0
 """Default number of points of a sample, and default time limit of the trials [s]."""
 
 ROUNDS_MAX = 27
@@ -62,11 +62,11 @@ ROUNDS_MAX = 27
 TRIAL_TIME_FRACTION = 0.003
 """Fraction of the time limit per trial, large enough for a negligible overhead of calls."""
 
-STRETCH_TIME_FACTOR = 2
-"""Time of a timed stretch of points as a multiple of that, so that overhead is negligible too."""
+TIMED_SEQUENCE_TIME_FACTOR = 2
+"""Time of a sequence of points that is timed, as a multiple of the time of a trial."""
 
-FIRST_STRETCH_DIVISOR = 8
-"""Divisor of the length of the stretches that find out which settings are slow."""
+FIRST_TIMED_SEQUENCE_DIVISOR = 8
+"""Divisor of the length of the first sequences, which show what settings are slow."""
 
 FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
 """Fractions of the time limit at which the first round, and the time-domain comparison, end."""
@@ -74,16 +74,16 @@ FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
 TIME_DOMAIN_POINTS_MIN, TIME_DOMAIN_POINTS_MAX = 3, 500
 """Least number of points in the time domain, whatever their time, and largest number."""
 
-TIME_DOMAIN_BEAMLETS = 109
+TIME_DOMAIN_BEAMLET_COUNT = 109
 """Number of beamlets in the time domain if accuracy sets it; each beamlet needs a record."""
 
-SINGLE_TRIAL_SECONDS = 1.0
+REPEATED_TRIAL_SECONDS_MAX = 1.0
 """Time of a trial [s] above which it is made only once."""
 
 FIXED_EFFECTS_TOLERANCES = (1e-1, 1e-3, 1e-6)
 """Tolerances whose effects are tried as fixed sets, the same at every point."""
 
-STORING_TRIALS = 3
+STORING_TIME_REPEATS = 3
 """Number of trials of each part of storing; the first may import and open modules and files."""
 
 
@@ -91,8 +91,8 @@ def measure_accuracy(
     spec: GridSpec | SceneSpec,
     *,
     store_path: Location,
-    n_points: int = SAMPLE_POINTS,
-    time_limit: float = TIME_LIMIT_SECONDS,
+    n_points: int = DEFAULT_SAMPLE_POINTS,
+    time_limit: float = DEFAULT_TIME_LIMIT_SECONDS,
     overwrite: bool = False,
     progress: bool | Progress = True,
 ) -> bool:
@@ -143,7 +143,7 @@ def measure_accuracy(
                 else GridSample(spec, n_points)
             )
         try:
-            measured_template = Measurement(
+            measured_template = AccuracyMeasurement(
                 sample, time_limit=time_limit, progress=listener, interrupts=interrupts
             ).run()
         except NothingMeasured:
@@ -156,9 +156,9 @@ def measure_accuracy(
 
 def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
     """Raise a StoreError if something at a path may not be replaced."""
-    if is_free(store_path):
+    if can_create_store(store_path):
         return
-    if store_format.read_attributes(store_path)["kind"] != ACCURACY_KIND:
+    if store_format.read_attributes(store_path)["kind"] != ACCURACY_STORE_KIND:
         raise StoreError(
             f"{store_path} holds a study's results: name another {option_name('store')}"
         )
@@ -174,11 +174,11 @@ def measure_storing_seconds(study: BlockStudy) -> float:
     results = {
         name: np.zeros(
             [region_slice.stop - region_slice.start for region_slice in region],
-            study.layout_by_name[name].dtype,
+            study.output_layout_by_name[name].dtype,
         )
         for name, region in study.chunk_regions(block).items()
     }
-    time_trials = partial(timeit.repeat, timer=process_time, repeat=STORING_TRIALS, number=1)
+    time_trials = partial(timeit.repeat, timer=process_time, repeat=STORING_TIME_REPEATS, number=1)
     with tempfile.TemporaryDirectory() as folder:
         store_path = Path(folder) / "study.zarr"
 
@@ -198,7 +198,7 @@ class NothingMeasured(Exception):
     """Raised if the measurement is interrupted before any point is complete."""
 
 
-class Measurement:
+class AccuracyMeasurement:
     """Measurement of all settings on a sample, in turn, so that drifts affect all settings alike.
 
     Each round has a different order of settings, as a short trial takes longer after a long one.
@@ -215,7 +215,9 @@ class Measurement:
     ) -> None:
         self._sample, self._time_limit = sample, time_limit
         self._progress, self._interrupts = progress, interrupts
-        self._setting_ladder = add_fixed_effects(build_ladder(sample.spec), sample)
+        self._setting_ladder = add_settings_with_fixed_effects(
+            build_setting_ladder(sample.spec), sample
+        )
         self._settings = self._setting_ladder.settings
         self._n_timed_points = np.ones(len(self._settings), np.int64)
         self._is_tried_once = np.zeros(len(self._settings), bool)
@@ -228,7 +230,7 @@ class Measurement:
             f"trying {n_settings} settings on {self._sample.size:,} {self._sample.points_noun}"
         )
         with show_activity("looking how long settings take", self._progress):
-            parts = self._sample.split(self._points_per_part())
+            parts = self._sample.split_into_parts(self._points_per_part())
             n_rounds = self._plan_rounds(parts)
         self._progress.begin(points=n_settings * len(parts) * n_rounds, done=0, unit="trials")
         try:
@@ -278,8 +280,11 @@ class Measurement:
         )
 
     def _points_per_part(self) -> int:
-        """Return the number of points of a part of the sample, so that two or more parts fit in."""
-        setting_numbers, first_part = range(len(self._settings)), self._sample.split(1)[0]
+        """Return the number of points of a part of the sample; the time allows two parts."""
+        setting_numbers, first_part = (
+            range(len(self._settings)),
+            self._sample.split_into_parts(1)[0],
+        )
         for setting_number in setting_numbers:  # compiles kernels, which does not count
             self._time_trial(setting_number, first_part)
         self._start = time.monotonic()
@@ -292,11 +297,11 @@ class Measurement:
             / seconds_per_round
         )
         # After an interruption complete parts are kept. One more part is tried before the rounds.
-        parts_min = max(2, len(self._sample.split(self._sample.size)))
+        parts_min = max(2, len(self._sample.split_into_parts(self._sample.size)))
         return max(1, min(self._sample.size // parts_min, int(points_that_fit / (parts_min + 1))))
 
     def _plan_rounds(self, parts: list[np.ndarray]) -> int:
-        """Return the number of rounds that fit in; set the number of points to time per setting."""
+        """Return the number of rounds that the time allows; set the points to time per setting."""
         n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
         while (
             self._time_trial(0, parts[0]) < trial_seconds / 2
@@ -304,7 +309,7 @@ class Measurement:
         ):
             n_points = min(2 * n_points, self._sample.timed_points_max)
             self._n_timed_points[0] = n_points
-        n_points_first = max(1, n_points // FIRST_STRETCH_DIVISOR)
+        n_points_first = max(1, n_points // FIRST_TIMED_SEQUENCE_DIVISOR)
         self._n_timed_points[:] = n_points_first
         first_seconds = np.array(
             [
@@ -312,10 +317,12 @@ class Measurement:
                 for setting_number in range(len(self._settings))
             ]
         )
-        points_that_fit = STRETCH_TIME_FACTOR * trial_seconds * n_points_first / first_seconds
+        points_that_fit = (
+            TIMED_SEQUENCE_TIME_FACTOR * trial_seconds * n_points_first / first_seconds
+        )
         self._n_timed_points[:] = np.exp2(np.floor(np.log2(points_that_fit))).clip(1, n_points)
         seconds_per_setting = first_seconds * self._n_timed_points / n_points_first
-        self._is_tried_once = seconds_per_setting > SINGLE_TRIAL_SECONDS
+        self._is_tried_once = seconds_per_setting > REPEATED_TRIAL_SECONDS_MAX
         seconds_left = 0.75 * (self._time_limit - self._elapsed_seconds) / len(parts)
         seconds_after_truth = (1 - TIME_DOMAIN_TIME_FRACTION) * self._time_limit / len(parts)
         repeated_seconds = max(float(seconds_per_setting[~self._is_tried_once].sum()), 1e-9)
@@ -336,7 +343,7 @@ class Measurement:
         if self._interrupts.is_stopping:
             raise NothingMeasured
         self._try_setting(setting_number, part)
-        self._sample.drop_caches()
+        self._sample.clear_caches()
         return time.monotonic() - start
 
     def _try_setting(self, setting_number: int, part: np.ndarray) -> Trial:
@@ -352,7 +359,10 @@ class Measurement:
         time_fraction: float,
         first_round: list[list[Trial]] | None = None,
     ) -> list[list[Trial]]:
-        """Try every setting on each part that time allows; slow ones only in the first round."""
+        """Try every setting on each part that time allows; slow settings only in the first round.
+
+        Return the trials by part and setting.
+        """
         trials_by_part: list[list[Trial]] = []
         for part in parts:
             if trials_by_part and self._elapsed_seconds > time_fraction * self._time_limit:
@@ -366,7 +376,7 @@ class Measurement:
                 else:
                     trials[setting_number] = self._try_setting(setting_number, part)
                 self._progress.advance(points=1, failed=0)
-            self._sample.drop_caches()
+            self._sample.clear_caches()
             trials_by_part.append(
                 [trials[setting_number] for setting_number in range(len(self._settings))]
             )
@@ -382,7 +392,9 @@ class Measurement:
         """
         reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
         differences: dict[int, np.ndarray] = {}
-        n_beamlets = TIME_DOMAIN_BEAMLETS if beamlets_field in reference_setting.overrides else 0
+        n_beamlets = (
+            TIME_DOMAIN_BEAMLET_COUNT if beamlets_field in reference_setting.overrides else 0
+        )
         if n_beamlets:
             overrides = {**reference_setting.overrides, beamlets_field: n_beamlets}
             reference_setting = replace(
@@ -401,11 +413,11 @@ class Measurement:
             )
             if np.isfinite(time_domain.pd).any():
                 differences[sample_row] = np.concatenate(result_differences(time_domain, simulated))
-        self._sample.drop_caches()
+        self._sample.clear_caches()
         return differences, n_beamlets
 
 
-def add_fixed_effects(
+def add_settings_with_fixed_effects(
     setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
 ) -> SettingLadder:
     """Return the ladder with settings that fix the effects of each tolerance at every point."""
@@ -421,11 +433,11 @@ def add_fixed_effects(
         for tolerance in FIXED_EFFECTS_TOLERANCES
         if tolerance in setting_by_tolerance
     }
-    sample.drop_caches()
+    sample.clear_caches()
     return add_fixed_effect_settings(setting_ladder, sample.spec, effects_by_tolerance, tolerances)
 
 
-ERROR_ARRAYS = {
+ERROR_ARRAY_LONG_NAMES = {
     "pd_error": "largest error of a probability of detection, of segments and shot",
     "log10_pfa_error": "error of log10 of a probability of false alarm",
     "magnitude_error": "error of the magnitude of the peak bins, over it or sigma if larger",
@@ -438,7 +450,7 @@ The first four are in the order of :func:`result_differences`.
 """
 
 N_PROMISED_ERRORS = 3
-"""Number of the first arrays whose errors a tolerance promises to bound."""
+"""Number of arrays in `ERROR_ARRAY_LONG_NAMES`, from the first on, that a tolerance bounds."""
 
 
 def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
@@ -479,7 +491,7 @@ class AccuracyTemplate:
     sample: StudySample
     setting_ladder: SettingLadder
     sample_rows: np.ndarray  # indices in the sample of the points that every setting has tried
-    rounds: list[list[Trial]]  # trials of all these points, by round and setting
+    trials_by_round: list[list[Trial]]  # trials of all these points, by round and setting
     n_timed_points: np.ndarray  # (settings,): number of points that are timed together
     time_domain_differences: dict[int, np.ndarray]
     """Differences of the reference from the time domain, by index in the sample."""
@@ -501,7 +513,7 @@ class AccuracyTemplate:
         """Return the spec, the reference of the errors, and totals of the measurement."""
         spec, settings_and_trials = (
             self.sample.spec,
-            zip(self.setting_ladder.settings, self.rounds[0], strict=True),
+            zip(self.setting_ladder.settings, self.trials_by_round[0], strict=True),
         )
         thesis_beamlets = [
             trial.results.n_beamlets
@@ -509,7 +521,7 @@ class AccuracyTemplate:
             if setting.kind == THESIS_KIND
         ]
         attributes: dict[str, Any] = {
-            "kind": ACCURACY_KIND,
+            "kind": ACCURACY_STORE_KIND,
             "title": spec.title,
             "question": "What does accuracy cost in time?",
             "spec": spec.to_json(),
@@ -544,7 +556,7 @@ class AccuracyTemplate:
         """Return coordinates, errors and times."""
         settings, results = (
             self.setting_ladder.settings,
-            [trial.results for trial in self.rounds[0]],
+            [trial.results for trial in self.trials_by_round[0]],
         )
         errors = [
             *zip(
@@ -559,13 +571,13 @@ class AccuracyTemplate:
         seconds = np.transpose(
             [
                 [trial.seconds_per_point for trial in results_of_setting]
-                for results_of_setting in self.rounds
+                for results_of_setting in self.trials_by_round
             ]
         )
         planning = np.transpose(
             [
                 [trial.planning_seconds_per_point for trial in results_of_setting]
-                for results_of_setting in self.rounds
+                for results_of_setting in self.trials_by_round
             ]
         )
         time_domain_pd = [
@@ -606,7 +618,9 @@ class AccuracyTemplate:
             make_layout("planning", ("rung", "round"), planning, "planning's share of it", "s"),
             *(
                 make_layout(name, ("rung", "point"), values, about)
-                for (name, about), values in zip(ERROR_ARRAYS.items(), errors, strict=True)
+                for (name, about), values in zip(
+                    ERROR_ARRAY_LONG_NAMES.items(), errors, strict=True
+                )
             ),
             make_layout(
                 "truth_pd_difference",

@@ -36,25 +36,25 @@ MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
 
 TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
-TRIED_BEAMLETS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
+TRIED_BEAMLET_COUNTS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
 """Numbers of beamlets that a study might fix: complete shells of a hexagonal lattice."""
 
-TRIED_LINE_BEAMLETS = (3, 9, 33, 163, 1234)
+TRIED_LINE_BEAMLET_COUNTS = (3, 9, 33, 163, 1234)
 """Numbers of beamlets in a line along the slope that a study over a plane might fix."""
 
-FIXED_EFFECTS_LINE_BEAMLETS = 163
-"""Number of them with fixed effects: enough for the widest footprints."""
+FIXED_EFFECTS_LINE_BEAMLET_COUNT = 163
+"""Number of beamlets in a line with fixed effects: enough for the widest footprints."""
 
-THESIS_BEAMLETS = 109
+THESIS_BEAMLET_COUNT = 109
 """Number of beamlets in [T 3.3.1]."""
 
-REFERENCE_RAYS, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
+REFERENCE_RAYS_PER_SHOT, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
 """Rays per shot of a flight's reference, and error by rays above which a shot gets more."""
 
-FIXED_RAYS_MAX = 223
+FIXED_RAYS_PER_SHOT_MAX = 223
 """Largest fixed number of rays that is tried; more cost as much as everything else together."""
 
-FIXED_RAYS_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
+FIXED_RAYS_PER_SHOT_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
 """Numbers of rays with fixed effects: the least, and the product of rays and tolerance.
 
 With this product one shot in a thousand over open ground exceeds the tolerance.
@@ -63,13 +63,13 @@ With this product one shot in a thousand over open ground exceeds the tolerance.
 REFERENCE_TOLERANCE = 1e-9
 """Tolerance of the reference for lines, leakage and, over a plane, the number of beamlets."""
 
-TRIED_DRAWS = (10, 100, 1000)
+TRIED_DRAW_COUNTS = (10, 100, 1000)
 
 REFERENCE_DRAWS_FACTOR = 10
 """Number of draws of the reference over that of the longest setting."""
 
 TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
-"""Tolerances of pd until which points are drawn."""
+"""Tolerances of pd that end the draws of a point."""
 
 _TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
     "accuracy.tolerance",
@@ -100,9 +100,9 @@ class AccuracySetting:
 
     @property
     def has_line_effects_only(self) -> bool:
-        """True if only effects are simulated that move or scale lines, as the thesis's method has.
+        """True if only effects are simulated that the thesis's method can simulate.
 
-        These are effects on lines, without changes within a record.
+        These move or scale a line as a whole, without changes within a record.
         """
         return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
 
@@ -139,13 +139,13 @@ class SettingLadder:
         return self.settings[-1]
 
 
-def build_ladder(spec: AnySpec) -> SettingLadder:
+def build_setting_ladder(spec: AnySpec) -> SettingLadder:
     """Return the settings of a study, without those with fixed effects."""
     if isinstance(spec, GridSpec) and spec.draws.has_draws:
-        return _build_draws_ladder(spec)
+        return _build_draw_setting_ladder(spec)
     notes: list[str] = []
     settings = [AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)]
-    why_beamlets_are_fixed = _why_beamlets_are_fixed(spec)
+    why_beamlets_are_fixed = _fixed_beamlets_reason(spec)
     adaptive_beamlets: dict[str, Any] = {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: "auto"}
     if _is_on_axis(spec, _TOLERANCE_FIELD):
         notes.append("accuracy.tolerance is on an axis: left as it is")
@@ -171,16 +171,16 @@ def build_ladder(spec: AnySpec) -> SettingLadder:
         notes.append(f"the number of beamlets is left alone: {why_beamlets_are_fixed}")
     elif isinstance(spec, SceneSpec):
         reference_overrides, rays_error_max = (
-            reference_overrides | {_BEAMLETS_FIELD: REFERENCE_RAYS},
+            reference_overrides | {_BEAMLETS_FIELD: REFERENCE_RAYS_PER_SHOT},
             REFERENCE_RAYS_TOLERANCE,
         )
-        reference_text += f", {REFERENCE_RAYS} beamlets or more"
+        reference_text += f", {REFERENCE_RAYS_PER_SHOT} beamlets or more"
     else:
         reference_overrides |= adaptive_beamlets | {_TOLERANCE_FIELD: REFERENCE_TOLERANCE}
         reference_text += f", beamlets as at {REFERENCE_TOLERANCE:g}"
     settings += () if why_beamlets_are_fixed else _beamlet_settings(isinstance(spec, SceneSpec))
     settings += _thesis_settings(
-        {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: THESIS_BEAMLETS},
+        {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: THESIS_BEAMLET_COUNT},
         beamlets_add_as_powers(spec.parameters()),
     )
     settings.append(
@@ -200,7 +200,7 @@ def add_fixed_effect_settings(
     effects_by_tolerance: Mapping[float, frozenset[str]],
     tolerances: Iterable[float] = (),
 ) -> SettingLadder:
-    """Add settings that simulate everywhere the effects that a tolerance needs anywhere.
+    """Add settings with fixed effects: at every point those that a tolerance needs at any point.
 
     ``tolerances`` of lines and leakage are tried with each set of effects; by default the
     tolerances of the sets.
@@ -238,33 +238,33 @@ def add_fixed_effect_settings(
 
 
 def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
-    """Return numbers of beamlets that a study with fixed effects might have, if none is given."""
-    if _why_beamlets_are_fixed(spec):
+    """Return overrides of the number of beamlets for fixed effects; empty if the scene sets it."""
+    if _fixed_beamlets_reason(spec):
         return {}
     if not isinstance(spec, SceneSpec):
-        return {_BEAMLETS_FIELD: FIXED_EFFECTS_LINE_BEAMLETS, _PATTERN_FIELD: _LINE_PATTERN}
-    rays_min = max(FIXED_RAYS_MIN, RAYS_TIMES_TOLERANCE / tolerance)
+        return {_BEAMLETS_FIELD: FIXED_EFFECTS_LINE_BEAMLET_COUNT, _PATTERN_FIELD: _LINE_PATTERN}
+    rays_min = max(FIXED_RAYS_PER_SHOT_MIN, RAYS_TIMES_TOLERANCE / tolerance)
     return {
         _BEAMLETS_FIELD: min(
             next(
-                (n_beamlets for n_beamlets in TRIED_BEAMLETS if n_beamlets >= rays_min),
-                FIXED_RAYS_MAX,
+                (n_beamlets for n_beamlets in TRIED_BEAMLET_COUNTS if n_beamlets >= rays_min),
+                FIXED_RAYS_PER_SHOT_MAX,
             ),
-            FIXED_RAYS_MAX,
+            FIXED_RAYS_PER_SHOT_MAX,
         )
     }
 
 
 def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
     """Return settings with fixed numbers of beamlets: in a lattice, and in a line over a plane."""
-    for n_beamlets in TRIED_BEAMLETS:
-        if not is_flight or n_beamlets <= FIXED_RAYS_MAX:
+    for n_beamlets in TRIED_BEAMLET_COUNTS:
+        if not is_flight or n_beamlets <= FIXED_RAYS_PER_SHOT_MAX:
             yield AccuracySetting(
                 name=f"{n_beamlets} beamlets",
                 kind=BEAMLETS_KIND,
                 overrides={_BEAMLETS_FIELD: n_beamlets},
             )
-    for n_beamlets in () if is_flight else TRIED_LINE_BEAMLETS:
+    for n_beamlets in () if is_flight else TRIED_LINE_BEAMLET_COUNTS:
         overrides = {_BEAMLETS_FIELD: n_beamlets, _PATTERN_FIELD: _LINE_PATTERN}
         yield AccuracySetting(
             name=f"{n_beamlets} in a line", kind=LINE_PATTERN_KIND, overrides=overrides
@@ -302,9 +302,9 @@ def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterato
         )
 
 
-def _build_draws_ladder(spec: GridSpec) -> SettingLadder:
+def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
     """Return settings of draws, with a long run of other draws as the reference."""
-    reference_draws = REFERENCE_DRAWS_FACTOR * TRIED_DRAWS[-1]
+    reference_draws = REFERENCE_DRAWS_FACTOR * TRIED_DRAW_COUNTS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     as_written_overrides: dict[str, Any] = {}
     for field_path, n_written in (
@@ -328,7 +328,7 @@ def _build_draws_ladder(spec: GridSpec) -> SettingLadder:
                 name=f"auto at {tolerance:g}", kind=ADAPTIVE_KIND, overrides=adaptive_overrides
             )
         )
-    for n_draws in TRIED_DRAWS:
+    for n_draws in TRIED_DRAW_COUNTS:
         draws_overrides = {_DRAWS_FIELD: n_draws, _DRAWS_LIMIT_FIELD: 0}
         noise_overrides = draws_overrides | {"draws.method": "noise"}
         settings += [
@@ -383,7 +383,7 @@ def _is_on_axis(spec: AnySpec, path: str) -> bool:
     return any(member.path == path for axis in spec.axes for member in axis.parameters)
 
 
-def _why_beamlets_are_fixed(spec: AnySpec) -> str:
+def _fixed_beamlets_reason(spec: AnySpec) -> str:
     """Return the reason why the scene, not accuracy, sets the number of beamlets; or ''."""
     if spec.parameters()["footprint.phases"] == "coherent":
         return "with coherent phases it is part of the scene, as the thesis has it"

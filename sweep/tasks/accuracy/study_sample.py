@@ -55,26 +55,29 @@ PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
 """Values of points and their attributes, by name of the coordinate."""
 
 
-def _flags_of_effects(effect_names: Collection[str]) -> np.uint32:
+def _effect_flags_of_names(effect_names: Collection[str]) -> np.uint32:
     """Return the flags of the named effects."""
     return np.uint32(sum(1 << EFFECT_NAMES.index(effect_name) for effect_name in effect_names))
 
 
-LINE_EFFECT_FLAGS = _flags_of_effects(
+THESIS_EFFECT_FLAGS = _effect_flags_of_names(
     [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
 )
-"""Flags of the effects that the thesis's method can have."""
+"""Flags of the effects that the thesis's method can simulate: those that move or scale lines."""
 
-TIME_DOMAIN_EFFECT_FLAGS = ~_flags_of_effects(
+TIME_DOMAIN_EFFECT_FLAGS = ~_effect_flags_of_names(
     ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
     + [effect.name for effect in EFFECTS if effect.is_random]
 )
 """Flags of the effects that the time-domain records contain."""
 
-TIMED_STRETCHES_PER_PART, TIMED_POINTS_MAX = 12, 8192
-"""Number of timed stretches of points per part of a grid's sample, and their largest length."""
+TIMED_SEQUENCES_PER_PART, TIMED_POINTS_MAX = 12, 8192
+"""Numbers of sequences of points that are timed per part of a grid's sample, and of their points.
 
-SAMPLED_AXIS_POINTS = 2
+The second number is the largest.
+"""
+
+AXIS_POINTS_PER_SCANNER = 2
 """Number of points of the axes at which each scanner of a flight is sampled."""
 
 RESERVED_COORDINATE_NAMES = ("number", "kind", "tolerance")
@@ -97,7 +100,7 @@ class SampleResults(NamedTuple):
 
 
 def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
-    """Return the results in the outputs of points.
+    """Return the sample results of some points from the model's outputs.
 
     With ``n_draws`` the outputs are counts of so many draws, otherwise probabilities.
     """
@@ -110,7 +113,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
         n_detected = [outputs[f"n_detected_{name}"].sum(axis=1) for name in segments_and_shot]
         pd = np.stack(n_detected, axis=1) / n_draws
         standard_error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / n_draws)
-        return unknown_results(len(pd))._replace(pd=pd, standard_error=standard_error.max(axis=1))
+        return nan_results(len(pd))._replace(pd=pd, standard_error=standard_error.max(axis=1))
     pd, variance = stack_outputs("pd_{}", segments_and_shot), outputs["noise_variance"]
     standard_errors = [
         outputs[f"pd_{name}_error"] for name in segments_and_shot if f"pd_{name}_error" in outputs
@@ -126,7 +129,7 @@ def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
     )
 
 
-def unknown_results(n_points: int) -> SampleResults:
+def nan_results(n_points: int) -> SampleResults:
     """Return results of nan for `n` points."""
     shapes = (
         (n_points, 4),
@@ -165,7 +168,7 @@ class StudySample(ABC):
 
     points_noun = "points"
     spec: AnySpec
-    study_with: Callable[[AccuracySetting], Any]  # returns the study with a setting
+    study_with_setting: Callable[[AccuracySetting], Any]  # returns the study with a setting
     point_indices: np.ndarray  # (size,): indices of the points, by which they are computed
     n_study_points: int  # number of points of the study, without the draws of a flight
     timed_points_max: int  # largest number of points that are timed together
@@ -176,8 +179,8 @@ class StudySample(ABC):
         return self.point_indices.size
 
     @abstractmethod
-    def split(self, points_per_part: int) -> list[np.ndarray]:
-        """Divide the sample into parts of about `points_per_part` points."""
+    def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
+        """Divide the sample into parts of about `points_per_part` points. Return their rows."""
 
     @abstractmethod
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
@@ -189,9 +192,9 @@ class StudySample(ABC):
 
     def simulated_effects(self, setting: AccuracySetting) -> frozenset[str]:
         """Return the effects that a setting simulates anywhere in the sample."""
-        parts = (self.point_indices[part] for part in self.split(self.size))
+        parts = (self.point_indices[part] for part in self.split_into_parts(self.size))
         effect_flags = [
-            np.bitwise_or.reduce(self._plan_flags(setting, indices)[0]) for indices in parts
+            np.bitwise_or.reduce(self._plan_effect_flags(setting, indices)[0]) for indices in parts
         ]
         return frozenset(unpack_effect_flags(int(np.bitwise_or.reduce(effect_flags))))
 
@@ -200,7 +203,7 @@ class StudySample(ABC):
     ) -> tuple[SampleResults, SampleResults]:
         """Compute a point in the time domain, and by the setting with the effects of both."""
         point_index = self.point_indices[[sample_row]]
-        effect_flags = self._plan_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
+        effect_flags = self._plan_effect_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
         # Records contain range walk, whatever effects are named.
         time_domain, simulated = (
             self._collect_results(
@@ -213,11 +216,11 @@ class StudySample(ABC):
         )
         return time_domain, simulated
 
-    def drop_caches(self) -> None:  # noqa: B027
+    def clear_caches(self) -> None:  # noqa: B027
         """Drop results that the trials of one part share; their time counts for each trial."""
 
     @abstractmethod
-    def _plan_flags(
+    def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
         """Return the effect flags of points (n,), and the time of planning per point [s]."""
@@ -233,13 +236,15 @@ class StudySample(ABC):
         """Yield indices of points, and their outputs; ``find_peaks`` replaces the peak search."""
 
     @cached_property
-    def _line_effect_flags(self) -> np.uint32:
-        """Flags of the study's effects that the thesis's method can have."""
-        return _flags_of_effects(self.simulated_effects(AS_WRITTEN_SETTING)) & LINE_EFFECT_FLAGS
+    def _thesis_effect_flags(self) -> np.uint32:
+        """Flags of the study's effects that the thesis's method can simulate."""
+        return (
+            _effect_flags_of_names(self.simulated_effects(AS_WRITTEN_SETTING)) & THESIS_EFFECT_FLAGS
+        )
 
     def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:
         """Plan and compute points; return the trial."""
-        effect_flags, planning_seconds = self._plan_flags(setting, point_indices)
+        effect_flags, planning_seconds = self._plan_effect_flags(setting, point_indices)
         find_peaks = (
             partial(find_peaks_on_grid, **setting.thesis_grid_options)
             if setting.thesis_grid_options
@@ -259,9 +264,11 @@ class StudySample(ABC):
     ) -> SampleResults:
         """Return the results of all points from the outputs of groups of points."""
         n_counted_draws = (
-            int(self.study_with(setting).spec.draws.number) if setting.counts_detections else 0
+            int(self.study_with_setting(setting).spec.draws.number)
+            if setting.counts_detections
+            else 0
         )
-        results = unknown_results(n_points)
+        results = nan_results(n_points)
         for rows, outputs in outputs_by_rows:
             for values, values_of_rows in zip(
                 results, extract_results(outputs, n_counted_draws), strict=True
@@ -316,8 +323,8 @@ class GridSample(StudySample):
         self, spec: GridSpec, n_points: int, point_indices: np.ndarray | None = None
     ) -> None:
         self.spec = spec
-        self.study_with = cache(lambda setting: GridStudy(setting.apply_to(spec)))
-        self._grid: ParameterBlockGrid = self.study_with(AS_WRITTEN_SETTING).grid
+        self.study_with_setting = cache(lambda setting: GridStudy(setting.apply_to(spec)))
+        self._grid: ParameterBlockGrid = self.study_with_setting(AS_WRITTEN_SETTING).grid
         self.point_indices = (
             halton_sample(self._grid.shape, n_points) if point_indices is None else point_indices
         )
@@ -325,7 +332,7 @@ class GridSample(StudySample):
         self._block_points = math.prod(self._grid.block_shape)
         self.timed_points_max = min(TIMED_POINTS_MAX, self._block_points)
 
-    def split(self, points_per_part: int) -> list[np.ndarray]:
+    def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
         """Divide the sample into parts, each spread as evenly as all of it."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
 
@@ -335,15 +342,15 @@ class GridSample(StudySample):
         trial = self._run_setting(setting, point_indices)
         if n_timed_points == 1:
             return trial
-        timed_points = point_indices[:: -(-part.size // TIMED_STRETCHES_PER_PART)].tolist()
-        stretches = np.concatenate(
+        timed_points = point_indices[:: -(-part.size // TIMED_SEQUENCES_PER_PART)].tolist()
+        timed_sequences = np.concatenate(
             [
                 self._points_computed_next(setting, timed_point, n_timed_points)
                 for timed_point in timed_points
             ]
         )
         # As many points per call as a block has, which share the overhead of a call.
-        blocks = np.array_split(stretches, -(-stretches.size // self._block_points))
+        blocks = np.array_split(timed_sequences, -(-timed_sequences.size // self._block_points))
         return merge_trials([self._run_setting(setting, block) for block in blocks])._replace(
             results=trial.results
         )
@@ -356,22 +363,22 @@ class GridSample(StudySample):
         index_coordinate = self.point_indices, {"long_name": "number of the point of the study"}
         return {"number": index_coordinate} | axis_coordinates(self.spec.axes, axis_indices)
 
-    def _plan_flags(
+    def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
         if setting.has_line_effects_only:
-            return np.full(point_indices.size, self._line_effect_flags), 0.0
-        effect_planner = self.study_with(setting).effect_planner
+            return np.full(point_indices.size, self._thesis_effect_flags), 0.0
+        effect_planner = self.study_with_setting(setting).effect_planner
         tiles, tile_of_point = np.unique(
             effect_planner.tiles.locate_points(point_indices)[0], return_inverse=True
         )
         effect_flags = np.empty(tiles.size, np.uint32)
         start = thread_time()
-        for members, effect_plan in effect_planner.iter_plans(tiles):
+        for members, effect_plan in effect_planner.iter_tile_plans(tiles):
             effect_flags[members] = pack_effect_flags(effect_plan.is_kept)
         seconds = thread_time() - start if setting.plans_effects else 0.0
         return effect_flags[tile_of_point], seconds / sum(
-            map(effect_planner.tiles.block_size, tiles.tolist())
+            map(effect_planner.tiles.count_block_points, tiles.tolist())
         )
 
     def _iter_outputs(
@@ -381,7 +388,7 @@ class GridSample(StudySample):
         effect_flags: np.ndarray,
         find_peaks: PeakFinder | None,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        study = self.study_with(setting)
+        study = self.study_with_setting(setting)
         for rows, effect_names in SelectedEffects(
             effect_flags, np.zeros(effect_flags.size)
         ).iter_equal_groups():
@@ -398,7 +405,7 @@ class GridSample(StudySample):
         self, setting: AccuracySetting, point_index: int, n_points: int
     ) -> np.ndarray:
         """Return a point and those that its block computes next, cyclically."""
-        grid = self.study_with(setting).grid
+        grid = self.study_with_setting(setting).grid
         (block,), (local_index,) = (
             array.tolist() for array in grid.locate_points(np.array([point_index]))
         )
@@ -418,7 +425,7 @@ class FlightSample(StudySample):
 
     def __init__(self, spec: SceneSpec, n_points: int) -> None:
         self.spec = spec
-        self.study_with = cache(self._make_study)
+        self.study_with_setting = cache(self._make_study)
         self._cast_eyepoints: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
         # The shots of a block share work that does not depend on their number, such as planning.
         self.timed_points_max = int(spec.storage.block_shots) or DEFAULT_BLOCK_SHOTS_MAX
@@ -431,10 +438,10 @@ class FlightSample(StudySample):
         self.point_indices = np.arange(self._shot_numbers.size)
         self.n_study_points = sum(
             part_shots.n_points // part_shots.n_draws
-            for part_shots in self.study_with(AS_WRITTEN_SETTING).grids
+            for part_shots in self.study_with_setting(AS_WRITTEN_SETTING).grids
         )
 
-    def split(self, points_per_part: int) -> list[np.ndarray]:
+    def split_into_parts(self, points_per_part: int) -> list[np.ndarray]:
         """Divide the sample into complete tiles of one scanner at a point of the axes, in turn."""
         tiles_per_part, parts_by_block = max(1, round(points_per_part / SHOTS_PER_TILE)), []
         for rows in (
@@ -455,8 +462,8 @@ class FlightSample(StudySample):
         ]
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the part, timed with neighbouring tiles of `n_points` shots and their rays."""
-        point_indices = self.extend_to_whole_tiles(part, n_timed_points)
+        """Compute the part, timed with neighbouring tiles up to `n_timed_points` shots."""
+        point_indices = self.extend_to_complete_tiles(part, n_timed_points)
         trial = self._run_setting(setting, point_indices)
         rows_of_part = np.searchsorted(point_indices, part)
         _, casting_seconds = self._cast_shots(setting, *self.flight_block_and_shots(point_indices))
@@ -479,18 +486,18 @@ class FlightSample(StudySample):
             "shot": (self._shot_numbers, {"long_name": "number of the shot"}),
         } | axis_coordinates(self.spec.axes, tuple(axis_indices[self._part_of_row].T))
 
-    def drop_caches(self) -> None:
+    def clear_caches(self) -> None:
         """Drop the rays that settings of the same geometry share."""
         self._cast_eyepoints.clear()
 
-    def extend_to_whole_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
-        """Return the rows of the tiles of some points, and of following tiles.
+    def extend_to_complete_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
+        """Return the rows of the complete tiles of some points, and of tiles that follow.
 
-        As many tiles follow as have `n_shots` shots with the first.
+        Tiles are added until those from the first one on have at least `n_shots` shots.
         """
         rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
         return rows_of_block[
-            rows_of_whole_tiles(
+            rows_of_complete_tiles(
                 self._shot_numbers[rows_of_block] // SHOTS_PER_TILE,
                 point_indices - rows_of_block[0],
                 n_shots,
@@ -503,18 +510,18 @@ class FlightSample(StudySample):
             point_indices
         ]
 
-    def _plan_flags(
+    def _plan_effect_flags(
         self, setting: AccuracySetting, point_indices: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        tile_rows = self.extend_to_whole_tiles(point_indices, 1)
+        tile_rows = self.extend_to_complete_tiles(point_indices, 1)
         flight_block, shot_numbers = self.flight_block_and_shots(tile_rows)
         eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
         start = thread_time()
         if setting.has_line_effects_only:
-            effect_flags = np.where(eyepoints.has_target, self._line_effect_flags, 0)
+            effect_flags = np.where(eyepoints.has_target, self._thesis_effect_flags, 0)
         else:
             effect_flags = (
-                self.study_with(setting)
+                self.study_with_setting(setting)
                 .select_effects(flight_block, eyepoints, shot_numbers)
                 .effect_flags
             )
@@ -529,7 +536,7 @@ class FlightSample(StudySample):
         find_peaks: PeakFinder | None,
     ) -> Iterator[tuple[np.ndarray, Results]]:
         study, (flight_block, shot_numbers) = (
-            self.study_with(setting),
+            self.study_with_setting(setting),
             self.flight_block_and_shots(point_indices),
         )
         eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
@@ -538,9 +545,12 @@ class FlightSample(StudySample):
             np.flatnonzero(eyepoints.has_target),
         )
         simulate_group = partial(
-            _shot_statistics, study, flight_block, find_peaks or evaluation.evaluate_segments
+            _simulate_shot_statistics,
+            study,
+            flight_block,
+            find_peaks or evaluation.evaluate_segments,
         )
-        yield from study.iter_clouds(
+        yield from study.iter_simulated_groups(
             flight_block.scanner,
             eyepoints,
             selected_effects,
@@ -551,13 +561,13 @@ class FlightSample(StudySample):
 
     def _sample_shots(self, n_points: int) -> Iterator[tuple[FlightBlock, np.ndarray]]:
         """Yield scanners at points of the axes, and shot numbers spread over the flight."""
-        study = self.study_with(AS_WRITTEN_SETTING)
+        study = self.study_with_setting(AS_WRITTEN_SETTING)
         for scanner, scanner_grid in study.scanner_grids.items():
-            axis_points = halton_sample(scanner_grid.axes_shape, SAMPLED_AXIS_POINTS)
+            axis_points = halton_sample(scanner_grid.axes_shape, AXIS_POINTS_PER_SCANNER)
             tiles_wanted = math.ceil(
                 n_points / SHOTS_PER_TILE / len(study.scanner_grids) / len(axis_points)
             )
-            shot_numbers = study.get_eyepoint_study(scanner).sample_cycles(
+            shot_numbers = study.get_eyepoint_study(scanner).sample_shots_of_cycles(
                 max(self.timed_points_max // SHOTS_PER_TILE, tiles_wanted)
             )
             for axis_point in axis_points:
@@ -574,14 +584,14 @@ class FlightSample(StudySample):
         # all studies share a scene, as building it can take seconds
         study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
         if setting.rays_error_max:
-            study.ray_accuracy = ErrorBudget(setting.rays_error_max, rays_tolerance_min=0.0)
+            study.ray_error_budget = ErrorBudget(setting.rays_error_max, rays_tolerance_min=0.0)
         return study
 
     def _cast_shots(
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
     ) -> tuple[Eyepoints, float]:
         """Return the eyepoints of shots, cached by geometry, and the time of casting them [s]."""
-        eyepoint_study = self.study_with(setting).get_eyepoint_study(flight_block.scanner)
+        eyepoint_study = self.study_with_setting(setting).get_eyepoint_study(flight_block.scanner)
         cache_key = eyepoint_study.id, shot_numbers.tobytes()
         if cache_key not in self._cast_eyepoints:
             start = thread_time()
@@ -592,11 +602,11 @@ class FlightSample(StudySample):
         return self._cast_eyepoints[cache_key]
 
 
-def rows_of_whole_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
-    """Return the rows of the tiles of some rows, and of following tiles, cyclically.
+def rows_of_complete_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
+    """Return the rows of the complete tiles of some rows, and of tiles that follow, cyclically.
 
-    ``tile_of_row`` (n,) is the rising number of each row's tile. So many tiles follow that they
-    have `n_shots` shots with the first.
+    ``tile_of_row`` (n,) is the rising number of each row's tile. Tiles are added until those from
+    the first one on have at least `n_shots` shots.
     """
     tiles, counts = np.unique(tile_of_row, return_counts=True)
     own_tiles = np.unique(tile_of_row[rows])
@@ -605,7 +615,7 @@ def rows_of_whole_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int)
     return np.flatnonzero(np.isin(tile_of_row, [*own_tiles, *tiles[tile_order[:n_tiles]]]))
 
 
-def _shot_statistics(
+def _simulate_shot_statistics(
     study: FlightStudy,
     flight_block: FlightBlock,
     find_peaks: PeakFinder,
@@ -614,7 +624,7 @@ def _shot_statistics(
     shot_numbers: np.ndarray,
     effect_flags: np.ndarray,
 ) -> Results:
-    """Return statistics of shots by a function that finds peaks; nan of shots that hit nothing."""
+    """Return statistics of shots from the peaks that ``find_peaks`` finds; nan without a hit."""
     hitting_shots, n_rays = eyepoints.has_target.nonzero()[0], eyepoints.weight.size
     shot_parameters, ground = parameters_and_ground_of_eyepoints(
         eyepoints.select(hitting_shots), study.parameters_at(flight_block), study.surfaces
@@ -624,7 +634,7 @@ def _shot_statistics(
     )
     peaks = find_peaks(shots)
     outputs = evaluation.shot_statistics(shots, peaks) | {"beamlets": np.full(shots.size, n_rays)}
-    if study.ray_accuracy is not None:
+    if study.ray_error_budget is not None:
         peak_bins = peaks[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
         outputs["beamlets_error"] = estimate_ray_error(
             shots, ground.beamlets, peak_bins, peaks[:, 2].T

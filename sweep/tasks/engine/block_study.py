@@ -33,11 +33,11 @@ class PartialResults(NamedTuple):
 NO_RESULTS = PartialResults(np.zeros(0, np.int64), {})
 
 
-class ReusedResults(NamedTuple):
-    """Results of a block that exist before it is computed."""
+class EarlierResults(NamedTuple):
+    """Results of a block from earlier tasks or another store: finished and unfinished points."""
 
-    done: PartialResults = NO_RESULTS  # points that need not be computed
-    begun: PartialResults = NO_RESULTS  # points that are computed in part, to be continued
+    finished: PartialResults = NO_RESULTS  # points that need not be computed
+    unfinished: PartialResults = NO_RESULTS  # points that are computed in part, to be continued
 
 
 def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
@@ -53,14 +53,14 @@ def concatenate_results(parts: Sequence[PartialResults]) -> PartialResults:
 
 @dataclass
 class Deadline:
-    """End of the time for one task's work on a block; calling it tells whether that has passed."""
+    """Time at which a task stops work on a block; calling the object tells if it has passed."""
 
-    at: float = float("inf")  # time by `time.monotonic` [s]
+    end_time: float = float("inf")  # time by `time.monotonic` [s]
     has_passed: bool = False  # True if any call so far was after the deadline
 
     def __call__(self) -> bool:
         """Return True after the deadline."""
-        self.has_passed = self.has_passed or time.monotonic() >= self.at
+        self.has_passed = self.has_passed or time.monotonic() >= self.end_time
         return self.has_passed
 
 
@@ -71,7 +71,7 @@ class UnfinishedBlock(Exception):
     counts in part.
     """
 
-    def __init__(self, results: ReusedResults, n_points: float) -> None:
+    def __init__(self, results: EarlierResults, n_points: float) -> None:
         super().__init__()
         self.results, self.n_points = results, n_points
 
@@ -109,7 +109,7 @@ class BlockStudy(StoreTemplate, ABC):
     * `constant_arrays` and `output_layouts`: its arrays, with values, and to be written by blocks.
     * `evaluate` and `compile_kernels`: computation of one block.
     * `has_checkpoints` and `evaluate_until`, if a block can stop at a deadline and be continued.
-    * `pop_reused_points`, if results of another store are reused.
+    * `pop_reused_point_count`, if results of another store are reused.
 
     Workers read the study of a store by `Workload.read_study`.
     """
@@ -144,43 +144,46 @@ class BlockStudy(StoreTemplate, ABC):
         return False
 
     def evaluate_until(
-        self, block: int, checkpoint_results: ReusedResults, deadline: Deadline
+        self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
-        """Return what `evaluate` does, from a checkpoint on; `UnfinishedBlock` at the deadline.
+        """Compute a block from a checkpoint on, with the same results as `evaluate`.
 
-        Called in place of `evaluate` if `has_checkpoints`.
+        Raise `UnfinishedBlock` at the deadline. It is called in place of `evaluate` if
+        `has_checkpoints`.
         """
         raise NotImplementedError
 
-    def pop_reused_points(self, block: int) -> int:
-        """Return how many points of a block that was evaluated came from another store, once."""
+    def pop_reused_point_count(self, block: int) -> int:
+        """Return the number of points of a computed block that another store had; forget it."""
         return 0
 
     def array_layouts(self) -> list[ArrayLayout]:
         """Return the layouts of all arrays of the store."""
-        return [*self.constant_arrays(), *self.layout_by_name.values()]
+        return [*self.constant_arrays(), *self.output_layout_by_name.values()]
 
     @cached_property
-    def layout_by_name(self) -> dict[str, ArrayLayout]:
+    def output_layout_by_name(self) -> dict[str, ArrayLayout]:
         """Layouts of the arrays that blocks write, by name."""
         return {layout.name: layout for layout in self.output_layouts()}
 
     @property
     def n_chunks(self) -> int:
         """Number of chunks of all blocks."""
-        return sum(layout.n_chunks for layout in self.layout_by_name.values())
+        return sum(layout.n_chunks for layout in self.output_layout_by_name.values())
 
     @property
     def nbytes(self) -> int:
         """Size of all results before compression [bytes]."""
-        return sum(layout.nbytes_of(layout.shape) for layout in self.layout_by_name.values())
+        return sum(
+            layout.nbytes_of_part(layout.shape) for layout in self.output_layout_by_name.values()
+        )
 
     @property
     def block_nbytes_max(self) -> int:
         """Size of the results of the largest block before compression [bytes]."""
         nbytes_by_group = dict.fromkeys(self._first_block_and_grid_by_group, 0)
-        for layout in self.layout_by_name.values():
-            nbytes_by_group[layout.group_path] += layout.nbytes_of(layout.chunks)
+        for layout in self.output_layout_by_name.values():
+            nbytes_by_group[layout.group_path] += layout.nbytes_of_part(layout.chunks)
         return max(nbytes_by_group.values())
 
     @property
@@ -218,18 +221,20 @@ class BlockStudy(StoreTemplate, ABC):
         """Return the number of the first block of a group."""
         return self._first_block_and_grid_by_group[group][0]
 
-    def block_size(self, block: int) -> int:
+    def count_block_points(self, block: int) -> int:
         """Return the number of points of a block."""
         grid, block_in_grid = self.locate_in_grid(block)
-        return grid.block_size(block_in_grid)
+        return grid.count_block_points(block_in_grid)
 
-    def count_points(self, is_included: np.ndarray) -> int:
+    def count_points_in_blocks(self, is_included: np.ndarray) -> int:
         """Count the points in the blocks that a mask (blocks,) of bool marks."""
         parts = np.split(is_included, np.cumsum([grid.n_blocks for grid in self.grids])[:-1])
-        return sum(grid.count_points(part) for grid, part in zip(self.grids, parts, strict=True))
+        return sum(
+            grid.count_points_in_blocks(part) for grid, part in zip(self.grids, parts, strict=True)
+        )
 
     @cached_property
-    def _grid_dims_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
+    def _grid_dim_indices_by_array(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
         """Index of the grid dimension that each dimension of an array follows.
 
         The keys are group and name of the array.
@@ -237,10 +242,10 @@ class BlockStudy(StoreTemplate, ABC):
         grid_dims: dict[str, dict[str, tuple[int | None, ...]]] = {
             group: {} for group in self._first_block_and_grid_by_group
         }
-        for name, layout in self.layout_by_name.items():
+        for name, layout in self.output_layout_by_name.items():
             grid_dims[layout.group_path][name] = self._first_block_and_grid_by_group[
                 layout.group_path
-            ][1].grid_dims_of(layout)
+            ][1].grid_dim_indices(layout)
         return grid_dims
 
     def chunk_positions(self, block: int) -> dict[str, tuple[int, ...]]:
@@ -256,26 +261,26 @@ class BlockStudy(StoreTemplate, ABC):
         }  # the array must have all of these dimensions
         return {
             name: tuple(0 if dim is None else position[dim] for dim in grid_dims)
-            for name, grid_dims in self._grid_dims_by_array[grid.group].items()
+            for name, grid_dims in self._grid_dim_indices_by_array[grid.group].items()
             if nonzero_dims.issubset(grid_dims)
         }
 
     def chunk_regions(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Return the slices that a block writes, by the name of the array."""
         return {
-            name: self.layout_by_name[name].region(position)
+            name: self.output_layout_by_name[name].chunk_region(position)
             for name, position in self.chunk_positions(block).items()
         }
 
-    def chunk_owners(self) -> dict[str, np.ndarray]:
+    def chunk_owner_blocks(self) -> dict[str, np.ndarray]:
         """Return the block that writes each chunk, by the name of the array.
 
         Each value has the shape of the array's grid of chunks.
         """
         owners_by_array = {}
-        for array_name, layout in self.layout_by_name.items():
+        for array_name, layout in self.output_layout_by_name.items():
             first_block, grid = self._first_block_and_grid_by_group[layout.group_path]
-            owners_by_array[array_name] = first_block + grid.chunk_owners(layout)
+            owners_by_array[array_name] = first_block + grid.chunk_owner_blocks(layout)
         return owners_by_array
 
 
@@ -297,7 +302,7 @@ class Workload(Protocol):
         """Workers, threads and scheduler that the spec asks for."""
 
     @property
-    def user_modules(self) -> tuple[str, ...]:
+    def user_module_names(self) -> tuple[str, ...]:
         """Names of the user's Python modules whose functions the blocks call."""
 
     @property

@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 Results = dict[str, np.ndarray]
+"""Arrays of results by the name of the output variable."""
 
 #: Fill value of an array by the kind of its dtype; the integers that are stored are not negative.
-FILL_VALUE_BY_KIND = {"f": float("nan"), "i": -1, "u": 0}
+FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
 
 
 def chunk_slices(
@@ -90,11 +91,11 @@ class ArrayLayout:
             -(-length // chunk) for length, chunk in zip(self.shape, self.chunks, strict=True)
         )
 
-    def nbytes_of(self, shape: tuple[int, ...]) -> int:
+    def nbytes_of_part(self, shape: tuple[int, ...]) -> int:
         """Return the size of a part of the array with this shape, before compression [bytes]."""
         return math.prod(shape) * np.dtype(self.dtype).itemsize
 
-    def region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
+    def chunk_region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
         """Return the slices of the chunk at a position in the grid of chunks."""
         return chunk_slices(position, self.chunks, self.shape)
 
@@ -149,17 +150,17 @@ class BlockGrid:
         """Return the slices of a block along each dimension, cut at the edge of the grid."""
         return chunk_slices(self.block_position(block), self.block_shape, self.shape)
 
-    def block_extent(self, block: int) -> tuple[int, ...]:
-        """Return the number of steps of a block along each dimension."""
+    def actual_block_shape(self, block: int) -> tuple[int, ...]:
+        """Return the number of grid steps of a block along each dimension, less at the edge."""
         return tuple(
             block_slice.stop - block_slice.start for block_slice in self.block_slices(block)
         )
 
-    def block_size(self, block: int) -> int:
+    def count_block_points(self, block: int) -> int:
         """Return the number of points of a block."""
-        return math.prod(self.block_extent(block)) * self.fine_steps
+        return math.prod(self.actual_block_shape(block)) * self.fine_steps
 
-    def count_points(self, is_included: np.ndarray) -> int:
+    def count_points_in_blocks(self, is_included: np.ndarray) -> int:
         """Count the points in the blocks that a mask (blocks,) of bool marks."""
         counts = np.asarray(is_included, bool).reshape(self.blocks_per_dim)
         for size, chunk in zip(self.shape[::-1], self.block_shape[::-1], strict=True):
@@ -182,13 +183,13 @@ class BlockGrid:
         return blocks, local_indices
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
-        """Return the indices in C order over the whole grid of points of a block.
+        """Return the indices, in C order over the whole grid, of some points of a block.
 
         `local_indices` (m,) are indices in C order over the block. Inverse of `locate_points`.
         """
         if not self.shape:
             return np.zeros(local_indices.size, np.int64)
-        axis_offsets = np.unravel_index(local_indices, self.block_extent(block))
+        axis_offsets = np.unravel_index(local_indices, self.actual_block_shape(block))
         axis_indices = [
             offset + block_slice.start
             for offset, block_slice in zip(axis_offsets, self.block_slices(block), strict=True)
@@ -221,11 +222,11 @@ class BlockGrid:
             chunks=tuple(chunk_sizes[dim] for dim in dims),
             dims=dims,
             dtype=dtype,
-            fill_value=FILL_VALUE_BY_KIND[dtype[0]],
+            fill_value=FILL_VALUE_BY_DTYPE_KIND[dtype[0]],
             attributes=attributes,
         )
 
-    def grid_dims_of(self, layout: ArrayLayout) -> tuple[int | None, ...]:
+    def grid_dim_indices(self, layout: ArrayLayout) -> tuple[int | None, ...]:
         """Return the index of the grid dimension that each dimension of an array follows.
 
         None for dimensions that follow none.
@@ -234,12 +235,12 @@ class BlockGrid:
         grid_dim_of |= {dim: position for position, dim in enumerate(self.dims)}
         return tuple(grid_dim_of.get(dim) for dim in layout.dims)
 
-    def chunk_owners(self, layout: ArrayLayout) -> np.ndarray:
+    def chunk_owner_blocks(self, layout: ArrayLayout) -> np.ndarray:
         """Return the block that writes each chunk of an array.
 
         The result has the shape of the array's grid of chunks.
         """
-        grid_dims = self.grid_dims_of(layout)
+        grid_dims = self.grid_dim_indices(layout)
         blocks = np.arange(self.n_blocks).reshape(self.blocks_per_dim)
         first_blocks = blocks[
             tuple(slice(None) if grid_dim in grid_dims else 0 for grid_dim in range(len(self.dims)))
@@ -253,4 +254,4 @@ class BlockGrid:
 
 #: Largest number of blocks of a study: a run keeps some 30 bytes per block in memory, and a block
 #: is stored in one file per array.
-BLOCKS_MAX = 2 * 10**7
+BLOCKS_PER_STUDY_MAX = 2 * 10**7

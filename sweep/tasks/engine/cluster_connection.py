@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from distributed import Client, Security
 
 #: Time in which a scheduler must respond [s].
-CONNECT_TIMEOUT = 15.0
+CONNECT_TIMEOUT_SECONDS = 15.0
 
 
 class ClusterConnection(NamedTuple):
     """Connection to a cluster."""
 
     client: Client
-    expected_slots: int  # largest number of worker threads; 0 if unknown
+    expected_worker_threads: int  # largest number of worker threads; 0 if unknown
     restart_workers: Callable[[], object] = lambda: None  # replaces lost workers
 
 
@@ -74,7 +74,7 @@ def connect_cluster(
             yield ClusterConnection(client, bounds.most * cluster.worker.threads)
         return
     with (
-        local_ssh.spawn_environment(),
+        local_ssh.isolate_spawned_workers(),
         _start_workers(cluster, bounds, processes) as dask_cluster,
         Client(dask_cluster, set_as_default=False) as client,
     ):
@@ -84,13 +84,13 @@ def connect_cluster(
             f": dashboard {local_ssh.dashboard_link(dask_cluster)}" if shows_dashboard else ""
         )
         say(f"{_workers_text(cluster, bounds)}{dashboard_text}")
-        expected_slots = bounds.most * cluster.worker.threads
+        expected_worker_threads = bounds.most * cluster.worker.threads
         if isinstance(cluster, LocalClusterConfig):
             yield ClusterConnection(
-                client, expected_slots, lambda: dask_cluster.scale(bounds.least)
+                client, expected_worker_threads, lambda: dask_cluster.scale(bounds.least)
             )
         else:  # the cluster itself replaces lost workers, or can't
-            yield ClusterConnection(client, expected_slots)
+            yield ClusterConnection(client, expected_worker_threads)
 
 
 def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
@@ -120,7 +120,9 @@ def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
                 f"what answers at {address} is no Dask scheduler ({type(error).__name__})"
             ) from error
     try:
-        return Client(address, timeout=CONNECT_TIMEOUT, security=security, set_as_default=False)
+        return Client(
+            address, timeout=CONNECT_TIMEOUT_SECONDS, security=security, set_as_default=False
+        )
     except (OSError, ValueError) as error:
         # Collected here: if it is collected while another client is made, it waits for the lock of
         # that client for ever.
@@ -134,9 +136,9 @@ async def _check_scheduler(address: str, security: Security | None) -> None:
     from distributed import Security, rpc
 
     connection_args = (security or Security()).get_connection_args("client")
-    async with asyncio.timeout(CONNECT_TIMEOUT + 1.0):  # the timeout of `rpc` has a message
+    async with asyncio.timeout(CONNECT_TIMEOUT_SECONDS + 1.0):  # the timeout of `rpc` has a message
         async with rpc(
-            address, timeout=CONNECT_TIMEOUT, connection_args=connection_args
+            address, timeout=CONNECT_TIMEOUT_SECONDS, connection_args=connection_args
         ) as scheduler:
             await scheduler.identity()
 
@@ -151,7 +153,7 @@ def _start_workers(
 
     try:
         shows_dashboard = local_ssh.shows_dashboard(cluster.scheduler)
-        page_settings = {} if shows_dashboard else local_ssh.NO_PAGES_CONFIG
+        page_settings = {} if shows_dashboard else local_ssh.NO_HTTP_PAGES_CONFIG
         with dask.config.set({**local_ssh.DASK_CONFIG, **page_settings}):
             if isinstance(cluster, LocalClusterConfig):
                 return local_ssh.start_local_cluster(cluster, bounds, processes=processes)

@@ -47,26 +47,26 @@ BLOCKS_PER_TASK_MAX = 1000
 TASKS_PER_SECOND_MAX = 100.0
 
 #: Age at which the count of worker threads is updated [s].
-SLOT_COUNT_AGE_MAX = 2.0
+WORKER_THREADS_REFRESH_SECONDS = 2.0
 
 #: Time without a response after which a worker is silent [s]; longer if its blocks take long.
-LEASE_SECONDS = 30.0
+WORKER_SILENCE_SECONDS = 30.0
 
 #: Largest time after which files that a worker has written are visible here [s]: NFS of Linux
 #: caches folders for as long.
-FILE_VISIBILITY_DELAY_MAX = 60.0
+FILE_VISIBILITY_SECONDS_MAX = 60.0
 
 #: Time without a response after which a stall is reported [s]; longer if tasks take longer.
-STALL_SECONDS = 60.0
+STALL_REPORT_SECONDS = 60.0
 
 #: Largest delay of the first response that is not a stall, as workers compile the model [s].
 COMPILATION_SECONDS_MAX = 600.0
 
 #: Multiple of the expected time of a task after which a stall is reported.
-STALL_TASK_TIMES = 5.0
+STALL_TASK_DURATION_FACTOR = 5.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.
-TASKS_SHOWN_MAX, WORKERS_SHOWN_MAX = 5, 10
+TASKS_IN_SUMMARY_MAX, WORKERS_IN_SUMMARY_MAX = 5, 10
 
 SHARED_FOLDER_REMEDY = "workers have to see the store's folder, under the same path"
 
@@ -80,42 +80,44 @@ class ThroughputEstimator:
     """Estimator of the number of blocks per task, from the times of the blocks so far."""
 
     n_blocks: int = 0
-    seconds: float = 0.0
+    work_seconds: float = 0.0
 
-    def update(self, task_result: TaskResult) -> None:
+    def add_task_result(self, task_result: TaskResult) -> None:
         """Add the times of a task's receipts."""
         self.n_blocks += len(task_result.receipts)
-        self.seconds += sum(receipt.seconds for receipt in task_result.receipts)
+        self.work_seconds += sum(receipt.seconds for receipt in task_result.receipts)
 
-    def blocks_per_task(self, n_blocks_left: int, n_slots: int) -> int:
+    def blocks_per_task(self, n_blocks_left: int, n_worker_threads: int) -> int:
         """Return the number of blocks for the next task.
 
         Tasks become smaller near the end, so that all workers end together.
         """
         if not self.n_blocks:
             return 1
-        task_seconds = max(TARGET_TASK_SECONDS, n_slots / TASKS_PER_SECOND_MAX)
-        n_fitting = int(task_seconds * self.n_blocks / max(self.seconds, 1e-9))
-        return max(1, min(n_fitting, BLOCKS_PER_TASK_MAX, n_blocks_left // (4 * n_slots)))
+        task_seconds = max(TARGET_TASK_SECONDS, n_worker_threads / TASKS_PER_SECOND_MAX)
+        n_fitting = int(task_seconds * self.n_blocks / max(self.work_seconds, 1e-9))
+        return max(1, min(n_fitting, BLOCKS_PER_TASK_MAX, n_blocks_left // (4 * n_worker_threads)))
 
 
 @dataclass
-class WorkerSlots:
+class WorkerThreadCount:
     """Number of worker threads of a cluster, updated every few seconds."""
 
     client: Client
-    expected_slots: int = 0
-    n_slots: int = 1
+    expected_worker_threads: int = 0
+    n_worker_threads: int = 1
     threads_by_worker: dict[str, int] = field(default_factory=dict)  # by the worker's address
     counted_at: float = -1e9
 
     def current_count(self) -> int:
         """Return the number of worker threads, at least 1."""
-        if time.monotonic() - self.counted_at > SLOT_COUNT_AGE_MAX:
+        if time.monotonic() - self.counted_at > WORKER_THREADS_REFRESH_SECONDS:
             self.threads_by_worker = dict(self.client.nthreads())
-            self.n_slots = max(1, self.expected_slots, sum(self.threads_by_worker.values()))
+            self.n_worker_threads = max(
+                1, self.expected_worker_threads, sum(self.threads_by_worker.values())
+            )
             self.counted_at = time.monotonic()
-        return self.n_slots
+        return self.n_worker_threads
 
 
 @dataclass(eq=False)
@@ -123,7 +125,7 @@ class _InFlightTask:
     """Blocks that are sent to a worker, and to further workers if that one is silent."""
 
     blocks: list[int]
-    futures: dict[Key, Future] = field(default_factory=dict)
+    futures_by_key: dict[Key, Future] = field(default_factory=dict)
     last_sent_at: float = 0.0  # by `time.monotonic` [s]
 
 
@@ -139,7 +141,7 @@ class TaskDispatcher:
     def __init__(
         self,
         client: Client,
-        expected_slots: int,
+        expected_worker_threads: int,
         settings: TaskSettings,
         block_queue: BlockQueue,
         *,
@@ -151,7 +153,10 @@ class TaskDispatcher:
         self._in_flight: dict[Key, _InFlightTask] = {}
         self._superseded: dict[Key, Future] = {}  # still running, but another worker has finished
         self._finished_futures: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._throughput, self._slots = ThroughputEstimator(), WorkerSlots(client, expected_slots)
+        self._throughput, self._slots = (
+            ThroughputEstimator(),
+            WorkerThreadCount(client, expected_worker_threads),
+        )
         self._resend_counts: Counter[int] = (
             Counter()
         )  # number of times that a task was sent again, by its first block
@@ -166,11 +171,11 @@ class TaskDispatcher:
         )  # workers of which a block was found in the store, by its digest
         self._excluded_workers: dict[str, int] = {}  # number of threads by excluded worker
         self._last_progress_at = time.monotonic()  # time of the last response
-        self._stall_patience = STALL_SECONDS  # time after it until the next report [s]
+        self._stall_patience = STALL_REPORT_SECONDS  # time after it until the next report [s]
         self._has_reported_stall = False  # whether a stall was reported since the last response
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Yield results of tasks as they arrive; an empty one every `IDLE_POLL_SECONDS` meanwhile.
+        """Yield results of tasks as they arrive; an empty result after each `IDLE_POLL_SECONDS`.
 
         Once `is_stopping` returns True no more tasks are sent. The iteration ends when those in
         flight end, or at once if there is no worker. SchedulerLostError if the scheduler is gone;
@@ -206,16 +211,18 @@ class TaskDispatcher:
             f"{len(self._unverified_receipts):,} written but not yet found in the store",
             f"{counted(len(tasks), 'task')} in flight, {len(self._superseded):,} superseded; "
             f"{counted(self._throughput.n_blocks, 'block')} came back in "
-            f"{duration_text(self._throughput.seconds)} of work",
+            f"{duration_text(self._throughput.work_seconds)} of work",
         ]
         lines += [
             f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
             f"{duration_text(now - task.last_sent_at)} ago, "
-            f"{counted(len(task.futures), 'time')}; Dask says "
-            f"{', '.join(sorted({str(future.status) for future in task.futures.values()}))}"
-            for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_SHOWN_MAX]
+            f"{counted(len(task.futures_by_key), 'time')}; Dask says "
+            f"{', '.join(sorted({str(future.status) for future in task.futures_by_key.values()}))}"
+            for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_IN_SUMMARY_MAX]
         ]
-        for worker, threads in sorted(self._slots.threads_by_worker.items())[:WORKERS_SHOWN_MAX]:
+        for worker, threads in sorted(self._slots.threads_by_worker.items())[
+            :WORKERS_IN_SUMMARY_MAX
+        ]:
             answered_at = self._last_response.get(worker)
             last_response_text = (
                 "never" if answered_at is None else f"{duration_text(now - answered_at)} ago"
@@ -265,21 +272,27 @@ class TaskDispatcher:
 
     def _submit_tasks(self, *, may_submit: bool) -> None:
         """Submit tasks until twice as many are in flight as there are worker threads."""
-        n_slots = self._slots.current_count()
-        if time.monotonic() - self._duplicated_at > SLOT_COUNT_AGE_MAX:
+        n_worker_threads = self._slots.current_count()
+        if time.monotonic() - self._duplicated_at > WORKER_THREADS_REFRESH_SECONDS:
             self._duplicated_at = time.monotonic()
             self._duplicate_stragglers()
-        while may_submit and not self._all_workers_excluded and len(self._in_flight) < 2 * n_slots:
-            count = self._throughput.blocks_per_task(self._block_queue.n_unassigned, n_slots)
+        while (
+            may_submit
+            and not self._all_workers_excluded
+            and len(self._in_flight) < 2 * n_worker_threads
+        ):
+            count = self._throughput.blocks_per_task(
+                self._block_queue.n_unassigned, n_worker_threads
+            )
             if not (
                 blocks := self._block_queue.take_blocks(
-                    count, include_failed=not self._failed_block_in_flight()
+                    count, include_failed=not self._is_failed_block_in_flight()
                 )
             ):
                 return
-            self._submit(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
+            self._submit_task(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
 
-    def _failed_block_in_flight(self) -> bool:
+    def _is_failed_block_in_flight(self) -> bool:
         """Return True if a block that failed before is in flight.
 
         Two such blocks at once could each be blamed for the error of the other.
@@ -295,7 +308,7 @@ class TaskDispatcher:
             return {"workers": others, "allow_other_workers": not self._excluded_workers}
         return {"workers": self._usable_workers()} if self._excluded_workers else {}
 
-    def _submit(self, task: _InFlightTask, **placement: Any) -> None:
+    def _submit_task(self, task: _InFlightTask, **placement: Any) -> None:
         """Submit a task, with further arguments of `Client.submit`."""
         first_block = task.blocks[0]
         key = task_key(
@@ -309,7 +322,7 @@ class TaskDispatcher:
         )
         task.last_sent_at = time.monotonic()
         _logger.debug("sent block %s and %s more as %s", first_block, len(task.blocks) - 1, key)
-        task.futures[future.key] = future
+        task.futures_by_key[future.key] = future
         self._in_flight[future.key] = task
         future.add_done_callback(self._finished_futures.put)
 
@@ -319,8 +332,10 @@ class TaskDispatcher:
         overdue = [
             task
             for task in set(self._in_flight.values())
-            if now - task.last_sent_at > self._lease_seconds(task)
-            and not any(future.done() for future in task.futures.values())  # yet to be collected
+            if now - task.last_sent_at > self._seconds_until_resend(task)
+            and not any(
+                future.done() for future in task.futures_by_key.values()
+            )  # yet to be collected
         ]
         if not overdue:
             return
@@ -328,8 +343,8 @@ class TaskDispatcher:
         tasks_by_silent_worker = {
             worker: tasks
             for worker, keys in keys_by_worker.items()
-            if now - self._last_response.get(worker, -1e9) > LEASE_SECONDS
-            and (tasks := [task for task in overdue if keys & task.futures.keys()])
+            if now - self._last_response.get(worker, -1e9) > WORKER_SILENCE_SECONDS
+            and (tasks := [task for task in overdue if keys & task.futures_by_key.keys()])
         }
         idle_workers = [
             worker
@@ -351,23 +366,25 @@ class TaskDispatcher:
         unassigned = [
             task
             for task in overdue
-            if not any(task.futures.keys() & k for k in keys_by_worker.values())
+            if not any(task.futures_by_key.keys() & k for k in keys_by_worker.values())
         ]
         for task in {*unassigned, *chain.from_iterable(tasks_by_silent_worker.values())}:
             self._resend_counts[task.blocks[0]] += 1
-            self._submit(task, workers=idle_workers)
+            self._submit_task(task, workers=idle_workers)
 
-    def _lease_seconds(self, task: _InFlightTask) -> float:
+    def _seconds_until_resend(self, task: _InFlightTask) -> float:
         """Return the time after which a task may be sent again [s]; it doubles each time."""
-        return max(LEASE_SECONDS, 5 * self._task_seconds(task)) * 2.0 ** (len(task.futures) - 1)
+        return max(WORKER_SILENCE_SECONDS, 5 * self._expected_task_seconds(task)) * 2.0 ** (
+            len(task.futures_by_key) - 1
+        )
 
-    def _task_seconds(self, task: _InFlightTask) -> float:
+    def _expected_task_seconds(self, task: _InFlightTask) -> float:
         """Return the expected time of a task, from the blocks so far [s]."""
         throughput = self._throughput
         return (
-            len(task.blocks) * throughput.seconds / throughput.n_blocks
+            len(task.blocks) * throughput.work_seconds / throughput.n_blocks
             if throughput.n_blocks
-            else LEASE_SECONDS
+            else WORKER_SILENCE_SECONDS
         )
 
     def _next_result(self) -> TaskResult:
@@ -388,21 +405,25 @@ class TaskDispatcher:
     def _finish_task(self, future: Future) -> TaskResult:
         """Return the result of a task that has ended, and update the state of the run by it."""
         task = self._in_flight[future.key]
-        for key in task.futures:
+        for key in task.futures_by_key:
             del self._in_flight[key]
-        for key in takewhile(lambda key: key != future.key, task.futures):
-            self._superseded[key] = task.futures[key]  # kept, so that its worker counts as busy
+        for key in takewhile(lambda key: key != future.key, task.futures_by_key):
+            self._superseded[key] = task.futures_by_key[
+                key
+            ]  # kept, so that its worker counts as busy
         task_result = _collect_task_result(future, task.blocks)
         self._last_response[task_result.worker_address] = self._last_progress_at = time.monotonic()
-        self._throughput.update(task_result)
-        self._stall_patience = max(STALL_SECONDS, STALL_TASK_TIMES * self._task_seconds(task))
+        self._throughput.add_task_result(task_result)
+        self._stall_patience = max(
+            STALL_REPORT_SECONDS, STALL_TASK_DURATION_FACTOR * self._expected_task_seconds(task)
+        )
         self._has_reported_stall = False
         _logger.debug(
             "%s answered: %s blocks written, %s failed, %s begun",
             task_result.worker_address or "a lost worker",
             len(task_result.receipts),
             len(task_result.failures),
-            len(task_result.checkpoint_points),
+            len(task_result.checkpoint_points_by_block),
         )
         self._failing_worker.update(
             (failure.block, task_result.worker_address) for failure in task_result.failures
@@ -410,15 +431,15 @@ class TaskDispatcher:
         settled_blocks = {r.block for r in task_result.receipts} | {
             f.block for f in task_result.failures
         }
-        self._requeue([block for block in task.blocks if block not in settled_blocks])
+        self._requeue_blocks([block for block in task.blocks if block not in settled_blocks])
         if task_result.worker_error is not None:
             self._exclude_worker(
                 task_result.worker_address, task_result.host, task_result.worker_error
             )
         return task_result
 
-    def _requeue(self, blocks: list[int]) -> None:
-        """Put blocks back that are unfinished, or whose task was lost without their fault."""
+    def _requeue_blocks(self, blocks: list[int]) -> None:
+        """Put blocks back into the queue that are unfinished, or whose task was lost."""
         self._block_queue.requeue(blocks)
         self._resend_counts.update(blocks)
 
@@ -429,7 +450,7 @@ class TaskDispatcher:
         """
         now = time.monotonic()
         pending = [
-            (receipt, task_result.worker_address, now + FILE_VISIBILITY_DELAY_MAX)
+            (receipt, task_result.worker_address, now + FILE_VISIBILITY_SECONDS_MAX)
             for receipt in task_result.receipts
         ]
         if now - self._rechecked_at > IDLE_POLL_SECONDS:
@@ -443,7 +464,7 @@ class TaskDispatcher:
             elif now < deadline and worker not in self._excluded_workers:
                 self._unverified_receipts.append((receipt, worker, deadline))
             else:
-                self._requeue([receipt.block])
+                self._requeue_blocks([receipt.block])
                 self._exclude_worker(worker, receipt.host, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
 
     def _exclude_worker(self, worker: str, host: str, error: Exception) -> None:
@@ -456,7 +477,7 @@ class TaskDispatcher:
         self._excluded_workers[worker] = self._slots.threads_by_worker.get(worker, 1)
         if (
             self._all_workers_excluded
-            and sum(self._excluded_workers.values()) >= self._slots.expected_slots
+            and sum(self._excluded_workers.values()) >= self._slots.expected_worker_threads
         ):
             if isinstance(error, NotAStoreError):  # the driver itself sees the store
                 raise StoreError(
@@ -472,11 +493,11 @@ class TaskDispatcher:
 
 
 def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
-    """Return the result of a task that has ended; an empty one if its worker died with it."""
+    """Return the result of a task that has ended; an empty one if it was lost with its worker."""
     error: BaseException | None = None
     if future.status == "finished":
         try:
-            return future.result(timeout=LEASE_SECONDS)
+            return future.result(timeout=WORKER_SILENCE_SECONDS)
         except TimeoutError:
             pass  # the result is lost, as below, and was not computed again in that time
         except (CancelledError, OSError) as connection_error:

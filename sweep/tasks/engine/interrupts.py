@@ -29,16 +29,16 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HANGUP_SIGNAL = getattr(signal, "SIGHUP", None)
 
 #: Time in which the main thread must handle a signal [s].
-REACTION_SECONDS_MAX = 2.0
+SIGNAL_HANDLING_SECONDS_MAX = 2.0
 
 #: Time after SIGTERM in which running blocks must end [s]; batch systems mostly kill after 30 s.
-TERMINATION_SECONDS_MAX = 15.0
+SIGTERM_GRACE_SECONDS = 15.0
 
 #: Interval at which the watcher checks whether a signal was handled [s].
-HANDLED_POLL_SECONDS = 0.1
+SIGNAL_POLL_SECONDS = 0.1
 
 #: Time limit of the last message of a process, for example to a stopped terminal [s].
-LAST_WORDS_SECONDS_MAX = 1.0
+EXIT_MESSAGE_SECONDS_MAX = 1.0
 
 #: Largest number of signals that are read at once, one byte each.
 _SIGNAL_BYTES_MAX = 4096
@@ -52,8 +52,8 @@ class InterruptHandler:
 
     It acts in the main thread only. A closed terminal (SIGHUP) counts as one Ctrl-C however often
     it is signalled, and not at all if the process ignores SIGHUP, as under nohup. SIGTERM counts as
-    Ctrl-C with a deadline: blocks that run `TERMINATION_SECONDS_MAX` later are stopped, and if
-    compiled code does not return within `REACTION_SECONDS_MAX` of SIGTERM, the process ends.
+    Ctrl-C with a deadline: blocks that run `SIGTERM_GRACE_SECONDS` later are stopped, and if
+    compiled code does not return within `SIGNAL_HANDLING_SECONDS_MAX` of SIGTERM, the process ends.
 
     Parameters
     ----------
@@ -76,12 +76,12 @@ class InterruptHandler:
 
     def __enter__(self) -> InterruptHandler:
         if threading.current_thread() is threading.main_thread():
-            self._watch_signals()
+            self._start_watcher()
             signals = list(STOP_SIGNALS)
             if HANGUP_SIGNAL is not None and signal.getsignal(HANGUP_SIGNAL) is not signal.SIG_IGN:
                 signals.append(HANGUP_SIGNAL)
             self._previous_handlers = {
-                signal_number: signal.signal(signal_number, self._handle)
+                signal_number: signal.signal(signal_number, self._handle_signal)
                 for signal_number in signals
             }
         return self
@@ -98,14 +98,14 @@ class InterruptHandler:
             self._wakeup_sender.close()
             self._watcher = None
 
-    def print_stopping(self) -> None:
+    def announce_stop(self) -> None:
         """Print, once, that the run stops when running blocks are written."""
         with self._announce_lock:
             if not self._is_announced:
                 self._is_announced = True
                 self._listener.say("stopping when what runs is written; again to stop at once")
 
-    def _handle(self, signal_number: int, frame: FrameType | None) -> None:
+    def _handle_signal(self, signal_number: int, frame: FrameType | None) -> None:
         if self._wakeup_receiver is not None:
             with suppress(OSError):
                 self._wakeup_receiver.recv(_SIGNAL_BYTES_MAX)
@@ -113,7 +113,7 @@ class InterruptHandler:
             raise KeyboardInterrupt
         self.is_stopping = True
         if signal_number == signal.SIGTERM:
-            self._deadline = time.monotonic() + TERMINATION_SECONDS_MAX
+            self._deadline = time.monotonic() + SIGTERM_GRACE_SECONDS
         self._wake_watcher()
 
     def _wake_watcher(self) -> None:
@@ -123,7 +123,7 @@ class InterruptHandler:
 
     # Methods of the watcher thread
 
-    def _watch_signals(self) -> None:
+    def _start_watcher(self) -> None:
         """Start the watcher thread, unless an event loop of the caller already receives signals."""
         receiver, sender = socket.socketpair()
         receiver.setblocking(False)
@@ -136,19 +136,19 @@ class InterruptHandler:
             return
         self._wakeup_receiver, self._wakeup_sender = receiver, sender
         self._is_over.clear()
-        self._watcher = threading.Thread(target=self._watch, args=(receiver,), daemon=True)
+        self._watcher = threading.Thread(target=self._run_watcher, args=(receiver,), daemon=True)
         self._watcher.start()
 
-    def _watch(self, receiver: socket.socket) -> None:
+    def _run_watcher(self, receiver: socket.socket) -> None:
         selector = selectors.DefaultSelector()  # also accepts descriptors above 1023
         selector.register(receiver, selectors.EVENT_READ)
         with selector:
-            self._watch_receiver(receiver, selector)
+            self._watch_for_signals(receiver, selector)
 
-    def _watch_receiver(self, receiver: socket.socket, selector: selectors.BaseSelector) -> None:
+    def _watch_for_signals(self, receiver: socket.socket, selector: selectors.BaseSelector) -> None:
         while not self._is_over.is_set():
-            selector.select(self._seconds_left())
-            if self._seconds_left() == 0.0:
+            selector.select(self._seconds_to_deadline())
+            if self._seconds_to_deadline() == 0.0:
                 self._deadline = None
                 if self.is_computing:
                     os.kill(os.getpid(), signal.SIGTERM)
@@ -157,14 +157,14 @@ class InterruptHandler:
                 if len(unhandled) > n_reported:
                     if self._is_handled_in_time(receiver, len(unhandled)):
                         continue
-                    self._handle_stalled(unhandled, is_repeated=n_reported > 0)
+                    self._react_to_stalled_signals(unhandled, is_repeated=n_reported > 0)
                     n_reported = len(unhandled)
-                elif self._is_over.wait(HANDLED_POLL_SECONDS):
+                elif self._is_over.wait(SIGNAL_POLL_SECONDS):
                     return
             if self.is_stopping and not self._is_over.is_set():
-                self.print_stopping()
+                self.announce_stop()
 
-    def _seconds_left(self) -> float | None:
+    def _seconds_to_deadline(self) -> float | None:
         """Return the time to the deadline [s]; None if there is none."""
         deadline = self._deadline
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
@@ -185,17 +185,17 @@ class InterruptHandler:
         return unhandled
 
     def _is_handled_in_time(self, receiver: socket.socket, n_signals: int) -> bool:
-        """Wait up to `REACTION_SECONDS_MAX`; return whether a signal was handled meanwhile."""
-        deadline = time.monotonic() + REACTION_SECONDS_MAX
+        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`. Return True once a signal is handled."""
+        deadline = time.monotonic() + SIGNAL_HANDLING_SECONDS_MAX
         while time.monotonic() < deadline:
             if (
-                self._is_over.wait(HANDLED_POLL_SECONDS)
+                self._is_over.wait(SIGNAL_POLL_SECONDS)
                 or len(self._unhandled_signals(receiver)) < n_signals
             ):
                 return True
         return False
 
-    def _handle_stalled(self, unhandled: list[int], *, is_repeated: bool) -> None:
+    def _react_to_stalled_signals(self, unhandled: list[int], *, is_repeated: bool) -> None:
         """React to signals that compiled code holds up: print a message, or end the process."""
         if set(unhandled) == {HANGUP_SIGNAL}:
             return
@@ -207,7 +207,7 @@ class InterruptHandler:
         elif is_asked_again:  # a Python program of the user's is not ended
             self._listener.say("compiled code runs: stopping as soon as it returns")
         else:
-            self.print_stopping()
+            self.announce_stop()
 
     def _exit_process(self, exit_code: int) -> None:
         """Print a last message and end the process from the watcher thread; never returns."""
@@ -224,5 +224,5 @@ class InterruptHandler:
 
         printer_thread = threading.Thread(target=print_last_words, daemon=True)
         printer_thread.start()
-        printer_thread.join(LAST_WORDS_SECONDS_MAX)
+        printer_thread.join(EXIT_MESSAGE_SECONDS_MAX)
         os._exit(exit_code)

@@ -46,7 +46,7 @@ from sweep.regular_files import RefusedFileError, open_regular
 from sweep.safe_json import parse_json
 from sweep.storage.locations import (
     CONCURRENT_REQUESTS_MAX,
-    HIDDEN_PROCESS,
+    HIDDEN_PROCESS_START_ID,
     JOURNAL_DIR,
     Location,
     ObjectPath,
@@ -66,25 +66,25 @@ from sweep.storage.store_format import (
     iter_records,
     open_log,
     read_receipt_totals,
-    verified_body,
+    verified_line_body,
 )
-from sweep.tasks.engine.block_study import BlockStudy, PartialResults, ReusedResults
+from sweep.tasks.engine.block_study import BlockStudy, EarlierResults, PartialResults
 from sweep.tasks.engine.progress import BusyError, StoreError, raise_as_store_error
 
-FAILURE_LOG = "failures.jsonl"
-SESSION_LOG = "sessions.jsonl"
-LOG_NAMES = (RECEIPTS_FILE, FAILURE_LOG, SESSION_LOG)
+FAILURE_LOG_FILE = "failures.jsonl"
+SESSION_LOG_FILE = "sessions.jsonl"
+LOG_FILE_NAMES = (RECEIPTS_FILE, FAILURE_LOG_FILE, SESSION_LOG_FILE)
 
 RECIPE_FILE = "recipe.json"
 
-#: Key of the path of the store that this one extends, and takes results from.
-EXTENDS_KEY = "extends"
+#: Recipe key of the path of the store that this one extends, and takes results from.
+EXTENDED_STORE_KEY = "extends"
 
-#: Key of the digests of the user's modules at the start of the first run.
-USER_CODE_KEY = "code"
+#: Recipe key of the digests of the user's modules at the start of the first run.
+USER_MODULE_DIGESTS_KEY = "code"
 
-#: Key of the id of the study whose store this one will replace; its value is '' without one.
-REPLACES_KEY = "replaces"
+#: Recipe key of the id of the study whose store this one will replace; '' without one.
+REPLACED_STUDY_ID_KEY = "replaces"
 
 #: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
 LISTING_THREADS = 4
@@ -103,7 +103,7 @@ class Receipt:
     host: str
     pid: int
     versions: dict[str, str]
-    taken: int = 0  # number of points taken from the store of a smaller study
+    reused_points: int = 0  # number of points taken from the store of a smaller study
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +125,11 @@ class Journal:
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
         journal_path = store_path / JOURNAL_DIR
-        self._logs = {name: open_log(journal_path / name, durable=durable) for name in LOG_NAMES}
+        self._logs = {
+            name: open_log(journal_path / name, durable=durable) for name in LOG_FILE_NAMES
+        }
         for log in self._logs.values():
-            log.remove_damaged_lines(lambda line: verified_body(line) is not None)
+            log.remove_damaged_lines(lambda line: verified_line_body(line) is not None)
 
     def commit(self, *receipts: Receipt) -> None:
         """Append receipts, which marks their blocks as done.
@@ -139,25 +141,25 @@ class Journal:
             RECEIPTS_FILE, *({**asdict(receipt), "time": commit_time} for receipt in receipts)
         )
 
-    def withdraw(self, block: int, reason: str) -> None:
+    def withdraw_receipt(self, block: int, reason: str) -> None:
         """Withdraw the receipt of a block, so that the block is computed again."""
         self._append(
             RECEIPTS_FILE, {"block": block, "withdrawn": reason, "time": round(time.time(), 3)}
         )
 
     def flush(self, *, force: bool = False) -> bool:
-        """Write pending lines if it is time to, or if `force`. Return True if none is left."""
+        """Write pending lines that are due, or all if `force`. Return True if none is left."""
         is_flushed = [log.flush(force=force) for log in self._logs.values()]
         return all(is_flushed)
 
     def record_failure(self, failure: Failure) -> None:
         """Append the error of a block that is permanently failed."""
-        self._append(FAILURE_LOG, asdict(failure))
+        self._append(FAILURE_LOG_FILE, asdict(failure))
 
     def record_run_event(self, event: str, **details: Any) -> None:
         """Append an event of the run, such as its begin or end, and write all pending lines."""
         utc = datetime.now(UTC).isoformat(timespec="seconds")
-        self._append(SESSION_LOG, {"event": event, "time": time.time(), "utc": utc, **details})
+        self._append(SESSION_LOG_FILE, {"event": event, "time": time.time(), "utc": utc, **details})
         self.flush(force=True)
 
     def _append(self, log_name: str, *records: dict[str, Any]) -> None:
@@ -166,8 +168,8 @@ class Journal:
             self._logs[log_name].append(b"".join(map(encode_record, records)))
 
 
-def committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
-    """Return the digest of each block from its receipt, (blocks,) of bytes; empty without one."""
+def read_committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
+    """Return the digest in the receipt of each block, (blocks,) of bytes; b'' without a receipt."""
     digest_by_block = np.zeros(n_blocks, dtype="S32")
     for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
         if 0 <= record["block"] < n_blocks:
@@ -184,13 +186,14 @@ def blocks_with_receipt(store_path: Location, study: BlockStudy) -> np.ndarray:
 
 def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
     """Return a mask (blocks,) of done blocks: with a receipt, and all chunks in the store."""
-    return scan_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
+    return find_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
 
 
-def permanently_failed(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
-    """Return the last failure of each block that failed for good and was not done since."""
+def read_permanent_failures(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
+    """Return the last failure record of each block that failed permanently and is not done."""
     last_failures = {
-        record["block"]: record for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG)
+        record["block"]: record
+        for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG_FILE)
     }
     if last_failures:
         for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
@@ -198,15 +201,15 @@ def permanently_failed(store_path: Location, n_blocks: int) -> dict[int, dict[st
     return {block: failure for block, failure in last_failures.items() if block < n_blocks}
 
 
-def last_run_start(store_path: Location) -> float:
+def last_run_start_time(store_path: Location) -> float:
     """Return the time at which the last run began [s since the epoch]; inf if there was none."""
-    runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG)
+    runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG_FILE)
     start_times = [run["time"] for run in runs if run.get("event") == "begun"]
     return float(start_times[-1]) if start_times else np.inf
 
 
 def write_recipe(store_path: Location, **facts: Any) -> None:
-    """Write the recipe in one step."""
+    """Replace the recipe of a store atomically; ``facts`` are its entries."""
     atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
 
 
@@ -218,10 +221,10 @@ def read_recipe(store_path: Location) -> dict[str, Any]:
     return records[0] or {} if len(records) == 1 else {}
 
 
-def remove_recipe_predecessors(store_path: Path) -> None:
-    """Remove from the recipe which store this one extends, and which it replaces."""
+def remove_predecessors_from_recipe(store_path: Path) -> None:
+    """Remove the entries of the extended and the replaced store from the recipe of a store."""
     facts = read_recipe(store_path)
-    for name in (EXTENDS_KEY, REPLACES_KEY):
+    for name in (EXTENDED_STORE_KEY, REPLACED_STUDY_ID_KEY):
         facts.pop(name, None)
     if facts:
         write_recipe(store_path, **facts)
@@ -256,10 +259,10 @@ class ChunkScan:
             """Return the candidate blocks whose chunk of an array is missing."""
             if self._is_stopped:
                 return np.empty(0, np.int64)
-            is_present = existing_chunks(store_path / array_name / "c", owner_blocks.shape)
+            is_present = find_existing_chunks(store_path / array_name / "c", owner_blocks.shape)
             return owner_blocks[~is_present & self._candidates[owner_blocks]]
 
-        owners_by_array = study.chunk_owners() if candidates.any() else {}
+        owners_by_array = study.chunk_owner_blocks() if candidates.any() else {}
         self._array_scans = [
             self._executor.submit(blocks_lacking_chunk, *name_and_owners)
             for name_and_owners in owners_by_array.items()
@@ -286,7 +289,7 @@ class ChunkScan:
         self._executor.shutdown(wait=False)
 
 
-def scan_complete_blocks(
+def find_complete_blocks(
     store_path: Location, study: BlockStudy, candidates: np.ndarray
 ) -> np.ndarray:
     """Return a mask (blocks,) of the candidates of which every chunk exists and is not empty."""
@@ -298,7 +301,7 @@ def scan_complete_blocks(
         scan.stop()
 
 
-def existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
+def find_existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
     """Return a mask, in the shape of an array's grid of chunks, of chunks that are not empty."""
     is_present = np.zeros(shape, bool)
     if isinstance(folder, ObjectPath):
@@ -361,13 +364,13 @@ def _mark_existing_chunks(
 
 
 #: Prefix of the names of checkpoints; the number of the block follows.
-CHECKPOINT_PREFIX = "begun-"
+CHECKPOINT_FILE_PREFIX = "begun-"
 
 
 class Checkpoint(NamedTuple):
     """Saved part of a block that is not complete."""
 
-    results: ReusedResults = ReusedResults()
+    results: EarlierResults = EarlierResults()
     points: float = 0.0  # number of points done; a point that is computed in part counts in part
     seconds: float = 0.0  # time spent so far [s]
 
@@ -395,7 +398,7 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
     """Return the checkpoint of a block of a study; an empty one if none is usable."""
     try:
         file_content = read_object(
-            store_path, f"{JOURNAL_DIR}/{CHECKPOINT_PREFIX}{block}", ARRAY_FILE_BYTES_MAX
+            store_path, f"{JOURNAL_DIR}/{CHECKPOINT_FILE_PREFIX}{block}", ARRAY_FILE_BYTES_MAX
         )
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError, RefusedFileError):
         return Checkpoint()
@@ -405,14 +408,14 @@ def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoi
         return Checkpoint()
     if header["digest"] != _content_digest(content):
         return Checkpoint()
-    arrays_by_part: dict[str, dict[str, np.ndarray]] = {"done": {}, "begun": {}}
+    arrays_by_part: dict[str, dict[str, np.ndarray]] = {"finished": {}, "unfinished": {}}
     try:
         for key, values in _iter_npz_arrays(content):
             part, _, name = key.partition("/")
             arrays_by_part[part][name] = values
     except (ValueError, KeyError, zipfile.BadZipFile):  # not made by this program
         return Checkpoint()
-    results = ReusedResults(
+    results = EarlierResults(
         **{
             part: PartialResults(arrays.pop("points"), arrays)
             for part, arrays in arrays_by_part.items()
@@ -441,11 +444,11 @@ def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
             yield member.filename.removesuffix(".npy"), np.load(member_file, allow_pickle=False)
 
 
-def checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
+def read_checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
     """Return the number of points done in the checkpoint of each unfinished block."""
     block_names = [
-        file.name.removeprefix(CHECKPOINT_PREFIX)
-        for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}*")
+        file.name.removeprefix(CHECKPOINT_FILE_PREFIX)
+        for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}*")
     ]
     checkpoints = {
         int(block_name): read_checkpoint(store_path, study_id, int(block_name))
@@ -459,16 +462,16 @@ def checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
 
 def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
     """Remove the checkpoint of one block, or of all blocks."""
-    for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}{block}"):
+    for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_FILE_PREFIX}{block}"):
         file.unlink(missing_ok=True)
 
 
 def _checkpoint_path(store_path: Location, block: int) -> Location:
     """Return the path of a block's checkpoint."""
-    return store_path / JOURNAL_DIR / f"{CHECKPOINT_PREFIX}{block}"
+    return store_path / JOURNAL_DIR / f"{CHECKPOINT_FILE_PREFIX}{block}"
 
 
-def _checkpoint_arrays(results: ReusedResults) -> dict[str, Any]:
+def _checkpoint_arrays(results: EarlierResults) -> dict[str, Any]:
     """Return the arrays of a checkpoint, by the names in its archive."""
     return {
         f"{part}/{name}": values
@@ -488,12 +491,12 @@ LOCK_FILE = "lock"
 LOCK_ATTEMPTS_MAX = 5
 
 #: Time between heartbeats [s], and age beyond which a holder on another host may be dead [s].
-HEARTBEAT_INTERVAL = 10.0
-HEARTBEAT_AGE_MAX = 120.0
+HEARTBEAT_INTERVAL_SECONDS = 10.0
+HEARTBEAT_AGE_SECONDS_MAX = 120.0
 
 #: Time for which an old heartbeat is watched before its holder counts as dead [s]. A clock that was
 #: set can make a heartbeat look old, but can't stop it from changing.
-SILENCE_WATCH_SECONDS = 35.0
+HEARTBEAT_WATCH_SECONDS = 35.0
 
 #: Largest size of a lock file [bytes].
 LOCK_BYTES_MAX = 1 << 16
@@ -580,7 +583,7 @@ def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
     """Return True if a holder runs: by its process on this machine, by its heartbeat elsewhere."""
     if (is_running := _is_running_here(holder)) is not None:
         return is_running
-    return heartbeat_age(store_path) < HEARTBEAT_AGE_MAX
+    return heartbeat_age(store_path) < HEARTBEAT_AGE_SECONDS_MAX
 
 
 def _is_running_here(holder: LockHolder) -> bool | None:
@@ -588,7 +591,7 @@ def _is_running_here(holder: LockHolder) -> bool | None:
     if not (holder.is_on_this_machine and holder.start):
         return None
     current_start = process_start_id(holder.pid)
-    return None if current_start == HIDDEN_PROCESS else current_start == holder.start
+    return None if current_start == HIDDEN_PROCESS_START_ID else current_start == holder.start
 
 
 def heartbeat_age(store_path: Location) -> float:
@@ -632,7 +635,7 @@ class _FileLock:
         """Return the JSON text of the holder; None if the lock is free."""
         return _read_lock_file(self._lock_path)
 
-    def heartbeat_mark(self) -> object:
+    def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if the lock is free."""
         try:
             descriptor = open_regular(
@@ -658,7 +661,7 @@ class _FileLock:
         with self._acquisition_guard(say):  # one process at a time checks and acquires
             stale_json = self.read_holder_json()
             check_holder()
-            self._remove_stale(stale_json)
+            self._remove_stale_lock(stale_json)
             new_lock_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
             atomic_write(
                 new_lock_path, holder_json.encode()
@@ -699,8 +702,8 @@ class _FileLock:
         finally:
             os.close(guard_descriptor)
 
-    def _remove_stale(self, stale_json: str | None) -> None:
-        """Remove the lock of a dead holder, and put back any other that is there by now."""
+    def _remove_stale_lock(self, stale_json: str | None) -> None:
+        """Remove the lock file of a dead holder; put back a newer one that was removed instead."""
         if stale_json is None:
             return
         aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
@@ -777,10 +780,10 @@ class _ObjectLock:
 
     def read_holder_json(self) -> str | None:
         """Return the JSON text of the holder; None if the lock is free."""
-        tagged = self._read_tagged()
-        return _first_line(tagged[0]) if tagged and tagged[0] else None
+        tagged = self._read_content_and_version()
+        return _holder_json_of_content(tagged[0]) if tagged and tagged[0] else None
 
-    def _read_tagged(self) -> tuple[bytes, ObjectVersion] | None:
+    def _read_content_and_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the content of the lock and its version, read once more if it is incomplete.
 
         An incomplete lock would look like that of another process. ObjectStoreError if it is
@@ -791,12 +794,12 @@ class _ObjectLock:
             if tagged is None or tagged[0].count(b"\n") == 2 or not tagged[0]:
                 return tagged
         if tagged:
-            self._lock_path.refuse_cut(tagged[0])
+            self._lock_path.refuse_truncated_content(tagged[0])
         return tagged
 
-    def heartbeat_mark(self) -> object:
+    def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if there is no lock."""
-        tagged = self._read_tagged()
+        tagged = self._read_content_and_version()
         return tagged and tagged[0]
 
     def acquire(
@@ -804,8 +807,10 @@ class _ObjectLock:
     ) -> None:
         """Acquire the lock for a holder; `check_holder` raises if the present holder lives."""
         for _ in range(LOCK_ATTEMPTS_MAX):
-            tagged = self._read_tagged()
-            if tagged and _first_line(tagged[0]) == holder_json:  # put, but the response was lost
+            tagged = self._read_content_and_version()
+            if (
+                tagged and _holder_json_of_content(tagged[0]) == holder_json
+            ):  # put, but the response was lost
                 self._holder_json, self._tag = holder_json, tagged[1]
                 return
             check_holder()
@@ -830,14 +835,14 @@ class _ObjectLock:
         """Replace the content of the lock, if this process still holds it."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
-            tagged = self._read_tagged()
-            if tagged and _first_line(tagged[0]) == self._holder_json:
+            tagged = self._read_content_and_version()
+            if tagged and _holder_json_of_content(tagged[0]) == self._holder_json:
                 tag = self._lock_path.put_if_unchanged(content.encode(), tagged[1])
         if tag is not None:
             self._tag = tag
 
 
-def _first_line(content: bytes) -> str:
+def _holder_json_of_content(content: bytes) -> str:
     """Return the first line of a lock's content, which names the holder."""
     return content.decode("utf-8", "replace").partition("\n")[0]
 
@@ -849,13 +854,13 @@ def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
 
 
 def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
-    """Wait until the last heartbeat of a holder elsewhere is too old, or a new one arrives.
+    """Wait until the heartbeat of a holder on another machine is too old, or a new one arrives.
 
     A job that is restarted on another node soon after it was killed thus need not be refused.
     """
-    other_holder, heartbeat_mark = (
+    other_holder, heartbeat_version = (
         read_lock_holder(store_path),
-        _lock_of_store(store_path).heartbeat_mark(),
+        _lock_of_store(store_path).heartbeat_version(),
     )
     if (
         other_holder is None
@@ -863,15 +868,15 @@ def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> Non
         or _is_running_here(other_holder) is not None
     ):
         return
-    seconds_left = HEARTBEAT_AGE_MAX - heartbeat_age(store_path)
-    if 0 < seconds_left <= HEARTBEAT_AGE_MAX:
-        _stays_silent(store_path, other_holder, heartbeat_mark, seconds_left, say)
+    seconds_left = HEARTBEAT_AGE_SECONDS_MAX - heartbeat_age(store_path)
+    if 0 < seconds_left <= HEARTBEAT_AGE_SECONDS_MAX:
+        _sends_no_heartbeat(store_path, other_holder, heartbeat_version, seconds_left, say)
 
 
-def _stays_silent(
+def _sends_no_heartbeat(
     store_path: Location,
     other_holder: LockHolder,
-    heartbeat_mark: object,
+    heartbeat_version: object,
     watch_seconds: float,
     say: Callable[[str], None],
 ) -> bool:
@@ -884,7 +889,10 @@ def _stays_silent(
     end_time, lock = time.monotonic() + watch_seconds, _lock_of_store(store_path)
     while (seconds_left := end_time - time.monotonic()) > 0:
         time.sleep(min(1.0, seconds_left, watch_seconds / 10))
-        if (read_lock_holder(store_path), lock.heartbeat_mark()) != (other_holder, heartbeat_mark):
+        if (read_lock_holder(store_path), lock.heartbeat_version()) != (
+            other_holder,
+            heartbeat_version,
+        ):
             return False
     return True
 
@@ -911,13 +919,13 @@ class StoreLock:
         self._heartbeat_thread.start()
 
     def _watch_other_holder(self, say: Callable[[str], None]) -> object:
-        """Watch the heartbeat of a holder elsewhere. Return the state of its lock if it is silent.
+        """Watch the heartbeat of a holder on another machine. Return its lock's state if silent.
 
         None if there is no such holder; BusyError if it lives.
         """
-        other_holder, heartbeat_mark = (
+        other_holder, heartbeat_version = (
             read_lock_holder(self._store_path),
-            self._lock.heartbeat_mark(),
+            self._lock.heartbeat_version(),
         )
         if (
             other_holder is None
@@ -925,12 +933,12 @@ class StoreLock:
             or _is_running_here(other_holder) is not None
         ):
             return None
-        is_doubtful = not 0 <= heartbeat_age(self._store_path) < HEARTBEAT_AGE_MAX
-        if is_doubtful and _stays_silent(
-            self._store_path, other_holder, heartbeat_mark, SILENCE_WATCH_SECONDS, say
+        is_doubtful = not 0 <= heartbeat_age(self._store_path) < HEARTBEAT_AGE_SECONDS_MAX
+        if is_doubtful and _sends_no_heartbeat(
+            self._store_path, other_holder, heartbeat_version, HEARTBEAT_WATCH_SECONDS, say
         ):
-            return other_holder, heartbeat_mark
-        raise self._busy_error(other_holder)
+            return other_holder, heartbeat_version
+        raise self._make_busy_error(other_holder)
 
     def _refuse_living_holder(self) -> None:
         """Raise a BusyError if another process holds the lock, and is not known to be dead."""
@@ -943,11 +951,11 @@ class StoreLock:
             return
         if self._silent_state is None or self._silent_state != (
             other_holder,
-            self._lock.heartbeat_mark(),
+            self._lock.heartbeat_version(),
         ):
-            raise self._busy_error(other_holder)
+            raise self._make_busy_error(other_holder)
 
-    def _busy_error(self, other_holder: LockHolder) -> BusyError:
+    def _make_busy_error(self, other_holder: LockHolder) -> BusyError:
         """Return the error of a lock that another process holds."""
         holder_text = (
             f"process {escape_to_one_line(other_holder.pid)} on "
@@ -960,7 +968,7 @@ class StoreLock:
 
     def _send_heartbeats(self) -> None:
         """Update the heartbeat until the lock is released."""
-        while not self._is_released.wait(HEARTBEAT_INTERVAL):
+        while not self._is_released.wait(HEARTBEAT_INTERVAL_SECONDS):
             try:
                 if self.is_held():
                     self._lock.send_heartbeat()
@@ -973,8 +981,8 @@ class StoreLock:
                         "heartbeat",
                         f"the heartbeat of the lock of {self._store_path} can't be written "
                         f"({os_error_reason(error, self._store_path)}): to other hosts this run "
-                        f"looks dead after {HEARTBEAT_AGE_MAX:g} s, so start none of this store "
-                        "there",
+                        f"looks dead after {HEARTBEAT_AGE_SECONDS_MAX:g} s, so start none of this "
+                        "store there",
                     )
 
     def is_held(self) -> bool:

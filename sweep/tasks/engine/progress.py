@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 #: Time between lines of progress without a terminal [s].
-LINE_INTERVAL = 30.0
+PROGRESS_LINE_INTERVAL_SECONDS = 30.0
 
 #: Rate at which a bar is drawn [Hz]; each time takes some ms of the driver.
-BAR_REFRESH_RATE = 4.0
+BAR_REFRESH_RATE_HZ = 4.0
 
 #: Width of a terminal from which a bar shows workers and bytes too [columns].
-WIDE_TERMINAL_COLUMNS = 100
+WIDE_TERMINAL_COLUMNS_MIN = 100
 
 #: Time before an activity is shown [s]; most activities are over by then.
-ACTIVITY_SILENT_SECONDS = 2.0
+ACTIVITY_SHOWN_AFTER_SECONDS = 2.0
 
 _logger = logging.getLogger("sweep")
 
@@ -76,7 +76,7 @@ class Progress:
     def advance(self, *, points: float, failed: int) -> None:
         """Add newly computed points and failed blocks; both are 0 if only time has passed."""
 
-    def at_work(self, *, workers: int, stored: int) -> None:
+    def update_workers(self, *, workers: int, stored: int) -> None:
         """Update the number of workers and the size stored [bytes]; called before `advance`."""
 
     def say(self, text: str) -> None:
@@ -120,8 +120,8 @@ class _GuardedListener(Progress):
     def advance(self, **keywords: Any) -> None:
         self._call_listener("advance", **keywords)
 
-    def at_work(self, **keywords: Any) -> None:
-        self._call_listener("at_work", **keywords)
+    def update_workers(self, **keywords: Any) -> None:
+        self._call_listener("update_workers", **keywords)
 
     def say(self, text: str) -> None:
         self._call_listener("say", text)
@@ -151,15 +151,15 @@ def show_activity(activity: str, progress: Progress | None = None) -> Iterator[N
         )
 
     def report() -> None:
-        delay = ACTIVITY_SILENT_SECONDS
+        delay = ACTIVITY_SHOWN_AFTER_SECONDS
         while not is_over.wait(delay):
             if isinstance(listener, ProgressBar):
                 with listener.console.status(activity_text()) as status:
-                    while not is_over.wait(1 / BAR_REFRESH_RATE):
+                    while not is_over.wait(1 / BAR_REFRESH_RATE_HZ):
                         status.update(activity_text())
             else:
                 listener.say(activity_text())
-                delay = min(2 * delay, LINE_INTERVAL)
+                delay = min(2 * delay, PROGRESS_LINE_INTERVAL_SECONDS)
 
     with install_recorder("numba:compile") as compile_events:
         reporter_thread = threading.Thread(target=report, daemon=True)
@@ -188,24 +188,24 @@ class _CountingProgress(Progress):
             unit,
         )
         self._start_time = time.monotonic()
-        self._show(is_start=True)
+        self._show_state(is_start=True)
 
     def advance(self, *, points: float, failed: int) -> None:
         self._points_done += points
         self._n_failed += failed
-        self._show()
+        self._show_state()
 
-    def _show(self, *, is_start: bool = False) -> None:
+    def _show_state(self, *, is_start: bool = False) -> None:
         """Show the present state."""
 
-    def at_work(self, *, workers: int, stored: int) -> None:
+    def update_workers(self, *, workers: int, stored: int) -> None:
         from rich.filesize import decimal
 
         count = f"{workers:,} worker{'' if workers == 1 else 's'}"
         self._workers_text = f"{count}, {decimal(stored)} stored"
 
     @property
-    def _rate(self) -> float:
+    def _points_per_second(self) -> float:
         """Points per second of this run."""
         return (self._points_done - self._points_before) / max(
             time.monotonic() - self._start_time, 1e-9
@@ -215,8 +215,10 @@ class _CountingProgress(Progress):
     def _column_texts(self) -> dict[str, Any]:
         """Texts of the present state, by the names of the columns of a bar."""
         return {
-            "done": amount_text(self._points_done),
-            "rate": f"{amount_text(self._rate)} {self._points_noun}/s" if self._rate > 0 else "",
+            "done": point_count_text(self._points_done),
+            "rate": f"{point_count_text(self._points_per_second)} {self._points_noun}/s"
+            if self._points_per_second > 0
+            else "",
             "work": self._workers_text,
             "failures": f"{counted(self._n_failed, 'block')} failed" if self._n_failed else "",
         }
@@ -230,8 +232,8 @@ class ProgressLines(_CountingProgress):
         self._printed_at = time.monotonic()
         self._stream = PatientStream(sys.stderr)
 
-    def _show(self, *, is_start: bool = False) -> None:
-        if is_start or time.monotonic() - self._printed_at >= LINE_INTERVAL:
+    def _show_state(self, *, is_start: bool = False) -> None:
+        if is_start or time.monotonic() - self._printed_at >= PROGRESS_LINE_INTERVAL_SECONDS:
             self.end()
 
     def say(self, text: str) -> None:
@@ -242,7 +244,11 @@ class ProgressLines(_CountingProgress):
         """Print the present state."""
         self._printed_at = time.monotonic()
         done_text, rate_text, workers_text, failures_text = self._column_texts.values()
-        seconds_left = (self._n_points - self._points_done) / self._rate if self._rate > 0 else 0.0
+        seconds_left = (
+            (self._n_points - self._points_done) / self._points_per_second
+            if self._points_per_second > 0
+            else 0.0
+        )
         parts = [f"{done_text} of {self._n_points:,} {self._points_noun}", rate_text]
         parts += [
             f"{duration_text(seconds_left)} left" if seconds_left > 0 else "",
@@ -268,22 +274,22 @@ class ProgressBar(_CountingProgress):
 
         workers_column = (
             [text_column("{task.fields[work]}")]
-            if self.console.width >= WIDE_TERMINAL_COLUMNS
+            if self.console.width >= WIDE_TERMINAL_COLUMNS_MIN
             else []
         )
         self._bar = Progress(
-            BarColumn(bar_width=min(40, max(self.console.width - WIDE_TERMINAL_COLUMNS, 8))),
+            BarColumn(bar_width=min(40, max(self.console.width - WIDE_TERMINAL_COLUMNS_MIN, 8))),
             text_column("{task.fields[done]} of {task.total:,.0f} {task.description}"),
             text_column("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
             *workers_column,
             text_column("[red]{task.fields[failures]}"),
             console=self.console,
-            refresh_per_second=BAR_REFRESH_RATE,
+            refresh_per_second=BAR_REFRESH_RATE_HZ,
         )
         self._task: TaskID | None = None
 
-    def _show(self, *, is_start: bool = False) -> None:
+    def _show_state(self, *, is_start: bool = False) -> None:
         if is_start:
             self._task = self._bar.add_task(
                 self._points_noun,
@@ -304,7 +310,7 @@ class ProgressBar(_CountingProgress):
         self._bar.stop()
 
 
-def amount_text(points: float) -> str:
+def point_count_text(points: float) -> str:
     """Return a number of points as text: `4,500`, or two digits if below 10, as `0.31`.
 
     Numbers below 10 are not whole if part of a point is done, or for a rate.

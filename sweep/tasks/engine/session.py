@@ -36,7 +36,12 @@ from sweep.spec.cluster_config import (
 )
 from sweep.spec.rules import suggest_similar_name
 from sweep.spec.sections import Execution
-from sweep.storage.locations import Location, ObjectStoreError, os_error_reason, write_remedy
+from sweep.storage.locations import (
+    Location,
+    ObjectStoreError,
+    os_error_reason,
+    remedy_for_write_error,
+)
 from sweep.storage.store_format import read_receipt_totals
 from sweep.tasks.engine import journal, study_store, user_code
 from sweep.tasks.engine.block_study import BlockEvaluator, BlockStudy, Workload
@@ -47,7 +52,7 @@ from sweep.tasks.engine.journal import (
     Journal,
     Receipt,
     StoreLock,
-    permanently_failed,
+    read_permanent_failures,
 )
 from sweep.tasks.engine.progress import (
     ClusterError,
@@ -76,20 +81,20 @@ if TYPE_CHECKING:
     from sweep.tasks.engine.cluster_connection import ClusterConnection
 
 #: Value of the option `scheduler` that selects serial computation in this process.
-SERIAL_SCHEDULER = "none"
+SERIAL_SCHEDULER_OPTION = "none"
 
 #: Number of failed blocks, without any success, after which a run stops.
 MAX_INITIAL_FAILURES = 20
 
 #: Time for which a run waits for the scan of existing chunks [s]. After that it trusts the log, and
 #: the scan goes on during the run.
-CHUNK_SCAN_TIMEOUT = 2.0
+CHUNK_SCAN_TIMEOUT_SECONDS = 2.0
 
 #: Time without a worker after which a warning is given [s].
-NO_WORKER_WARNING_AFTER = 20.0
+NO_WORKER_WARNING_SECONDS = 20.0
 
 #: Fields of receipts that a run adds up.
-RECEIPT_TOTALS = ("points", "taken", "bytes", "seconds", "write_seconds")
+SUMMED_RECEIPT_FIELDS = ("points", "reused_points", "bytes", "seconds", "write_seconds")
 
 _logger = logging.getLogger("sweep.session")
 
@@ -157,15 +162,17 @@ class RunOptions:
             is_integer = isinstance(number, Integral) and not isinstance(number, bool)
             if number is not None and not (is_integer and number > 0):
                 raise ClusterError(f"{name} must be a whole number above 0, not {number!r}")
-        if self.threads is not None and (named := self._options_of_workers()):
+        if self.threads is not None and (named := self._first_option_of_workers()):
             raise ClusterError(
                 f"{option_text('threads')} computes in this process, and {option_text(named)} with "
                 "workers: leave out one"
             )
-        if self.scheduler not in (None, SERIAL_SCHEDULER) and not _is_address(self.scheduler):
+        if self.scheduler not in (None, SERIAL_SCHEDULER_OPTION) and not _is_scheduler_address(
+            self.scheduler
+        ):
             raise ClusterError(
                 f"{self.scheduler!r} is no address of a Dask scheduler: write e.g. "
-                f"'tcp://10.0.0.5:8786', or '{SERIAL_SCHEDULER}' for a plain loop here"
+                f"'tcp://10.0.0.5:8786', or '{SERIAL_SCHEDULER_OPTION}' for a plain loop here"
             )
         timeout = self.block_timeout
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
@@ -207,11 +214,13 @@ class RunOptions:
         scheduler, execution = self.scheduler, workload.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
-        if scheduler == SERIAL_SCHEDULER and self.dashboard:
+        if scheduler == SERIAL_SCHEDULER_OPTION and self.dashboard:
             raise ClusterError(
                 f"a plain loop has no dashboard: leave out {option_text('dashboard')}"
             )
-        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_threads(workload)):
+        if scheduler == SERIAL_SCHEDULER_OPTION or (
+            scheduler is None and self._prefers_threads(workload)
+        ):
             return None
         if scheduler is not None:
             if self.dashboard:
@@ -250,10 +259,12 @@ class RunOptions:
         if self.threads is not None:
             return True
         execution = workload.execution
-        needs_workers = self._options_of_workers() or self.evaluate or workload.user_modules
+        needs_workers = (
+            self._first_option_of_workers() or self.evaluate or workload.user_module_names
+        )
         return not needs_workers and execution == Execution()
 
-    def _options_of_workers(self) -> str:
+    def _first_option_of_workers(self) -> str:
         """Return the name of an option that only workers can serve; '' if none is set."""
         is_set = {
             "workers": self.workers is not None,
@@ -270,7 +281,7 @@ class RunOptions:
     def n_threads(self, workload: Workload) -> int:
         """Return the number of threads of this process that compute blocks; 1 for a plain loop."""
         scheduler = self.scheduler or (self.workers is None and workload.execution.scheduler)
-        if scheduler == SERIAL_SCHEDULER:
+        if scheduler == SERIAL_SCHEDULER_OPTION:
             return 1
         if self.threads is not None:
             return int(self.threads)
@@ -279,7 +290,7 @@ class RunOptions:
         return int(CPU_COUNT)
 
 
-def _is_address(address: object) -> bool:
+def _is_scheduler_address(address: object) -> bool:
     """Return True if a text is an address of a Dask scheduler, with or without a protocol."""
     return isinstance(address, str) and bool(
         re.fullmatch(r"(\w+://)?[^\s/:]\S*:\d+|inproc://.+", address)
@@ -395,7 +406,7 @@ class ComputeBackend(ExitStack):
             options.evaluate,
             options.block_timeout,
             options.durable,
-            tuple(user_code.module_digests(self._workload.user_modules).items()),
+            tuple(user_code.module_digests(self._workload.user_module_names).items()),
         )
         if self.is_in_process:
             if options.performance_report is not None:
@@ -411,11 +422,11 @@ class ComputeBackend(ExitStack):
             return run_in_threads(*in_process, n_threads)
         from sweep.tasks.engine.dispatcher import TaskDispatcher
 
-        client, expected_slots, _ = self.connect()
+        client, expected_worker_threads, _ = self.connect()
         _logger.info("blocks are computed by the workers of %s", client)
         dispatcher = TaskDispatcher(
             client,
-            expected_slots,
+            expected_worker_threads,
             settings,
             block_queue,
             verify_receipt=verify_receipt,
@@ -434,7 +445,7 @@ class SessionOutcome:
     """Result of one session."""
 
     store: Location
-    unit: str  # name of the points, in the plural
+    points_noun: str  # name of the points, in the plural
     points: int  # number of points of the study
     blocks: int
     points_done: int  # points of committed blocks, in this run or before
@@ -442,8 +453,8 @@ class SessionOutcome:
     points_computed: int  # in this run, without those taken from a smaller study's store
     blocks_computed: int
     failures: tuple[Failure, ...]
-    left_out: int  # blocks that failed in an earlier run and were not tried again
-    stopped: str  # reason for stopping early, or ''
+    blocks_skipped: int  # blocks that failed in an earlier run and were not tried again
+    stop_reason: str  # reason for stopping early, or ''
     seconds: float  # wall time of this run [s]
     work_seconds: float  # time of evaluating and writing, summed over workers [s]
     write_seconds: float  # part of it for writing [s]
@@ -454,19 +465,24 @@ class SessionOutcome:
         return self.blocks_done == self.blocks
 
     @property
-    def why(self) -> str:
+    def incomplete_reason(self) -> str:
         """Reason why blocks are missing; '' if the study is complete."""
         if self.complete:
             return ""
-        if self.stopped:
-            return self.stopped
+        if self.stop_reason:
+            return self.stop_reason
         if not self.failures:
             retry = option_text("retry_failed")
-            return f"{_blocks_text(self.left_out)} failed before; {retry} tries them again"
-        return f"{_blocks_text(len(self.failures))} failed, the first with {self.failures[0].error}"
+            return (
+                f"{_block_count_text(self.blocks_skipped)} failed before; {retry} tries them again"
+            )
+        return (
+            f"{_block_count_text(len(self.failures))} failed, "
+            f"the first with {self.failures[0].error}"
+        )
 
 
-def _blocks_text(count: int) -> str:
+def _block_count_text(count: int) -> str:
     """Return a number of blocks as text."""
     return f"{count:,} block{'' if count == 1 else 's'}"
 
@@ -478,10 +494,10 @@ class NoWorkerMonitor:
         self._last_seen, self._has_had_workers, self._warn_after = (
             time.monotonic(),
             False,
-            NO_WORKER_WARNING_AFTER,
+            NO_WORKER_WARNING_SECONDS,
         )
 
-    def message(self, n_workers: int, *, has_receipts: bool = False) -> str:
+    def warning_text(self, n_workers: int, *, has_receipts: bool = False) -> str:
         """Return a warning if there has been no worker for long, else ''.
 
         `has_receipts` means that a worker has returned a result since the last call.
@@ -490,7 +506,7 @@ class NoWorkerMonitor:
             self._last_seen, self._has_had_workers, self._warn_after = (
                 time.monotonic(),
                 True,
-                NO_WORKER_WARNING_AFTER,
+                NO_WORKER_WARNING_SECONDS,
             )
         seconds_without_worker = time.monotonic() - self._last_seen
         if seconds_without_worker < self._warn_after:
@@ -514,7 +530,7 @@ class Session:
         try:
             self._journal = Journal(store_path, durable=backend.options.durable)
         except OSError as error:
-            raise StoreError(write_failure_text(store_path, error)) from error
+            raise StoreError(store_write_error_text(store_path, error)) from error
         self._receipt_totals: dict[str, float] = defaultdict(
             float
         )  # sums over the receipts of this run
@@ -532,16 +548,16 @@ class Session:
         not empty, no block is computed.
         """
         start_time = time.monotonic()
-        self._checkpoint_points = journal.checkpoint_points(self._store_path, self._study.id)
+        self._checkpoint_points = journal.read_checkpoint_points(self._store_path, self._study.id)
         receipts = read_receipt_totals(self._store_path, self._study.n_blocks)
         self._bytes_before = int(receipts.bytes_by_block.sum())
         chunk_scan = ChunkScan(self._store_path, self._study, receipts.points_by_block > 0)
         try:
-            chunk_scan.wait(CHUNK_SCAN_TIMEOUT)
+            chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS)
             is_done = chunk_scan.complete_blocks()
             is_settled = is_done.copy()
             if not self._backend.options.retry_failed:
-                is_settled[list(permanently_failed(self._store_path, is_done.size))] = True
+                is_settled[list(read_permanent_failures(self._store_path, is_done.size))] = True
             n_blocks_skipped = int(np.count_nonzero(is_settled & ~is_done))
             _logger.info(
                 "%s: study %s of %s blocks, %s done before, %s left out for their errors",
@@ -552,7 +568,7 @@ class Session:
                 n_blocks_skipped,
             )
             stop_reason = (
-                self._record_event("begun", host=socket.gethostname(), pid=os.getpid())
+                self._record_run_event("begun", host=socket.gethostname(), pid=os.getpid())
                 or prior_stop_reason
             )
             stop_reason = (
@@ -566,16 +582,16 @@ class Session:
         study, totals = self._study, self._receipt_totals
         outcome = SessionOutcome(
             store=self._store_path,
-            unit=study.points_noun,
+            points_noun=study.points_noun,
             points=study.n_points,
             blocks=study.n_blocks,
-            points_done=study.count_points(is_done) + int(totals["points"]),
+            points_done=study.count_points_in_blocks(is_done) + int(totals["points"]),
             blocks_done=int(np.count_nonzero(is_done)) + int(totals["blocks"]),
-            points_computed=int(totals["points"] - totals["taken"]),
+            points_computed=int(totals["points"] - totals["reused_points"]),
             blocks_computed=int(totals["blocks"]),
             failures=tuple(self._permanent_failures),
-            left_out=n_blocks_skipped,
-            stopped=stop_reason,
+            blocks_skipped=n_blocks_skipped,
+            stop_reason=stop_reason,
             seconds=time.monotonic() - start_time,
             work_seconds=totals["seconds"],
             write_seconds=totals["write_seconds"],
@@ -589,9 +605,9 @@ class Session:
             f"; stopped: {stop_reason}" if stop_reason else "",
         )
         if outcome.complete:
-            study_store.remove_partial_files(self._store_path)
+            study_store.remove_draft_files(self._store_path)
             journal.delete_checkpoints(self._store_path)
-        self._record_event(
+        self._record_run_event(
             "ended",
             blocks=outcome.blocks_computed,
             failed=len(outcome.failures),
@@ -599,12 +615,12 @@ class Session:
         )
         return outcome
 
-    def _record_event(self, event: str, **details: Any) -> str:
+    def _record_run_event(self, event: str, **details: Any) -> str:
         """Append an event to the run log. Return an error message if it is unwritable, else ''."""
         try:
             self._journal.record_run_event(event, **details)
         except OSError as error:
-            return write_failure_text(self._store_path, error)
+            return store_write_error_text(self._store_path, error)
         return ""
 
     def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
@@ -612,9 +628,9 @@ class Session:
 
         Return the reason for stopping early, or ''.
         """
-        if not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
+        if not chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS):
             self._progress.say("looking whether the chunks of what was done before are there")
-        while not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
+        while not chunk_scan.wait(CHUNK_SCAN_TIMEOUT_SECONDS):
             if self._interrupts.is_stopping:
                 return "interrupted"
         is_settled = chunk_scan.complete_blocks() | ~is_done
@@ -628,7 +644,7 @@ class Session:
         if is_settled.all():
             return ""
         block_queue = BlockQueue(is_settled)
-        points_before = self._study.count_points(is_done) + self._receipt_totals["points"]
+        points_before = self._study.count_points_in_blocks(is_done) + self._receipt_totals["points"]
         with ExitStack() as stack:
             try:
                 self._interrupts.is_computing = True  # a stop while workers start loses nothing
@@ -658,11 +674,11 @@ class Session:
             except KeyboardInterrupt:
                 return "stopped at once"
             except OSError as error:
-                return write_failure_text(self._store_path, error)
+                return store_write_error_text(self._store_path, error)
             except StoreError:
                 if _store_exists(self._store_path):
                     raise
-                return write_failure_text(self._store_path, FileNotFoundError())
+                return store_write_error_text(self._store_path, FileNotFoundError())
             finally:
                 self._interrupts.is_computing = False
 
@@ -684,25 +700,25 @@ class Session:
                 if not _store_exists(self._store_path):
                     raise FileNotFoundError(self._store_path)
                 return "another process took the store's lock"
-            if warning := no_worker_monitor.message(
+            if warning := no_worker_monitor.warning_text(
                 task_result.n_workers, has_receipts=bool(task_result.receipts)
             ):
                 self._progress.say(warning)
                 self._backend.restart_workers()
-            self._commit(task_result, block_queue)
+            self._commit_task_result(task_result, block_queue)
             if self._interrupts.is_stopping:
-                self._interrupts.print_stopping()
+                self._interrupts.announce_stop()
             if (
                 not self._receipt_totals["blocks"]
                 and len(self._permanent_failures) >= MAX_INITIAL_FAILURES
             ):
                 return f"the first {MAX_INITIAL_FAILURES} blocks all failed"
         points_before = self._points_so_far()
-        self._flush_commits(force=True)
+        self._flush_receipts(force=True)
         self._progress.advance(points=self._points_so_far() - points_before, failed=0)
         return "interrupted" if self._interrupts.is_stopping else ""
 
-    def _commit(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
+    def _commit_task_result(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
         """Append receipts and failures to the journal, and report the progress."""
         points_before, failures_before = self._points_so_far(), len(self._permanent_failures)
         self._journal.commit(*task_result.receipts)
@@ -712,19 +728,19 @@ class Session:
                 self._journal.record_failure(failure)
                 self._permanent_failures.append(failure)
             _logger.info("block %s failed on %s: %s", failure.block, failure.host, failure.error)
-        for block, saved_points in task_result.checkpoint_points.items():
+        for block, saved_points in task_result.checkpoint_points_by_block.items():
             if saved_points <= self._checkpoint_points.get(block, 0.0):
                 raise StoreError(CHECKPOINT_LOST_MESSAGE.format(block))
             self._checkpoint_points[block] = saved_points
-        self._flush_commits()
+        self._flush_receipts()
         bytes_stored = self._bytes_before + int(self._receipt_totals["bytes"])
-        self._progress.at_work(workers=task_result.n_workers, stored=bytes_stored)
+        self._progress.update_workers(workers=task_result.n_workers, stored=bytes_stored)
         self._progress.advance(
             points=self._points_so_far() - points_before,
             failed=len(self._permanent_failures) - failures_before,
         )
 
-    def _flush_commits(self, *, force: bool = False) -> None:
+    def _flush_receipts(self, *, force: bool = False) -> None:
         """Write pending receipts, and add those that are written to the totals."""
         if not self._journal.flush(force=force):
             return
@@ -732,7 +748,7 @@ class Session:
             _logger.debug("committed %s blocks", len(self._unflushed_receipts))
         for receipt in self._unflushed_receipts:
             self._receipt_totals["blocks"] += 1
-            for quantity in RECEIPT_TOTALS:
+            for quantity in SUMMED_RECEIPT_FIELDS:
                 self._receipt_totals[quantity] += getattr(receipt, quantity)
             if self._checkpoint_points.pop(receipt.block, None) is not None:
                 journal.delete_checkpoints(self._store_path, receipt.block)
@@ -743,13 +759,13 @@ class Session:
         return self._receipt_totals["points"] + sum(self._checkpoint_points.values())
 
 
-def write_failure_text(store_path: Location, error: OSError) -> str:
+def store_write_error_text(store_path: Location, error: OSError) -> str:
     """Return the reason why a store can't be written, and the remedy."""
     if isinstance(error, ObjectStoreError):
         return f"the store can't be written: {error.strerror}"
     if not _store_exists(store_path):
         return f"{store_path} is no longer there: have its disk back, or its folder"
-    remedy = write_remedy(error, store_path, "see to its disk")
+    remedy = remedy_for_write_error(error, store_path, "see to its disk")
     return f"the store can't be written ({os_error_reason(error, store_path)}): {remedy}"
 
 

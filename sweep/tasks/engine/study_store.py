@@ -31,13 +31,12 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from sweep.messages import option_name, option_text, suggestion
 from sweep.regular_files import RefusedFileError
 from sweep.storage import locations, store_format
-from sweep.storage.foreign_files import is_litter, list_foreign_files
+from sweep.storage.foreign_files import is_ignorable_file, list_foreign_files
 from sweep.storage.locations import (
     JOURNAL_DIR,
     Location,
     ObjectPath,
     ObjectStoreError,
-    atomic_path,
     atomic_write,
     file_sizes_below,
     iter_entries_below,
@@ -46,10 +45,11 @@ from sweep.storage.locations import (
     os_error_reason,
     parse_location,
     recover_interrupted_replace,
+    remedy_for_write_error,
     remove_atomically,
     staging_path_for,
     translate_errors,
-    write_remedy,
+    write_path_atomically,
 )
 from sweep.storage.size_checks import SingleWriterLocalStore, compressed_bytes_max
 from sweep.storage.store_format import (
@@ -58,20 +58,20 @@ from sweep.storage.store_format import (
     ZSTD_LEVEL,
     contents_digest,
     encode_record,
-    format_versions,
-    has_digest,
+    format_software_versions,
     iter_lines_and_records,
     iter_records,
+    objects_match_digest,
     parse_software_versions,
     stored_objects_digest,
 )
-from sweep.storage.verified_store import CHUNK_NAME
+from sweep.storage.verified_store import CHUNK_NAME_PATTERN
 from sweep.tasks.engine.block_study import BlockStudy, StoreTemplate
 from sweep.tasks.engine.blocks import CF_CONVENTIONS, ArrayLayout
 from sweep.tasks.engine.journal import (
     LOCK_FILE,
-    LOG_NAMES,
-    REPLACES_KEY,
+    LOG_FILE_NAMES,
+    REPLACED_STUDY_ID_KEY,
     Receipt,
     StoreLock,
     read_recipe,
@@ -79,20 +79,20 @@ from sweep.tasks.engine.journal import (
 )
 from sweep.tasks.engine.progress import BusyError, StoreError
 
-ROOT_DOCUMENT = "zarr.json"
+ROOT_DOCUMENT_FILE = "zarr.json"
 
 MANIFEST_PATH = f"{JOURNAL_DIR}/{MANIFEST_FILE}"
 
 #: Object that marks a store in an object store as incompletely created or removed.
-UNFINISHED_MARKER = "partial"
+UNFINISHED_MARKER_FILE = "partial"
 
 #: Largest number of foreign files that an error message names.
-FOREIGN_FILES_NAMED_MAX = 5
+FOREIGN_FILES_IN_MESSAGE_MAX = 5
 
 #: Compression of the chunks, and their checksum.
-CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
+CHUNK_CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
-_ZSTD = Zstd(level=ZSTD_LEVEL)
+_ZSTD_ENCODER = Zstd(level=ZSTD_LEVEL)
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -114,7 +114,7 @@ def create_store(
     store_path = parse_location(store_path)
     try:
         if isinstance(store_path, Path):
-            with atomic_path(store_path, replace=replace_existing) as draft_path:
+            with write_path_atomically(store_path, replace=replace_existing) as draft_path:
                 try:
                     _build_store(draft_path, template, recipe)
                 except OSError as error:  # the reason is found before the draft is removed
@@ -132,7 +132,9 @@ def create_store(
             raise BusyError(
                 f"{store_path} is there already: another process has made it"
             ) from error
-        remedy = write_remedy(error, store_path, f"name another place, {option_name('store')}")
+        remedy = remedy_for_write_error(
+            error, store_path, f"name another place, {option_name('store')}"
+        )
         raise StoreError(
             f"{store_path} can't be made: {error.strerror or error}; {remedy}"
         ) from error
@@ -150,14 +152,16 @@ def _build_store(
 
 def _upload_store(local_path: Path, store_path: ObjectPath) -> None:
     """Copy a store on disk to a path in an object store, its root last."""
-    names = file_sizes_below(local_path).keys() - {ROOT_DOCUMENT}
+    names = file_sizes_below(local_path).keys() - {ROOT_DOCUMENT_FILE}
     with reserve_object_location(store_path):
         map_concurrently(
             store_path,
             lambda name: (store_path / name).write_bytes((local_path / name).read_bytes()),
             names,
         )
-        (store_path / ROOT_DOCUMENT).write_bytes((local_path / ROOT_DOCUMENT).read_bytes())
+        (store_path / ROOT_DOCUMENT_FILE).write_bytes(
+            (local_path / ROOT_DOCUMENT_FILE).read_bytes()
+        )
 
 
 @contextmanager
@@ -166,7 +170,7 @@ def reserve_object_location(store_path: ObjectPath) -> Iterator[None]:
 
     StoreError if something else is at the path.
     """
-    marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER
+    marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER_FILE
     with StoreLock(store_path):
         if marker.exists():  # an interrupted creation or removal has left files
             remove_store(store_path)
@@ -189,10 +193,10 @@ def remove_store(store_path: Location) -> None:
     if isinstance(store_path, Path):
         remove_atomically(store_path)
         return
-    marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER
+    marker = store_path / JOURNAL_DIR / UNFINISHED_MARKER_FILE
     marker.write_bytes(b"")
-    (store_path / ROOT_DOCUMENT).unlink()
-    kept_names = {f"{JOURNAL_DIR}/{LOCK_FILE}", f"{JOURNAL_DIR}/{UNFINISHED_MARKER}"}
+    (store_path / ROOT_DOCUMENT_FILE).unlink()
+    kept_names = {f"{JOURNAL_DIR}/{LOCK_FILE}", f"{JOURNAL_DIR}/{UNFINISHED_MARKER_FILE}"}
     object_names = [name for name, _ in store_path.iter_objects_below() if name not in kept_names]
     map_concurrently(store_path, lambda name: (store_path / name).unlink(), object_names)
     marker.unlink()
@@ -230,8 +234,8 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
         "Conventions": CF_CONVENTIONS,
         "study_id": template.id,
         "model_version": template.model_version,
-        "software": format_versions(current_versions()),
-        "processor": processor_text(),
+        "software": format_software_versions(current_software_versions()),
+        "processor": processor_description(),
         "layout": LAYOUT_VERSION,
     }
 
@@ -239,7 +243,7 @@ def template_attributes(template: StoreTemplate) -> dict[str, Any]:
 def write_manifest(
     store_path: Location, attributes: dict[str, Any], digests: Mapping[str, str]
 ) -> None:
-    """Write the list of a store's root attributes and of digests of its first objects."""
+    """Write the manifest of a store: its root attributes, and digests of objects by name."""
     records = [encode_record({"attributes": attributes, "objects": len(digests)})]
     records += [
         encode_record({"object": name, "digest": object_digest})
@@ -264,7 +268,7 @@ def _create_array(
         **fill_option,
         dimension_names=layout.dims,
         attributes=dict(layout.attributes),
-        compressors=CODECS,
+        compressors=CHUNK_CODECS,
     )
     if layout.values is not None:
         array[...] = layout.values
@@ -304,7 +308,7 @@ def encode_chunk(layout: ArrayLayout, values: np.ndarray) -> bytes:
     else:
         chunk = np.full(layout.chunks, layout.fill_value, dtype)
         chunk[tuple(slice(length) for length in values.shape)] = values
-    content: bytes = _ZSTD.encode(chunk)
+    content: bytes = _ZSTD_ENCODER.encode(chunk)
     return content + google_crc32c.value(content).to_bytes(4, "little")
 
 
@@ -333,11 +337,11 @@ class BlockWriter:
         def write_chunk(array_name: str) -> tuple[str, bytes]:
             """Write a chunk. Return its path inside the store, and its bytes."""
             layout, position, values = (
-                self.study.layout_by_name[array_name],
+                self.study.output_layout_by_name[array_name],
                 positions[array_name],
                 results[array_name],
             )
-            region_shape = tuple(s.stop - s.start for s in layout.region(position))
+            region_shape = tuple(s.stop - s.start for s in layout.chunk_region(position))
             if values.shape != region_shape:
                 raise ValueError(
                     f"{array_name} has shape {values.shape} for its chunk {region_shape} at "
@@ -366,23 +370,23 @@ def chunk_names_of_block(study: BlockStudy, block: int) -> list[str]:
     ]
 
 
-def chunk_size_limits(study: BlockStudy) -> Callable[[str], int]:
+def make_chunk_size_limit(study: BlockStudy) -> Callable[[str], int]:
     """Return a function from the path of a chunk inside the store to its largest size [bytes]."""
 
     def size_limit(chunk_path: str) -> int:
-        layout = study.layout_by_name[array_of_chunk(chunk_path)]
-        return compressed_bytes_max(layout.nbytes_of(layout.chunks))
+        layout = study.output_layout_by_name[array_name_of_chunk(chunk_path)]
+        return compressed_bytes_max(layout.nbytes_of_part(layout.chunks))
 
     return size_limit
 
 
-def array_of_chunk(chunk_path: str) -> str:
+def array_name_of_chunk(chunk_path: str) -> str:
     """Return the path, inside the store, of the array of a chunk; '' if an object is no chunk.
 
-    >>> [array_of_chunk(name) for name in ("tile/pd_up/c/0/3", "weight/c", "pd_up/zarr.json")]
+    >>> [array_name_of_chunk(name) for name in ("tile/pd_up/c/0/3", "weight/c", "pd_up/zarr.json")]
     ['tile/pd_up', 'weight', '']
     """
-    match = CHUNK_NAME.fullmatch(chunk_path)
+    match = CHUNK_NAME_PATTERN.fullmatch(chunk_path)
     return match[1] if match else ""
 
 
@@ -409,7 +413,7 @@ def sync_to_disk(store_path: Location) -> None:
         os.close(descriptor)
 
 
-def remove_partial_files(store_path: Location) -> None:
+def remove_draft_files(store_path: Location) -> None:
     """Remove incomplete files of writers that were killed."""
     if isinstance(store_path, Path):
         partial_files = (
@@ -417,7 +421,7 @@ def remove_partial_files(store_path: Location) -> None:
             for candidate in iter_entries_below(str(store_path))
             if candidate.name.endswith(locations.DRAFT_SUFFIX)
         )
-        for entry in _exclude_foreign(store_path, partial_files):
+        for entry in _exclude_foreign_files(store_path, partial_files):
             with suppress(FileNotFoundError):
                 os.unlink(entry.path)
 
@@ -433,13 +437,13 @@ def refuse_links(store_path: Location) -> None:
             for entry in iter_entries_below(str(store_path))
             if entry.is_symlink() and (entry.is_dir() or not os.path.exists(entry.path))
         )
-        for entry in _exclude_foreign(store_path, links):
+        for entry in _exclude_foreign_files(store_path, links):
             raise StoreError(
                 f"{entry.path} is a symbolic link, no folder: sweep made none such, remove it"
             )
 
 
-def _exclude_foreign(
+def _exclude_foreign_files(
     store_path: Path, entries: Iterable[os.DirEntry[str]]
 ) -> list[os.DirEntry[str]]:
     """Return the entries below a store that are not foreign files."""
@@ -459,14 +463,14 @@ def _exclude_foreign(
 class Damage(NamedTuple):
     """Object of a store that differs from what was written."""
 
-    object: str  # path inside the store; with the line number in a log
-    what: str  # description of the damage
+    object_name: str  # path inside the store; with the line number in a log
+    description: str  # description of the damage
     block: int = -1  # block of the object; -1 without one
-    mended_by: str = "resume"  # "repair" for objects of the template, "hand" for surplus ones
+    repaired_by: str = "resume"  # "repair" for objects of the template, "hand" for surplus ones
 
 
-def manifest_digests(store_path: Location) -> dict[str, str]:
-    """Return the digests of the objects of the template, from the undamaged lines of their list."""
+def read_manifest_digests(store_path: Location) -> dict[str, str]:
+    """Return the digests of the template's objects by name; skip damaged lines of the manifest."""
     return {
         record["object"]: record["digest"]
         for record in iter_records(store_path / MANIFEST_PATH)
@@ -474,32 +478,34 @@ def manifest_digests(store_path: Location) -> dict[str, str]:
     }
 
 
-def template_damages(store_path: Location) -> list[Damage]:
-    """Return the damaged objects of the template, and the damaged lines of their list."""
+def find_template_damages(store_path: Location) -> list[Damage]:
+    """Return the damaged objects of the template, and the damaged lines of the manifest."""
     records = [record for _, record in iter_lines_and_records(store_path / MANIFEST_PATH)]
     if not records:
-        return [Damage(MANIFEST_PATH, "is missing or empty", mended_by="repair")]
+        return [Damage(MANIFEST_PATH, "is missing or empty", repaired_by="repair")]
     problems = [
-        Damage(f"{MANIFEST_PATH} line {line_number}", "is damaged", mended_by="repair")
+        Damage(f"{MANIFEST_PATH} line {line_number}", "is damaged", repaired_by="repair")
         for line_number, record_or_none in enumerate(records, 1)
         if record_or_none is None
     ]
     undamaged = [record for record in records if record]
     if not problems and undamaged[0].get("objects") != len(undamaged) - 1:
-        problems.append(Damage(MANIFEST_PATH, "lacks lines", mended_by="repair"))
+        problems.append(Damage(MANIFEST_PATH, "lacks lines", repaired_by="repair"))
     return problems + [
-        Damage(name, problem, mended_by="repair")
-        for name, expected_digest in manifest_digests(store_path).items()
-        if (problem := template_object_damage(store_path, name, expected_digest))
+        Damage(name, problem, repaired_by="repair")
+        for name, expected_digest in read_manifest_digests(store_path).items()
+        if (problem := describe_template_object_damage(store_path, name, expected_digest))
     ]
 
 
-def template_object_damage(store_path: Location, object_name: str, expected_digest: str) -> str:
+def describe_template_object_damage(
+    store_path: Location, object_name: str, expected_digest: str
+) -> str:
     """Return the damage of an object of the template with a known digest; '' if it has none."""
     return damage_or_read_error(
         lambda: (
             ""
-            if has_digest(store_path, [object_name], expected_digest)
+            if objects_match_digest(store_path, [object_name], expected_digest)
             else "is not as it was made"
         )
     )
@@ -508,8 +514,10 @@ def template_object_damage(store_path: Location, object_name: str, expected_dige
 def refuse_damaged_template(store_path: Location) -> None:
     """Raise a StoreError if the template is damaged, as new results might not fit it."""
     refuse_links(store_path)
-    if problems := template_damages(store_path):
-        problem_lines = "\n".join(f"  {damage.object} {damage.what}" for damage in problems)
+    if problems := find_template_damages(store_path):
+        problem_lines = "\n".join(
+            f"  {damage.object_name} {damage.description}" for damage in problems
+        )
         raise StoreError(
             f"{store_path} is not as it was made:\n{problem_lines}\n"
             f"{suggestion('verify', store_path, repair=True)} puts back what was there."
@@ -544,7 +552,7 @@ def is_block_visible(
     try:
         if check_digest:
             return (
-                stored_objects_digest(store_path, chunk_paths, chunk_size_limits(study))
+                stored_objects_digest(store_path, chunk_paths, make_chunk_size_limit(study))
                 == receipt.digest
             )
         if isinstance(store_path, Path):
@@ -562,13 +570,13 @@ VERSIONED_DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
 @cache
-def current_versions() -> dict[str, str]:
+def current_software_versions() -> dict[str, str]:
     """Return the versions of the software that results depend on, by name."""
     return {name: version(name) for name in VERSIONED_DISTRIBUTIONS}
 
 
 @cache
-def processor_text() -> str:
+def processor_description() -> str:
     """Return machine, processor and vector instructions, by which NumPy and LLVM select code."""
     import llvmlite.binding
     import numpy as np
@@ -582,7 +590,8 @@ def processor_text() -> str:
 def refuse_foreign_store(store_path: Location) -> None:
     """Raise a StoreError if what is at a path was not made by sweep; a damaged store passes."""
     if not any(
-        any(iter_records(store_path / JOURNAL_DIR / name)) for name in (MANIFEST_FILE, *LOG_NAMES)
+        any(iter_records(store_path / JOURNAL_DIR / name))
+        for name in (MANIFEST_FILE, *LOG_FILE_NAMES)
     ):
         store_format.refuse_foreign_store(store_path)
 
@@ -601,9 +610,9 @@ def refuse_foreign_files(store_path: Location) -> None:
     """Raise a StoreError if the folder of a store contains files that are not sweep's."""
     if not isinstance(store_path, Path):
         return
-    if names := [name for name in list_foreign_files(store_path) if not is_litter(name)]:
-        names_text = ", ".join(names[:FOREIGN_FILES_NAMED_MAX]) + (
-            ", ..." if len(names) > FOREIGN_FILES_NAMED_MAX else ""
+    if names := [name for name in list_foreign_files(store_path) if not is_ignorable_file(name)]:
+        names_text = ", ".join(names[:FOREIGN_FILES_IN_MESSAGE_MAX]) + (
+            ", ..." if len(names) > FOREIGN_FILES_IN_MESSAGE_MAX else ""
         )
         raise StoreError(
             f"{store_path} has files in it that are not sweep's ({names_text}): move them "
@@ -611,7 +620,7 @@ def refuse_foreign_files(store_path: Location) -> None:
         )
 
 
-def pending_replacement(store_path: Location) -> Path | None:
+def find_pending_replacement(store_path: Location) -> Path | None:
     """Return the unfinished store that will replace the one at a path; None without one.
 
     StoreError if the unfinished store was begun to replace another store.
@@ -622,7 +631,9 @@ def pending_replacement(store_path: Location) -> Path | None:
         or not (staging_path := staging_path_for(store_path)).exists()
     ):
         return None
-    if read_recipe(staging_path).get(REPLACES_KEY) != store_format.read_study_id(store_path):
+    if read_recipe(staging_path).get(REPLACED_STUDY_ID_KEY) != store_format.read_study_id(
+        store_path
+    ):
         situation = "holds another study now" if store_path.exists() else "is gone"
         raise StoreError(
             f"{staging_path} was begun to take the place of a store at {store_path}, which "
@@ -641,7 +652,7 @@ def refuse_other_versions(
     Its bits could differ from those of new results. `reader` names this process in the message.
     """
     recorded = {"model": attributes["model_version"], **parse_software_versions(attributes)}
-    current = {"model": model_version, **current_versions()}
+    current = {"model": model_version, **current_software_versions()}
     if recorded != current:
         difference_lines = "\n".join(
             f"  {name}: {recorded.get(name, 'none')} in the store, {current.get(name, 'none')} here"

@@ -139,7 +139,9 @@ class PatientStream(ForgivingStream):
                     self._waiting_texts.put_nowait(text)
                 if self._writer_thread is None:
                     super().flush()  # earlier text in the buffer comes first
-                    self._writer_thread = threading.Thread(target=self._write_all, daemon=True)
+                    self._writer_thread = threading.Thread(
+                        target=self._write_waiting_texts, daemon=True
+                    )
                     self._writer_thread.start()
         return len(text)
 
@@ -157,7 +159,7 @@ class PatientStream(ForgivingStream):
                 self._waiting_texts.all_tasks_done.wait(seconds_left)
             self._is_reader_stopped = self._waiting_texts.unfinished_tasks > 0
 
-    def _write_all(self) -> None:
+    def _write_waiting_texts(self) -> None:
         """Write texts as they arrive.
 
         Buffers of the stream are avoided, as the main thread needs their locks to exit.
@@ -217,7 +219,7 @@ def is_terminal(stream: Any) -> bool:
 
 
 @contextmanager
-def forgiving_output() -> Iterator[None]:
+def silence_failing_output() -> Iterator[None]:
     """Make standard output and error of this process silent after their first error."""
     _open_standard_descriptors()
     original_streams = sys.stdout, sys.stderr

@@ -70,7 +70,7 @@ def _module_file_digest(module: ModuleType) -> str:
 
 
 @lru_cache(maxsize=64)
-def allow_same_module(module: str, digest: str) -> None:
+def allow_identical_module(module: str, digest: str) -> None:
     """Allow a module in this worker, as in the run's driver; CodeError if its file differs.
 
     It is checked once per process: an imported module does not change with its file.

@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from sweep.storage.locations import parse_location, store_identity
+from sweep.storage.locations import parse_location, store_fingerprint
 from sweep.storage.store_format import read_attributes
 from sweep.tasks.engine import journal, study_store, user_code
 from sweep.tasks.engine.block_study import BlockEvaluator, Deadline, StudyReader, UnfinishedBlock
@@ -32,7 +32,7 @@ from sweep.tasks.engine.blocks import Results
 from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
 from sweep.tasks.engine.progress import CodeError, StoreError
 
-T = TypeVar("T")
+ReturnValue = TypeVar("ReturnValue")
 
 #: Errors of the storage: every further block would raise them too.
 STORAGE_ERRNOS = {
@@ -42,7 +42,7 @@ STORAGE_ERRNOS = {
 
 #: Time after which the results of an unfinished block are saved, and the block is put back for
 #: another task [s]. As much is lost if a worker dies, and Ctrl-C waits for as long.
-CHECKPOINT_INTERVAL = 10.0
+CHECKPOINT_INTERVAL_SECONDS = 10.0
 
 #: Time in which a thread must return from compiled code after its time limit [s].
 INTERRUPT_GRACE_SECONDS = 10.0
@@ -59,6 +59,10 @@ RESULTS_NOT_VISIBLE_MESSAGE = (
 )
 
 ReceiptVerifier = Callable[[Receipt, bool], bool]
+"""Function that returns True if the block of a receipt is in the store as seen from here.
+
+Its second argument tells whether to compare digests, and not only sizes.
+"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class TaskSettings:
     evaluate: BlockEvaluator | None = None  # replaces the study's `evaluate`, with its results
     block_timeout: float | None = None  # time limit of a block [s]
     durable: bool = False  # whether chunks are on the disk before the receipt
-    user_code: tuple[
+    user_module_digests: tuple[
         tuple[str, str], ...
     ] = ()  # the user's modules that may be imported, and their digests
 
@@ -82,7 +86,7 @@ class TaskResult:
 
     receipts: list[Receipt] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
-    checkpoint_points: dict[int, float] = field(
+    checkpoint_points_by_block: dict[int, float] = field(
         default_factory=dict
     )  # number of points done so far, by unfinished block
     worker_address: str = ""  # address of the worker; '' for serial computation
@@ -94,7 +98,7 @@ class TaskResult:
 _open_writer_lock = threading.Lock()
 
 
-def block_writer_of_store(
+def get_block_writer(
     store_path: str, study_id: str, read_study: StudyReader
 ) -> study_store.BlockWriter:
     """Return the writer of a store, opened once per process; StoreError for another study."""
@@ -122,7 +126,7 @@ _cached_block_writer = lru_cache(maxsize=OPEN_STUDIES_MAX)(_open_block_writer)
 
 def _refuse_replaced_store(store_path: str, study_id: str) -> None:
     """Raise a StoreError if the store was replaced since the task was sent."""
-    store_stamp = store_identity(parse_location(store_path))
+    store_stamp = store_fingerprint(parse_location(store_path))
     stored_id = (
         _stored_study_id(store_path, store_stamp)
         if store_stamp
@@ -149,7 +153,7 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
             _allow_user_code(settings)
         _run_blocks(
             task_result,
-            block_writer_of_store(settings.store_path, settings.study_id, settings.read_study),
+            get_block_writer(settings.store_path, settings.study_id, settings.read_study),
             blocks,
             settings,
         )
@@ -160,8 +164,8 @@ def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
 
 def _allow_user_code(settings: TaskSettings) -> None:
     """Allow the user's modules that the driver allows; CodeError if a file differs here."""
-    for module, digest in settings.user_code:
-        user_code.allow_same_module(module, digest)
+    for module, digest in settings.user_module_digests:
+        user_code.allow_identical_module(module, digest)
 
 
 def _run_blocks(
@@ -171,26 +175,26 @@ def _run_blocks(
     settings: TaskSettings,
 ) -> None:
     """Compute and write blocks, and add their receipts, failures and points to the result."""
-    receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL
+    receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL_SECONDS
     for block in blocks:
         try:
-            receipt_or_points = _run_block(writer, block, settings, Deadline(checkpoint_time))
+            receipt_or_points = _compute_block(writer, block, settings, Deadline(checkpoint_time))
             if isinstance(receipt_or_points, Receipt):
                 receipts.append(receipt_or_points)
             else:
-                task_result.checkpoint_points[block] = receipt_or_points
+                task_result.checkpoint_points_by_block[block] = receipt_or_points
         except StoreError:
             raise
         except Exception as error:
             if isinstance(error, OSError) and error.errno in STORAGE_ERRNOS:
                 raise
             task_result.failures.append(make_failure(block, error))
-    if settings.durable and (receipts or task_result.checkpoint_points):
+    if settings.durable and (receipts or task_result.checkpoint_points_by_block):
         study_store.sync_to_disk(writer.store_path)
     task_result.receipts = receipts
 
 
-def _run_block(
+def _compute_block(
     writer: study_store.BlockWriter, block: int, settings: TaskSettings, deadline: Deadline
 ) -> Receipt | float:
     """Compute one block. Return its receipt, or the number of points done at the deadline."""
@@ -222,15 +226,15 @@ def _run_block(
     ended_at = time.perf_counter()
     return Receipt(
         block=block,
-        points=stored_study.block_size(block),
+        points=stored_study.count_block_points(block),
         bytes=stored_block.n_bytes,
         digest=stored_block.digest,
         seconds=round(checkpoint.seconds + ended_at - started_at, 6),
         write_seconds=round(ended_at - evaluated_at, 6),
         host=socket.gethostname(),
         pid=os.getpid(),
-        versions=study_store.current_versions(),
-        taken=stored_study.pop_reused_points(block),
+        versions=study_store.current_software_versions(),
+        reused_points=stored_study.pop_reused_point_count(block),
     )
 
 
@@ -255,8 +259,8 @@ class _TimeoutInterruption(SystemExit):
 
 
 def run_with_timeout(
-    function: Callable[[], T], timeout: float | None, seconds_spent: float = 0.0
-) -> T:
+    function: Callable[[], ReturnValue], timeout: float | None, seconds_spent: float = 0.0
+) -> ReturnValue:
     """Call a function; BlockTimeoutError if it exceeds `timeout` less `seconds_spent` [s].
 
     The function runs in a thread, where Python code is interrupted. A worker process ends itself if
@@ -264,7 +268,7 @@ def run_with_timeout(
     """
     if timeout is None:
         return function()
-    return_values: list[T] = []
+    return_values: list[ReturnValue] = []
     errors: list[BaseException] = []
     is_finished, may_exit = threading.Event(), threading.Event()
 
@@ -324,7 +328,7 @@ class BlockQueue:
 
     def __init__(self, is_done: np.ndarray) -> None:
         self.n_unassigned = int(is_done.size - np.count_nonzero(is_done))  # not yet taken
-        self._untried = _iter_unmarked(is_done)
+        self._untried = _iter_false_indices(is_done)
         self._failed_once: deque[int] = deque()
         self._requeued: deque[int] = deque()
         self.failed: set[int] = set()
@@ -359,7 +363,7 @@ class BlockQueue:
             (self._failed_once if block in self.failed else self._requeued).append(block)
 
 
-def _iter_unmarked(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
+def _iter_false_indices(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
     """Yield the indices of False elements, found in steps of `step` elements."""
     for start in range(0, mask.size, step):
         yield from (start + np.flatnonzero(~mask[start : start + step])).tolist()
@@ -471,5 +475,5 @@ def _accept_result(
                 for block in task_blocks
             ]
         )
-    block_queue.requeue(list(task_result.checkpoint_points))
+    block_queue.requeue(list(task_result.checkpoint_points_by_block))
     return task_result

@@ -56,7 +56,7 @@ def process_memory() -> WorkerMemory:
 def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
     """Return the memory of the smallest worker of a client, or of a cluster to be started."""
     if client is not None:
-        return WorkerMemory(lambda: _least_memory_limit(client), "a worker of the client")
+        return WorkerMemory(lambda: _smallest_worker_memory_limit(client), "a worker of the client")
     if isinstance(cluster, LocalClusterConfig):
         from sweep.tasks.engine.cluster_connection import cpu_count
         from sweep.tasks.engine.deploy.local_ssh import worker_memory_limit
@@ -70,7 +70,7 @@ def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> Wo
     return WorkerMemory(lambda: bytes_max or np.inf, "each worker of the cluster")
 
 
-def _least_memory_limit(client: Client) -> float:
+def _smallest_worker_memory_limit(client: Client) -> float:
     """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
 
     inf also if the client is closed or its scheduler is gone. A study with missing blocks then

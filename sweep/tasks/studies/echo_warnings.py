@@ -114,12 +114,12 @@ class EchoDiagnosis(NamedTuple):
     """True (n,) if the beats are read as another range or velocity."""
     has_phase_walk: np.ndarray
     """True (n,) if the laser's phase varies more than the model of detection allows."""
-    is_exchanged: np.ndarray
+    is_range_velocity_exchanged: np.ndarray
     """True (n,) if up and down beat alone are read with range and velocity exchanged.
 
     The other assumption for two beats would read them correctly.
     """
-    is_exchanged_by_other: np.ndarray
+    is_exchanged_by_other_assumption: np.ndarray
     """True (n,) if the other assumption for two beats exchanges range and velocity.
 
     Points at which the present assumption does so too are not marked.
@@ -141,7 +141,10 @@ class FootprintDeviations(NamedTuple):
 
     @classmethod
     def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
-        """Return the deviations of footprints on a plane, from parameters of equal strings."""
+        """Return the deviations of footprints on a plane at ranges `range_` (n,) [m].
+
+        Text parameters in `p` are the same at all points.
+        """
         with np.errstate(all="ignore"):
             places, directions = beam.footprint_angles(p, range_)
             range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
@@ -209,10 +212,10 @@ def diagnose_echoes(
                 name: _is_misread(p, range_, velocity, name)
                 for name in (assumption, other_assumption)
             }
-            diagnosis.is_exchanged[index] = (
+            diagnosis.is_range_velocity_exchanged[index] = (
                 is_misread_by[assumption] & ~is_misread_by[other_assumption]
             )
-            diagnosis.is_exchanged_by_other[index] = (
+            diagnosis.is_exchanged_by_other_assumption[index] = (
                 is_misread_by[other_assumption] & ~is_misread_by[assumption]
             )
         diagnosis.crosses_spectrum_edge[index] = _crosses_spectrum_edge(
@@ -374,7 +377,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
     is_shifted = (
         has_overlap & ~is_absent & (diagnosis.window_fraction_lost > PHASE_ESTIMATOR_LOSS_MAX)
     )
-    if (kinds := _phase_estimators(study)) and is_shifted.any():
+    if (kinds := _used_phase_estimators(study)) and is_shifted.any():
         yield (
             f"instrument.processing.estimator.kind {' and '.join(kinds)} takes echoes for whole "
             f"records, and echoes begin within theirs at {_fraction_text(is_shifted)} of the "
@@ -386,8 +389,8 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         )
     is_wrong = diagnosis.is_misread & ~is_absent
     if _reads_two_beats(study):
-        yield from _exchanged_warning(study, diagnosis, is_absent, points_noun)
-        is_wrong &= ~diagnosis.is_exchanged
+        yield from _iter_exchange_warnings(study, diagnosis, is_absent, points_noun)
+        is_wrong &= ~diagnosis.is_range_velocity_exchanged
     if is_wrong.any():
         yield (
             f"the peaks are read as another range or velocity at {_fraction_text(is_wrong)} of the "
@@ -428,7 +431,7 @@ def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
         )
 
 
-def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
+def _used_phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
     """Return the phase estimators that a study uses."""
     path = f"{ESTIMATOR_PREFIX}kind"
     values = [
@@ -455,7 +458,7 @@ def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
     )
 
 
-def _exchanged_warning(
+def _iter_exchange_warnings(
     study: GridStudy | FlightStudy,
     diagnosis: EchoDiagnosis,
     is_absent: np.ndarray,
@@ -466,22 +469,27 @@ def _exchanged_warning(
     No warning is given if the target is fast at some points and far at others, and assumed to be
     fast.
     """
-    is_exchanged, is_exchanged_by_other = (
-        diagnosis.is_exchanged & ~is_absent,
-        diagnosis.is_exchanged_by_other & ~is_absent,
+    is_range_velocity_exchanged, is_exchanged_by_other_assumption = (
+        diagnosis.is_range_velocity_exchanged & ~is_absent,
+        diagnosis.is_exchanged_by_other_assumption & ~is_absent,
     )
     assumes_far = (
         str((PARAMETER_DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS_PATH])
         == waveform.FAR_TARGET
     )
-    if not is_exchanged.any() or (not assumes_far and is_exchanged_by_other.any()):
+    if not is_range_velocity_exchanged.any() or (
+        not assumes_far and is_exchanged_by_other_assumption.any()
+    ):
         return
     relation, other_name = ("exceeds", "fast") if assumes_far else ("is below", "far")
-    if np.count_nonzero(is_exchanged_by_other) < np.count_nonzero(is_exchanged):
+    if np.count_nonzero(is_exchanged_by_other_assumption) < np.count_nonzero(
+        is_range_velocity_exchanged
+    ):
         remedy = f"write processing.two_beats: {other_name}"
-        if is_exchanged_by_other.any():
+        if is_exchanged_by_other_assumption.any():
             remedy += (
-                f", which is wrong at {_fraction_text(is_exchanged_by_other)} of the {points_noun}"
+                f", which is wrong at {_fraction_text(is_exchanged_by_other_assumption)} of the "
+                f"{points_noun}"
             )
     else:
         remedy = (
@@ -490,11 +498,11 @@ def _exchanged_warning(
             "or raise chirp.bandwidth over chirp.duration"
         )
     yield (
-        f"the Doppler shift {relation} the beat of the range at {_fraction_text(is_exchanged)} of "
-        f"the {points_noun}, "
-        f"{_range_text(is_exchanged, diagnosis.range, is_absent)}, and processing.two_beats is "
-        f"{'far' if assumes_far else 'fast'}: an up and a down beat that no Doppler beat confirms "
-        "are read "
+        f"the Doppler shift {relation} the beat of the range at "
+        f"{_fraction_text(is_range_velocity_exchanged)} of the {points_noun}, "
+        f"{_range_text(is_range_velocity_exchanged, diagnosis.range, is_absent)}, and "
+        f"processing.two_beats is {'far' if assumes_far else 'fast'}: an up and a down "
+        "beat that no Doppler beat confirms are read "
         f"there with range and velocity exchanged (misread): {remedy}"
     )
 
@@ -505,7 +513,7 @@ def _fraction_text(mask: np.ndarray) -> str:
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Return the ranges of some points as text: 'from x on' if it holds for all others beyond.
+    """Return the ranges of the marked points as text: 'from x on' if all beyond are marked.
 
     Points that are ``is_absent`` are ignored.
     """
@@ -560,7 +568,7 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
     }
     for eyepoints in study.eyepoint_studies():
         eyepoints_of_sample = eyepoints_from_arrays(
-            eyepoints.cast_shots(eyepoints.sample_tiles(SAMPLED_TILES_PER_SCANNER)),
+            eyepoints.cast_shots(eyepoints.sample_shots_of_tiles(SAMPLED_TILES_PER_SCANNER)),
             eyepoints.beamlet_weights,
         )
         hitting_shots = eyepoints_of_sample.has_target.nonzero()[0]

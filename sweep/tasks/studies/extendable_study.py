@@ -49,7 +49,7 @@ class ExtendableStudy(BlockStudy):
         """Return the block that holds the results shared by all draws of a block's points."""
         return block
 
-    def pop_reused_points(self, block: int) -> int:
+    def pop_reused_point_count(self, block: int) -> int:
         """Return how many points of a block came from the smaller study's store, and forget it."""
         reuse_source = self.reuse_source
         return reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0

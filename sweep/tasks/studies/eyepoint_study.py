@@ -23,9 +23,9 @@ from sweep.model.outputs import (
     CYCLE_VARIABLES,
     SHOT_VARIABLES,
 )
-from sweep.storage.store_format import MAP_GROUP
+from sweep.storage.store_format import TERRAIN_MAP_GROUP
 from sweep.tasks.engine.block_study import BlockStudy
-from sweep.tasks.engine.blocks import FILL_VALUE_BY_KIND, ArrayLayout, BlockGrid, Results
+from sweep.tasks.engine.blocks import FILL_VALUE_BY_DTYPE_KIND, ArrayLayout, BlockGrid, Results
 from sweep.tasks.studies.output_layouts import cf_attributes, make_output_layout
 from sweep.tasks.studies.parameter_grid import DEFAULT_BLOCKS_MIN, SHOTS_PER_TILE
 
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 #: Largest numbers of shots and beamlets of a block, which contains complete cycles.
-BLOCK_SHOTS_MAX = 4096
-BLOCK_BEAMLETS_MAX = 1 << 20
+SHOTS_PER_BLOCK_MAX = 4096
+BEAMLETS_PER_BLOCK_MAX = 1 << 20
 
 #: Number of beamlets above which rays are cut into several blocks, for all cores of a machine: they
 #: take some half a second.
@@ -51,14 +51,14 @@ MAP_NODES_MIN = 16
 
 #: Number of shots of each scanner, or of times, that sample the extent of a flight; and the margin
 #: of the map around it, as a fraction of the extent.
-FLIGHT_SAMPLES = 512
+FLIGHT_SAMPLE_POINTS = 512
 MAP_MARGIN_FRACTION = 0.08
 
 #: Height of the viewpoint of the map above the scene and the flight [m].
-MAP_VIEW_CLEARANCE = 1.0
+MAP_VIEWPOINT_CLEARANCE = 1.0
 
 #: Largest distance from the ground of a platform that stands on it [m].
-GROUND_CONTACT_MAX = 1e-6
+GROUND_CONTACT_DISTANCE_MAX = 1e-6
 
 #: Sizes of the model's dimensions of vectors and matrices.
 VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
@@ -86,8 +86,8 @@ class EyepointStudy(BlockStudy):
         self.n_beamlets = n_beamlets or int(spec.parameters()["footprint.beamlets"])
         n_beamlets_in_all = self.n_cycles * self.shots_per_cycle * self.n_beamlets
         beamlets_max = max(n_beamlets_in_all // DEFAULT_BLOCKS_MIN, DEFAULT_BLOCK_BEAMLETS_MIN)
-        beamlets_max = min(beamlets_max, BLOCK_BEAMLETS_MAX)
-        shots_max = max(1, min(BLOCK_SHOTS_MAX, beamlets_max // self.n_beamlets))
+        beamlets_max = min(beamlets_max, BEAMLETS_PER_BLOCK_MAX)
+        shots_max = max(1, min(SHOTS_PER_BLOCK_MAX, beamlets_max // self.n_beamlets))
         cycles_per_block = min(self.n_cycles, max(1, shots_max // self.shots_per_cycle))
         self._grid = BlockGrid(
             ("cycle",),
@@ -135,7 +135,7 @@ class EyepointStudy(BlockStudy):
                 BEAMLET_WEIGHT_VARIABLE.dims,
                 self.beamlet_weights,
                 weight_attributes,
-                fill_value=FILL_VALUE_BY_KIND["f"],
+                fill_value=FILL_VALUE_BY_DTYPE_KIND["f"],
             )
         ]
 
@@ -166,12 +166,12 @@ class EyepointStudy(BlockStudy):
         self.cast_cycles(np.arange(self.shots_per_cycle))
 
     def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
-        """Return the arrays of shots in complete cycles, and of the cycles, by shot number (n,)."""
+        """Cast the shots (n,) of complete cycles. Return the arrays of shots and of cycles."""
         shot_arrays = self.cast_shots(shot_numbers)
         return shot_arrays | self._cycle_arrays(shot_arrays)
 
     def cast_shots(self, shot_numbers: np.ndarray) -> Results:
-        """Return the arrays of any shots, by their numbers (n,)."""
+        """Cast any shots, given by numbers (n,). Return their arrays by name."""
         from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 
         shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
@@ -183,7 +183,7 @@ class EyepointStudy(BlockStudy):
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def sample_tiles(self, n_tiles: int) -> np.ndarray:
+    def sample_shots_of_tiles(self, n_tiles: int) -> np.ndarray:
         """Return the numbers of all shots of `n_tiles` tiles, spread over the flight."""
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
@@ -192,9 +192,9 @@ class EyepointStudy(BlockStudy):
         shot_numbers = (first_shots[:, None] + np.arange(SHOTS_PER_TILE)).ravel()
         return np.asarray(shot_numbers[shot_numbers < self.n_points])
 
-    def sample_cycles(self, n_tiles: int) -> np.ndarray:
+    def sample_shots_of_cycles(self, n_tiles: int) -> np.ndarray:
         """Return the numbers of all shots of cycles that overlap `n_tiles` tiles of the flight."""
-        cycle_numbers = np.unique(self.sample_tiles(n_tiles) // self.shots_per_cycle)
+        cycle_numbers = np.unique(self.sample_shots_of_tiles(n_tiles) // self.shots_per_cycle)
         return np.asarray(
             (
                 cycle_numbers[:, None] * self.shots_per_cycle + np.arange(self.shots_per_cycle)
@@ -210,7 +210,7 @@ class EyepointStudy(BlockStudy):
             shot_numbers,
             caster=world.caster,
             body_motions=world.body_flights,
-            **self._observe_keywords,
+            **self._observation_arguments,
         )
 
     def _cycle_arrays(self, shot_arrays: Results) -> Results:
@@ -233,7 +233,7 @@ class EyepointStudy(BlockStudy):
         return self._world or build_world(self.spec)
 
     @cached_property
-    def _observe_keywords(self) -> dict[str, Any]:
+    def _observation_arguments(self) -> dict[str, Any]:
         """Arguments of :func:`observe_eyepoints` for the instrument and its flight."""
         return {
             "flight": self.spec.build_flight(),
@@ -269,12 +269,12 @@ def height_above_surface(
 def below_surface_warning(spec: SceneSpec) -> str:
     """Return a warning if the flight is below its scene at times; '' if it is not."""
     world, flight = build_world(spec), spec.build_flight()
-    time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLES)
+    time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLE_POINTS)
     position = flight.state(time).position
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
     hits_above = world.caster.cast_bundles(position, up, poses=_body_poses(world, time))
     # For a platform on the ground, rounding may place the ground just above it.
-    is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_MAX)
+    is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_DISTANCE_MAX)
     is_low = is_covered & np.isinf(height_above_surface(world, position, time))
     if not is_low.any():
         return ""
@@ -329,8 +329,8 @@ def refine_rays(
             )
 
 
-def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
-    """Return the map of heights around a flight and its hits, seen from above at its start."""
+def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
+    """Return the arrays of a map of heights around a flight and its hits, at its start."""
     world = build_world(spec)
     positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
@@ -341,7 +341,7 @@ def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
         for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True)
         if body is None
     ]
-    view_height = max(max(mesh_tops, default=0.0), positions[:, 2].max()) + MAP_VIEW_CLEARANCE
+    view_height = max(max(mesh_tops, default=0.0), positions[:, 2].max()) + MAP_VIEWPOINT_CLEARANCE
     view_points = np.stack(
         [*np.meshgrid(x, y), np.full((len(y), len(x)), view_height)], axis=-1
     ).reshape(-1, 3)
@@ -349,11 +349,11 @@ def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     height = np.where(np.isfinite(depth), view_height - depth, np.nan).reshape(len(y), len(x))
     return [
         ArrayLayout.from_values(
-            f"{MAP_GROUP}/{name}",
+            f"{TERRAIN_MAP_GROUP}/{name}",
             dims,
             values,
             cf_attributes("m", long_name),
-            fill_value=FILL_VALUE_BY_KIND["f"],
+            fill_value=FILL_VALUE_BY_DTYPE_KIND["f"],
         )
         for name, dims, values, long_name in (
             ("x", ("x",), x, "x of the map's nodes"),
@@ -369,7 +369,7 @@ def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.n
 
     n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
     scan = spec.scan_pattern(scanner).shots(
-        np.unique(np.linspace(0, n_shots - 1, FLIGHT_SAMPLES).astype(int))
+        np.unique(np.linspace(0, n_shots - 1, FLIGHT_SAMPLE_POINTS).astype(int))
     )
     flight = spec.build_flight()
     state = flight.state(flight.start + scan.time)

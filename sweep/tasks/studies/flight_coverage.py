@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 SAMPLED_RAYS_PER_SCANNER = 1 << 17
 """Number of rays per scanner, spread over the flight, that sample its hits."""
 
-MISSED_FRACTION_MAX = 0.01
+MISSED_SHOTS_FRACTION_MAX = 0.01
 """Fraction of a scanner's shots without a hit above which a warning is given."""
 
-_SAMPLED_TIMES = 65
+_N_SAMPLED_TIMES = 65
 """Number of times at which the positions of the platform and of moving objects are sampled."""
 
 
@@ -55,22 +55,28 @@ class ScannerHits(NamedTuple):
 class FlightCoverage(NamedTuple):
     """Hits of a flight by scanner, and the extents of path and scene."""
 
-    scanners: tuple[ScannerHits, ...]
-    path_box: np.ndarray
+    scanner_hits: tuple[ScannerHits, ...]
+    path_bounding_box: np.ndarray
     """Least and largest coordinates of the platform, (2, 3) [m]."""
-    scene_box: np.ndarray
+    scene_bounding_box: np.ndarray
     """Least and largest coordinates of the scene, (2, 3) [m]."""
 
     def extents_text(self) -> str:
         """Return the extents of path and scene as text."""
         return (
-            f"the path spans {_box_text(self.path_box)}, and the scene {_box_text(self.scene_box)}"
+            f"the path spans {_box_text(self.path_bounding_box)}, "
+            f"and the scene {_box_text(self.scene_bounding_box)}"
         )
 
     def warnings(self) -> Iterator[str]:
-        """Yield a warning for each scanner that misses more than `MISSED_FRACTION_MAX` of shots."""
+        """Yield a warning for each scanner with too many shots that hit nothing.
+
+        The limit is `MISSED_SHOTS_FRACTION_MAX`.
+        """
         mostly_missing = [
-            scanner for scanner in self.scanners if scanner.hit_fraction < 1 - MISSED_FRACTION_MAX
+            scanner
+            for scanner in self.scanner_hits
+            if scanner.hit_fraction < 1 - MISSED_SHOTS_FRACTION_MAX
         ]
         for scanner in mostly_missing:
             yield f"scanners.{scanner.name}: only {scanner.hits_text()}: {self.extents_text()}"
@@ -80,7 +86,7 @@ class FlightCoverage(NamedTuple):
 def sample_coverage(spec: SceneSpec) -> FlightCoverage:
     """Cast a sample of the shots of each scanner; the last result is cached."""
     world, flight = build_world(spec), spec.build_flight()
-    times = np.linspace(flight.start, flight.stop, _SAMPLED_TIMES)
+    times = np.linspace(flight.start, flight.stop, _N_SAMPLED_TIMES)
     positions = flight.state(times).position
     scanners = tuple(_sample_scanner(spec, scanner) for scanner in spec.scanners)
     return FlightCoverage(
@@ -91,9 +97,9 @@ def sample_coverage(spec: SceneSpec) -> FlightCoverage:
 def refuse_flight_without_hits(spec: SceneSpec) -> None:
     """Raise a SceneError, with the reason, if no beam of the sample hits anything."""
     flight_coverage = sample_coverage(spec)
-    if any(scanner.hit_fraction for scanner in flight_coverage.scanners):
+    if any(scanner.hit_fraction for scanner in flight_coverage.scanner_hits):
         return
-    n_shots = sum(scanner.n_shots for scanner in flight_coverage.scanners)
+    n_shots = sum(scanner.n_shots for scanner in flight_coverage.scanner_hits)
     rule = (
         f"leads nowhere that a beam hits anything, of {counted(n_shots, 'shot')}: "
         f"{flight_coverage.extents_text()}"
@@ -138,7 +144,7 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
 
 
 def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
-    """Return corners (n, 3) of all bodies; of a moving body, of a ball around it along its path."""
+    """Return corners (n, 3) [m] of boxes that contain all bodies, moving ones at all times."""
     corners = []
     for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin

@@ -30,17 +30,17 @@ from sweep.model.outputs import (
 )
 from sweep.spec.rules import Mistake, SpecError
 from sweep.spec.scene_sections import scene_projection
-from sweep.storage.locations import Location, eyepoints_path
-from sweep.storage.store_format import MAP_GROUP
-from sweep.storage.verified_store import open_array_group
-from sweep.tasks.engine.blocks import BLOCKS_MAX, ArrayLayout, BlockGrid, Results
+from sweep.storage.locations import Location, eyepoint_store_location
+from sweep.storage.store_format import TERRAIN_MAP_GROUP
+from sweep.storage.verified_store import open_verified_group
+from sweep.tasks.engine.blocks import BLOCKS_PER_STUDY_MAX, ArrayLayout, BlockGrid, Results
 from sweep.tasks.studies.extendable_study import ExtendableStudy
 from sweep.tasks.studies.eyepoint_study import (
     VECTOR_DIM_SIZES,
     EyepointStudy,
     build_world,
-    height_map_layouts,
     refine_rays,
+    terrain_map_layouts,
 )
 from sweep.tasks.studies.grid_study import (
     EFFECTS_ARRAY,
@@ -65,14 +65,14 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
     CloudSimulator = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
-    """Results of shots with some effects, by their eyepoints, numbers and flags."""
+    """Function of effect names, eyepoints, shot numbers and effect flags that returns results."""
 
 #: Domain of the keys of draws. The key of a shot is its number, so the draws of a flight are the
 #: same at every point of the axes and for every instrument.
 FLIGHT_KEY_DOMAIN = "sweep.flight"
 
 #: Smallest number of shots of a cycle for a velocity vector.
-NAVIGATION_SHOTS_MIN = 3
+NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
 
 #: Outputs of the geometry of shots and cycles, which do not depend on the axes.
 GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
@@ -144,24 +144,24 @@ class ScannerGrid(ParameterGrid, BlockGrid):
             fine_dim="shot",
             fine_steps=self.shots_per_cycle,
         )
-        if self.n_blocks > BLOCKS_MAX:
+        if self.n_blocks > BLOCKS_PER_STUDY_MAX:
             rule = (
                 f"cuts {self.n_draws:,} draws of {self.n_cycles:,} cycles of {scanner} into "
-                f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_MAX:.0e}"
+                f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_PER_STUDY_MAX:.0e}"
             )
             size = f"{block_draws}"
             remedy = "raise it or storage.block_shots, or take fewer draws"
             raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
 
     def values_by_dim(self) -> list[dict[str, np.ndarray]]:
-        """Return the values along each dimension by their name; there may be very many."""
+        """Return the values along each dimension, by parameter path, or as `draw` and `cycle`."""
         draw_values = {"draw": np.arange(self.n_draws)}
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
     @property
     def has_navigation(self) -> bool:
         """True if a cycle has enough shots for a velocity vector."""
-        return self.shots_per_cycle >= NAVIGATION_SHOTS_MIN
+        return self.shots_per_cycle >= NAVIGATION_SHOTS_PER_CYCLE_MIN
 
     def flight_block(self, block_in_grid: int) -> FlightBlock:
         """Return the block of this scanner with a number."""
@@ -272,11 +272,11 @@ class FlightStudy(ExtendableStudy):
                 "coordinates": coordinate_names,
             }
             for scanner, scanner_grid in self.scanner_grids.items()
-        } | {MAP_GROUP: {}}
+        } | {TERRAIN_MAP_GROUP: {}}
 
     def constant_arrays(self) -> list[ArrayLayout]:
         """Return the map of the scene, and the coordinates of every scanner."""
-        return height_map_layouts(self.spec) + [
+        return terrain_map_layouts(self.spec) + [
             replace(layout, name=f"{scanner}/{layout.name}")
             for scanner in self.scanner_grids
             for layout in axis_coordinate_layouts(self.spec.axes)
@@ -335,13 +335,16 @@ class FlightStudy(ExtendableStudy):
             EFFECTS_ARRAY: selected_effects.effect_flags,
             EFFECTS_ERROR_ARRAY: selected_effects.error_bound,
         }
-        reused = self._reused_cloud(block, selected_effects) if self.reuse_source else None
+        reused = self._read_reused_cloud(block, selected_effects) if self.reuse_source else None
         results |= self.simulate_shots(
             flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused
         )
         chunks = {}
         for name in self.chunk_positions(block):
-            values, n_dims = results[name.rpartition("/")[2]], len(self.layout_by_name[name].shape)
+            values, n_dims = (
+                results[name.rpartition("/")[2]],
+                len(self.output_layout_by_name[name].shape),
+            )
             chunks[name] = values.reshape((1,) * (n_dims - values.ndim) + values.shape)
         return chunks
 
@@ -400,9 +403,9 @@ class FlightStudy(ExtendableStudy):
         is_reused, results = reused or self._empty_cloud(
             scanner_grid, selected_effects.effect_flags.size, n_draws
         )
-        for rows, draw_slice in _iter_missing(~is_reused):
+        for rows, draw_slice in _iter_missing_draws(~is_reused):
             simulate_cloud = partial(self._simulate_cloud, flight_block, draw_slice)
-            for shot_rows, part_results in self.iter_clouds(
+            for shot_rows, part_results in self.iter_simulated_groups(
                 flight_block.scanner,
                 eyepoints,
                 selected_effects,
@@ -413,7 +416,7 @@ class FlightStudy(ExtendableStudy):
                 _insert_results(results, shot_rows, draw_slice, part_results)
         if scanner_grid.has_navigation:
             is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
-            for cycles, draw_slice in _iter_missing(np.asarray(is_missing)):
+            for cycles, draw_slice in _iter_missing_draws(np.asarray(is_missing)):
                 rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()
                 part_results = self._solve_navigation(
                     shots_per_cycle, shot_arrays, results, rows, draw_slice
@@ -435,7 +438,7 @@ class FlightStudy(ExtendableStudy):
         results = {name: output.empty(sizes) for name, output in outputs.items()}
         return ReusedCloud(np.zeros((n_shots, n_draws), bool), results)
 
-    def iter_clouds(
+    def iter_simulated_groups(
         self,
         scanner: str,
         eyepoints: Eyepoints,
@@ -444,7 +447,10 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         simulate_cloud: CloudSimulator,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield results of shots in groups that are computed together; with more rays if needed."""
+        """Yield rows and results of shots in groups that are simulated together.
+
+        Shots that need more rays are cast and simulated again.
+        """
         for members, effect_names, effect_flags in selected_effects.subset(
             rows
         ).iter_joint_groups():
@@ -452,7 +458,7 @@ class FlightStudy(ExtendableStudy):
             results = simulate_group(
                 eyepoints.select(group_rows), shot_numbers[group_rows], effect_flags
             )
-            if self.ray_accuracy is not None:
+            if self.ray_error_budget is not None:
                 n_rays = eyepoints.weight.size
                 self._refine_rays(
                     scanner, n_rays, shot_numbers[group_rows], effect_flags, results, simulate_group
@@ -492,7 +498,7 @@ class FlightStudy(ExtendableStudy):
             returns_max=int(self.spec.draws.returns),
             effects=effect_names,
             effect_flags=effect_flags,
-            estimates_ray_error=self.ray_accuracy is not None,
+            estimates_ray_error=self.ray_error_budget is not None,
             motion_priors=self.motion_priors,
         )
         if not any(self.error_floor):
@@ -511,7 +517,7 @@ class FlightStudy(ExtendableStudy):
         simulate_group: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
     ) -> None:
         """Replace the results of shots that need more rays."""
-        assert self.ray_accuracy is not None
+        assert self.ray_error_budget is not None
 
         def cast_more_rays(rows: np.ndarray, n_rays_now: int) -> np.ndarray:
             row_shots = shot_numbers[rows]
@@ -524,7 +530,7 @@ class FlightStudy(ExtendableStudy):
                 results[name][rows] = values
             return finer_results["beamlets_error"]
 
-        refine_rays(n_rays, results["beamlets_error"], self.ray_accuracy, cast_more_rays)
+        refine_rays(n_rays, results["beamlets_error"], self.ray_error_budget, cast_more_rays)
 
     def _solve_navigation(
         self,
@@ -554,7 +560,7 @@ class FlightStudy(ExtendableStudy):
             motion_priors=self.motion_priors,
         )
 
-    def _reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
+    def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
         """Return the results of a block from the smaller study, for shots with equal effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
@@ -652,7 +658,7 @@ class FlightStudy(ExtendableStudy):
         return tuple(self.spec.surfaces())
 
     @cached_property
-    def ray_accuracy(self) -> ErrorBudget | None:
+    def ray_error_budget(self) -> ErrorBudget | None:
         """Accuracy that sets the number of rays of each shot; None if the number is given."""
         return (
             ErrorBudget.from_parameters(self.spec.parameters())
@@ -662,7 +668,9 @@ class FlightStudy(ExtendableStudy):
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Open the eyepoint store of a scanner. Return its arrays by name, and beamlet weights."""
-        group = open_array_group(eyepoints_path(self.store_path, self.spec.geometry_id(scanner)))
+        group = open_verified_group(
+            eyepoint_store_location(self.store_path, self.spec.geometry_id(scanner))
+        )
         arrays: dict[str, Any] = {
             name: group[name] for name in SHOT_VARIABLES | BEAMLET_VARIABLES | CYCLE_VARIABLES
         }
@@ -694,8 +702,8 @@ class FlightStudy(ExtendableStudy):
         return [self.get_eyepoint_study(scanner) for scanner in self.scanner_grids]
 
 
-def _iter_missing(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield rows and ranges of draws that are missing; rows that lack the same come together."""
+def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
+    """Yield groups of rows that lack the same draws, and a slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
@@ -717,15 +725,15 @@ class ShotEffectPlan(NamedTuple):
 
     hitting_shots: np.ndarray  # (m,) indices of the shots that hit something
     tile_index: np.ndarray  # (m,) index of the tile of each such shot in the plan
-    plan: EffectPlan  # plan of the tiles
+    tile_plan: EffectPlan  # plan of the tiles
 
     def selected_effects(self, n_shots: int) -> SelectedEffects:
         """Return the effects simulated at `n_shots` shots; none at shots that hit nothing."""
         selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
-        selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.plan.is_kept)[
+        selected.effect_flags[self.hitting_shots] = pack_effect_flags(self.tile_plan.is_kept)[
             self.tile_index
         ]
-        selected.error_bound[self.hitting_shots] = self.plan.total_error[self.tile_index]
+        selected.error_bound[self.hitting_shots] = self.tile_plan.total_error[self.tile_index]
         return selected
 
 
@@ -752,7 +760,7 @@ def plan_shot_effects(
     hitting_eyepoints = (
         eyepoints if hitting_shots.size == len(tile_of_shot) else eyepoints.select(hitting_shots)
     )
-    run_edges, tile_index = _tile_runs(tile_of_shot[hitting_shots])
+    run_edges, tile_index = _find_tile_runs(tile_of_shot[hitting_shots])
     shots, ground = parameters_and_ground_of_eyepoints(
         hitting_eyepoints, PARAMETER_DEFAULTS | dict(parameters), surfaces
     )
@@ -768,7 +776,7 @@ def plan_shot_effects(
     return ShotEffectPlan(hitting_shots, tile_index, effect_plan)
 
 
-def _tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges of runs of equal tiles, at least one run, and the run of each element."""
     starts_new_run = np.diff(tile_numbers) != 0
     run_edges = np.concatenate([[0], np.flatnonzero(starts_new_run) + 1, [tile_numbers.size]])

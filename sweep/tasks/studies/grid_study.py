@@ -48,8 +48,8 @@ from sweep.model.waveform import PEAKS_PATH
 from sweep.tasks.engine.block_study import (
     NO_RESULTS,
     Deadline,
+    EarlierResults,
     PartialResults,
-    ReusedResults,
     UnfinishedBlock,
     concatenate_results,
 )
@@ -103,13 +103,13 @@ EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
 
 #: Largest number of points of a tile: small enough for similar points, large enough for cheap
 #: planning.
-TILE_POINTS_MAX = 1024
+POINTS_PER_TILE_MAX = 1024
 
 #: Number of points that are planned at once, and number per tile in the preview of tiles.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
 #: Numeric parameters that are constant within a tile: sizes of records, and accuracy.
-CONSTANT_IN_TILE = (
+PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
     "instrument.processing.acquisition_delay",
@@ -155,7 +155,7 @@ class SelectedEffects(NamedTuple):
 class TileGroup(NamedTuple):
     """Tiles that share the values of all strings and sizes."""
 
-    code: int  # number of the group in the grid
+    group_number: int  # number of the group in the grid
     requested_indices: np.ndarray  # (m,): indices of the tiles in the request
     parameters: dict[str, ParameterValue]
     """Parameters by dotted path: strings, numbers, and arrays that broadcast over (m, *tile).
@@ -208,17 +208,19 @@ class TileGrid(BlockGrid):
             members = np.flatnonzero(group_codes == group_code)
             parameters: dict[str, ParameterValue] = {**self.grid.fixed_parameters}
             for axis, position in enumerate(positions):
-                parameters |= self._values_along(axis, position[members], stride)
+                parameters |= self._values_along_axis(axis, position[members], stride)
             yield TileGroup(int(group_code), members, parameters)
 
     def _is_constant_in_tile(self, axis: int) -> bool:
         """Return True if the values of an axis must not vary within a tile."""
         return any(
-            values.dtype.kind in "UO" or path in CONSTANT_IN_TILE or path in EFFECT_CATEGORY_PATHS
+            values.dtype.kind in "UO"
+            or path in PARAMETERS_CONSTANT_IN_TILE
+            or path in EFFECT_CATEGORY_PATHS
             for path, values in self.grid.values_by_axis[axis].items()
         )
 
-    def _values_along(
+    def _values_along_axis(
         self, axis: int, tile_index_along: np.ndarray, stride: int
     ) -> dict[str, ParameterValue]:
         """Return the values of an axis in tiles, by path, shaped to broadcast with other axes."""
@@ -248,7 +250,7 @@ class TileGrid(BlockGrid):
 
 def fit_tile_shape(sizes: tuple[int, ...], is_constant: tuple[bool, ...]) -> tuple[int, ...]:
     """Return the number of points of a tile along each axis: about equal, but 1 if constant."""
-    shape, points_left = [1] * len(sizes), TILE_POINTS_MAX
+    shape, points_left = [1] * len(sizes), POINTS_PER_TILE_MAX
     divisible_axes = sorted(
         (axis for axis in range(len(sizes)) if not is_constant[axis]), key=lambda k: sizes[k]
     )
@@ -276,7 +278,7 @@ class EffectPlanner:
         are planned.
         """
         tiles, tile_index = self.tiles.tiles_of_block(block)
-        parameters = self.tiles.grid.parameters(block)
+        parameters = self.tiles.grid.parameters_of_block(block)
         if local_indices is not None:
             needed_tiles, tile_index = np.unique(tile_index[local_indices], return_inverse=True)
             tiles = tiles[needed_tiles]
@@ -289,7 +291,7 @@ class EffectPlanner:
             ],
             np.int64,
         )
-        for members, plan in self.iter_plans(unplanned_tiles):
+        for members, plan in self.iter_tile_plans(unplanned_tiles):
             flags_of_tiles = pack_effect_flags(plan.is_kept)
             for tile, flag, error in zip(
                 unplanned_tiles[members], flags_of_tiles, plan.total_error, strict=True
@@ -300,10 +302,12 @@ class EffectPlanner:
             np.array([tile_flags for tile_flags, _ in planned], np.uint32),
             np.array([tile_error for _, tile_error in planned]),
         )
-        inactive = self.inactive_flags(parameters, len(tile_index))
+        inactive = self.absent_effect_flags(parameters, len(tile_index))
         return SelectedEffects(flags_of_tiles[tile_index] & ~inactive, errors[tile_index])
 
-    def inactive_flags(self, parameters: Mapping[str, ParameterValue], n_points: int) -> np.ndarray:
+    def absent_effect_flags(
+        self, parameters: Mapping[str, ParameterValue], n_points: int
+    ) -> np.ndarray:
         """Return the flags (n,) of effects that are absent at each point, whatever its tile has."""
         inactive_bits = np.zeros(n_points, np.uint32)
         for bit, effect in enumerate(EFFECT_CATALOGUE):
@@ -311,7 +315,7 @@ class EffectPlanner:
             inactive_bits |= np.where(is_inactive, np.uint32(1 << bit), np.uint32(0))
         return inactive_bits
 
-    def iter_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
+    def iter_tile_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
         """Yield indices of tiles in `tiles`, and the plan of these tiles.
 
         A preview of a few points per tile comes first: if it already keeps all effects, the other
@@ -371,7 +375,7 @@ BATCH_DIM = "batch"
 
 
 def block_outputs(spec: GridSpec) -> dict[str, OutputVariable]:
-    """Return the arrays that blocks write, by sorted name, with their dimensions but the axes."""
+    """Return the output variables of blocks by sorted name; their dimensions omit the axes."""
     error_output = replace(
         EFFECT_VARIABLES[EFFECTS_ERROR_ARRAY],
         comment="sum over the effects left out of what each may change: of pd in all three "
@@ -411,7 +415,7 @@ class GridStudy(ExtendableStudy):
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
         """Return a mask (points,), or one bool for all, of points that depend on the tolerance."""
-        return is_set_by_tolerance(self.grid.parameters(block))
+        return is_set_by_tolerance(self.grid.parameters_of_block(block))
 
     def store_attributes(self) -> dict[str, Any]:
         """Return title, question, spec and shape of blocks."""
@@ -469,7 +473,7 @@ class GridStudy(ExtendableStudy):
     def evaluate(
         self,
         block: int,
-        checkpoint_results: ReusedResults = ReusedResults(),  # noqa: B008
+        checkpoint_results: EarlierResults = EarlierResults(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> Results:
         """Compute a block; fill values at points that the model does not support.
@@ -478,11 +482,11 @@ class GridStudy(ExtendableStudy):
         the deadline.
         """
         selected_effects = self.effect_planner.select_for_block(block)
-        reused = self._reused_results(block, selected_effects)
-        extent, n_points = self.grid.block_extent(block), self.grid.block_size(block)
+        reused = self._read_reused_results(block, selected_effects)
+        extent, n_points = self.grid.actual_block_shape(block), self.grid.count_block_points(block)
         results = {
             name: np.full((n_points, *layout.shape[len(extent) :]), layout.fill_value, layout.dtype)
-            for name, layout in self.layout_by_name.items()
+            for name, layout in self.output_layout_by_name.items()
         }
         results |= {
             EFFECTS_ARRAY: selected_effects.effect_flags,
@@ -497,7 +501,11 @@ class GridStudy(ExtendableStudy):
             checkpoint_results,
             deadline or Deadline(),
         )
-        for local_indices, part_results in (reused.done, checkpoint_results.done, *computed):
+        for local_indices, part_results in (
+            reused.finished,
+            checkpoint_results.finished,
+            *computed,
+        ):
             for name in (
                 results.keys() & part_results.keys()
             ):  # other results serve to continue draws only
@@ -510,22 +518,22 @@ class GridStudy(ExtendableStudy):
         return self.spec.draws.has_draws
 
     def evaluate_until(
-        self, block: int, checkpoint_results: ReusedResults, deadline: Deadline
+        self, block: int, checkpoint_results: EarlierResults, deadline: Deadline
     ) -> Results:
         """Compute a block from a checkpoint on; `UnfinishedBlock` at the deadline."""
         return self.evaluate(block, checkpoint_results, deadline)
 
-    def _reused_results(self, block: int, selected_effects: SelectedEffects) -> ReusedResults:
-        """Return the points of a block from the smaller study: complete, or their first draws."""
+    def _read_reused_results(self, block: int, selected_effects: SelectedEffects) -> EarlierResults:
+        """Return the results that the smaller study has of a block: final ones, or first draws."""
         if (reuse_source := self.reuse_source) is None:
-            return ReusedResults()
+            return EarlierResults()
         parts = []
         for shared in reuse_source.iter_shared_points(block):
             if (source_results := reuse_source.read_block(shared.source_block)) is None:
                 continue
             n_axes, n_source_points = (
                 len(reuse_source.source_study.grids[0].shape),
-                reuse_source.source_study.block_size(shared.source_block),
+                reuse_source.source_study.count_block_points(shared.source_block),
             )
             has_same_effects = (
                 source_results[EFFECTS_ARRAY].ravel()[shared.source_local_indices]
@@ -541,15 +549,15 @@ class GridStudy(ExtendableStudy):
             parts.append(PartialResults(shared.local_indices[has_same_effects], results))
         local_indices, results = concatenate_results(parts)
         reused = PartialResults(
-            local_indices, empty_running_sums(self.spec, local_indices.size) | results
+            local_indices, zero_running_sums(self.spec, local_indices.size) | results
         )
         reuse_source.reused_points_by_block[block] = (
             local_indices.size if reuse_source.has_final_results else 0
         )
         return (
-            ReusedResults(done=reused)
+            EarlierResults(finished=reused)
             if reuse_source.has_final_results
-            else ReusedResults(begun=reused)
+            else EarlierResults(unfinished=reused)
         )
 
     def count_reusable_points(self, block: int) -> int:
@@ -609,7 +617,7 @@ POINTS_PER_CALL_MAX = 1 << 16
 COUNTS_PER_CALL_MAX = 1 << 19
 
 #: Prefixes of parameters that change how draws are evaluated, and not the draws.
-NON_PHYSICAL_PREFIXES = (
+NON_PHYSICAL_PARAMETER_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
 
@@ -622,8 +630,8 @@ def iter_block_results(
     grid: ParameterBlockGrid,
     block: int,
     selected_effects: SelectedEffects,
-    reused: ReusedResults,
-    checkpoint_results: ReusedResults,
+    reused: EarlierResults,
+    checkpoint_results: EarlierResults,
     deadline: Deadline,
 ) -> Iterator[PartialResults]:
     """Yield the results of a block's points that are not done, in groups with the same effects.
@@ -632,11 +640,13 @@ def iter_block_results(
     are not computed again. `UnfinishedBlock` at the deadline; a later call continues to the same
     bits.
     """
-    parameters, order = grid.parameters(block), grid.geometry_order(block)
+    parameters, order = grid.parameters_of_block(block), grid.geometry_order(block)
     order = order[
-        ~np.isin(order, [*reused.done.local_indices, *checkpoint_results.done.local_indices])
+        ~np.isin(
+            order, [*reused.finished.local_indices, *checkpoint_results.finished.local_indices]
+        )
     ]
-    finished, points_per_call = [checkpoint_results.done], _points_per_call(spec)
+    finished, points_per_call = [checkpoint_results.finished], _points_per_call(spec)
     pending = deque(
         (effects, local_indices)
         for members, effects in selected_effects.subset(order).iter_equal_groups()
@@ -647,10 +657,10 @@ def iter_block_results(
     while pending:
         effects, local_indices = pending.popleft()
         if len(finished) > 1 and deadline():
-            raise _unfinished_block(spec, finished, NO_RESULTS)
-        is_resumed = np.isin(local_indices, checkpoint_results.begun.local_indices).any()
-        prior_draws = previous_draws(
-            spec, (checkpoint_results if is_resumed else reused).begun, local_indices
+            raise _make_unfinished_block(spec, finished, NO_RESULTS)
+        is_resumed = np.isin(local_indices, checkpoint_results.unfinished.local_indices).any()
+        prior_draws = extract_prior_draws(
+            spec, (checkpoint_results if is_resumed else reused).unfinished, local_indices
         )
         subset = select_parameters(parameters, local_indices)
         try:
@@ -664,21 +674,21 @@ def iter_block_results(
                 )
             continue
         if deadline.has_passed:
-            raise _unfinished_block(spec, finished, PartialResults(local_indices, results))
+            raise _make_unfinished_block(spec, finished, PartialResults(local_indices, results))
         finished.append(PartialResults(local_indices, results))
         yield finished[-1]
 
 
-def _unfinished_block(
+def _make_unfinished_block(
     spec: GridSpec, finished: list[PartialResults], unfinished: PartialResults
 ) -> UnfinishedBlock:
     """Return the exception of a block that stops at its deadline, with the results so far."""
-    results = ReusedResults(
+    results = EarlierResults(
         concatenate_results([part for part in finished if part.local_indices.size]), unfinished
     )
     n_draws = unfinished.results["n_draws"].sum() if unfinished.local_indices.size else 0
     point_fraction = float(n_draws) / max(spec.draws.number, spec.draws.limit, 1)
-    return UnfinishedBlock(results, results.done.local_indices.size + point_fraction)
+    return UnfinishedBlock(results, results.finished.local_indices.size + point_fraction)
 
 
 def evaluate_points(
@@ -728,7 +738,7 @@ def batch_sizes(spec: GridSpec) -> list[int]:
     return [min(draws_per_batch, n_draws - first) for first in range(0, n_draws, draws_per_batch)]
 
 
-def draw_keys(
+def random_keys_of_points(
     spec: GridSpec, parameters: Mapping[str, ParameterValue], n_points: int
 ) -> np.ndarray:
     """Return the random keys (n_points, 2) uint64 of points, which no accuracy setting changes."""
@@ -737,14 +747,14 @@ def draw_keys(
     physical = {
         path: value
         for path, value in parameters.items()
-        if not path.startswith(NON_PHYSICAL_PREFIXES)
+        if not path.startswith(NON_PHYSICAL_PARAMETER_PREFIXES)
     }
     return point_keys(
         canonical_point_rows(physical, n_points), domain=GRID_KEY_DOMAIN, seed=spec.seed
     )
 
 
-def previous_draws(
+def extract_prior_draws(
     spec: GridSpec, previous: PartialResults, local_indices: np.ndarray
 ) -> PriorDraws | None:
     """Return the earlier draws of some points of a block; None if there are none."""
@@ -783,13 +793,13 @@ def _simulate_draws(
     prior_draws: PriorDraws | None,
     should_stop: Callable[[], bool] | None,
 ) -> Results:
-    """Draw points until all draws are made, the tolerance is met, or `should_stop`."""
+    """Draw points until all draws are made, the tolerance is met, or `should_stop` is True."""
     from sweep.model.sampling.samplers import never_stop, simulate_draws
     from sweep.tasks.studies.user_functions import spectrum_methods
 
     draws = spec.draws
     keywords: dict[str, Any] = {
-        "keys": draw_keys(spec, parameters, n_points),
+        "keys": random_keys_of_points(spec, parameters, n_points),
         "prior_draws": prior_draws,
         "should_stop": should_stop or never_stop,
         "method": draws.method,
@@ -801,10 +811,10 @@ def _simulate_draws(
         keywords |= {"batch_sizes": batch_sizes(spec)}
     if draws.draws_whole_spectra:
         return simulate_draws(parameters, effects, methods=spectrum_methods(parameters), **keywords)
-    return empty_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)
+    return zero_running_sums(spec, n_points) | simulate_draws(parameters, effects, **keywords)
 
 
-def empty_running_sums(spec: GridSpec, n_points: int) -> Results:
+def zero_running_sums(spec: GridSpec, n_points: int) -> Results:
     """Return running sums of zeros (n_points, sums), if the study stores running sums."""
     has_running_sums = spec.has_random_effects and not spec.draws.draws_whole_spectra
     return {RUNNING_SUMS: np.zeros((n_points, N_RUNNING_SUMS))} if has_running_sums else {}

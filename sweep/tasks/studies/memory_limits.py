@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
 
-BYTES_PER_BIN = 250
-BYTES_PER_DRAWN_BIN = 300
+PEAK_BYTES_PER_FFT_POINT = 250
+PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA = 300
 """Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22.
 
-`BYTES_PER_BIN` is for closed-form results, `BYTES_PER_DRAWN_BIN` for draws of whole spectra.
+`PEAK_BYTES_PER_FFT_POINT` is for closed-form results, `PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA` for
+draws of whole spectra.
 """
 
 
@@ -38,18 +39,20 @@ def fft_size_max(spec: GridSpec | SceneSpec) -> int:
     return int(np.max(sizes[0])) if sizes else int(spec.parameters()[FFT_SIZE_PARAMETER])
 
 
-def point_bytes_max(spec: GridSpec | SceneSpec) -> int:
+def point_memory_bytes(spec: GridSpec | SceneSpec) -> int:
     """Return the peak memory of one point, or shot [bytes]."""
     draws_spectra = getattr(spec.draws, "draws_whole_spectra", False)
-    return fft_size_max(spec) * (BYTES_PER_DRAWN_BIN if draws_spectra else BYTES_PER_BIN)
+    return fft_size_max(spec) * (
+        PEAK_BYTES_PER_FFT_POINT_OF_SPECTRA if draws_spectra else PEAK_BYTES_PER_FFT_POINT
+    )
 
 
 def block_bytes_max(study: GridStudy | FlightStudy) -> int:
     """Return the peak memory of a thread that computes and writes one block [bytes]."""
-    return point_bytes_max(study.spec) + 2 * study.block_nbytes_max
+    return point_memory_bytes(study.spec) + 2 * study.block_nbytes_max
 
 
-def scene_bytes(spec: SceneSpec) -> int:
+def scene_memory_bytes(spec: SceneSpec) -> int:
     """Return the size of a scene's triangles and search trees, copied into each process [bytes]."""
     from sweep.tasks.studies.eyepoint_study import build_world
 
@@ -58,11 +61,11 @@ def scene_bytes(spec: SceneSpec) -> int:
 
 def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if one point needs more memory than a process has."""
-    bytes_needed = point_bytes_max(spec)
+    bytes_needed = point_memory_bytes(spec)
     if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"makes a point take about {_gigabytes_text(bytes_needed)} of memory, "
-            f"{_available_phrase(worker_memory)}"
+            f"{_available_memory_phrase(worker_memory)}"
         )
         size = f"{fft_size_max(spec):,} points"
         remedy = f"take fewer points of the FFT{_fewer_workers_remedy(worker_memory, bytes_needed)}"
@@ -79,11 +82,11 @@ def refuse_too_large_study(study: GridStudy | FlightStudy, worker_memory: Worker
 
 def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if a scene and one point need more memory than a process has."""
-    bytes_needed = point_bytes_max(spec) + scene_bytes(spec)
+    bytes_needed = point_memory_bytes(spec) + scene_memory_bytes(spec)
     if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"takes about {_gigabytes_text(bytes_needed)} of memory in each process that computes, "
-            f"{_available_phrase(worker_memory)}"
+            f"{_available_memory_phrase(worker_memory)}"
         )
         remedy = (
             f"take coarser grounds and meshes{_fewer_workers_remedy(worker_memory, bytes_needed)}"
@@ -97,12 +100,12 @@ def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> N
     if not worker_memory.has_room_for(bytes_needed):
         rule = (
             f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "
-            f"{_available_phrase(worker_memory)}"
+            f"{_available_memory_phrase(worker_memory)}"
         )
         raise SpecError([Mistake("storage", rule, "", "lower the number that a block holds")])
 
 
-def _available_phrase(worker_memory: WorkerMemory) -> str:
+def _available_memory_phrase(worker_memory: WorkerMemory) -> str:
     """Return the available memory as a clause of a message."""
     return f"and {worker_memory.process_name} has {_gigabytes_text(worker_memory.bytes_max)}"
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sweep.spec.rules import Mistake, SpecError
-from sweep.tasks.engine.blocks import BLOCKS_MAX, BlockGrid
+from sweep.tasks.engine.blocks import BLOCKS_PER_STUDY_MAX, BlockGrid
 
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
@@ -24,7 +24,7 @@ GEOMETRIC_PARAMETERS = (
     "target.transverse_velocity",
     "target.pointing_jitter",
 )
-GEOMETRIC_PREFIXES = (
+GEOMETRIC_PARAMETER_PREFIXES = (
     "instrument.laser.beam_", "instrument.laser.focus", "instrument.telescope.coupling",
     "instrument.receiver.local_oscillator_waist", "footprint.",
 )  # fmt: skip
@@ -41,7 +41,7 @@ BLOCK_CPU_SECONDS_MAX = 60.0
 #: Default size of a block [points], and number of blocks above which blocks grow instead. A block
 #: is some 25 files, which are listed, copied and removed one by one.
 DEFAULT_BLOCK_POINTS = 1 << 16
-DEFAULT_BLOCKS_MAX = 1 << 14
+BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
 
 #: Number of blocks into which studies are cut by default, so that all cores of a machine have work
 #: from the first second on; and least estimated time of such a block on one core [s].
@@ -142,7 +142,7 @@ def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
     """Return the default number of points per block of a study with `n_points` points."""
     block_cpu_seconds = default_block_cpu_seconds(n_points * cpu_seconds_per_point)
     block_points = min(DEFAULT_BLOCK_POINTS, math.ceil(block_cpu_seconds / cpu_seconds_per_point))
-    return max(block_points, -(-n_points // DEFAULT_BLOCKS_MAX))
+    return max(block_points, -(-n_points // BLOCKS_OF_DEFAULT_SIZE_MAX))
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
@@ -179,7 +179,7 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         self.spec = spec
         self.is_geometric_axis = tuple(
             any(
-                path in GEOMETRIC_PARAMETERS or path.startswith(GEOMETRIC_PREFIXES)
+                path in GEOMETRIC_PARAMETERS or path.startswith(GEOMETRIC_PARAMETER_PREFIXES)
                 for path in values
             )
             for values in self.values_by_axis
@@ -189,17 +189,19 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         BlockGrid.__init__(
             self, dims, self.shape, fit_block_shape(self.shape, self.is_geometric_axis, points_max)
         )
-        if self.n_blocks > BLOCKS_MAX:
+        if self.n_blocks > BLOCKS_PER_STUDY_MAX:
             rule = (
                 f"makes {self.n_points:.3g} points in {self.n_blocks:.3g} blocks, and a study has "
-                f"at most {BLOCKS_MAX:.0e}"
+                f"at most {BLOCKS_PER_STUDY_MAX:.0e}"
             )
             remedy = "take fewer values or fewer draws, or raise storage.block_points"
             raise SpecError([Mistake("axes", rule, "", remedy)])
 
-    def parameters(self, block: int) -> dict[str, ParameterValue]:
+    def parameters_of_block(self, block: int) -> dict[str, ParameterValue]:
         """Return the parameters of a block's points by path: scalars, or arrays (n,) in C order."""
-        return self.parameters_at(self.grid_indices(block, np.arange(self.block_size(block))))
+        return self.parameters_at(
+            self.grid_indices(block, np.arange(self.count_block_points(block)))
+        )
 
     def parameters_at(self, grid_indices: np.ndarray) -> dict[str, ParameterValue]:
         """Return the parameters of points by path: scalars, or arrays (n,).
@@ -218,7 +220,9 @@ class ParameterBlockGrid(ParameterGrid, BlockGrid):
         Radiometric axes vary fastest, and velocities slowest, as the change of a line within a
         record depends on velocity.
         """
-        local_indices = np.arange(self.block_size(block)).reshape(self.block_extent(block))
+        local_indices = np.arange(self.count_block_points(block)).reshape(
+            self.actual_block_shape(block)
+        )
         is_velocity_axis = ["target.radial_velocity" in values for values in self.values_by_axis]
         axes = sorted(
             range(len(self.shape)),

@@ -14,10 +14,10 @@ from sweep.messages import option_text
 from sweep.model.detection.detectors import cached_window_samples
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, Looks
 from sweep.model.effects.catalogue import EFFECTS, PARAMETER_DEFAULTS
-from sweep.storage.locations import atomic_path, is_free
+from sweep.storage.locations import can_create_store, write_path_atomically
 from sweep.storage.size_checks import SingleWriterLocalStore
 from sweep.tasks.engine.progress import StoreError
-from sweep.tasks.studies.grid_study import draw_keys
+from sweep.tasks.studies.grid_study import random_keys_of_points
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,7 +29,7 @@ SEGMENT_NAMES = ("up", "doppler", "down")
 FILE_SUFFIXES = (".zarr", ".npz")
 
 
-def point_spectra(
+def draw_point_spectra(
     spec: GridSpec,
     parameters: Mapping[str, float | int | str],
     *,
@@ -66,7 +66,7 @@ def point_spectra(
             f"a file of spectra holds one record of each segment, and {LOOKS_NUMBER_PATH} takes "
             f"{Looks.from_parameters(parameters).number}: export a point of one look"
         )
-    effect_modes, key = spec.effect_modes(), draw_keys(spec, parameters, 1)
+    effect_modes, key = spec.effect_modes(), random_keys_of_points(spec, parameters, 1)
     arrays = {
         path: np.asarray(value) for path, value in (PARAMETER_DEFAULTS | dict(parameters)).items()
     }
@@ -198,7 +198,7 @@ def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -
     Parameters
     ----------
     dataset
-        Spectra of :func:`point_spectra`.
+        Spectra of :func:`draw_point_spectra`.
     path
         Path that ends in .zarr or .npz.
     overwrite
@@ -211,14 +211,14 @@ def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -
     """
     if path.suffix not in FILE_SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(FILE_SUFFIXES)}")
-    if not is_free(path):
+    if not can_create_store(path):
         if not overwrite:
             raise StoreError(
                 f"{path} is there already: {option_text('overwrite')} puts the new one in its place"
             )
         if not _is_spectra_file(path):
             raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another file")
-    with atomic_path(path.resolve(), replace=overwrite) as draft_path:
+    with write_path_atomically(path.resolve(), replace=overwrite) as draft_path:
         if path.suffix == ".zarr":
             dataset.to_zarr(
                 SingleWriterLocalStore(draft_path), mode="w", zarr_format=3, consolidated=False

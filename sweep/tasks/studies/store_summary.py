@@ -18,10 +18,10 @@ from sweep.model.outputs import PD_OUTPUTS
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.storage.locations import PACKED_ATTRIBUTE, Location, file_sizes_below, parse_location
 from sweep.storage.store_format import read_receipt_totals
-from sweep.storage.verified_store import open_array_group
+from sweep.storage.verified_store import open_verified_group
 from sweep.tasks.engine import journal
 from sweep.tasks.engine.block_study import BlockStudy
-from sweep.tasks.engine.journal import blocks_with_receipt, checkpoint_points
+from sweep.tasks.engine.journal import blocks_with_receipt, read_checkpoint_points
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies import study_loading
 from sweep.tasks.studies.flight_study import FlightStudy
@@ -56,7 +56,7 @@ class DetectionRow:
 
     label: str
     n_points: int
-    detected_fraction: float  # fraction of points with pd_shot above `DETECTED`
+    detected_fraction: float  # fraction of points with pd_shot above `DETECTED_PD_MIN`
     median_pd_shot: float  # median of pd_shot
     median_pd_doppler: float
 
@@ -139,7 +139,7 @@ def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) ->
         study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
     )
     try:
-        parameters = select_parameters(study.grid.parameters(block), local_index)
+        parameters = select_parameters(study.grid.parameters_of_block(block), local_index)
         evaluate_points(limit_draws(study.spec, 1), parameters, 1, effects)
     except UnsupportedShotError as error:
         return str(error)
@@ -182,8 +182,8 @@ def _format_value(value: object) -> str:
 def iter_block_values(
     store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
-    """Yield slices of arrays of equal chunks, and their values, for each committed block."""
-    group = open_array_group(store)
+    """Yield the slices that each block wrote in arrays of equal chunks, and their values."""
+    group = open_verified_group(store)
     arrays: list[Any] = [group[array_name] for array_name in array_names]
     for block in blocks:
         if (region := study.chunk_regions(int(block)).get(array_names[0])) is not None:
@@ -208,7 +208,7 @@ class ScannerRow:
         all_pd = np.concatenate([*self.pd_of_shots, np.empty(0)])
         return float(all_pd.mean()) if all_pd.size else float("nan")
 
-    def add(self, block_arrays: Mapping[str, np.ndarray]) -> None:
+    def add_block(self, block_arrays: Mapping[str, np.ndarray]) -> None:
         """Add a block, given the part of each array that it wrote."""
         from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
         from sweep.model.pointcloud.pairing import TRUE_FLAG
@@ -225,8 +225,8 @@ class ScannerRow:
             self.solved_cycles += int((status <= STATUS_EXCLUDED).sum())
 
 
-def scene_summary(store: str | Location) -> list[ScannerRow]:
-    """Return a row for each scanner and point of the axes; for each scanner if there are many."""
+def flight_summary(store: str | Location) -> list[ScannerRow]:
+    """Return a row for each scanner and point of the axes; one per scanner if points are many."""
     store_path = parse_location(store)
     _, study = study_loading.read_study(store_path)
     if not isinstance(study, FlightStudy):
@@ -240,7 +240,7 @@ def scene_summary(store: str | Location) -> list[ScannerRow]:
         for scanner in study.scanner_grids
         for axis_point in (axis_points if is_listed_by_axis_point else [()])
     }
-    group: Any = open_array_group(store_path)
+    group: Any = open_verified_group(store_path)
     for block in np.flatnonzero(blocks_with_receipt(store_path, study)).tolist():
         _, flight_block = study.locate_flight_block(block)
         regions = study.chunk_regions(block)
@@ -254,7 +254,7 @@ def scene_summary(store: str | Location) -> list[ScannerRow]:
         }
         rows[
             flight_block.scanner, flight_block.axis_indices if is_listed_by_axis_point else ()
-        ].add(block_arrays)
+        ].add_block(block_arrays)
     return list(rows.values())
 
 
@@ -277,23 +277,23 @@ class AccuracyRow:
     n_points: int = (
         0  # points computed with a known error; for a flight shots times points of the axes
     )
-    n_met: int = 0  # number of points within the tolerance
+    n_points_within_tolerance: int = 0  # number of points within the tolerance
     worst_error: float = (
         math.nan
     )  # error, as a half-width, of the point with the largest excess over its tolerance
-    tolerance_at_worst: float = math.nan  # tolerance at this point
-    worst_label: str = ""
-    samples_at_worst: int = 0  # number of draws, or of rays, at this point
+    tolerance_at_worst_point: float = math.nan  # tolerance at this point
+    worst_point_label: str = ""
+    samples_at_worst_point: int = 0  # number of draws, or of rays, at this point
     total_samples: int = 0  # number of draws, or of rays, at all points
     samples_max: int = 0
-    worst_index: tuple[int, ...] = ()  # index of this point in the array
+    worst_point_index: tuple[int, ...] = ()  # index of this point in the array
     block_fraction: float = 1.0  # fraction of the blocks that were read
     _worst_excess: float = -math.inf
 
     @property
     def excess(self) -> float:
         """Excess of the error over the tolerance at the worst point; 0 if it is met."""
-        return max(0.0, self.worst_error - self.tolerance_at_worst)
+        return max(0.0, self.worst_error - self.tolerance_at_worst_point)
 
     @property
     def mean_samples(self) -> float:
@@ -308,11 +308,13 @@ class AccuracyRow:
         """
         if not self.excess:
             return math.nan
-        if not self.tolerance_at_worst:
+        if not self.tolerance_at_worst_point:
             return math.inf
-        return math.ceil(self.samples_at_worst * (self.worst_error / self.tolerance_at_worst) ** 2)
+        return math.ceil(
+            self.samples_at_worst_point * (self.worst_error / self.tolerance_at_worst_point) ** 2
+        )
 
-    def add(
+    def add_points(
         self,
         errors: np.ndarray,
         tolerances: np.ndarray,
@@ -324,22 +326,22 @@ class AccuracyRow:
         samples = np.where(is_known, np.nan_to_num(samples), 0)
         excess = np.where(is_known, errors - tolerances, -np.inf)
         self.n_points += int(is_known.sum())
-        self.n_met += int((excess <= 0).sum() - (~is_known).sum())
+        self.n_points_within_tolerance += int((excess <= 0).sum() - (~is_known).sum())
         self.total_samples += int(samples.sum())
         self.samples_max = max(self.samples_max, int(samples.max(initial=0)))
         worst = np.unravel_index(np.argmax(excess), excess.shape)
         if excess[worst] > self._worst_excess:
             self._worst_excess, self.worst_error = float(excess[worst]), float(errors[worst])
-            self.tolerance_at_worst, self.samples_at_worst = (
+            self.tolerance_at_worst_point, self.samples_at_worst_point = (
                 float(tolerances[worst]),
                 int(samples[worst]),
             )
-            self.worst_index = tuple(
+            self.worst_point_index = tuple(
                 offset + int(i) for offset, i in zip(start_index, worst, strict=True)
             )
 
 
-def draw_accuracy_rows(
+def accuracy_rows_of_draws(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row for each probability with a promised accuracy.
@@ -360,7 +362,7 @@ def draw_accuracy_rows(
     ]
 
 
-def ray_accuracy_rows(
+def accuracy_rows_of_rays(
     store: str | Location, done_blocks: np.ndarray | None = None
 ) -> list[AccuracyRow]:
     """Return a row for each scanner; for a grid one row if the most beamlets are too few."""
@@ -377,7 +379,7 @@ def ray_accuracy_rows(
         return [row for row in rows if row.excess]
     if not isinstance(study, FlightStudy) or not study.spec.is_ray_number_set_by_tolerance:
         return []
-    reported_rows, group = [], open_array_group(store_path)
+    reported_rows, group = [], open_verified_group(store_path)
     for name in study.scanner_grids:
         error_arrays, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
         for row in _accuracy_rows(
@@ -385,9 +387,11 @@ def ray_accuracy_rows(
         ):
             if row.n_points:
                 shot_times: Any = group[f"{name}/time"]
-                time_label = f"time {float(np.asarray(shot_times[row.worst_index[-1]])):.4g} s"
-                row.worst_label = (
-                    f"{row.worst_label}, {time_label}" if study.spec.axes else time_label
+                time_label = (
+                    f"time {float(np.asarray(shot_times[row.worst_point_index[-1]])):.4g} s"
+                )
+                row.worst_point_label = (
+                    f"{row.worst_point_label}, {time_label}" if study.spec.axes else time_label
                 )
                 reported_rows.append(row)
     return reported_rows
@@ -401,19 +405,20 @@ def _accuracy_rows(
     samples_array: str,
     tolerance: np.ndarray,
 ) -> list[AccuracyRow]:
-    """Return rows by the names of the arrays of errors, and of draws or rays."""
+    """Return a row for each array of errors; ``samples_array`` has numbers of draws or rays."""
     (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
     rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
-    tolerance = np.broadcast_to(tolerance, study.layout_by_name[samples_array].shape)
+    tolerance = np.broadcast_to(tolerance, study.output_layout_by_name[samples_array].shape)
     for region, (samples, *error_values) in iter_block_values(
         store_path, study, [samples_array, *error_arrays.values()], blocks
     ):
         for row, errors in zip(rows, error_values, strict=True):
-            row.add(errors, tolerance[region], samples, tuple(part.start for part in region))
+            row.add_points(errors, tolerance[region], samples, tuple(part.start for part in region))
     for row in rows:
         if row.n_points:
-            row.worst_label = (
-                ", ".join(axis_value_labels(axes, row.worst_index[: len(axes)])) or "the point"
+            row.worst_point_label = (
+                ", ".join(axis_value_labels(axes, row.worst_point_index[: len(axes)]))
+                or "the point"
             )
     return rows
 
@@ -433,21 +438,21 @@ class Status:
     store: Location
     title: str
     study_id: str
-    unit: str  # name of the points, in the plural
+    points_noun: str  # name of the points, in the plural
     points: int
     points_done: int
     blocks: int
     blocks_done: int
-    done: np.ndarray  # numbers of the blocks that are done
-    points_begun: float  # number of points done in unfinished blocks
+    done_blocks: np.ndarray  # numbers of the blocks that are done
+    points_in_unfinished_blocks: float  # number of points done in unfinished blocks
     failures: dict[int, dict[str, Any]]  # last failure by block that is not done
-    holder: journal.LockHolder | None  # process that holds the lock
-    holder_lives: bool
+    lock_holder: journal.LockHolder | None  # process that holds the lock
+    is_lock_holder_alive: bool
     draws_done: int  # number of draws if each point has a fixed number, else 0
-    bytes: int  # size of all results as stored, or of all files of a packed copy
-    rate: float  # points per second in the last run; 0 if it committed nothing
-    workers: int  # number of processes that computed in the last run
-    heartbeat: float  # age of the last heartbeat of the lock [s]; inf without one
+    bytes_stored: int  # size of all results as stored, or of all files of a packed copy
+    points_per_second: float  # points per second in the last run; 0 if it committed nothing
+    workers_in_last_run: int  # number of processes that computed in the last run
+    heartbeat_age: float  # age of the last heartbeat of the lock [s]; inf without one
 
     @property
     def complete(self) -> bool:
@@ -455,9 +460,13 @@ class Status:
         return self.blocks_done == self.blocks
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Estimated time left at the rate of the last run [s]; inf if the rate is 0."""
-        return (self.points - self.points_done) / self.rate if self.rate else float("inf")
+        return (
+            (self.points - self.points_done) / self.points_per_second
+            if self.points_per_second
+            else float("inf")
+        )
 
 
 def status(store: str | Location) -> Status:
@@ -480,35 +489,35 @@ def status(store: str | Location) -> Status:
     """
     store_path = parse_location(store)
     attributes, study = study_loading.read_study(store_path)
-    run_start = journal.last_run_start(store_path)
+    run_start = journal.last_run_start_time(store_path)
     receipts = read_receipt_totals(store_path, study.n_blocks, since=run_start)
     packed_bytes = (
         sum(file_sizes_below(store_path).values()) if PACKED_ATTRIBUTE in attributes else 0
     )
     holder = journal.read_lock_holder(store_path)
-    points_done = study.count_points(receipts.points_by_block > 0)
-    run_seconds = receipts.last_time - run_start
+    points_done = study.count_points_in_blocks(receipts.points_by_block > 0)
+    run_seconds = receipts.last_receipt_time - run_start
     return Status(
         store=store_path,
         title=attributes.get("title", ""),
         study_id=attributes["study_id"],
-        unit=study.points_noun,
+        points_noun=study.points_noun,
         points=study.n_points,
         points_done=points_done,
         blocks=study.n_blocks,
         blocks_done=receipts.n_committed_blocks,
-        done=np.flatnonzero(receipts.points_by_block),
-        points_begun=sum(checkpoint_points(store_path, study.id).values()),
-        failures=journal.permanently_failed(store_path, study.n_blocks),
-        holder=holder,
-        holder_lives=holder is not None and journal.is_holder_alive(store_path, holder),
+        done_blocks=np.flatnonzero(receipts.points_by_block),
+        points_in_unfinished_blocks=sum(read_checkpoint_points(store_path, study.id).values()),
+        failures=journal.read_permanent_failures(store_path, study.n_blocks),
+        lock_holder=holder,
+        is_lock_holder_alive=holder is not None and journal.is_holder_alive(store_path, holder),
         draws_done=points_done * int(study.spec.draws.number)
         if isinstance(study, GridStudy)
         else 0,
-        bytes=packed_bytes or int(receipts.bytes_by_block.sum()),
-        rate=receipts.recent_points / run_seconds
+        bytes_stored=packed_bytes or int(receipts.bytes_by_block.sum()),
+        points_per_second=receipts.recent_points / run_seconds
         if receipts.recent_points and run_seconds > 0
         else 0.0,
-        workers=len(receipts.workers),
-        heartbeat=journal.heartbeat_age(store_path) if holder else float("inf"),
+        workers_in_last_run=len(receipts.recent_workers),
+        heartbeat_age=journal.heartbeat_age(store_path) if holder else float("inf"),
     )

@@ -27,33 +27,41 @@ from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
     Location,
     ObjectPath,
-    atomic_path,
     atomic_write,
-    eyepoints_path,
+    can_create_store,
+    eyepoint_store_location,
     file_sizes_below,
-    is_free,
     iter_names_below,
     parse_location,
     read_object,
     recover_interrupted_replace,
     to_zarr_store,
     translate_errors,
+    write_path_atomically,
 )
 from sweep.storage.store_format import (
     contents_digest,
     encode_record,
-    has_digest,
     iter_lines_and_records,
     iter_records,
+    objects_match_digest,
     stored_objects_digest,
 )
-from sweep.storage.verified_store import CHUNK_NAME, chunk_damage, open_array_group
+from sweep.storage.verified_store import (
+    CHUNK_NAME_PATTERN,
+    describe_chunk_damage,
+    open_verified_group,
+)
 from sweep.tasks.engine import journal, study_store
 from sweep.tasks.engine.block_study import BlockStudy
 from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid
-from sweep.tasks.engine.journal import LOG_NAMES, RECIPE_FILE, committed_blocks, read_recipe
+from sweep.tasks.engine.journal import LOG_FILE_NAMES, RECIPE_FILE, committed_blocks, read_recipe
 from sweep.tasks.engine.progress import Progress, StoreError, make_progress, raise_as_store_error
-from sweep.tasks.engine.study_store import Damage, damage_or_read_error, template_object_damage
+from sweep.tasks.engine.study_store import (
+    Damage,
+    damage_or_read_error,
+    describe_template_object_damage,
+)
 from sweep.tasks.studies import study_loading
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.study_loading import AnyStudy
@@ -62,31 +70,31 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
 #: Number of blocks that are read at once, and number of threads that read them.
-BLOCKS_PER_BATCH = 256
+BLOCKS_PER_READ_BATCH = 256
 READER_THREADS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class VerificationReport:
     """Result of the verification of a store."""
 
     store: Location
     blocks: int
-    whole: int  # number of committed and undamaged blocks
+    undamaged_blocks: int  # number of committed and undamaged blocks
     damages: tuple[Damage, ...]
-    restored: tuple[str, ...]  # objects of the template that were restored
-    foreign: tuple[str, ...]  # files that were not made by sweep
-    unmarked: str  # why damaged blocks could not be marked for `resume`; '' if they are
+    restored_objects: tuple[str, ...]  # objects of the template that were restored
+    foreign_objects: tuple[str, ...]  # files that were not made by sweep
+    withdrawal_error: str  # why damaged blocks could not be marked for `resume`; '' if they are
 
     @property
-    def sound(self) -> bool:
+    def is_undamaged(self) -> bool:
         """True if nothing is damaged."""
         return not self.damages
 
     @property
     def complete(self) -> bool:
         """True if every block is committed and undamaged."""
-        return self.whole == self.blocks
+        return self.undamaged_blocks == self.blocks
 
 
 def verify(
@@ -95,7 +103,7 @@ def verify(
     repair: bool = False,
     spec: GridSpec | SceneSpec | None = None,
     progress: bool | Progress = True,
-) -> list[Report]:
+) -> list[VerificationReport]:
     """Check every byte of a store, and of the eyepoint stores that its study uses.
 
     Receipts of damaged blocks are withdrawn, so that `resume` computes them again, unless another
@@ -114,7 +122,7 @@ def verify(
 
     Returns
     -------
-    list of Report
+    list of VerificationReport
         Result for the store, then for each eyepoint store that exists.
 
     Raises
@@ -129,7 +137,7 @@ def verify(
     studies_by_store: dict[Location, AnyStudy | None] = {path: study}
     if isinstance(study, FlightStudy):
         studies_by_store |= {
-            eyepoints_path(path, store_path.id): store_path
+            eyepoint_store_location(path, store_path.id): store_path
             for store_path in study.eyepoint_studies()
         }
     return [
@@ -153,7 +161,7 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
             "names it"
         )
     if (
-        attributes["kind"] == study_loading.ACCURACY_KIND
+        attributes["kind"] == study_loading.ACCURACY_STORE_KIND
         or (attributes["kind"] == "eyepoints" and not read_recipe(store_path))
         or PACKED_ATTRIBUTE in attributes
     ):
@@ -167,24 +175,28 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
 
 def _verify_store(
     store_path: Location, study: AnyStudy | None, repair: bool, progress: Progress
-) -> Report:
+) -> VerificationReport:
     """Verify one store; restore its template if `repair`."""
-    template_damage, restored = study_store.template_damages(store_path), []
+    template_damage, restored = study_store.find_template_damages(store_path), []
     if template_damage and study and repair:
         study_store.refuse_foreign_store(store_path)  # a lock would be its first file made by sweep
         with journal.StoreLock(store_path, progress.say):
             template_damage, restored = [], restore_template(store_path, study)
-    log_damage = _log_damages(store_path)
+    log_damage = _find_log_damages(store_path)
     block_damage = list(_iter_block_damages(store_path, study, progress)) if study else []
-    surplus = [] if study_store.template_damages(store_path) else _surplus_chunks(store_path, study)
-    return Report(
+    surplus = (
+        []
+        if study_store.find_template_damages(store_path)
+        else _iter_surplus_chunks(store_path, study)
+    )
+    return VerificationReport(
         store=store_path,
         blocks=study.n_blocks if study else 0,
-        whole=_count_undamaged_blocks(store_path, study, block_damage) if study else 0,
+        undamaged_blocks=_count_undamaged_blocks(store_path, study, block_damage) if study else 0,
         damages=(*template_damage, *log_damage, *block_damage, *surplus),
-        restored=tuple(restored),
-        foreign=tuple(_foreign_object_names(store_path)),
-        unmarked=_withdraw_receipts(store_path, block_damage, progress)
+        restored_objects=tuple(restored),
+        foreign_objects=tuple(_foreign_object_names(store_path)),
+        withdrawal_error=_withdraw_receipts(store_path, block_damage, progress)
         if log_damage or block_damage
         else "",
     )
@@ -197,21 +209,21 @@ def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: li
     return int(np.count_nonzero(is_undamaged))
 
 
-def _log_damages(store_path: Location) -> list[Damage]:
+def _find_log_damages(store_path: Location) -> list[Damage]:
     """Return the damaged lines of the journal.
 
     The last line of a log that is being written may be unfinished, and does not count.
     """
-    unreadable = store_format.irregular_journal_files(store_path)
+    unreadable = store_format.find_irregular_journal_files(store_path)
     holder = None if unreadable else journal.read_lock_holder(store_path)
-    holder_lives = holder is not None and journal.is_holder_alive(store_path, holder)
-    return [Damage(name, problem, mended_by="hand") for name, problem in unreadable.items()] + [
+    is_lock_holder_alive = holder is not None and journal.is_holder_alive(store_path, holder)
+    return [Damage(name, problem, repaired_by="hand") for name, problem in unreadable.items()] + [
         Damage(f"{JOURNAL_DIR}/{name} line {line_number}", "is damaged or cut short")
-        for name in (*journal.LOG_NAMES, RECIPE_FILE)
+        for name in (*journal.LOG_FILE_NAMES, RECIPE_FILE)
         for line_number, (line, record) in enumerate(
             iter_lines_and_records(store_path / JOURNAL_DIR / name), start=1
         )
-        if record is None and not (holder_lives and not line.endswith(b"\n"))
+        if record is None and not (is_lock_holder_alive and not line.endswith(b"\n"))
     ]
 
 
@@ -219,7 +231,7 @@ def _foreign_object_names(store_path: Location) -> list[str]:
     """Return the names of the objects in a store that were not made by sweep."""
     if isinstance(store_path, Path):
         return list_foreign_files(store_path)
-    manifest = study_store.manifest_digests(store_path)
+    manifest = study_store.read_manifest_digests(store_path)
     names = (
         name for name in iter_names_below(store_path) if not name.startswith(f"{JOURNAL_DIR}/")
     )
@@ -227,22 +239,23 @@ def _foreign_object_names(store_path: Location) -> list[str]:
     return [
         object_name
         for object_name in names
-        if object_name not in manifest and study_store.array_of_chunk(object_name) not in arrays
+        if object_name not in manifest
+        and study_store.array_name_of_chunk(object_name) not in arrays
     ]
 
 
-def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
+def _iter_surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
     """Yield chunks outside the arrays of a store, except drafts of killed writers."""
-    manifest = study_store.manifest_digests(store_path)
+    manifest = study_store.read_manifest_digests(store_path)
     chunk_grid_shapes = (
-        {name: owner_blocks.shape for name, owner_blocks in study.chunk_owners().items()}
+        {name: owner_blocks.shape for name, owner_blocks in study.chunk_owner_blocks().items()}
         if study
         else {}
     )
     for name in iter_names_below(store_path):
         if name in manifest or name.startswith(f"{JOURNAL_DIR}/") or name.endswith(DRAFT_SUFFIX):
             continue
-        chunk = CHUNK_NAME.fullmatch(name)
+        chunk = CHUNK_NAME_PATTERN.fullmatch(name)
         if not (chunk and f"{chunk[1]}/zarr.json" in manifest):
             continue  # reported as foreign
         if not study:
@@ -252,25 +265,25 @@ def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Da
         if len(chunk_index) != len(chunk_grid_shape) or any(
             int(index) >= count for index, count in zip(chunk_index, chunk_grid_shape, strict=True)
         ):
-            yield Damage(name, "is no part of the store", mended_by="hand")
+            yield Damage(name, "is no part of the store", repaired_by="hand")
 
 
 def _iter_block_damages(
     store_path: Location, study: BlockStudy, progress: Progress
 ) -> Iterator[Damage]:
     """Yield the damages of committed blocks."""
-    committed_digests = journal.committed_digests(store_path, study.n_blocks)
+    committed_digests = journal.read_committed_digests(store_path, study.n_blocks)
     blocks = np.flatnonzero(committed_digests != b"")
     progress = (
-        progress if len(blocks) > BLOCKS_PER_BATCH else Progress()
+        progress if len(blocks) > BLOCKS_PER_READ_BATCH else Progress()
     )  # a short verification shows no progress
     progress.begin(points=len(blocks), done=0, unit="blocks")
     try:
         with ThreadPoolExecutor(READER_THREADS) as pool:
-            for start in range(0, len(blocks), BLOCKS_PER_BATCH):
-                batch = [int(block) for block in blocks[start : start + BLOCKS_PER_BATCH]]
+            for start in range(0, len(blocks), BLOCKS_PER_READ_BATCH):
+                batch = [int(block) for block in blocks[start : start + BLOCKS_PER_READ_BATCH]]
                 for damages in pool.map(
-                    lambda block_number: _damages_of_block(
+                    lambda block_number: _find_block_damages(
                         store_path, study, block_number, bytes(committed_digests[block_number])
                     ),
                     batch,
@@ -281,45 +294,45 @@ def _iter_block_damages(
         progress.end()
 
 
-def _damages_of_block(
+def _find_block_damages(
     store_path: Location, study: BlockStudy, block: int, expected_digest: bytes
 ) -> list[Damage]:
     """Return the damages of a block's chunks, whose digest is in its receipt."""
     chunk_paths, bytes_max = (
         study_store.chunk_names_of_block(study, block),
-        study_store.chunk_size_limits(study),
+        study_store.make_chunk_size_limit(study),
     )
     try:
-        if has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max):
+        if objects_match_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max):
             return []
     except OSError:
         pass  # reported below, object by object
     damages = []
     for name in chunk_paths:
         if problem := damage_or_read_error(
-            partial(_damage_of_chunk, store_path, name, bytes_max(name))
+            partial(_read_chunk_damage, store_path, name, bytes_max(name))
         ):
             damages.append(Damage(name, problem, block))
     if (
         not damages
         and isinstance(store_path, ObjectPath)
-        and has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max)
+        and objects_match_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max)
     ):
         return []  # earlier responses were incomplete
     description = f"one of its {counted(len(chunk_paths), 'chunk')}"
     return damages or [Damage(description, "is whole but not the one that was committed", block)]
 
 
-def _damage_of_chunk(store_path: Location, chunk_path: str, bytes_max: int) -> str:
+def _read_chunk_damage(store_path: Location, chunk_path: str, bytes_max: int) -> str:
     """Return the damage of a chunk; '' if it has none.
 
     In an object store a damaged chunk is read twice, as a response may be incomplete.
     """
-    problem = chunk_damage(read_object(store_path, chunk_path, bytes_max))
+    problem = describe_chunk_damage(read_object(store_path, chunk_path, bytes_max))
     if problem and isinstance(store_path, ObjectPath):
         content = read_object(store_path, chunk_path, bytes_max)
-        if problem := chunk_damage(content):
-            (store_path / chunk_path).refuse_cut(content)
+        if problem := describe_chunk_damage(content):
+            (store_path / chunk_path).refuse_truncated_content(content)
     return problem
 
 
@@ -333,11 +346,11 @@ def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Pr
             log = journal.Journal(store_path)
             for block in sorted({damage.block for damage in damages}):
                 problems = [
-                    f"{block_damage.object} {block_damage.what}"
+                    f"{block_damage.object_name} {block_damage.description}"
                     for block_damage in damages
                     if block_damage.block == block
                 ]
-                log.withdraw(block, "; ".join(problems))
+                log.withdraw_receipt(block, "; ".join(problems))
             log.flush(force=True)
     except StoreError as error:
         return str(error)
@@ -350,8 +363,8 @@ def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
         return store_format.check_attributes(store_path, manifest_attributes)
     attributes = store_format.read_attributes(store_path)
     if (
-        expected_digest := study_store.manifest_digests(store_path).get("zarr.json")
-    ) and template_object_damage(store_path, "zarr.json", expected_digest):
+        expected_digest := study_store.read_manifest_digests(store_path).get("zarr.json")
+    ) and describe_template_object_damage(store_path, "zarr.json", expected_digest):
         raise StoreError(
             f"{store_path / 'zarr.json'} is damaged{store_format.repair_hint(store_path)}"
         )
@@ -392,9 +405,9 @@ def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
         altered_names = [
             name
             for name, expected_digest in template_digests.items()
-            if template_object_damage(store_path, name, expected_digest)
+            if describe_template_object_damage(store_path, name, expected_digest)
         ]
-        if not (attributes or "zarr.json" in study_store.manifest_digests(store_path)):
+        if not (attributes or "zarr.json" in study_store.read_manifest_digests(store_path)):
             _refuse_unproven_study(store_path, study, template_path, altered_names)
         for name in altered_names:
             atomic_write(store_path / name, (template_path / name).read_bytes())
@@ -406,8 +419,8 @@ def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
 
     Only undamaged lines of the manifest count.
     """
-    for name, expected_digest in study_store.manifest_digests(store_path).items():
-        if template_object_damage(template_path, name, expected_digest):
+    for name, expected_digest in study_store.read_manifest_digests(store_path).items():
+        if describe_template_object_damage(template_path, name, expected_digest):
             raise StoreError(
                 f"{name} of {store_path} can't be made again as it was on this machine, or from "
                 "this "
@@ -426,7 +439,7 @@ def _refuse_unproven_study(
         raise StoreError(
             f"{store_path} holds another study, or too little is left: {min(other_names)} differs"
         )
-    committed_digests = journal.committed_digests(store_path, study.n_blocks)
+    committed_digests = journal.read_committed_digests(store_path, study.n_blocks)
     for block in (committed_digests != b"").nonzero()[0][:1].tolist():
         stored_block = study_store.BlockWriter(template_path, study).write(
             block, study.evaluate(block)
@@ -476,12 +489,12 @@ def pack_store(
             else f"lacks {counted(n_missing, 'block')}: resume it"
         )
         raise StoreError(f"{store_path} {reason}")
-    if not is_free(output):
+    if not can_create_store(output):
         raise StoreError(f"{output} is there already: name another place")
     listener = make_progress(progress)
     with raise_as_store_error(f"{output} can't be made"):
         if isinstance(output, Path):
-            with atomic_path(output) as draft_path:
+            with write_path_atomically(output) as draft_path:
                 draft_path.mkdir()
                 _write_packed_store(store_path, draft_path, study, listener)
                 study_store.sync_to_disk(
@@ -500,11 +513,11 @@ def _write_packed_store(
     attributes = {**study_loading.read_study(store_path)[0], PACKED_ATTRIBUTE: True}
     with tempfile.TemporaryDirectory() as directory:
         template = Path(directory) / "template"
-        study_store.build_template(template, study, attributes, shard_shape_of=shard_shape)
+        study_store.build_template(template, study, attributes, shard_shape_of=shard_shape_of_array)
         root_document = (template / "zarr.json").read_bytes()
         for name in file_sizes_below(template).keys() - {"zarr.json", study_store.MANIFEST_PATH}:
             atomic_write(output / name, (template / name).read_bytes())
-    names, arrays = sorted(study.chunk_owners()), open_array_group(store_path)
+    names, arrays = sorted(study.chunk_owner_blocks()), open_verified_group(store_path)
     progress.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:
@@ -515,7 +528,7 @@ def _write_packed_store(
         progress.end()
     if study_loading.read_study(store_path)[0]["study_id"] != study.id:
         raise StoreError(f"{store_path} was extended or replaced while it was copied: try again")
-    for name in (*LOG_NAMES, RECIPE_FILE):
+    for name in (*LOG_FILE_NAMES, RECIPE_FILE):
         lines = iter_records(store_path / JOURNAL_DIR / name)
         # without the name of the machine, as copies are given to others
         anonymous_lines = [
@@ -556,11 +569,11 @@ def _copy_region(
         raise OSError(5, f"{target.path} does not read back as it was written")
 
 
-def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
+def shard_shape_of_array(layout: ArrayLayout) -> tuple[int, ...] | None:
     """Return the shape of a shard of complete chunks, filled along the last axis first; or None."""
     if layout.values is not None:
         return None
-    chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of(layout.chunks))
+    chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of_part(layout.chunks))
     counts = [1] * len(layout.shape)
     for k in reversed(range(len(counts))):
         counts[k] = max(1, min(-(-layout.shape[k] // layout.chunks[k]), chunks_left))

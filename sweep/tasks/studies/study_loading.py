@@ -32,10 +32,15 @@ from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.storage import store_format
 from sweep.storage.locations import Location, parse_location, resolve_links
-from sweep.storage.verified_store import open_array_group
+from sweep.storage.verified_store import open_verified_group
 from sweep.tasks.engine import study_store
 from sweep.tasks.engine.blocks import Results
-from sweep.tasks.engine.journal import EXTENDS_KEY, committed_blocks, committed_digests, read_recipe
+from sweep.tasks.engine.journal import (
+    EXTENDED_STORE_KEY,
+    committed_blocks,
+    read_committed_digests,
+    read_recipe,
+)
 from sweep.tasks.engine.progress import StoreError
 from sweep.tasks.studies.extendable_study import CHUNK_READ_ERRORS
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
@@ -45,7 +50,7 @@ from sweep.tasks.studies.parameter_grid import TOLERANCE_PARAMETER, ParameterGri
 
 AnySpec = GridSpec | SceneSpec
 
-ACCURACY_KIND = "accuracy"
+ACCURACY_STORE_KIND = "accuracy"
 """Kind of the stores of `sweep accuracy`, which hold no study."""
 
 GridOrFlightStudy = GridStudy | FlightStudy
@@ -92,7 +97,7 @@ def _find_reuse_source(
 def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
     """Return the attributes of a store, and its study; StoreError if it can't be read."""
     attributes = store_format.read_attributes(store_path)
-    if attributes["kind"] == ACCURACY_KIND:
+    if attributes["kind"] == ACCURACY_STORE_KIND:
         figures_command = shell_command("figures", store_path)
         raise StoreError(
             f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
@@ -110,7 +115,9 @@ def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
             )
         return EyepointStudy(_read_spec(store_path, recipe, recipe["spec"]), recipe["scanner"])
     spec = _read_spec(store_path, recipe, attributes["spec"])
-    source_path = parse_location(recipe[EXTENDS_KEY]) if EXTENDS_KEY in recipe else None
+    source_path = (
+        parse_location(recipe[EXTENDED_STORE_KEY]) if EXTENDED_STORE_KEY in recipe else None
+    )
     return make_study(
         spec, store_path, source_path if source_path != resolve_links(store_path) else None
     )
@@ -182,14 +189,14 @@ class ReuseSource:
         self.reused_points_by_block: dict[
             int, int
         ] = {}  # number of points of each block that were not computed
-        self.has_final_results = has_same_results(source_study.spec, target_study.spec)
+        self.has_final_results = have_equal_results(source_study.spec, target_study.spec)
         self.has_first_draws = not self.has_final_results and continues_draws(
             source_study.spec, target_study.spec
         )
-        self._has_other_tolerance = has_other_tolerance(source_study.spec, target_study.spec)
-        self._committed_digests = committed_digests(source_path, source_study.n_blocks)
+        self._has_other_tolerance = have_different_tolerances(source_study.spec, target_study.spec)
+        self._committed_digests = read_committed_digests(source_path, source_study.n_blocks)
         self.read_block = lru_cache(maxsize=CACHED_BLOCKS_MAX)(self._read_block)
-        self._matching_of_group = cache(self._match_group)
+        self._matching_of_group = cache(self._match_points_of_group)
 
     def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
         """Yield the points of a block that committed blocks of the older store contain."""
@@ -228,7 +235,7 @@ class ReuseSource:
                     source_local_indices[is_in_block],
                 )
 
-    def _match_group(self, group: str) -> PointMatching:
+    def _match_points_of_group(self, group: str) -> PointMatching:
         """Return the matching of points between the grids of a group in both studies."""
         source_grid, target_grid = (
             next(grid for grid in study.grids if grid.group == group)
@@ -237,7 +244,7 @@ class ReuseSource:
         return PointMatching(
             source_grid,
             target_grid,
-            parameters_to_ignore(self.source_study.spec, self._target_study.spec),
+            parameters_ignored_in_matching(self.source_study.spec, self._target_study.spec),
         )
 
     def _read_block(self, source_block: int) -> Results | None:
@@ -245,7 +252,7 @@ class ReuseSource:
         try:
             chunk_paths = study_store.chunk_names_of_block(self.source_study, source_block)
             digest = store_format.stored_objects_digest(
-                self._source_path, chunk_paths, study_store.chunk_size_limits(self.source_study)
+                self._source_path, chunk_paths, study_store.make_chunk_size_limit(self.source_study)
             )
             if digest.encode() != self._committed_digests[source_block]:
                 return None
@@ -265,7 +272,7 @@ class ReuseSource:
     @cached_property
     def _source_arrays(self) -> Any:
         """Arrays of the older store, opened once."""
-        return open_array_group(self._source_path)
+        return open_verified_group(self._source_path)
 
     def reuse_remark(self) -> str:
         """Return a remark on results that can't be reused as they are; '' if all can."""
@@ -294,7 +301,7 @@ class ReuseSource:
 def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
     """Return a message on how many points are done, in this store or in the one it extends."""
     is_done = committed_blocks(store_path, study)
-    n_points_there, remark = study.count_points(is_done), ""
+    n_points_there, remark = study.count_points_in_blocks(is_done), ""
     if study.reuse_source is not None:
         n_points_there += sum(
             study.count_reusable_points(int(block)) for block in np.flatnonzero(~is_done)
@@ -305,7 +312,7 @@ def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
     return f"{count_text} ({remark})" if remark else count_text
 
 
-def parameters_to_ignore(source_spec: AnySpec, target_spec: AnySpec) -> tuple[str, ...]:
+def parameters_ignored_in_matching(source_spec: AnySpec, target_spec: AnySpec) -> tuple[str, ...]:
     """Return the parameters that may differ between points with the same results.
 
     These are the tolerance, if neither study varies it, and detector and estimator, if no spectra
@@ -323,7 +330,7 @@ def parameters_to_ignore(source_spec: AnySpec, target_spec: AnySpec) -> tuple[st
     return (*method_paths, TOLERANCE_PARAMETER) if has_fixed_tolerances else tuple(method_paths)
 
 
-def has_other_tolerance(source_spec: AnySpec, target_spec: AnySpec) -> bool:
+def have_different_tolerances(source_spec: AnySpec, target_spec: AnySpec) -> bool:
     """Return True if the two studies have different tolerances, each the same at all points."""
     source_tolerance, target_tolerance = (
         _fixed_tolerance(source_spec),
@@ -336,7 +343,7 @@ def has_other_tolerance(source_spec: AnySpec, target_spec: AnySpec) -> bool:
     )
 
 
-def has_same_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
+def have_equal_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
     """Return True if equal points of two studies have equal results at equal accuracy."""
     if isinstance(target_spec, SceneSpec) or isinstance(source_spec, SceneSpec):
         return True
@@ -418,12 +425,12 @@ def refuse_not_larger_study(
 def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]:
     """Return the reasons why a study is not larger than another of its kind, one per field."""
     return [
-        *_disallowed_changes(source_spec, target_spec),
-        *_lost_axis_values(source_spec, target_spec),
+        *_iter_disallowed_changes(source_spec, target_spec),
+        *_iter_lost_axis_values(source_spec, target_spec),
     ]
 
 
-def _disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
+def _iter_disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
     """Yield the changes of fields that an extension does not allow."""
     on_axes = {
         member.path
@@ -464,7 +471,7 @@ def _field_value(spec: AnySpec, path: str) -> float:
     return float(getattr(getattr(spec, section), name))
 
 
-def _lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
+def _iter_lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
     """Yield the values of the store's axes that the study lacks."""
     source_grid, target_grid = ParameterGrid(source_spec), ParameterGrid(target_spec)
     varying_paths = {
@@ -474,7 +481,7 @@ def _lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[st
         for path in values
     }
     for lookup in PointMatching(
-        target_grid, source_grid, parameters_to_ignore(source_spec, target_spec)
+        target_grid, source_grid, parameters_ignored_in_matching(source_spec, target_spec)
     ).lookups:
         if (lookup.index_along_axis >= 0).all() or varying_paths.isdisjoint(lookup.paths):
             continue
@@ -524,10 +531,10 @@ class PointMatching:
     ) -> None:
         self._other_grid = other_grid
         self.lookups = [
-            _axis_lookup(
+            _make_axis_lookup(
                 grid, axis, {path: array for path, array in values.items() if path not in ignored}
             )
-            for axis, values in _parameter_groups(other_grid, grid)
+            for axis, values in _iter_parameter_groups(other_grid, grid)
         ]
 
     def match_slices(self, grid_slices: tuple[slice, ...]) -> np.ndarray:
@@ -555,7 +562,7 @@ class PointMatching:
         ).ravel()
 
 
-def _parameter_groups(
+def _iter_parameter_groups(
     other_grid: ParameterGrid, grid: ParameterGrid
 ) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
     """Yield parameters that are matched together: those of each axis, and the fixed ones."""
@@ -571,7 +578,7 @@ def _parameter_groups(
     yield None, fixed_values
 
 
-def _axis_lookup(
+def _make_axis_lookup(
     grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
 ) -> AxisLookup:
     """Match the values of a group of parameters in a grid with those of the other grid."""

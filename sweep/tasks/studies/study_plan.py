@@ -17,7 +17,7 @@ import psutil
 from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
 from sweep.model.outputs import SHOT_VARIABLES
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
-from sweep.storage.locations import Location, eyepoints_path
+from sweep.storage.locations import Location, eyepoint_store_location
 from sweep.tasks.engine.session import RunOptions
 from sweep.tasks.engine.worker_memory import process_memory
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
@@ -71,7 +71,7 @@ class ScannerPlan:
     n_cycles: int
     n_shots: int
     n_rays: int
-    is_cast: bool  # whether the eyepoints exist already
+    has_eyepoints: bool  # whether the eyepoints exist already
     seconds_per_ray: float  # measured time of a ray on one worker [s]
     seconds_per_draw: float  # measured time of one draw of a shot, with navigation [s]
 
@@ -136,7 +136,7 @@ def plan_study(
         eyepoints = study.eyepoint_studies()
         scanners = tuple(_plan_scanner(study, seconds_per_point) for seconds_per_point in eyepoints)
         ray_seconds = sum(
-            0 if scanner_plan.is_cast else scanner_plan.n_rays * scanner_plan.seconds_per_ray
+            0 if scanner_plan.has_eyepoints else scanner_plan.n_rays * scanner_plan.seconds_per_ray
             for scanner_plan in scanners
         )
         draw_seconds = sum(
@@ -181,12 +181,12 @@ def measure_seconds_per_point(study: GridStudy) -> float:
     accuracy after few draws count with the limit of draws.
     """
     study.compile_kernels()
-    blocks = _blocks_to_time(study)
+    blocks = _choose_timed_blocks(study)
 
     def time_round(n_geometries: int) -> TimedRound:
         for block in blocks:  # planning of effects serves many points, and is not timed
             study.effect_planner.select_for_block(
-                block, _sample_points_of_block(study, block, n_geometries)
+                block, _sampled_indices_of_block(study, block, n_geometries)
             )
         start = time.process_time()
         samples = [_evaluate_sample(study, block, n_geometries) for block in blocks]
@@ -198,7 +198,7 @@ def measure_seconds_per_point(study: GridStudy) -> float:
     return timed_round.seconds_by_part[0] / timed_round.n_points
 
 
-def _blocks_to_time(study: GridStudy) -> list[int]:
+def _choose_timed_blocks(study: GridStudy) -> list[int]:
     """Return blocks spread over the grid, fewer if points take long; each is computed once.
 
     This loads compiled kernels, which takes longer than many points.
@@ -227,7 +227,7 @@ class TimedRound(NamedTuple):
 def _time_growing_rounds(
     time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
 ) -> TimedRound:
-    """Time rounds of increasing size, until one takes long enough or covers the study."""
+    """Time rounds of increasing size. Return the first that is long enough or covers the study."""
     from numba.core.event import install_recorder
 
     n_samples, start = 1, time.perf_counter()
@@ -243,10 +243,12 @@ def _time_growing_rounds(
         n_samples *= 4
 
 
-def _sample_points_of_block(study: GridStudy, block: int, n_geometries: int) -> np.ndarray:
+def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -> np.ndarray:
     """Return indices of points in a block: complete sets that share a geometry."""
     grid, points_per_geometry = study.grid, 1
-    for length, is_geometric in zip(grid.block_extent(block), grid.is_geometric_axis, strict=True):
+    for length, is_geometric in zip(
+        grid.actual_block_shape(block), grid.is_geometric_axis, strict=True
+    ):
         points_per_geometry *= 1 if is_geometric else length
     geometry_groups = grid.geometry_order(block).reshape(-1, points_per_geometry)
     sampled_groups = np.unique(
@@ -258,8 +260,8 @@ def _sample_points_of_block(study: GridStudy, block: int, n_geometries: int) -> 
 def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
     """Return the number of points computed, and the estimated time of their omitted draws [s]."""
     spec, extrapolated_seconds = study.spec, 0.0
-    local_indices = _sample_points_of_block(study, block, n_geometries)
-    parameters = study.grid.parameters(block)
+    local_indices = _sampled_indices_of_block(study, block, n_geometries)
+    parameters = study.grid.parameters_of_block(block)
     for members, effects in study.effect_planner.select_for_block(
         block, local_indices
     ).iter_equal_groups():
@@ -267,15 +269,15 @@ def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[i
         draws_max = TIMED_SPECTRA_MAX if spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
         extrapolated_seconds += time_points(
             spec, group_parameters, len(members), effects, draws_max=draws_max
-        ).extrapolated
+        ).extrapolated_seconds
     return len(local_indices), extrapolated_seconds
 
 
 class PointTimes(NamedTuple):
     """Processor time of some points."""
 
-    measured: float  # measured time [s]
-    extrapolated: float
+    measured_seconds: float  # measured time [s]
+    extrapolated_seconds: float
     """Estimated time of omitted draws [s]: up to the limit, at points that miss their accuracy."""
 
 
@@ -326,7 +328,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
 
     def time_round(n_tiles: int) -> TimedRound:
         start = time.process_time()
-        shot_numbers = eyepoints.sample_cycles(n_tiles)
+        shot_numbers = eyepoints.sample_shots_of_cycles(n_tiles)
         shot_arrays = eyepoints.cast_cycles(shot_numbers)
         cast_at = time.process_time()
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
@@ -348,7 +350,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         n_cycles=eyepoints.n_cycles,
         n_shots=eyepoints.n_points,
         n_rays=eyepoints.n_rays,
-        is_cast=eyepoints_path(study.store_path, eyepoints.id).exists(),
+        has_eyepoints=eyepoint_store_location(study.store_path, eyepoints.id).exists(),
         seconds_per_ray=casting_seconds / eyepoints.count_rays(timed_round.n_points),
         seconds_per_draw=draw_seconds / (timed_round.n_points * len(flight_block.draws)),
     )
@@ -362,16 +364,21 @@ SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
 
 #: Sample for measuring the cost of an effect: tiles of a grid, points or shots of each, draws of
 #: each point, and samples of a flight's scanners.
-COST_TILES_MAX, COST_POINTS_MAX, COST_DRAWS_MAX, COST_SCANNER_SAMPLES_MAX = 4, 24, 20, 3
+(
+    EFFECT_COST_TILES_MAX,
+    EFFECT_COST_POINTS_MAX,
+    EFFECT_COST_DRAWS_MAX,
+    EFFECT_COST_SCANNER_SAMPLES_MAX,
+) = 4, 24, 20, 3
 #: Number of rounds of measuring the cost of an effect, at most, and at least if they take long.
-COST_ROUNDS_MAX, COST_ROUNDS_MIN = 5, 3
+EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
 
 #: Largest relative spread of an effect's cost over the rounds for which the cost is reported. It is
 #: about twice the error of the median.
-COST_SPREAD_MAX = 0.1
+EFFECT_COST_SPREAD_MAX = 0.1
 
 #: Sufficient time of a round of measuring an effect's cost [s].
-COST_ROUND_SECONDS = 0.1
+EFFECT_COST_ROUND_SECONDS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,9 +388,9 @@ class EffectRow:
     name: str
     mode: str
     simulated_fraction: float  # fraction of the points at which the effect is simulated
-    simulated_at: str  # region of the study that contains these points
+    simulated_region: str  # region of the study that contains these points
     change_bound: float  # largest bound of its change of pd, log10 pfa or relative |X|
-    largest_change_at: str  # region of the largest bound
+    largest_change_region: str  # region of the largest bound
     time_fraction: float  # fraction of the time of the points where it is simulated; nan if unknown
 
 
@@ -402,7 +409,7 @@ class EffectsTable:
             if row.mode == "off" and row.change_bound > self.tolerance:
                 yield (
                     f"effects.{row.name} is off and may change pd, log10 pfa or |X| by up to "
-                    f"{row.change_bound:.2g} ({row.largest_change_at}); the tolerance is "
+                    f"{row.change_bound:.2g} ({row.largest_change_region}); the tolerance is "
                     f"{self.tolerance:g}: "
                     "say auto to have it where it matters"
                 )
@@ -437,7 +444,7 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
     )
     is_kept = np.empty((len(EFFECTS), len(tiles)), bool)
     change_bounds, error_bounds = np.empty(is_kept.shape), np.empty(len(tiles))
-    for members, effect_plan in effect_planner.iter_plans(tiles):
+    for members, effect_plan in effect_planner.iter_tile_plans(tiles):
         is_kept[:, members], change_bounds[:, members], error_bounds[members] = (
             effect_plan.is_kept,
             effect_plan.omission_error,
@@ -445,13 +452,13 @@ def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
         )
     points_by_tile = [_tile_grid_indices(effect_planner, tile) for tile in tiles.tolist()]
     n_points_by_tile = np.array([len(tile_points) for tile_points in points_by_tile])
-    inactive_flags = effect_planner.inactive_flags(
+    absent_effect_flags = effect_planner.absent_effect_flags(
         study.grid.parameters_at(np.concatenate(points_by_tile)), int(n_points_by_tile.sum())
     )
     first_points = np.cumsum(n_points_by_tile) - n_points_by_tile
     n_active_points = np.array(
         [
-            np.add.reduceat((inactive_flags >> bit & 1) == 0, first_points)
+            np.add.reduceat((absent_effect_flags >> bit & 1) == 0, first_points)
             for bit in range(len(EFFECTS))
         ]
     )
@@ -480,7 +487,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
     axes = tuple(int(axis.size) for axis in study.spec.axes)
     axis_points = list(np.ndindex(axes))
     for eyepoints in study.eyepoint_studies():
-        shot_numbers = eyepoints.sample_tiles(SCANNER_TILES_SAMPLED)
+        shot_numbers = eyepoints.sample_shots_of_tiles(SCANNER_TILES_SAMPLED)
         sample_eyepoints = eyepoints_from_arrays(
             eyepoints.cast_shots(shot_numbers), eyepoints.beamlet_weights
         )
@@ -495,7 +502,10 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
                 flight_block, sample_eyepoints, shot_numbers // SHOTS_PER_TILE
             )
             if shot_plan is not None:
-                effect_plan, n_hitting_by_tile = shot_plan.plan, np.bincount(shot_plan.tile_index)
+                effect_plan, n_hitting_by_tile = (
+                    shot_plan.tile_plan,
+                    np.bincount(shot_plan.tile_index),
+                )
                 tile_effects.append(
                     _TileEffects(
                         effect_plan.is_kept * n_hitting_by_tile,
@@ -510,7 +520,10 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
     if not tile_effects:
         tolerance = float(study.spec.accuracy.tolerance)
         return EffectsTable(rows=(), tolerance=tolerance, error_bound=0.0, tile_fraction=1.0)
-    time_of_tile, shot_samples = np.concatenate(tile_times), _sample_flight(study) if costs else []
+    time_of_tile, shot_samples = (
+        np.concatenate(tile_times),
+        _sample_flight_shots(study) if costs else [],
+    )
     return _make_effects_table(
         study.spec,
         _TileEffects(
@@ -547,9 +560,9 @@ def _make_effects_table(
             name=effect.name,
             mode=effect_modes[effect.name],
             simulated_fraction=float(n_simulated.sum() / n_points),
-            simulated_at=region_text(n_simulated > 0) if n_simulated.any() else "",
+            simulated_region=region_text(n_simulated > 0) if n_simulated.any() else "",
             change_bound=float(bounds.max()),
-            largest_change_at=region_text(np.arange(bounds.size) == bounds.argmax()),
+            largest_change_region=region_text(np.arange(bounds.size) == bounds.argmax()),
             time_fraction=effect_cost(effect.name, n_simulated > 0)
             if n_simulated.any()
             else math.nan,
@@ -606,13 +619,14 @@ def _make_tile_sampler(
 
     @cache
     def sample_tile(tile: int) -> _PointSample:
-        ((_, effect_plan),) = effect_planner.iter_plans(np.array([tile]))
+        ((_, effect_plan),) = effect_planner.iter_tile_plans(np.array([tile]))
         effect_names = tuple(compress(EFFECT_NAMES, effect_plan.is_kept[:, 0]))
         sampled_indices, single_index = (
-            _tile_grid_indices(effect_planner, tile, n_points) for n_points in (COST_POINTS_MAX, 1)
+            _tile_grid_indices(effect_planner, tile, n_points)
+            for n_points in (EFFECT_COST_POINTS_MAX, 1)
         )
         parameters = effect_planner.tiles.grid.parameters_at(single_index)
-        if _seconds_of_points(spec, parameters, 1, effect_names) < COST_ROUND_SECONDS / 2:
+        if _seconds_of_points(spec, parameters, 1, effect_names) < EFFECT_COST_ROUND_SECONDS / 2:
             return _PointSample(
                 effect_planner.tiles.grid.parameters_at(sampled_indices),
                 len(sampled_indices),
@@ -630,7 +644,9 @@ def _seconds_of_points(
     effect_names: Collection[str],
 ) -> float:
     """Return the time of some points with some effects [s]."""
-    return sum(time_points(spec, parameters, n_points, effect_names, draws_max=COST_DRAWS_MAX))
+    return sum(
+        time_points(spec, parameters, n_points, effect_names, draws_max=EFFECT_COST_DRAWS_MAX)
+    )
 
 
 Stopwatch = Callable[[], float]
@@ -650,38 +666,38 @@ def _grid_effect_cost(
             lambda: _seconds_of_points(spec, parameters, n_points, without),
         )
 
-    return reproducible_share(
-        map(stopwatches_of_tile, _evenly_spaced(tiles.tolist(), COST_TILES_MAX))
+    return reproducible_time_fraction(
+        map(stopwatches_of_tile, _select_evenly_spaced(tiles.tolist(), EFFECT_COST_TILES_MAX))
     )
 
 
-def reproducible_share(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
+def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
     """Return the fraction of the time that an effect takes; nan if it is not reproducible.
 
     Parameters
     ----------
     stopwatches
         Pairs of functions that time the same work with and without the effect. They are used until
-        the work with the effect takes :data:`COST_ROUND_SECONDS` in total.
+        the work with the effect takes :data:`EFFECT_COST_ROUND_SECONDS` in total.
 
     Returns
     -------
     float
         Median over rounds, in which work with and without the effect alternates. nan if the rounds
-        differ by more than :data:`COST_SPREAD_MAX` of the median.
+        differ by more than :data:`EFFECT_COST_SPREAD_MAX` of the median.
     """
     timed_pairs, total_seconds = [], 0.0
     for time_with, time_without in stopwatches:
         time_without()  # loads compiled kernels
         total_seconds += time_with()
         timed_pairs.append((time_with, time_without))
-        if total_seconds > COST_ROUND_SECONDS:
+        if total_seconds > EFFECT_COST_ROUND_SECONDS:
             break
     fractions, start = [], time.process_time()
-    for round_number in range(COST_ROUNDS_MAX):
+    for round_number in range(EFFECT_COST_ROUNDS_MAX):
         if (
-            round_number >= COST_ROUNDS_MIN
-            and time.process_time() - start > COST_ROUNDS_MAX * COST_ROUND_SECONDS
+            round_number >= EFFECT_COST_ROUNDS_MIN
+            and time.process_time() - start > EFFECT_COST_ROUNDS_MAX * EFFECT_COST_ROUND_SECONDS
         ):
             break
         times = np.array([(time_with(), time_without()) for time_with, time_without in timed_pairs])
@@ -690,7 +706,7 @@ def reproducible_share(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> fl
             (seconds_with - seconds_without) / seconds_with if seconds_with > 0 else math.nan
         )
     median = float(np.median(fractions))
-    return median if np.ptp(fractions) <= COST_SPREAD_MAX * median else math.nan
+    return median if np.ptp(fractions) <= EFFECT_COST_SPREAD_MAX * median else math.nan
 
 
 class _ShotSample(NamedTuple):
@@ -716,7 +732,7 @@ class _ShotSample(NamedTuple):
         )
 
 
-def _sample_flight(study: FlightStudy) -> list[_ShotSample]:
+def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
     """Sample cycles spread over the flight of each scanner, at the ends of the axes."""
     axis_corners = {
         tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
@@ -724,13 +740,13 @@ def _sample_flight(study: FlightStudy) -> list[_ShotSample]:
     }
     samples = []
     for eyepoints in study.eyepoint_studies():
-        shot_numbers = eyepoints.sample_cycles(SCANNER_TILES_SAMPLED)
+        shot_numbers = eyepoints.sample_shots_of_cycles(SCANNER_TILES_SAMPLED)
         shot_arrays = eyepoints.cast_cycles(shot_numbers)
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
         for corner in sorted(axis_corners):
             flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
             flight_block = flight_block._replace(
-                draws=range(min(len(flight_block.draws), COST_DRAWS_MAX))
+                draws=range(min(len(flight_block.draws), EFFECT_COST_DRAWS_MAX))
             )
             selected_effects = study.select_effects(flight_block, shot_eyepoints, shot_numbers)
             samples.append(
@@ -754,11 +770,11 @@ def _flight_effect_cost(
             .reshape(-1, shots_per_cycle)
             .any(axis=1)
         )
-        for n_cycles in (1, -(-COST_POINTS_MAX // shots_per_cycle)):
-            cycles = np.array(_evenly_spaced(cycles_with_effect, n_cycles))
+        for n_cycles in (1, -(-EFFECT_COST_POINTS_MAX // shots_per_cycle)):
+            cycles = np.array(_select_evenly_spaced(cycles_with_effect, n_cycles))
             if (
                 _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags)
-                > COST_ROUND_SECONDS / 2
+                > EFFECT_COST_ROUND_SECONDS / 2
             ):  # one cycle takes long enough
                 break
         return (
@@ -771,12 +787,15 @@ def _flight_effect_cost(
         for sample in shot_samples
         if (sample.selected_effects.effect_flags & effect_flag).any()
     ]
-    return reproducible_share(
-        map(stopwatches_of_sample, _evenly_spaced(samples_with_effect, COST_SCANNER_SAMPLES_MAX))
+    return reproducible_time_fraction(
+        map(
+            stopwatches_of_sample,
+            _select_evenly_spaced(samples_with_effect, EFFECT_COST_SCANNER_SAMPLES_MAX),
+        )
     )
 
 
-def _evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
+def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
     """Return at most `n_max` items, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
@@ -801,6 +820,6 @@ def _tile_grid_indices(
     effect_planner: EffectPlanner, tile: int, n_max: int | None = None
 ) -> np.ndarray:
     """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid."""
-    tile_size = effect_planner.tiles.block_size(tile)
+    tile_size = effect_planner.tiles.count_block_points(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
     return effect_planner.tiles.grid_indices(tile, local_indices)

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.flight_study import FlightStudy
     from sweep.tasks.studies.grid_study import GridStudy
 
-_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_PACKAGE_FOLDER = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
 
 class StudyWarning(UserWarning):
     """Warning about a study that can be computed, but is probably not what was meant."""
 
 
-def spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
+def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     """Yield warnings about a study's beam, scene, path and threshold.
 
     Raises
@@ -50,7 +50,7 @@ def spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     yield from iter_alarm_warnings(spec)
 
 
-def result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
+def iter_result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
     """Yield warnings about late or ambiguous echoes, and about disabled effects that matter."""
     yield from echo_warnings(study)
     if "off" in study.spec.effect_modes().values():
@@ -66,9 +66,9 @@ def issue_study_warnings(study: GridStudy | FlightStudy, say: Callable[[str], No
     Errors that are not stated are messages of `say`.
     """
     stack_level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE_FOLDER):
         stack_level, frame = stack_level + 1, frame.f_back
-    for sentences in (spec_warnings(study.spec), result_warnings(study)):
+    for sentences in (iter_spec_warnings(study.spec), iter_result_warnings(study)):
         for sentence in sentences:
             if is_run_as_command():
                 say(f"warning: {sentence}")

@@ -10,7 +10,7 @@ SPECTRUM_METHOD_PARAMETERS = {
 """Parameters that name the detector and the estimator of whole spectra: built-in or the user's."""
 
 
-def user_functions(spec: Any) -> Iterator[tuple[str, str]]:
+def iter_user_functions(spec: Any) -> Iterator[tuple[str, str]]:
     """Yield role and name of each function of the user's that a spec names."""
     draws = getattr(spec, "draws", None)
     if not getattr(draws, "draws_whole_spectra", False):
@@ -23,6 +23,6 @@ def user_functions(spec: Any) -> Iterator[tuple[str, str]]:
         yield from ((role, name) for name in dict.fromkeys(map(str, names)) if ":" in name)
 
 
-def user_modules(spec: Any) -> tuple[str, ...]:
+def user_module_names(spec: Any) -> tuple[str, ...]:
     """Return the names of the modules whose functions a spec names, each once."""
-    return tuple(dict.fromkeys(name.partition(":")[0] for _, name in user_functions(spec)))
+    return tuple(dict.fromkeys(name.partition(":")[0] for _, name in iter_user_functions(spec)))

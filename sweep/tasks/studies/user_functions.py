@@ -21,7 +21,7 @@ from sweep.model.detection.estimators import ESTIMATORS
 from sweep.model.window import get_window
 from sweep.tasks.engine import user_code
 from sweep.tasks.engine.progress import CodeError
-from sweep.tasks.studies.user_function_names import SPECTRUM_METHOD_PARAMETERS, user_functions
+from sweep.tasks.studies.user_function_names import SPECTRUM_METHOD_PARAMETERS, iter_user_functions
 
 if TYPE_CHECKING:
     from sweep.model.sampling.noisy_spectra import SpectrumMethods
@@ -32,8 +32,8 @@ DETECTOR_ROLE, ESTIMATOR_ROLE = SPECTRUM_METHOD_PARAMETERS
 
 def check_user_functions(spec: GridSpec | SceneSpec) -> None:
     """Import the functions that a study names, and test each; CodeError if one fails."""
-    for role, name in user_functions(spec):
-        _try_user_function(role, name)
+    for role, name in iter_user_functions(spec):
+        _test_user_function(role, name)
 
 
 def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
@@ -45,7 +45,7 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 
     user_functions_by_role = {
         role: {
-            name: checked_function(role, name)
+            name: load_checked_function(role, name)
             for name in map(str, np.unique(np.asarray(parameters[path])))
             if ":" in name
         }
@@ -58,14 +58,14 @@ def spectrum_methods(parameters: Mapping[str, Any]) -> SpectrumMethods:
 
 
 @lru_cache(maxsize=64)
-def checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
+def load_checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
     """Return a user's function with read-only arguments and checked results."""
     function = _import_user_function(name)
     definition = f"{name}{_definition_text(function)}"
 
     def detect(power: np.ndarray, setting: SpectrumSettings) -> np.ndarray:
         answer = _call_user_function(name, function, _read_only_view(power), setting)
-        return _checked_answer(definition, answer, power.shape, np.dtype(bool))
+        return _check_returned_array(definition, answer, power.shape, np.dtype(bool))
 
     def estimate(
         spectrum: np.ndarray, peak_bins: np.ndarray, setting: SpectrumSettings
@@ -73,7 +73,7 @@ def checked_function(role: str, name: str) -> Callable[..., np.ndarray]:
         answer = _call_user_function(
             name, function, _read_only_view(spectrum), _read_only_view(peak_bins), setting
         )
-        return _checked_answer(definition, answer, peak_bins.shape, np.dtype(float))
+        return _check_returned_array(definition, answer, peak_bins.shape, np.dtype(float))
 
     return detect if role == DETECTOR_ROLE else estimate
 
@@ -135,7 +135,9 @@ def _read_only_view(array: np.ndarray) -> np.ndarray:
     return view
 
 
-def _checked_answer(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+def _check_returned_array(
+    name: str, answer: Any, shape: tuple[int, ...], dtype: np.dtype
+) -> np.ndarray:
     """Return the array that a function returned; CodeError for a wrong type, shape or value."""
     if not isinstance(answer, np.ndarray):
         raise CodeError(f"{name} gives a {type(answer).__name__}, and must give a numpy array")
@@ -148,8 +150,11 @@ def _checked_answer(name: str, answer: Any, shape: tuple[int, ...], dtype: np.dt
     return answer
 
 
-def _try_user_function(role: str, name: str) -> None:
-    """Call a function with three spectra of a tone at bin 40.25 of 128 in weak noise."""
+def _test_user_function(role: str, name: str) -> None:
+    """Test a function on three spectra of a tone at bin 40.25 of 128 in weak noise.
+
+    CodeError if it fails.
+    """
     n_samples, generator = 256, np.random.default_rng(1)
     setting = SpectrumSettings(
         fft_size=n_samples,
@@ -165,7 +170,7 @@ def _try_user_function(role: str, name: str) -> None:
     record = 20 * np.cos(2 * np.pi * 40.25 * np.arange(n_samples) / n_samples) + generator.normal(
         size=(3, n_samples)
     )
-    spectrum, function = np.fft.rfft(record * setting.taper), checked_function(role, name)
+    spectrum, function = np.fft.rfft(record * setting.taper), load_checked_function(role, name)
     try:
         if role == DETECTOR_ROLE:
             function(np.abs(spectrum) ** 2, setting)

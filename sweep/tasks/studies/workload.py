@@ -12,7 +12,7 @@ from sweep.tasks.studies import study_loading, user_function_names
 
 @dataclass(frozen=True)
 class SpecWorkload:
-    """:class:`sweep.tasks.engine.block_study.Workload` of the study that a spec declares."""
+    """Requirements of a spec's study on machines, as `block_study.Workload` declares them."""
 
     spec: GridSpec | SceneSpec
 
@@ -22,9 +22,9 @@ class SpecWorkload:
         return self.spec.execution
 
     @property
-    def user_modules(self) -> tuple[str, ...]:
+    def user_module_names(self) -> tuple[str, ...]:
         """Names of the modules of the user's detectors and estimators."""
-        return user_function_names.user_modules(self.spec)
+        return user_function_names.user_module_names(self.spec)
 
     @property
     def read_study(self) -> StudyReader:

@@ -21,7 +21,7 @@ from sweep.tasks.engine.deploy import local_ssh
 
 
 @contextmanager
-def _signal_handlers_kept() -> Iterator[None]:
+def _keep_signal_handlers() -> Iterator[None]:
     """Keep this thread's signal handlers while dask_jobqueue is imported.
 
     dask_jobqueue sets a handler on import, by which Ctrl-C ends the program at once. In any thread
@@ -41,13 +41,13 @@ def _signal_handlers_kept() -> Iterator[None]:
         signal.signal = set_handler
 
 
-with _signal_handlers_kept():
+with _keep_signal_handlers():
     from dask_jobqueue import PBSCluster, SLURMCluster
     from dask_jobqueue.pbs import PBSJob
     from dask_jobqueue.slurm import SLURMJob
 
 #: Time after which a running cluster submits a rejected job again [s].
-RESUBMIT_PAUSE = 15.0
+RESUBMIT_PAUSE_SECONDS = 15.0
 
 
 class _JobWithStatus:
@@ -79,7 +79,7 @@ class _ResubmittingCluster:
                     del self.workers[name]
                     self.worker_spec.pop(name, None)
             if self.workers:
-                await asyncio.sleep(RESUBMIT_PAUSE)
+                await asyncio.sleep(RESUBMIT_PAUSE_SECONDS)
             raise
 
 
@@ -100,7 +100,10 @@ class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
 
 
 def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
-    """Return a cluster with its least number of workers submitted; RuntimeError if rejected."""
+    """Start a cluster, and submit jobs for its least number of workers.
+
+    RuntimeError if the batch system rejects them.
+    """
     cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
     dask_cluster = cluster_class(**jobqueue_options(cluster))
     try:

@@ -13,7 +13,7 @@ from sweep.spec.cluster_config import KubernetesClusterConfig, WorkerBounds
 from sweep.tasks.engine.deploy import local_ssh
 from sweep.tasks.engine.progress import ClusterError
 
-API_VERSION = "kubernetes.dask.org/v1"
+DASK_OPERATOR_API_VERSION = "kubernetes.dask.org/v1"
 SCHEDULER_PORT = 8786
 
 #: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
@@ -50,13 +50,13 @@ def deploy_cluster(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> It
                 autoscaler_resource(cluster, bounds),
             ):
                 if declaration is not None:
-                    kubernetes_object = new_class(declaration["kind"], API_VERSION)(
+                    kubernetes_object = new_class(declaration["kind"], DASK_OPERATOR_API_VERSION)(
                         declaration, namespace=cluster.namespace
                     )
                     kubernetes_object.create()
                     stack.callback(_delete_resource, kubernetes_object)
             service = _wait_for_service(Service, cluster)
-            address = stack.enter_context(_reach_service(service, cluster))
+            address = stack.enter_context(_open_service_address(service, cluster))
         except kubernetes_errors as error:
             raise ClusterError(f"Kubernetes starts no workers: {error}") from error
         yield address
@@ -83,9 +83,9 @@ def _wait_for_service(service_class: Any, cluster: KubernetesClusterConfig) -> A
 
 
 @contextmanager
-def _reach_service(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
-    """Return the address of a service: its own inside the cluster, a forwarded port outside."""
-    if _is_known_host(scheduler_host(cluster)):
+def _open_service_address(service: Any, cluster: KubernetesClusterConfig) -> Iterator[str]:
+    """Yield the address of a service: its own inside the cluster, a forwarded port outside."""
+    if _is_resolvable_host(scheduler_host(cluster)):
         yield f"{connection_protocol(cluster)}://{scheduler_host(cluster)}:{SCHEDULER_PORT}"
         return
     with socket.socket() as free_socket:
@@ -99,7 +99,7 @@ def _reach_service(service: Any, cluster: KubernetesClusterConfig) -> Iterator[s
         forward.stop()
 
 
-def _is_known_host(name: str) -> bool:
+def _is_resolvable_host(name: str) -> bool:
     """Return True if the name of a host can be resolved."""
     try:
         socket.getaddrinfo(name, SCHEDULER_PORT)
@@ -125,7 +125,7 @@ def autoscaler_resource(
     if bounds.least == bounds.most:
         return None
     return {
-        "apiVersion": API_VERSION,
+        "apiVersion": DASK_OPERATOR_API_VERSION,
         "kind": "DaskAutoscaler",
         "metadata": {"name": cluster.name},
         "spec": {"cluster": cluster.name, "minimum": bounds.least, "maximum": bounds.most},
@@ -155,7 +155,7 @@ def cluster_resource(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> 
         "DASK_DISTRIBUTED__ADAPTIVE__TARGET_DURATION": local_ssh.ADAPTIVE_TARGET_DURATION,
         "DASK_DISTRIBUTED__SCHEDULER__HTTP__ROUTES": str(SCHEDULER_HTTP_ROUTES),
     }
-    _fill_pod(scheduler_pod, ["scheduler", *arguments], variables, cluster)
+    _configure_pod(scheduler_pod, ["scheduler", *arguments], variables, cluster)
     arguments = [
         "--name",
         "$(DASK_WORKER_NAME)",
@@ -169,12 +169,12 @@ def cluster_resource(cluster: KubernetesClusterConfig, bounds: WorkerBounds) -> 
         "DASK_SCHEDULER_ADDRESS": address,
         **local_ssh.worker_environment(cluster.environment),
     }
-    _fill_pod(worker_pod, ["worker", *arguments], variables, cluster)
+    _configure_pod(worker_pod, ["worker", *arguments], variables, cluster)
     worker_pod["containers"][0].pop("ports")  # a worker has no HTTP server
     return declaration
 
 
-def _fill_pod(
+def _configure_pod(
     pod: dict[str, Any],
     arguments: list[str],
     variables: dict[str, str],

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PRELOAD_MODULE = "sweep.tasks.preload"
 
 #: Environment variables that limit libraries with threads of their own to one per worker slot.
-ONE_THREAD_VARIABLES = {
+SINGLE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -56,25 +56,25 @@ DASK_CONFIG: dict[str, Any] = {
 
 #: Settings of a scheduler without a dashboard. Dask starts its HTTP server anyway, but without
 #: pages; by default it shows workers, tasks and logs to all users of the machine.
-NO_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
+NO_HTTP_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 
 #: Time of pending work per worker thread above which an adaptive cluster adds a thread [s].
 ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers: thread limits, safe path, and those given."""
+    """Return the environment variables of workers: thread limits, safe path, and the user's."""
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
     }
-    return {**ONE_THREAD_VARIABLES, SAFE_PATH_VARIABLE: "1", **dask_variables, **user_variables}
+    return {**SINGLE_THREAD_VARIABLES, SAFE_PATH_VARIABLE: "1", **dask_variables, **user_variables}
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
     """Return the TLS security of client, scheduler and workers; None without certificates.
 
-    With it they refuse connections without a certificate.
+    Client, scheduler and workers then refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -95,7 +95,7 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
-    """Return the addresses of a scheduler of this process and of its dashboard, if any."""
+    """Return Dask's options for the addresses of a scheduler in this process and its dashboard."""
     options: dict[str, Any] = {
         "port": scheduler.port,
         "dashboard": shows_dashboard(scheduler),
@@ -125,15 +125,15 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
     return f"{LOOPBACK_ADDRESS}:{port}"
 
 
-WORKER_BYTES_MIN = 1 << 30
+WORKER_MEMORY_BYTES_MIN = 1 << 30
 
 #: Time after which a worker without a heartbeat is ended and restarted.
 WORKER_TTL = "2 minutes"
 
 
 @contextmanager
-def spawn_environment() -> Iterator[None]:
-    """Context in which workers are started, and restarted, as processes.
+def isolate_spawned_workers() -> Iterator[None]:
+    """Context manager in which worker processes start without the caller's script and folder.
 
     By default a spawned process imports from the working directory, and runs the script of its
     parent. Workers need neither: functions of the script are sent by value.
@@ -182,7 +182,7 @@ def start_local_cluster(
         options["worker_dashboard_address"] = (
             f"{LOOPBACK_ADDRESS}:0"  # by default it listens on all networks
         )
-        options["worker_class"] = _worker_without_pages()
+        options["worker_class"] = _make_worker_class_without_pages()
     config_name = "distributed.nanny.pre-spawn-environ"
     environment_variables = {
         **dask.config.get(config_name),
@@ -196,7 +196,7 @@ def start_local_cluster(
             return LocalCluster(scheduler_kwargs=dashboard_options, **options)
 
 
-def _worker_without_pages() -> type:
+def _make_worker_class_without_pages() -> type:
     """Return a class of thread workers whose HTTP server, which Dask requires, has no page."""
     from distributed import Worker
 
@@ -219,14 +219,17 @@ def dashboard_link(dask_cluster: Any) -> str:
 
 
 def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
-    """Return the memory at which Dask restarts a worker [bytes]; by default its share of 90 %."""
+    """Return the memory at which Dask restarts a worker [bytes].
+
+    By default it is an equal share of 90 % of the machine's memory.
+    """
     from distributed.system import MEMORY_LIMIT
 
     requested_bytes = cluster.worker.memory
     return (
         int(requested_bytes)
         if requested_bytes
-        else max(WORKER_BYTES_MIN, int(0.9 * MEMORY_LIMIT / bounds.most))
+        else max(WORKER_MEMORY_BYTES_MIN, int(0.9 * MEMORY_LIMIT / bounds.most))
     )
 
 
@@ -252,7 +255,10 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return the workers to start on each machine, by its name, evenly distributed."""
+    """Return Dask's specification of the workers on each machine, by its name.
+
+    The workers are distributed evenly.
+    """
     from distributed.deploy.ssh import Worker
 
     hosts = cluster.hosts[:n_workers]
