@@ -17,7 +17,7 @@ import sweep
 from sweep.model import beam, evaluation
 from sweep.spec import GridSpec
 from sweep.spec.axes import remove_fields_on_axes
-from sweep.spec.yaml_document import library_instruments, read_document
+from sweep.spec.yaml_document import library_instrument_files, read_document
 
 SPEED_OF_LIGHT = 299792458.0
 DRAWS_PER_PLACE = 400
@@ -29,7 +29,7 @@ InstrumentFields = Mapping[str, Any]
 
 def instrument_file(name: str) -> dict[str, Any]:
     """Content of the file of an instrument."""
-    return read_document(library_instruments()[name]).content
+    return read_document(library_instrument_files()[name]).content
 
 
 def spec_before_target(instrument: Any, target: InstrumentFields, **sections: Any) -> GridSpec:
@@ -300,6 +300,6 @@ if __name__ == "__main__":
         "instruments.md",
         "instruments",
         "\n\n".join(
-            instrument_section(name, simulate_numbers(name)) for name in library_instruments()
+            instrument_section(name, simulate_numbers(name)) for name in library_instrument_files()
         ),
     )

@@ -30,7 +30,7 @@ EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
 """Exit codes of verify for a damaged store, and of compare for different results."""
 
 #: Largest number of damaged objects that are listed for a store.
-LISTED_OBJECTS_MAX = 20
+LISTED_DAMAGED_OBJECTS_MAX = 20
 
 
 @click.command()
@@ -181,17 +181,17 @@ def _print_verify_report(report: Report) -> None:
     store = shorten_path(report.store)
     for name in report.restored:
         click.echo(f"{store}: {name} put back")
-    for damage in report.damages[:LISTED_OBJECTS_MAX]:
+    for damage in report.damages[:LISTED_DAMAGED_OBJECTS_MAX]:
         block = f"block {damage.block}: " if damage.block >= 0 else ""
         echo_wrapped(f"{store}: {block}{damage.object} {damage.what}", err=True)
-    if len(report.damages) > LISTED_OBJECTS_MAX:
-        click.echo(f"and {len(report.damages) - LISTED_OBJECTS_MAX:,} more", err=True)
+    if len(report.damages) > LISTED_DAMAGED_OBJECTS_MAX:
+        click.echo(f"and {len(report.damages) - LISTED_DAMAGED_OBJECTS_MAX:,} more", err=True)
     if report.foreign:
-        listed_names = ", ".join(report.foreign[:LISTED_OBJECTS_MAX])
-        omitted_text = f" and {len(report.foreign) - LISTED_OBJECTS_MAX:,} more"
+        listed_names = ", ".join(report.foreign[:LISTED_DAMAGED_OBJECTS_MAX])
+        omitted_text = f" and {len(report.foreign) - LISTED_DAMAGED_OBJECTS_MAX:,} more"
         echo_wrapped(
             f"{store}: not sweep's, and left alone: {listed_names}"
-            f"{omitted_text if len(report.foreign) > LISTED_OBJECTS_MAX else ''}"
+            f"{omitted_text if len(report.foreign) > LISTED_DAMAGED_OBJECTS_MAX else ''}"
         )
     if report.blocks:
         echo_wrapped(

@@ -286,11 +286,11 @@ def test_an_axis_of_radiometry_is_read_and_stands_in_for_its_field():
 
 
 def test_no_parameter_that_may_vary_bears_the_name_of_an_array():
-    from sweep.spec.scene_checks import stored_names
+    from sweep.spec.scene_checks import store_array_and_dimension_names
     from sweep.spec.sections import parameter_rules
 
     free = {p.rsplit(".", 1)[-1] for p in parameter_rules() if SceneSpec.may_be_on_axis(p)}
-    assert len(free) > 20 and not free & stored_names()
+    assert len(free) > 20 and not free & store_array_and_dimension_names()
 
 
 PAIR = {"kind": "fixed", "beams": [["0 deg", "0 deg"], ["1 deg", "0 deg"]], "rate": "1 Hz"}
