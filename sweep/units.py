@@ -47,7 +47,7 @@ _POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
 _EXPONENT_MAX = 999
 """Largest magnitude of the exponent in a power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
-"""Pattern of the text after a number that may be a unit."""
+"""Pattern of text after a number, if that text may be a unit."""
 _QUANTITY_PATTERN = re.compile(
     rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
 )

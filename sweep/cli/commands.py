@@ -263,7 +263,7 @@ def run(
     from sweep.tasks import driver
 
     if overwrite and resuming:
-        raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
+        raise click.UsageError("--overwrite starts again, and --resume continues: give one of them")
     study_spec, path = load(spec), store or _default_store(spec)
     if is_free(path) or not resuming:  # else the user confirmed when the study began
         confirm_large_study(study_spec, path, yes=yes)

@@ -137,7 +137,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
     from sweep.tasks.studies.store_verification import verify as verify_stores
 
     if spec_file and not repair:
-        raise click.UsageError("--spec is for --repair: what is whole says itself what it holds")
+        raise click.UsageError("--spec is for --repair: an undamaged store holds its own spec")
     reports = verify_stores(store, repair=repair, spec=load(spec_file) if spec_file else None)
     for report in reports:
         _print_verify_report(report)

@@ -767,7 +767,7 @@ def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
 def study_effects_table(
     spec: GridSpec | SceneSpec, store: Location, *, costs: bool = True
 ) -> EffectsTable:
-    """Return the table of effects of a study; ``costs`` measures their share of the time."""
+    """Return the table of effects of a study; ``costs`` adds each effect's share of the time."""
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import effects_table
 

@@ -85,7 +85,7 @@ class Axis:
 
     @property
     def is_zipped(self) -> bool:
-        """True if the axis is zipped: the name of its dimension is not that of its parameter."""
+        """True if the axis is zipped: it has several parameters, or a name of its own."""
         return len(self.parameters) > 1 or self.parameters[0].coordinate != self.name
 
 
@@ -398,7 +398,7 @@ def _read_zipped_piece(raw_piece: object, location: Location) -> dict[str, list[
     }
     if len(set(lengths.values())) > 1:
         lengths_text = ", ".join(f"{path} has {n}" for path, n in lengths.items())
-        findings.append(Finding(location, f"must give as many values of each: {lengths_text}"))
+        findings.append(Finding(location, f"must give equal numbers of values: {lengths_text}"))
     findings.raise_if_any()
     length = max(lengths.values(), default=1)
     return {
@@ -476,10 +476,10 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
         )
         if axis.is_zipped and axis.name in other_coordinates | own_coordinates:
             findings.append(
-                Finding(("axes", axis.name), "bears the name of a coordinate", _AXIS_NAME_REMEDY)
+                Finding(("axes", axis.name), "has the name of a coordinate", _AXIS_NAME_REMEDY)
             )
         elif axis.is_zipped and axis.name in GRID_VARIABLE_NAMES:
-            problem = "bears the name of a variable of the store"
+            problem = "has the name of a variable of the store"
             findings.append(Finding(("axes", axis.name), problem, _AXIS_NAME_REMEDY))
     return findings
 
@@ -801,7 +801,10 @@ def _step_progression(bounds: list[Fraction], location: Location) -> Progression
 def _progression_values(
     progression: Progression, unit: Unit, rule: NumericRule, location: Location
 ) -> AxisPiece:
-    """Return the values of an arithmetic progression, as integers if the field takes integers."""
+    """Return an arithmetic progression in `unit` as values of an axis.
+
+    The values are integers if the field takes integers.
+    """
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
         return AxisPiece(si_values, unit, progression)

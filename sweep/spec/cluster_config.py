@@ -102,17 +102,17 @@ class Security(SpecSection):
 
     ca: str = declare.file_path_field("Certificate of the authority that signed the others")
     certificate: str = declare.file_path_field("Certificate of scheduler, workers and client")
-    key: str = declare.file_path_field("Its private key")
+    key: str = declare.file_path_field("Private key of that certificate")
 
 
 class LocalWorkerConfig(SpecSection):
     """Threads and memory of a worker process on this machine."""
 
     threads: int = declare.integer_field(
-        "Threads, each with a block of its own", "1", at_most="1000", default=1
+        "Threads of a worker; each computes a block of its own", "1", at_most="1000", default=1
     )
     memory: float | None = declare.quantity_field(
-        "Memory that it may take; without one, its share of 90 % of it",
+        "Memory of a worker at most; by default its share of 90 % of the machine's memory",
         *_MEMORY_FIELD_ARGUMENTS,
         default=None,
     )
@@ -121,7 +121,7 @@ class LocalWorkerConfig(SpecSection):
 class WorkerConfig(LocalWorkerConfig):
     """Threads and memory of a worker process; the memory is required."""
 
-    memory: float = declare.quantity_field("Memory that it may take", *_MEMORY_FIELD_ARGUMENTS)
+    memory: float = declare.quantity_field("Memory of a worker at most", *_MEMORY_FIELD_ARGUMENTS)
 
 
 class SchedulerConfig(SpecSection):
@@ -130,9 +130,15 @@ class SchedulerConfig(SpecSection):
     Without a host or an interface the scheduler accepts connections from this machine alone.
     """
 
-    host: str = declare.command_word_field("Address that workers reach it by", "10.0.0.5", "")
-    interface: str = declare.command_word_field("Or the network interface that it has", "ib0", "")
-    port: int = declare.integer_field("Port; 0 for any", "8786", "0", "65535", default=0)
+    host: str = declare.command_word_field(
+        "Address at which workers reach the scheduler", "10.0.0.5", ""
+    )
+    interface: str = declare.command_word_field(
+        "Network interface of the scheduler, in place of its address", "ib0", ""
+    )
+    port: int = declare.integer_field(
+        "Port of the scheduler; 0 for any free port", "8786", "0", "65535", default=0
+    )
     dashboard: str = declare.text_field(
         "Port of Dask's dashboard, 0 for any; none: no dashboard. It has no password, and listens "
         "to this machine alone: all users of this machine can see it",
@@ -148,7 +154,7 @@ class BatchJobConfig(SpecSection):
 
     workers: int = declare.integer_field("Workers of one job", "8", at_most="1000", default=1)
     walltime: float = declare.duration_field(
-        "Time that a job may take; workers leave before it", "2 h", "1 min", "365 d"
+        "Longest time of a job; workers leave before it ends", "2 h", "1 min", "365 d"
     )
     queue: str = declare.command_word_field("Queue or partition", "normal", "")
     account: str = declare.command_word_field("Account that is charged", "lidar", "")
@@ -161,7 +167,7 @@ class BatchJobConfig(SpecSection):
         0, _LIST_TEXTS_MAX, (),
         description="Shell lines before the worker starts", element_noun="texts",
     )  # fmt: skip
-    logs: str = declare.command_word_field("Directory for what jobs print", "logs", "logs")
+    logs: str = declare.command_word_field("Directory for the output of jobs", "logs", "logs")
 
 
 class ClusterConfig(SpecSection):
@@ -200,7 +206,10 @@ class LocalClusterConfig(SessionStartedClusterConfig):
 
     kind: Literal["local"]
     workers: WorkerBounds | None = declare.field_with_rule(
-        CustomRule(description="Workers; without a number, one a core", reader=_read_worker_bounds),
+        CustomRule(
+            description="Number of workers; by default one for each core",
+            reader=_read_worker_bounds,
+        ),
         None,
     )
     worker: LocalWorkerConfig = LocalWorkerConfig()
@@ -230,20 +239,25 @@ class SSHClusterConfig(SessionStartedClusterConfig):
         element_noun="texts",
     )
     workers: WorkerBounds = declare.field_with_rule(
-        CustomRule(description="Workers, dealt out over the machines", reader=_read_worker_bounds)
+        CustomRule(
+            description="Number of workers, distributed over the machines",
+            reader=_read_worker_bounds,
+        )
     )
     worker: WorkerConfig
     scheduler: SchedulerConfig
-    user: str = declare.command_word_field("User there; without one, as here", "lidar", "")
+    user: str = declare.command_word_field(
+        "User on the machines; by default the name of the user here", "lidar", ""
+    )
     port: int = declare.integer_field("Port of SSH", "22", at_most="65535", default=22)
     identity: str = declare.file_path_field(
-        "Private key to log in with; without one, as ssh does", ""
+        "Private key for the login; by default the one that ssh takes", ""
     )
     known_hosts: str = declare.file_path_field(
-        "Keys of known machines; without one, as ssh does", ""
+        "File of the keys of known machines; by default the one that ssh takes", ""
     )
     python: str = declare.command_word_field(
-        "Python there; without one, the path of this one", "python", ""
+        "Python on the machines; by default the path of this Python", "python", ""
     )
 
 
@@ -257,7 +271,7 @@ class BatchClusterConfig(SessionStartedClusterConfig):
     job: BatchJobConfig
     scheduler: SchedulerConfig
     python: str = declare.command_word_field(
-        "Python of the jobs; without one, the path of this one", "python", ""
+        "Python of the jobs; by default the path of this Python", "python", ""
     )
 
 
@@ -276,8 +290,10 @@ class PBSClusterConfig(BatchClusterConfig):
 class PersistentVolume(SpecSection):
     """Persistent volume for stores and scenes, mounted at one path in all pods and here."""
 
-    claim: str = declare.command_word_field("Its claim", "studies")
-    path: str = declare.command_word_field("Where it is mounted, the same as here", "/data")
+    claim: str = declare.command_word_field("Claim of the persistent volume", "studies")
+    path: str = declare.command_word_field(
+        "Path at which the volume is mounted, in the pods and here", "/data"
+    )
 
 
 class KubernetesClusterConfig(SessionStartedClusterConfig):
@@ -285,7 +301,9 @@ class KubernetesClusterConfig(SessionStartedClusterConfig):
 
     kind: Literal["kubernetes"]
     workers: WorkerBounds = declare.field_with_rule(
-        CustomRule(description="Workers, a pod each", reader=_read_worker_bounds)
+        CustomRule(
+            description="Number of workers, each in a pod of its own", reader=_read_worker_bounds
+        )
     )
     worker: WorkerConfig
     image: str = declare.command_word_field(
@@ -300,7 +318,7 @@ class KubernetesClusterConfig(SessionStartedClusterConfig):
     namespace: str = declare.command_word_field("Namespace", "lidar", "default")
     volume: PersistentVolume | None = None
     secret: str = declare.command_word_field(
-        "Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls", ""
+        "Secret with ca.pem, certificate.pem and key.pem, if TLS is used", "sweep-tls", ""
     )
 
 
@@ -384,7 +402,7 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
     for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"
-            yield Finding(("security", name), "names a file that is not there", remedy, path)
+            yield Finding(("security", name), "names a file that does not exist", remedy, path)
     if isinstance(cluster, LocalClusterConfig | SSHClusterConfig | BatchClusterConfig):
         yield from _scheduler_findings(
             cluster.scheduler, is_remote=not isinstance(cluster, LocalClusterConfig)
@@ -395,7 +413,7 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
             problem = "is encrypted, and no certificates are given"
             yield Finding(("address",), problem, "add a security section", address)
         if cluster.security and not is_encrypted:
-            problem = "is not encrypted, for all that there are certificates"
+            problem = "is not encrypted, although certificates are given"
             yield Finding(("address",), problem, "write 'tls://...'", address)
     if isinstance(cluster, SSHClusterConfig) and cluster.workers.least < cluster.workers.most:
         problem = "must be a number: machines reached by SSH are there or not"
@@ -415,5 +433,5 @@ def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Itera
     if scheduler.host and scheduler.interface:
         yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")
     elif is_remote and not (scheduler.host or scheduler.interface):
-        problem = "must say where workers on other machines reach it"
+        problem = "must state where workers on other machines reach it"
         yield Finding(("scheduler",), problem, "write e.g. 'interface: ib0' or 'host: 10.0.0.5'")

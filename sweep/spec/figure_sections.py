@@ -83,7 +83,7 @@ _COORDINATE_SELECTION_RULE = CustomRule(
 )
 _NUMBER_SCHEMA = {"type": ["number", "string"]}
 _PUBLISHED_NUMBERS_RULE = CustomRule(
-    description="The numbers as published, row by row, to stand beside ours",
+    description="Published numbers, row by row, for comparison",
     reader=_read_published_numbers,
     value_schema={
         "type": "array",
@@ -238,11 +238,14 @@ FIGURE_QUANTITIES = (
 SEVERAL_SURFACES_KEYWORD = "several_surfaces"
 """Keyword for the first shot whose footprint has several surfaces, in place of a shot's number."""
 _VIEW_DIRECTION_RULE = ChoiceRule(
-    description="Where from", options=("oblique", "above", "side", "front")
+    description="Direction from which the cloud is seen",
+    options=("oblique", "above", "side", "front"),
 )
 _EYE_ANGLE_RULES = {
-    "azimuth": declare.quantity_rule("Of the eye, from x towards y", "rad", "-60 deg"),
-    "elevation": declare.quantity_rule("Above the horizon", "rad", "30 deg", "-90 deg", "90 deg"),
+    "azimuth": declare.quantity_rule("Azimuth of the eye, from x towards y", "rad", "-60 deg"),
+    "elevation": declare.quantity_rule(
+        "Elevation of the eye above the horizon", "rad", "30 deg", "-90 deg", "90 deg"
+    ),
 }
 
 
@@ -293,7 +296,7 @@ def _crop_field(axis: str) -> Any:
 
 _SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
 _RANGES_FIELD = declare.choice_field(
-    "By whole bins, or interpolated between them", ("quantised", "interpolated")
+    "Ranges quantised to bins, or interpolated between bins", ("quantised", "interpolated")
 )
 _DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME_FIELD = declare.list_field(
@@ -314,7 +317,7 @@ class CloudFigure(SceneFigureBase):
     FILE_NAME_PARTS = ("scanner", "colour")
     kind: Literal["cloud"]
     scanner: str | None = _SCANNER_FIELD
-    colour: str = _plotted_quantity_field("What colours the points", "range")
+    colour: str = _plotted_quantity_field("Quantity that colours the points", "range")
     ranges: str = _RANGES_FIELD
     view: str | dict[str, float] = declare.field_with_rule(_VIEW_RULE, "oblique")
     x: CropLimits | None = _crop_field("x")
@@ -335,7 +338,7 @@ class ScatterFigure(SceneFigureBase):
     scanner: str | None = _SCANNER_FIELD
     x: str = _plotted_quantity_field("Quantity along x", "time")
     y: str = _plotted_quantity_field("Quantity along y")
-    colour: str = _plotted_quantity_field("What colours the points", "beam")
+    colour: str = _plotted_quantity_field("Quantity that colours the points", "beam")
     ranges: str = _RANGES_FIELD
     time: CropLimits | None = _TIME_FIELD
     draw: int = _DRAW_FIELD
@@ -363,7 +366,7 @@ class _NavigationFigureBase(SceneFigureBase):
         description="Scanners; all by default", element_noun="names", distinct=True,
     )  # fmt: skip
     quantity: str = declare.choice_field("Velocity vector or altitude", ("velocity", "altitude"))
-    show: str = declare.choice_field("Which statistics", ("all", "availability", "bias", "rmse"))
+    show: str = declare.choice_field("Statistics to show", ("all", "availability", "bias", "rmse"))
     bins: int = declare.integer_field("Bins of altitude", "12", "1", "1000", default=12)
 
 

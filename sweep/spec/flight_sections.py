@@ -30,11 +30,11 @@ class StraightPath(SpecSection):
     """Straight path with constant acceleration along it."""
 
     kind: Literal["straight"]
-    begin: Vector = declare.position_field("Where it begins", alias="from")
-    to: Vector = declare.position_field("Where it ends")
+    begin: Vector = declare.position_field("Position of the start", alias="from")
+    to: Vector = declare.position_field("Position of the end")
     initial_speed: float = declare.speed_field("Speed at the beginning")
     final_speed: float | None = declare.speed_field(
-        "Speed at the end; the initial one", default=None
+        "Speed at the end; by default the initial speed", default=None
     )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
@@ -56,7 +56,7 @@ class AccelerationPath(SpecSection):
     acceleration: Vector = declare.vector_field(
         "Acceleration", "m/s^2", "1 m/s^2", default=(0, 0, 0)
     )
-    duration: float = declare.duration_field("How long it lasts", at_least="1 ns")
+    duration: float = declare.duration_field("Duration of the path", at_least="1 ns")
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the trajectory of constant acceleration; `files` and `span` are not used."""
@@ -68,9 +68,9 @@ class WaypointPath(SpecSection):
     """Path through the waypoints of a table."""
 
     kind: Literal["waypoints"]
-    file: str = declare.file_path_field("CSV table with time, x, y, z and, if it likes, attitude")
+    file: str = declare.file_path_field("CSV table with time, x, y, z and optionally attitude")
     smooth: bool = declare.flag_field(
-        "Join them by a cubic spline, not by straight lines", default=True
+        "Join the waypoints by a cubic spline, not by straight lines", default=True
     )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
@@ -85,9 +85,9 @@ class StationaryPath(SpecSection):
     """Path of a body at rest."""
 
     kind: Literal["still"]
-    position: Vector = declare.position_field("Where it stays")
+    position: Vector = declare.position_field("Position of the body")
     duration: float | None = declare.duration_field(
-        "How long; a target stays throughout the flight by default", at_least="1 ns", default=None
+        "Duration; by default a target stays throughout the flight", at_least="1 ns", default=None
     )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
@@ -114,12 +114,18 @@ class Orientation(SpecSection):
     """Rotation of a body relative to the world, or of an instrument relative to its body."""
 
     heading: float = declare.angle_field(
-        "Of forward, from x, counter-clockwise from above", default=0.0
+        "Direction of the forward axis, from x, counter-clockwise seen from above", default=0.0
     )
-    pitch: float = declare.angle_field("Nose up", "10 deg", "-90 deg", "90 deg", default=0.0)
-    roll: float = declare.angle_field("Left side up", default=0.0)
+    pitch: float = declare.angle_field(
+        "Angle by which the nose is up", "10 deg", "-90 deg", "90 deg", default=0.0
+    )
+    roll: float = declare.angle_field("Angle by which the left side is up", default=0.0)
     quaternion: Vector | None = declare.vector_field(
-        "The turn as w, x, y, z, instead of angles", "", "0.5", dimensions=4, default=None
+        "Rotation as a quaternion w, x, y, z, in place of angles",
+        "",
+        "0.5",
+        dimensions=4,
+        default=None,
     )
 
     def to_quaternion(self) -> np.ndarray:
@@ -142,7 +148,8 @@ class NadirAttitude(SpecSection):
 
     kind: Literal["nadir"]
     heading: float | str = declare.angle_field(
-        "Of forward, from x, counter-clockwise from above; 'track' follows the path",
+        "Direction of the forward axis, from x, counter-clockwise seen from above; 'track' follows "
+        "the path",
         keyword="track", keyword_value="track", default=0.0,
     )  # fmt: skip
 
@@ -155,7 +162,7 @@ class AlongTrackAttitude(SpecSection):
     """Attitude whose forward axis points along the velocity."""
 
     kind: Literal["along_track"]
-    roll: float = declare.angle_field("Left side up", default=0.0)
+    roll: float = declare.angle_field("Angle by which the left side is up", default=0.0)
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the attitude law of a body whose forward axis points along its velocity."""
@@ -347,7 +354,7 @@ class BeamDirectionsRule(Rule):
         )
 
     def format(self, value: Any) -> Any:
-        """Return lists that read back as exactly `value`."""
+        """Return the beams as a spec would hold them; `read` converts them back exactly."""
         return [beam_rule(beam).format(beam) for beam in value]
 
     def _value_schema(self) -> JsonObject:
@@ -382,8 +389,12 @@ class ConeScanner(SpecSection):
 
     kind: Literal["cone"]
     beams: int = declare.integer_field("Beams", "3", at_most=str(BEAMS_MAX))
-    half_angle: float = declare.angle_field("From nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
-    azimuth: float = declare.angle_field("Of the first beam, from forward to the left", default=0.0)
+    half_angle: float = declare.angle_field(
+        "Angle between the beams and nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS
+    )
+    azimuth: float = declare.angle_field(
+        "Azimuth of the first beam, from forward towards the left", default=0.0
+    )
     rate: float = _CYCLE_RATE_FIELD
     interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
 
@@ -423,7 +434,9 @@ class CornersScanner(SpecSection):
     """One beam steered to the corners of a square."""
 
     kind: Literal["corners"]
-    angle: float = declare.angle_field("Of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
+    angle: float = declare.angle_field(
+        "Angle of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS
+    )
     rate: float = _CYCLE_RATE_FIELD
     interval: float | None = _INTERVAL_FIELD_EVEN_BY_DEFAULT
 

@@ -435,7 +435,7 @@ def _beam_findings(grid: GridValues) -> Iterator[Finding]:
         problem = "must be given, or beam_waist in its place"
         yield grid.make_finding(beam.DIVERGENCE_PATH, problem, "write e.g. '50 urad'")
     elif grid.any_point_meets({beam.DIVERGENCE_PATH: _is_positive, beam.WAIST_PATH: _is_positive}):
-        problem = "stands beside beam_divergence, and each follows from the other"
+        problem = "is given in addition to beam_divergence, and each follows from the other"
         yield grid.make_finding(beam.WAIST_PATH, problem, "leave one of them out")
     else:
         yield from _beam_width_findings(grid)
@@ -632,7 +632,7 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
         added_in_amplitude
         | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _condition_equal_to("gaussian")}
     ):
-        problem = "tells nothing of the phase from one record to the next, of which the sum is made"
+        problem = "does not determine the phase from one record to the next, which the sum needs"
         yield grid.make_finding(LINE_SHAPE_PATH, problem, "take lorentzian, or combine: power")
     if grid.any_point_meets(
         combined_by_bin
@@ -657,7 +657,7 @@ def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
-    """Yield a finding if noise is drawn with a leak line, or in the bins of several looks."""
+    """Yield a finding if draws of noise are requested with a leak line or several looks."""
     if method != "probabilities" and grid.any_point_meets(
         {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
     ):
@@ -680,7 +680,7 @@ def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the search band: missing or swapped ends, or counted bins outside."""
     missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.parameter_values(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
-        problem = "is left out, and a beat tells of range and velocity both"
+        problem = "is missing, and a beat depends on both range and velocity"
         yield Finding(tuple(missing_ends[0].split(".")), problem, "give all four ends, or none")
     for low, high in (SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS):
         least_span = _least_weighted_sum(grid, {high: 1.0, low: -1.0})
@@ -794,7 +794,7 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         _is_positive,
         beam.ARCHITECTURE_PATH,
         _condition_equal_to("direct"),
-        "makes speckle, of which direct detection averages over an unknown number",
+        "makes speckle, and direct detection averages an unknown number of speckle grains",
         "take a coherent receiver",
         holds_if_forced_on=True,
     ),
@@ -803,7 +803,7 @@ EFFECT_PARAMETER_REQUIREMENTS = (
         _is_positive,
         "footprint.speckle",
         _condition_equal_to("developed"),
-        "says how rough the target is, which developed speckle takes to be without limit",
+        "states the roughness of the target, which is unlimited in developed speckle",
         "set footprint.speckle: none",
     ),
     ParameterRequirement(
@@ -866,7 +866,7 @@ def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
             beam.ARCHITECTURE_PATH: _condition_equal_to("direct"),
         }
     ):
-        problem = "samples I and Q, of which direct detection has one"
+        problem = "samples I and Q, and direct detection has only one of them"
         yield grid.make_finding(RECORD_PATH, problem, "take a coherent receiver, or record: real")
     if (
         _least_weighted_sum(grid, {SAMPLE_RATE_PATH: 1.0, ANTIALIAS_BANDWIDTH_PATH: -1.0}) or 0.0
@@ -997,7 +997,7 @@ def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Ite
     yield from _drawn_noise_findings(grid, draws.method)
     if not draws.draws_whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA_METHOD}, number: 1000}}, or leave it out"
-        problem = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"
+        problem = f"examines whole spectra, which draws.method {draws.method!r} does not draw"
         for path in _changed_spectrum_method_paths(grid):
             yield grid.make_finding(path, problem, remedy)
     elif not draws.has_draws:

@@ -48,7 +48,9 @@ class Material(SpecSection):
     """Optical properties of a surface."""
 
     reflectance: float = REFLECTANCE_FIELD
-    reflectance_law: str = declare.choice_field("How it scatters", REFLECTANCE_LAWS, "lambert")
+    reflectance_law: str = declare.choice_field(
+        "Law by which the surface scatters light", REFLECTANCE_LAWS, "lambert"
+    )
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)
@@ -100,7 +102,7 @@ class Craters(SpecSection):
     )
     largest: float = declare.positive_length_field("Largest diameter", "300 m")
     least_fresh: float = declare.number_field(
-        "Freshness of the most worn, against 1", "0.1", "0", "1", default=0.1
+        "Freshness of the most worn craters; 1 is fresh", "0.1", "0", "1", default=0.1
     )
     equilibrium_diameter: float | None = declare.positive_length_field(
         "Diameter up to which craters have worn each other down; all by default", "100 m",
@@ -138,7 +140,7 @@ class Ground(Material, ABC):
         default=0.0,
     )  # fmt: skip
     factor: int = declare.integer_field(
-        "New grid steps to each old one, by a cubic spline", "8", "1", "1000", default=1
+        "Number of new grid steps for each old one, by a cubic spline", "8", "1", "1000", default=1
     )
     relief: Relief | None = None
     craters: Craters | None = None
@@ -210,7 +212,7 @@ class PlacedGround(Ground):
     """Base of grounds whose grid has no coordinates: `position` places its middle."""
 
     position: Vector = declare.position_field(
-        "Where the middle of its grid lies, its heights above that", default=(0.0, 0.0, 0.0)
+        "Position of the grid's middle; heights are relative to its z", default=(0.0, 0.0, 0.0)
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
@@ -236,10 +238,13 @@ class JacksboroGround(PlacedGround):
 
     kind: Literal["jacksboro"]
     size: float | None = declare.length_field(
-        "Side of the square cut from it; all of it by default", "3 km", "1 km", default=None
+        "Side of the square cut from the survey; by default all of the survey",
+        "3 km",
+        "1 km",
+        default=None,
     )
     middle: Vector = declare.position_field(
-        "Middle of that square, eastwards and northwards from that of the survey",
+        "Middle of that square, eastwards and northwards from the middle of the survey",
         dimensions=2, default=(0.0, 0.0),
     )  # fmt: skip
 
@@ -263,11 +268,11 @@ class JacksboroGround(PlacedGround):
 
 
 _NO_DATA_FIELD = declare.number_field(
-    "Value that stands for a missing height, where the file does not declare it",
+    "Value that stands for a missing height, if the file does not declare it",
     "-9999", "-1e39", "1e39", default=None,
 )  # fmt: skip
 _HEIGHT_SCALE_FIELD = declare.number_field(
-    "Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0
+    "Metres per unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0
 )
 
 
@@ -294,7 +299,7 @@ class RasterGround(Ground):
         "northwards, of a map whose scale differs from that of the ground",
     )  # fmt: skip
     height_unit: str | None = declare.text_field(
-        "Unit of the heights, where the file does not tell it: m, ft, sft (US survey foot)", None
+        "Unit of the heights, if the file does not state it: m, ft, sft (US survey foot)", None
     )
     no_data: float | None = _NO_DATA_FIELD
     pixel: float | None = declare.positive_length_field(
@@ -398,11 +403,11 @@ class PlaneGround(SquareGround):
     """Square plane with an optional slope."""
 
     kind: Literal["plane"]
-    height: float = declare.length_field("Height of its middle", "0 m", default=0.0)
+    height: float = declare.length_field("Height of the plane's middle", "0 m", default=0.0)
     slope: float = declare.angle_field(
         "Angle from the level", "10 deg", "0 deg", "80 deg", default=0.0
     )
-    uphill: float = declare.angle_field("Heading in which it rises", "90 deg", default=0.0)
+    uphill: float = declare.angle_field("Heading in which the plane rises", "90 deg", default=0.0)
     spacing: float | None = declare.positive_length_field(
         "Grid step, for relief and craters; one cell by default", "5 m", default=None
     )

@@ -424,9 +424,9 @@ class NumericRule(Rule):
         return None
 
     def format(self, value: Any) -> str | int | float:
-        """Return a number, or text such as ``0.001 W``, that reads back as exactly `value`.
+        """Return a number, or text such as ``0.001 W``; `read` converts it back exactly.
 
-        Decibels read back to 15 digits.
+        Decibels are converted back to 15 digits.
         """
         if self.keyword and value == self.keyword_value:
             return self.keyword
@@ -575,7 +575,7 @@ class TextRule(Rule):
             )
             raise QuantityError("must be text", remedy)
         if re.fullmatch(self.pattern, str(raw_value)) is None:
-            raise QuantityError("is no text that can stand here", self.remedy)
+            raise QuantityError("is no valid text for this field", self.remedy)
         return str(raw_value)
 
     def _value_schema(self) -> JsonObject:
@@ -590,7 +590,7 @@ class FilePathRule(Rule):
     """Function that returns the digest of all that is read from the file."""
 
     def read(self, raw_value: object) -> str:
-        """Return the path as written."""
+        """Return the path as written, after a check that it may be the path of a file."""
         if not isinstance(raw_value, str) or not 0 < len(raw_value.strip()) <= 4096:
             raise QuantityError("must be the path of a file", "write it relative to this file")
         if "\0" in raw_value:
@@ -650,7 +650,7 @@ class ListRule(Rule):
         return values
 
     def format(self, value: Any) -> Any:
-        """Return a list that reads back as exactly `value`."""
+        """Return the list as a spec would hold it; `read` converts it back exactly."""
         return [self.element_rule.format(element) for element in value]
 
     def _value_schema(self) -> JsonObject:
@@ -726,7 +726,7 @@ class FrequencyErrorTableRule(Rule):
         return table_text
 
     def format(self, value: Any) -> Any:
-        """Return rows that read back as exactly `value`."""
+        """Return the rows as a spec would hold them; `read` converts them back exactly."""
         if value == NO_TABLE:
             return value
         rules = (_CHIRP_TIME_RULE, _FREQUENCY_ERROR_RULE)

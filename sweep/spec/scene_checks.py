@@ -47,7 +47,7 @@ _SOLIDS_WITH_REQUIRED_POSITION = (scene_sections.Sphere, scene_sections.Box)
 OBJECTS_LOCATION: Location = ("scene", "objects")
 """Location of the section of objects in a spec."""
 _N_ATTITUDE_TRIAL_TIMES = 257
-"""Number of times along a path at which its attitude is evaluated as a trial."""
+"""Number of instants of a path at which its attitude is evaluated as a trial."""
 
 
 def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
@@ -269,7 +269,7 @@ def _solid_findings(
     """Yield mistakes in a solid: two positions or none, an invalid rotation, an unknown unit."""
     position_location = (*location, "position")
     if scene_object.motion is not None and scene_object.position is not None:
-        problem = "stands beside a motion, whose path places the object"
+        problem = "is given in addition to a motion, whose path places the object"
         yield Finding(position_location, problem, "leave one of them out")
     if (
         isinstance(scene_object, _SOLIDS_WITH_REQUIRED_POSITION)
@@ -495,12 +495,12 @@ def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
     """
     parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(grid.values)
     if parameters[PATTERN_PATH] in ("line", "square"):
-        problem = "stands for a plane alone, and the ground of a scene is none"
+        problem = "is only for a plane, and the ground of a scene is none"
         yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN_PATH])
     for axis in grid.axes:
         for parameter in axis.parameters:
             location = parameter_location(parameter.path, grid.axes)
             yield from variation_findings(parameters, parameter.path, parameter.values, location)
         if axis.is_zipped and axis.name in store_array_and_dimension_names():
-            problem = "bears the name of something stored"
+            problem = "has the name of an array or dimension of the store"
             yield Finding(("axes", axis.name), problem, "take a word such as 'cut'")

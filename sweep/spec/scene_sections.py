@@ -57,7 +57,8 @@ class SolidObject(Material, ABC):
     """
 
     position: Vector | None = declare.position_field(
-        "Where its own zero lies; its coordinates as they are", default=None
+        "Position of the object's own origin; by default its coordinates stay as they are",
+        default=None,
     )
     rotation: Orientation = Orientation()
     motion: RigidMotion | None = None
@@ -84,8 +85,12 @@ class MeshObject(SolidObject):
     file: str = declare.file_path_field(
         "The mesh: STL, OBJ, PLY, OFF or glTF; polygons are cut into triangles"
     )
-    unit: str | None = declare.text_field("Unit of its lengths; the file's own, or m", None)
-    up: str | None = declare.choice_field("Its vertical axis; y for glTF, else z", ("y", "z"), None)
+    unit: str | None = declare.text_field(
+        "Unit of the file's lengths; by default the unit that the file states, or m", None
+    )
+    up: str | None = declare.choice_field(
+        "Vertical axis of the file; by default y for glTF, else z", ("y", "z"), None
+    )
     scale: float = declare.number_field("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
@@ -101,7 +106,11 @@ class Sphere(SolidObject):
     kind: Literal["sphere"]
     radius: float = declare.positive_length_field("Radius", "1 m")
     subdivisions: int = declare.integer_field(
-        "Times that an icosahedron's faces are cut in four", "4", "0", "8", default=4
+        "Number of times that each face of an icosahedron is divided into four",
+        "4",
+        "0",
+        "8",
+        default=4,
     )
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
@@ -159,12 +168,12 @@ class Boulders(Material):
     """Half-ellipsoids on a ground, with random positions and sizes."""
 
     kind: Literal["boulders"]
-    on: str = declare.object_name_field("Ground that they lie on")
+    on: str = declare.object_name_field("Ground on which the boulders lie")
     law: Annotated[MartianRocks | PowerLaw, Field(discriminator="kind")]
     smallest: float = declare.positive_length_field("Smallest diameter", "0.5 m")
     largest: float = declare.positive_length_field("Largest diameter", "3 m")
     centre: Vector = declare.position_field(
-        "Middle of the square that they lie in", dimensions=2, default=(0.0, 0.0)
+        "Middle of the square in which the boulders lie", dimensions=2, default=(0.0, 0.0)
     )
     within: float | None = declare.positive_length_field(
         "Side of that square; all of the ground by default", "200 m", default=None
@@ -175,7 +184,13 @@ class Boulders(Material):
     elongation: float = declare.number_field(
         "Largest ratio of long to short axis", "1.5", "1", "10", default=1.5
     )
-    subdivisions: int = declare.integer_field("Refinement of their shape", "2", "0", "4", default=2)
+    subdivisions: int = declare.integer_field(
+        "Number of times that the triangles of a boulder are divided into four",
+        "2",
+        "0",
+        "4",
+        default=2,
+    )
     seed: int = declare.seed_field()
 
     def build_facets(self, ground: Terrain) -> Facets:
@@ -208,11 +223,17 @@ class TreeDimensions(SpecSection):
     """Mean dimensions of the trees of a clump."""
 
     height: float = declare.positive_length_field(
-        "From the ground to the top", "12 m", default=12.0
+        "Height from the ground to the top", "12 m", default=12.0
     )
-    crown_diameter: float = declare.positive_length_field("Across", "7 m", default=7.0)
-    crown_base: float = declare.length_field("Height of its lower end", "3 m", "0 m", default=3.0)
-    trunk_diameter: float = declare.positive_length_field("At the ground", "40 cm", default=0.4)
+    crown_diameter: float = declare.positive_length_field(
+        "Diameter of the crown", "7 m", default=7.0
+    )
+    crown_base: float = declare.length_field(
+        "Height of the crown's lower end", "3 m", "0 m", default=3.0
+    )
+    trunk_diameter: float = declare.positive_length_field(
+        "Diameter of the trunk at the ground", "40 cm", default=0.4
+    )
     leaf_length: float = declare.positive_length_field(
         "Long diagonal of a leaf", "30 cm", default=0.30
     )
@@ -223,7 +244,7 @@ class TreeDimensions(SpecSection):
         "One-sided leaf area over that of the outline", "2", "0", "20", default=2.0
     )
     variation: float = declare.number_field(
-        "Share by which sizes vary to each side", "0.25", "0", "0.99", default=0.25
+        "Fraction by which sizes vary to either side", "0.25", "0", "0.99", default=0.25
     )
 
 
@@ -231,9 +252,11 @@ class Trees(SpecSection):
     """Clump of broad-leaved trees on a ground, with materials for leaves and trunks."""
 
     kind: Literal["trees"]
-    on: str = declare.object_name_field("Ground that they grow on")
+    on: str = declare.object_name_field("Ground on which the trees grow")
     centre: Vector = declare.position_field("Middle of the clump", dimensions=2, default=(0.0, 0.0))
-    radius: float = declare.positive_length_field("Trunks stand within it", "15 m")
+    radius: float = declare.positive_length_field(
+        "Radius of the circle in which trunks stand", "15 m"
+    )
     number: int = declare.integer_field("Trees", "7", at_most="10000")
     tree: TreeDimensions = TreeDimensions()
     leaf: Material
@@ -308,7 +331,7 @@ class Scene(SpecSection):
     origin: str = declare.object_name_field(
         "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN
     )
-    objects: dict[str, AnySceneObject] = Field(description="What there is, by name")
+    objects: dict[str, AnySceneObject] = Field(description="Objects of the scene, by name")
     solar_irradiance: float = sunlight_field("scene")
 
 
@@ -318,11 +341,11 @@ class SceneDraws(SpecSection):
     number: int = declare.integer_field("Draws", "1000", at_most="1e9", default=1)
     method: str = declare.choice_field(
         "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
-        "shot for instrument.processing.detector and .estimator to look at",
+        "shot for instrument.processing.detector and .estimator to examine",
         ("probabilities", "noise", SPECTRA_METHOD),
     )
     returns: int = declare.integer_field(
-        "Points kept of a shot at most", "4", at_most="64", default=4
+        "Largest number of points kept of a shot", "4", at_most="64", default=4
     )
 
     @property
@@ -415,13 +438,13 @@ class Interface(SpecSection):
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
     min_range: float | None = declare.length_field(
-        f"Least range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
+        f"Smallest range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
     )
     max_range: float | None = declare.length_field(
         f"Largest range that a report can hold; {_CLIPPING_NOTE}", "5 km", "0 m", default=None
     )
     min_radial_velocity: float | None = declare.quantity_field(
-        f"Least radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+        f"Smallest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
         "m/s", "-60 m/s", default=None,
     )  # fmt: skip
     max_radial_velocity: float | None = declare.quantity_field(
@@ -433,7 +456,7 @@ class Interface(SpecSection):
         "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,
     )  # fmt: skip
     value: str = declare.choice_field(
-        "What a report holds of the valid shots in its period: their mean, or the last",
+        "Value of a report: the mean of the valid shots in its period, or the last of them",
         ("mean", "last"),
     )
     valid_shots: int = declare.integer_field(
@@ -463,9 +486,9 @@ class SceneStorage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
     block_shots: int = declare.integer_field(
-        "Shots that one block holds at most", "4096", default=4096
+        "Largest number of shots in a block", "4096", default=4096
     )
-    block_draws: int = declare.integer_field("Draws that one block holds at most", "64", default=64)
+    block_draws: int = declare.integer_field("Largest number of draws in a block", "64", default=64)
 
 
 # The built scene: objects as bodies at which rays can be cast

@@ -37,12 +37,14 @@ def json_schema() -> JsonObject:
         definitions["Instrument"],
         "YAML file of the instrument, relative to this one",
     )
-    instrument["description"] = "A Doppler lidar: in whole, or fields set anew of a known one"
+    instrument["description"] = (
+        "A Doppler lidar: all of its fields, or changes to a known instrument"
+    )
     instrument["properties"] = {
         "like": {
             "enum": list(library_instrument_files()),
-            "description": "Instrument of the library, which has all fields that are not given "
-            "here; sweep instruments tells of each",
+            "description": "Instrument of the library that supplies all fields not given "
+            "here; sweep instruments describes each",
         },
         "file": {"type": "string", "description": file_description},
         **instrument["properties"],
@@ -70,7 +72,7 @@ def _complete_study_schema(
     """Add instrument, axes and required sections to the schema of a study."""
     study_schema["properties"]["instrument"] = {
         "description": "The instrument: its name in the library (sweep instruments), the path of "
-        "its file, one of these with fields set anew, or all of it",
+        "its file, one of these with changed fields, or all of its fields",
         "anyOf": [
             {"type": "string", "examples": ["settembrini_2026", "instruments/table_4_1.yaml"]},
             {"$ref": "#/$defs/Instrument"},

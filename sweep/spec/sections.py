@@ -79,7 +79,7 @@ class Chirp(SpecSection):
     duration: float = declare.duration_field("Length of one segment", "500 us", "1 ps", "1e6 s")
     segments: str = declare.choice_field(
         "Segments of a shot in the order of time: up- and down-chirp, and the light without a "
-        "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
+        "chirp, which measures the Doppler shift alone. 'up down' is the triangle of automotive "
         "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
         waveform.SEGMENT_ORDERS,
     )
@@ -112,7 +112,7 @@ class Telescope(SpecSection):
     )  # fmt: skip
     coupling: str = declare.choice_field(
         "Light that mixes with the local oscillator: that of a single mode, or all in "
-        "the aperture, as the thesis has it; direct detection always has all",
+        "the aperture, as in the thesis; direct detection always has all",
         COUPLINGS,
     )
 
@@ -150,15 +150,17 @@ class Receiver(SpecSection):
         "Hz", "250 MHz", *_FREQUENCY_BOUNDS, default=0.0, keyword="none",
     )  # fmt: skip
     antialias_order: int = declare.integer_field(
-        "Order of that filter, whose stop band falls by 6 dB an octave and order", "6", "3", "12",
-        default=6,
+        "Order of the anti-alias filter; its stop band falls by 6 dB per octave and order",
+        "6", "3", "12", default=6,
     )  # fmt: skip
     noise_shape: str = declare.choice_field(
         "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
         "white over the record",
         ("receiver", "white"),
     )
-    architecture: str = declare.choice_field("How the echo is detected", ARCHITECTURES)
+    architecture: str = declare.choice_field(
+        "Detection architecture of the receiver", ARCHITECTURES
+    )
     record: str = declare.choice_field(
         "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
         "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
@@ -176,7 +178,7 @@ class Receiver(SpecSection):
     )  # fmt: skip
     mixing_efficiency: float = declare.number_field(
         "Heterodyne efficiency: share of the echo's power that mixes with the local "
-        "oscillator, as which it counts in the SNR",
+        "oscillator and counts in the SNR",
         "0.7", "1e-9", "1", default=1.0, is_power_ratio=True,
     )  # fmt: skip
     apd_gain: float = declare.number_field(
@@ -256,13 +258,13 @@ class SearchBand(SpecSection):
     It selects bins by their beats.
     """
 
-    min_range: float | None = _search_limit_field("Least range looked for", "m", "10 m", "0 m")
-    max_range: float | None = _search_limit_field("Largest range looked for", "m", "2 km", "0 m")
+    min_range: float | None = _search_limit_field("Smallest range searched", "m", "10 m", "0 m")
+    max_range: float | None = _search_limit_field("Largest range searched", "m", "2 km", "0 m")
     min_radial_velocity: float | None = _search_limit_field(
-        "Least radial velocity looked for, positive when closing", "m/s", "-5 m/s"
+        "Smallest radial velocity searched, positive when closing", "m/s", "-5 m/s"
     )
     max_radial_velocity: float | None = _search_limit_field(
-        "Largest radial velocity looked for, positive when closing", "m/s", "40 m/s"
+        "Largest radial velocity searched, positive when closing", "m/s", "40 m/s"
     )
 
 
@@ -307,12 +309,12 @@ class Processing(SpecSection):
         ("half", "all"),
     )
     detection: str = declare.choice_field(
-        "Bins by which an echo is detected: any that it occupies, or the largest alone",
+        "Bins by which an echo is detected: any bin that it occupies, or the largest alone",
         ("any_bin", "peak_bin"),
     )
     shot_detection: str = declare.choice_field(
-        "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
-        "range and velocity where the third is missed",
+        "Segments in which a shot is detected: both chirps; or any two of three, which still give "
+        "range and velocity if the third is missed",
         waveform.SHOT_DETECTIONS,
     )
     peaks: str = declare.choice_field(
@@ -322,7 +324,7 @@ class Processing(SpecSection):
         waveform.REPORTED_PEAKS,
     )
     two_beats: str = declare.choice_field(
-        "What is taken for granted where two beats of a real record tell range and velocity: far, "
+        "Assumption by which two beats of a real record give range and velocity: far, "
         "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
         "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
         waveform.TWO_BEAT_ASSUMPTIONS,
@@ -421,7 +423,7 @@ class Target(SpecSection):
     )
     reflectance: float = REFLECTANCE_FIELD
     reflectance_law: str = declare.choice_field(
-        "How it scatters: Lambertian, as regolith, or as the thesis has it",
+        "Law of reflection: Lambertian, that of regolith, or that of the thesis",
         REFLECTANCE_LAWS,
         "lambert",
     )
@@ -467,9 +469,9 @@ class Accuracy(SpecSection):
     """Accuracy of the computation; part of a study's identity."""
 
     tolerance: float = declare.number_field(
-        "How far a probability of detection, log10 of one of a false alarm or a relative "
-        "magnitude may be off by effects left out, all together, and where it is drawn a "
-        "probability by the half-width of its interval; 0 simulates all that the scene has",
+        "Largest error of a probability of detection, of log10 of a false-alarm probability and of "
+        "a relative magnitude by all omitted effects together; also the largest half-width of the "
+        "interval of a drawn probability. 0 simulates every effect that the scene has",
         "1e-3", "0", "1", default=1e-3,
     )  # fmt: skip
     confidence: float = declare.number_field(
@@ -498,7 +500,11 @@ class Draws(SpecSection):
     """Random realisations of each point."""
 
     number: int = declare.integer_field(
-        "Draws a point; 0 computes probabilities alone", "10000", "0", "1e12", default=0
+        "Number of draws of a point; 0 computes probabilities alone",
+        "10000",
+        "0",
+        "1e12",
+        default=0,
     )
     limit: int = declare.integer_field(
         "Draws of a point at most, where it draws until accuracy.tolerance is met; 0 draws "
@@ -510,12 +516,12 @@ class Draws(SpecSection):
     )
     method: str = declare.choice_field(
         "Draw against the probabilities, add noise to the bins that matter, or draw "
-        "whole spectra for instrument.processing.detector and .estimator to look at",
+        "whole spectra for instrument.processing.detector and .estimator to examine",
         ("probabilities", "noise", SPECTRA_METHOD),
     )
     interval: str = declare.choice_field(
         "Interval of the share of draws with a detection, where noise alone is drawn: "
-        "at least as sure as promised everywhere, or on the average",
+        "with at least the stated confidence everywhere, or on average",
         tuple(COUNT_INTERVALS),
     )
 
@@ -539,7 +545,7 @@ class Storage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
     block_points: int = declare.integer_field(
-        "Points that one block holds at most; 0 for 65536, and more in studies so large that "
+        "Largest number of points in a block; 0 for 65536, and more in studies so large that "
         "their files would be too many to handle",
         "65536", "0", "1e9", default=0,
     )  # fmt: skip

@@ -111,12 +111,12 @@ WARNED_LINE_DRIFT_BINS_MIN = 2.0
 on the stated standard errors are too small."""
 
 _N_ACCELERATION_SAMPLES = 1000
-"""Number of times of a flight at which its acceleration is evaluated."""
+"""Number of instants of a flight at which its acceleration is evaluated."""
 
 FILE_DIGESTS_KEY = "files"
 """Key of a stored spec that holds the digest of each file by the file's path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections of a spec whose defaults are not written out."""
+"""Sections whose defaults the complete spec of `to_yaml_mapping` leaves out."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
 """Rule of the field `axes`: `read_axes` has read the axes before pydantic validates the spec."""
 
@@ -129,7 +129,7 @@ class BaseSpec(SpecSection):
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
 
-    title: str = declare.text_field("What the study is called")
+    title: str = declare.text_field("Title of the study")
     question: str = declare.text_field("The question that the study answers", "")
     instrument: sections.Instrument
     atmosphere: sections.Atmosphere = sections.Atmosphere()
@@ -502,7 +502,7 @@ def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
         any_two_condition
         | {waveform.DOPPLER_SLOPE_PATH: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
     ):
-        problem = "is another segment's too, and these two tell neither range nor velocity: any_two"
+        problem = "is another segment's too, and these two give neither range nor velocity: any_two"
         yield grid.make_finding(
             waveform.DOPPLER_SLOPE_PATH, problem, "write another, or take both_chirps"
         )
@@ -527,7 +527,7 @@ def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
          "may be the line of instrument.telescope.leak_path, whose noise has no law",
          "leave the leak's path out"),
         ({waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO},
-         "may be wrong in one of three segments, and shot_detection: any_two cannot tell in which",
+         "may be wrong in one of three segments, and shot_detection: any_two cannot show in which",
          "shot_detection: both_chirps"),
     )  # fmt: skip
     for conditions, problem, remedy in refused_combinations:
@@ -579,9 +579,14 @@ class GridSpec(BaseSpec):
                 )
             findings += () if draws.has_draws else undrawn_effect_findings(grid)
             if draws.number and draws.limit:
-                problem = f"stands beside draws.number, {draws.number}: only one of them can say "
-                remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw "
-                problem, remedy = f"{problem}how much to draw", f"{remedy}so many times"
+                problem = (
+                    f"is given in addition to draws.number, {draws.number}: only one of them can "
+                    "set how much to draw"
+                )
+                remedy = (
+                    "keep limit to draw until accuracy.tolerance is met, or number to draw so many "
+                    "times"
+                )
                 findings.append(Finding(("draws", "limit"), problem, remedy, draws.limit))
         return findings
 
@@ -676,7 +681,7 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return True if an axis may set the parameter at a dotted path without moving beamlets."""
+        """Return True if an axis may set the parameter at a dotted path: it moves no beamlet."""
         return not axis_refusal(path)[0]
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:

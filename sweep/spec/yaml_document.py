@@ -577,7 +577,10 @@ def _merge_error_floor(document: Document, instrument_floor: object, instrument_
 
 
 def _load_frequency_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
-    """Replace the path of a table of the sweep's frequency error by the rows of that CSV file."""
+    """Replace the path of a CSV file in an instrument's fields by the rows of the file.
+
+    The file holds the sweep's frequency error. Mistakes in it are added to the document's findings.
+    """
     chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE_PATH.split(".")
     if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
         return
@@ -849,7 +852,7 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
         return Finding(
             location, "lacks its kind", f"write {_kind_hint(resolved.value_models)}", raw_value
         )
-    problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has a value that cannot stand here")
+    problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has an invalid value")
     remedy = (
         _missing_field_remedy(resolved)
         if resolved.value_models

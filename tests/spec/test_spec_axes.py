@@ -233,5 +233,5 @@ def test_no_coordinate_bears_the_name_of_a_variable(tmp_path):
     assert beamlets.coordinate == "footprint_beamlets"
     pieces = [{"target.range": f"{r} km", "target.grazing_angle": "45 deg"} for r in (1, 2)]
     for name in ("pd_shot", "range_error", "effects", "n_draws", "range_bias"):
-        with pytest.raises(SpecError, match=f"axes.{name}: bears the name of a variable"):
+        with pytest.raises(SpecError, match=f"axes.{name}: has the name of a variable"):
             GridSpec.from_mapping(changed_spec(axes={name: {"zip": pieces}}))

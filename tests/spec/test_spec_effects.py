@@ -264,7 +264,7 @@ def test_speckle_is_refused_for_direct_detection(on_axis):
         changes["axes"] = {"instrument.receiver.architecture": ["homodyne", "direct"]}
     else:
         changes |= receiver
-    with pytest.raises(SpecError, match="makes speckle, of which direct detection averages"):
+    with pytest.raises(SpecError, match="makes speckle, and direct detection averages"):
         spec(changes)
     assert spec(changes | {"effects.speckle": "off"}).effect_modes()["speckle"] == "off"
 
