@@ -1,4 +1,4 @@
-"""Cost of accuracy in time: docs/accuracy.md and its figures, from `sweep accuracy` itself.
+"""Write docs/accuracy.md and its figures: the cost of accuracy in time, by `sweep accuracy`.
 
 Run with `make accuracy`, some quarter of an hour. Names of studies below as arguments measure
 those alone and print their sections; --time-limit SECONDS is that of each (180).
@@ -18,7 +18,7 @@ from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting
 
 
 class MeasuredStudy(NamedTuple):
-    """A study to measure: an experiment, what is put onto it, and why it is looked at."""
+    """A study to measure: an experiment with overrides, and a description for the page."""
 
     experiment: str
     heading: str
@@ -152,7 +152,7 @@ Take the cheapest setting that meets the error you can live with: for most studi
 
 
 def study_section(name: str, study: MeasuredStudy, time_limit: float) -> str:
-    """A study's part of the page; its figure is drawn."""
+    """Return a study's section of the page, and draw the study's figure."""
     spec = AccuracySetting(name="", kind=AS_WRITTEN_KIND, overrides=study.overrides).apply_to(
         load(EXPERIMENTS / f"{study.experiment}.yaml")
     )
@@ -184,7 +184,7 @@ def study_section(name: str, study: MeasuredStudy, time_limit: float) -> str:
 
 
 def main() -> None:
-    """The whole page, or some of its sections."""
+    """Write the page, or print the sections of the studies named as arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*STUDIES, []])
     parser.add_argument("--time-limit", type=float, default=180.0)

@@ -1,4 +1,4 @@
-"""Helpers of the benchmarks: experiments with changes, tables, and pages to put them into."""
+"""Helpers of the benchmarks: experiments with changed sections, Markdown tables and pages."""
 
 import tempfile
 import textwrap
@@ -12,7 +12,7 @@ TABLE_4_1 = EXPERIMENTS / "instruments" / "table_4_1.yaml"
 
 
 def experiment_spec(name: str, **changes: Any) -> Any:
-    """An experiment with sections put in the place of its own, and no figures."""
+    """Return the spec of an experiment without figures; `changes` replace whole sections."""
     from sweep.spec import GridSpec, SceneSpec
     from sweep.spec.axes import remove_fields_on_axes
     from sweep.spec.yaml_document import read_document
@@ -25,8 +25,8 @@ def experiment_spec(name: str, **changes: Any) -> Any:
 def experiment_mapping(folder: Path, name: str) -> dict[str, Any]:
     """Read an experiment of a check-out as plain data, without figures.
 
-    The path of an instrument's file is absolute. YAML reads some keys (`on`) as true: they are as
-    they were written.
+    The path of an instrument's file becomes absolute. YAML reads the key `on` as true, which is
+    undone.
     """
     import yaml
 
@@ -50,7 +50,7 @@ def experiment_mapping(folder: Path, name: str) -> dict[str, Any]:
 
 
 def load_mapping(mapping: dict[str, Any]) -> Any:
-    """Load a study from plain data; an axis replaces the field of its name, in any version."""
+    """Load a spec from plain data, by any version of sweep; an axis replaces its field."""
     import contextlib
 
     import yaml
@@ -68,17 +68,17 @@ def load_mapping(mapping: dict[str, Any]) -> Any:
 
 
 def markdown_row(cells: Iterable[str]) -> str:
-    """A row of a table in Markdown."""
+    """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a Markdown table."""
     return "\n".join(map(markdown_row, [head, ["---"] * len(head), *rows]))
 
 
 def wrap_page(page: str) -> str:
-    """A page whose paragraphs have lines of 100 characters; tables, lists and heads stay."""
+    """Wrap the paragraphs of a Markdown page to 100 characters; keep tables, lists and headings."""
     parts = page.split("\n\n")
     return "\n\n".join(
         part if part.lstrip().startswith(("|", "-", "#")) else textwrap.fill(part, 100)
@@ -87,7 +87,7 @@ def wrap_page(page: str) -> str:
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table."""
+    """Print a table to the terminal."""
     from rich.console import Console
     from rich.table import Table
 
@@ -98,7 +98,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def replace_page_part(page: str, name: str, content: str) -> None:
-    """Put text between the marks of that name in a page of docs."""
+    """Replace the text between the marks ``name: begin`` and ``name: end`` in a page of docs/."""
     path, begin_mark, end_mark = DOCS / page, f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, found_begin, after_begin = path.read_text(encoding="utf-8").partition(begin_mark)
     _, found_end, after = after_begin.partition(end_mark)

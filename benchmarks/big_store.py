@@ -1,8 +1,9 @@
-"""A store larger than memory, reduced in bounded memory: ``python benchmarks/big_store.py``.
+"""Reduce a store larger than memory in bounded memory: ``python benchmarks/big_store.py``.
 
-A store of 10 GB (uncompressed), laid out as sweep lays it out, is filled with made-up results that
-follow a closed form, and then summarised. Prints times and the largest resident size of the process
-that reads, which is a process of its own. ``--gigabytes`` and ``--directory``: how much, and where.
+A store of 10 GB (uncompressed), in sweep's layout, is filled with invented results that follow a
+closed form, and then summarised by another process. The script prints times and the largest
+resident size of that process. ``--gigabytes`` sets the size, ``--directory`` the place of the
+store.
 """
 
 import argparse
@@ -20,11 +21,11 @@ from scipy.special import ndtr
 
 N_ANGLES, BLOCK_POINTS = 90, 65_536
 BYTES_PER_POINT = 8 * 27 + 4
-"""27 arrays of floats and one of flags."""
+"""Uncompressed bytes of a point: 27 arrays of 8-byte floats, and one of 4-byte flags."""
 
 
 def spec_of_size(gigabytes, block_points=BLOCK_POINTS, powers=100, figures=()):
-    """A study of about so many GB of results."""
+    """Return the spec of a grid whose results take about `gigabytes` GB uncompressed."""
     ranges = max(2, round(gigabytes * 1e9 / BYTES_PER_POINT / N_ANGLES / powers))
     return experiment_spec(
         "range_angle_coarse",
@@ -40,7 +41,7 @@ def spec_of_size(gigabytes, block_points=BLOCK_POINTS, powers=100, figures=()):
 
 
 def make_store(path, spec):
-    """The store, every block written with the closed form of `pd_deviate`; its size [B]."""
+    """Write a store with pd from `pd_deviate`; return its uncompressed size [bytes]."""
     from sweep.tasks.engine import study_store
     from sweep.tasks.studies.grid_study import GridStudy
 
@@ -73,22 +74,22 @@ def make_store(path, spec):
 
 
 def pd_deviate(distance, grazing_angle, power):
-    """Normal deviate of the made-up pd: z(0.9) at :func:`range_at_pd_90`."""
+    """Return the normal deviate of the invented pd, which is z(0.9) at `range_at_pd_90`."""
     return 1.2815515655446004 + 8 * (1 - distance / range_at_pd_90(grazing_angle, power))
 
 
 def range_at_pd_90(grazing_angle, power):
-    """Range [m] at which the made-up pd is 0.9."""
+    """Return the range at which the invented pd is 0.9 [m]."""
     return 6000 * np.sqrt(power) * np.sin(grazing_angle) ** 0.5
 
 
 def peak_memory_mb():
-    """Largest resident size of this process."""
+    """Return the largest resident size of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def reduce_store(path):
-    """Summary and maximum range of a store; seconds, and the largest error of the range [m]."""
+    """Compute summary and maximum range of a store; return their time, memory and error by name."""
     import dask.array  # noqa: F401
     import zarr  # noqa: F401
 

@@ -1,4 +1,4 @@
-"""False alarms, losses and masking of the detectors, and errors of the estimators.
+"""Measure false alarms, losses and masking of detectors, and errors of estimators.
 
 Run with `make detectors`, a minute on one core. Writes the tables and figures of docs/detectors.md.
 """
@@ -45,7 +45,7 @@ TONE_BIN, N_TONES, SNR_DB = 200, 500, np.arange(8, 61, 4.0)
 
 
 def detector_setting(name: str, fft_size: int, **changes: float) -> SpectrumSettings:
-    """Settings of detectors and estimators in noise of variance 1."""
+    """Return the settings of detectors and estimators in noise of variance 1."""
     w = get_window(name, RECORD_LENGTH)
     options = {
         "noise_power": w.energy,
@@ -61,7 +61,7 @@ def detector_setting(name: str, fft_size: int, **changes: float) -> SpectrumSett
 
 
 def false_alarm_rows() -> Iterator[list[str]]:
-    """Rows: false alarms a bin over those designed for, in windowed and padded noise."""
+    """Yield table rows with the ratio of measured to design pfa, by window and padding."""
     for name, padding in WINDOWS_AND_PADDING:
         s = detector_setting(name, padding * RECORD_LENGTH)
         noise = np.random.default_rng(1).standard_normal(
@@ -76,7 +76,7 @@ def false_alarm_rows() -> Iterator[list[str]]:
 
 
 def loss_rows() -> Iterator[list[str]]:
-    """Rows: SNR beyond that of a known noise level, for a signal that fluctuates as speckle."""
+    """Yield table rows with the CFAR loss of each detector, for a signal with speckle."""
     for training in (16, 32, 64):
         for pfa in (1e-4, 1e-6):
             yield [
@@ -87,7 +87,7 @@ def loss_rows() -> Iterator[list[str]]:
 
 
 def cfar_loss_db(kind: str, training: int, pfa: float, pd: float = 0.5) -> float:
-    """That loss [dB], in closed form."""
+    """Return the CFAR loss in closed form: the SNR beyond that for a known noise level [dB]."""
     rank = 3 * training // 4
     factor = cfar_factor(kind, training=training, rank=rank, pfa=pfa)
 
@@ -100,7 +100,7 @@ def cfar_loss_db(kind: str, training: int, pfa: float, pd: float = 0.5) -> float
 
 
 def draw_masking(path: Path) -> None:
-    """Detection of a weak return at some distance from a strong one."""
+    """Draw the figure of pd of a weak return over its distance from a strong one."""
     separations = np.arange(2, 41)
     figure, axes = canvas.sheet_with_axes(10.0, 3.8, 1, 2, sharex=True, sharey=True)
     for axis, name in zip(axes, ("rectangular", "hann"), strict=True):
@@ -134,7 +134,10 @@ def draw_masking(path: Path) -> None:
 
 
 def masked_detections(detector: SpectrumSettings, separation: float) -> Iterator[np.ndarray]:
-    """Flags of each detector in the weak return's bin, draw by draw; it may lie on a null."""
+    """Yield the flags (draws,) of each detector in the weak return's bin.
+
+    The strong return lies `separation` + 0.5 bins above the weak one.
+    """
     rng, sample_numbers = np.random.default_rng(int(separation)), np.arange(RECORD_LENGTH)
     record = rng.standard_normal((MASKING_DRAWS, RECORD_LENGTH))
     for snr_db, line_bin in ((WEAK_SNR_DB, WEAK_BIN), (STRONG_SNR_DB, WEAK_BIN + separation + 0.5)):
@@ -148,13 +151,16 @@ def masked_detections(detector: SpectrumSettings, separation: float) -> Iterator
 
 
 def tone_amplitude(snr_db: float, detector: SpectrumSettings) -> float:
-    """Of a tone of some SNR after the FFT, in noise of variance 1."""
+    """Return the amplitude of a tone of an SNR after the FFT [dB], in noise of variance 1."""
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (snr_db / 10), window=detector.window)
     return float(np.sqrt(2 * cnr))
 
 
 def frequency_errors(name: str) -> dict[str, np.ndarray]:
-    """Errors [bins] of every estimator, (SNR, tones), of tones anywhere between bins."""
+    """Return the errors of each estimator (SNR, tones) for tones between bins [bins].
+
+    `name` is that of the window.
+    """
     detector, sample_numbers, rng = (
         detector_setting(name, RECORD_LENGTH),
         np.arange(RECORD_LENGTH),
@@ -180,7 +186,7 @@ def frequency_errors(name: str) -> dict[str, np.ndarray]:
 
 
 def frequency_error_bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Cramer-Rao bound, and what the largest value of the windowed spectrum reaches [bins]."""
+    """Return the Cramer-Rao bound and that of the windowed spectrum's peak, (SNR,) [bins]."""
     w = get_window(name, RECORD_LENGTH)
     cnr = estimators.carrier_to_noise_ratio(snr=10 ** (SNR_DB / 10), window=w)
     sample_rate = float(RECORD_LENGTH)
@@ -191,7 +197,7 @@ def frequency_error_bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_estimators(errors_by_window: dict[str, dict[str, np.ndarray]], path: Path) -> None:
-    """RMSE and bias over SNR, a column for each window."""
+    """Draw the figure of RMSE and bias of the estimators over SNR, with a column per window."""
     figure, axes = canvas.sheet_with_axes(
         12.5, 7.0, 2, len(errors_by_window), sharex=True, sharey="row"
     )
@@ -224,13 +230,13 @@ def draw_estimators(errors_by_window: dict[str, dict[str, np.ndarray]], path: Pa
 
 
 def bias_in_upper_half(error: np.ndarray) -> np.ndarray:
-    """|Mean error| of tones in the upper half of their bin, (SNR,)."""
+    """Return the |mean error| of tones in the upper half of their bin, (SNR,) [bins]."""
     bin_offset = np.random.default_rng(3).uniform(-0.5, 0.5, N_TONES)
     return np.abs(error[:, bin_offset > 0].mean(axis=1))
 
 
 def rmse_ratio_rows(errors_by_window: dict[str, dict[str, np.ndarray]]) -> Iterator[list[str]]:
-    """Rows: RMSE over the Cramer-Rao bound at three SNR."""
+    """Yield table rows with the ratio of RMSE to the Cramer-Rao bound at three SNR."""
     for kind in ESTIMATORS:
         cells = [f"`{kind}`"]
         for name, errors_by_estimator in errors_by_window.items():
@@ -243,7 +249,7 @@ def rmse_ratio_rows(errors_by_window: dict[str, dict[str, np.ndarray]]) -> Itera
 
 
 def main() -> None:
-    """Tables and figures, in their page and beside it."""
+    """Write the tables into docs/detectors.md, and the figures into docs/."""
     errors_by_window = {name: frequency_errors(name) for name in ("rectangular", "hamming")}
     estimator_heads = [
         "",

@@ -1,9 +1,9 @@
-"""All effects on against those that are called for: what it changes, what it saves.
+"""Compare effects on demand with all effects on: change of results, and time saved.
 
-Run with `make effects`, some minutes: every experiment in the repository, whole but for draws of a
-flight's noise, with each effect forced on, and with effects on demand at three tolerances.
-All in one process, one variant of an experiment after the other; quote the ratios. Writes
-docs/effects_table.md.
+Run with `make effects`, some minutes. Every experiment in the repository is computed with all
+effects forced on, and with effects on demand at three tolerances. Draws of noise in flights are
+left out. One process computes all variants in turn, so that ratios of times are more reliable than
+times. Writes docs/effects_table.md.
 """
 
 import sys
@@ -40,7 +40,7 @@ all blocks together take less than a second. Studies with draws take 1000 a poin
 
 
 class VariantResult(NamedTuple):
-    """Result of a variant of an experiment."""
+    """Times [s] and probabilities of a variant of an experiment."""
 
     seconds: float
     planning: float
@@ -48,7 +48,7 @@ class VariantResult(NamedTuple):
 
 
 def variant_spec(path: Path, tolerance: float | None) -> GridSpec | SceneSpec:
-    """An experiment with all effects on, for None, or on demand at a tolerance."""
+    """Return an experiment's spec with effects on demand at a tolerance, or all on for None."""
     mapping = read_document(path).content
     spec_class = SceneSpec if "scene" in mapping else GridSpec
     has_draws = spec_class is GridSpec and "draws" in mapping
@@ -65,7 +65,7 @@ def variant_spec(path: Path, tolerance: float | None) -> GridSpec | SceneSpec:
 def evaluate_variant(
     spec: GridSpec | SceneSpec, folder: Path, progress: Progress, title: str
 ) -> VariantResult:
-    """Probabilities of detection at every point, and the time that they took."""
+    """Compute the probabilities of detection at every point, and measure the time."""
     store_path, is_flight = folder / "study.zarr", isinstance(spec, SceneSpec)
     if is_flight and not (folder / "eyepoints").exists():
         driver.run(spec, store=store_path, progress=False)  # casts the rays
@@ -102,7 +102,10 @@ def evaluate_variant(
 
 
 def largest_change(first: VariantResult, second: VariantResult) -> float:
-    """Largest difference of any probability at any point; where one is nan, so is the other."""
+    """Return the largest difference of any probability at any point.
+
+    Both results must be nan at the same points.
+    """
     worst = 0.0
     for name, values in first.probabilities.items():
         change = np.abs(values - second.probabilities[name])
@@ -112,7 +115,7 @@ def largest_change(first: VariantResult, second: VariantResult) -> float:
 
 
 def experiment_row(path: Path, progress: Progress) -> str:
-    """An experiment's row of the table."""
+    """Return an experiment's row of the table."""
     cells = []
     with tempfile.TemporaryDirectory() as temporary:
         folder, name = Path(temporary), path.stem
@@ -133,7 +136,7 @@ def experiment_row(path: Path, progress: Progress) -> str:
 
 
 def main() -> None:
-    """The whole table."""
+    """Write the table, or print the rows of the experiments named as arguments."""
     names = sys.argv[1:]
     head = [
         "experiment",
@@ -159,7 +162,7 @@ def main() -> None:
 
 
 def reason_left_out(path: Path) -> str:
-    """Why an experiment is not looked at: a file is not here, or it has no probabilities."""
+    """Return why an experiment is left out: no file, or no probabilities; '' if it is not."""
     try:
         spec = load(path)
     except SpecError as error:

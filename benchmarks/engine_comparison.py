@@ -1,4 +1,4 @@
-"""Cost of the engine beside others': 10,000 points of a millisecond, stored, side by side.
+"""Compare the cost of the engine with that of others: 10,000 points of a millisecond, stored.
 
 Run with `make peers`, some six minutes on a quiet machine. Every contender computes the same three
 numbers at each point of a 100 x 100 grid, taking a millisecond of the processor's time over it,
@@ -38,7 +38,7 @@ POINT_SECONDS = 1e-3
 BATCH_POINTS = 1000
 N_ROUNDS = 3
 THROUGHPUT_SHARE_MIN = 0.8
-"""Share of the best contender's throughput."""
+"""Contenders with less than this share of the best throughput are left out of later rounds."""
 
 BLOCK_SECONDS = 1.0
 N_ONE_SECOND_BLOCKS = 100
@@ -46,14 +46,14 @@ VARIABLE_NAMES = ("a", "b", "c")
 
 
 def burn_cpu(seconds: float) -> None:
-    """Take so much of the processor's time."""
+    """Spend a given processor time [s]."""
     end = time.thread_time() + seconds
     while time.thread_time() < end:
         pass
 
 
 def cpu_seconds_of_process_tree() -> float:
-    """Seconds of the processor's that this process and all below it have taken."""
+    """Return the processor time of this process and all its descendants [s]."""
     this_process = psutil.Process()
     cpu_seconds = 0.0
     for process in (this_process, *this_process.children(recursive=True)):
@@ -64,13 +64,13 @@ def cpu_seconds_of_process_tree() -> float:
 
 
 def compute_point(x: float, y: float) -> tuple[float, float, float]:
-    """Three numbers, a millisecond later."""
+    """Return the three numbers of a point after a millisecond of processor time."""
     burn_cpu(POINT_SECONDS)
     return x + y, x * y, x - y
 
 
 def point_coordinates() -> tuple[np.ndarray, np.ndarray]:
-    """Both coordinates of every point."""
+    """Return the two coordinates of every point, (points,) each."""
     x, y = np.meshgrid(
         np.arange(POINTS_PER_AXIS, dtype=float),
         np.arange(POINTS_PER_AXIS, dtype=float),
@@ -80,7 +80,7 @@ def point_coordinates() -> tuple[np.ndarray, np.ndarray]:
 
 
 def results_to_dataset(results) -> xr.Dataset:
-    """Results of every point, in order, as a Dataset."""
+    """Return the results of all points, in order, as a Dataset."""
     columns = np.asarray(results).reshape(POINTS_PER_AXIS, POINTS_PER_AXIS, len(VARIABLE_NAMES))
     return xr.Dataset(
         {name: (("x", "y"), columns[..., column]) for column, name in enumerate(VARIABLE_NAMES)}
@@ -88,13 +88,16 @@ def results_to_dataset(results) -> xr.Dataset:
 
 
 def run_plain_loop(n_points: int) -> None:
-    """A plain loop over so many points."""
+    """Compute points in a plain loop."""
     for i in range(n_points):
         compute_point(float(i), 1.0)
 
 
 def ideal_seconds(workers: int) -> float:
-    """Seconds of plain loops over all points, on as many processes, nothing stored."""
+    """Return the wall time of plain loops over all points in parallel processes [s].
+
+    Nothing is stored.
+    """
     context = multiprocessing.get_context("fork")
     start = time.perf_counter()
     children = [
@@ -108,7 +111,7 @@ def ideal_seconds(workers: int) -> float:
 
 
 def grid_spec(block_points: int = BATCH_POINTS):
-    """A grid of 100 x 100 points."""
+    """Return the spec of a grid of 100 x 100 points."""
     axes = {
         "target.range": {"linear": ["10 m", "5 km"], "number": POINTS_PER_AXIS},
         "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": POINTS_PER_AXIS},
@@ -118,7 +121,7 @@ def grid_spec(block_points: int = BATCH_POINTS):
 
 @contextmanager
 def sweep_contender(workers: int, folder: Path):
-    """`sweep.run` on a client whose workers are up."""
+    """Context manager: yield a function that runs `sweep.run` on workers already started."""
     import sweep
 
     spec = grid_spec()
@@ -134,19 +137,19 @@ def sweep_contender(workers: int, folder: Path):
 
 
 def evaluate_millisecond_points(study, block):
-    """A block's arrays a millisecond a point later; their values are those of no model."""
+    """Return invented arrays of a block after a millisecond of processor time per point."""
     burn_cpu(POINT_SECONDS * study.count_block_points(block))
     return filled_block_arrays(study, block)
 
 
 def evaluate_one_second_block(study, block):
-    """A block's arrays a second later."""
+    """Return invented arrays of a block after a second of processor time."""
     burn_cpu(BLOCK_SECONDS)
     return filled_block_arrays(study, block)
 
 
 def filled_block_arrays(study, block: int) -> dict[str, np.ndarray]:
-    """Arrays of the shapes and types that a block has, with numbers that don't compress away."""
+    """Return arrays with a block's shapes and types, whose numbers do not compress away."""
     values = np.arange(study.count_block_points(block), dtype=float)
     return {
         name: np.resize(
@@ -157,7 +160,7 @@ def filled_block_arrays(study, block: int) -> dict[str, np.ndarray]:
 
 
 def import_on_workers(client, folder: Path) -> None:
-    """Have every worker import what it will need, as any long study has after seconds."""
+    """Let every worker import all modules that a study needs, by running a small study."""
     import sweep
 
     store = folder / "rehearsal.zarr"
@@ -168,7 +171,7 @@ def import_on_workers(client, folder: Path) -> None:
 
 @contextmanager
 def sweep_cluster_client(workers: int):
-    """A client of workers that are started as `sweep run` does."""
+    """Context manager: yield a client whose workers are started as by `sweep run`."""
     from sweep.tasks.engine.cluster_connection import connect_cluster
     from sweep.tasks.engine.session import RunOptions
     from sweep.tasks.studies.workload import SpecWorkload
@@ -184,7 +187,7 @@ def sweep_cluster_client(workers: int):
 
 @contextmanager
 def dask_client(workers: int):
-    """A Dask client of as many processes, none of them idle for want of imports."""
+    """Context manager: yield a client of `workers` Dask worker processes that are ready."""
     from distributed import Client, LocalCluster
 
     with (
@@ -200,7 +203,10 @@ def dask_client(workers: int):
 
 @contextmanager
 def joblib_contender(workers: int, folder: Path):
-    """joblib (loky), its processes up, results gathered here and stored at the end: no resume."""
+    """Context manager: yield a function that computes with joblib (loky) and stores at the end.
+
+    The processes are already started. A stopped run can't be resumed.
+    """
     import joblib
 
     parallel = joblib.Parallel(n_jobs=workers, batch_size=BATCH_POINTS)
@@ -216,7 +222,10 @@ def joblib_contender(workers: int, folder: Path):
 
 @contextmanager
 def xyzpy_crop_contender(workers: int, folder: Path):
-    """xyzpy: a Crop of batches on disk, grown by loky's processes, reaped into one file."""
+    """Context manager: yield a function that computes an xyzpy Crop with loky's processes.
+
+    Batches are kept on disk and then joined in one file.
+    """
     import xyzpy
     from joblib.externals.loky import get_reusable_executor
 
@@ -241,7 +250,7 @@ def xyzpy_crop_contender(workers: int, folder: Path):
 
 @contextmanager
 def xyzpy_dask_contender(workers: int, folder: Path):
-    """xyzpy on Dask: a task a point."""
+    """Context manager: yield a function that computes with xyzpy on Dask, one task per point."""
     import xyzpy
 
     with dask_client(workers) as client:
@@ -261,7 +270,7 @@ def xyzpy_dask_contender(workers: int, folder: Path):
 
 @contextmanager
 def dask_delayed_contender(workers: int, folder: Path):
-    """dask.delayed, a task a point as its users write it, and xarray."""
+    """Context manager: yield a function that computes with dask.delayed, one task per point."""
     import dask
 
     with dask_client(workers) as client:
@@ -287,14 +296,16 @@ CONTENDERS = {
 
 
 class IdealShares(NamedTuple):
-    """Shares of the ideal that a contender reaches."""
+    """Speed of a contender, as shares of the ideal."""
 
-    wall: float  # of plain loops right before and after it
-    cpu: float  # seconds of all points over those that the processor spent in all
+    wall: float
+    """Wall time of plain loops right before and after the contender, over its own."""
+    cpu: float
+    """Processor time of the points alone, over that of the contender in all."""
 
 
 def measure_contender(name: str, workers: int) -> IdealShares:
-    """Shares of the ideal that a contender reaches."""
+    """Run a contender once; return its speed as shares of the ideal."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         run_contender = stack.enter_context(CONTENDERS[name](workers, Path(folder)))
         ideal_before = ideal_seconds(workers)
@@ -311,7 +322,7 @@ def measure_contender(name: str, workers: int) -> IdealShares:
 
 
 def overhead_of_one_second_blocks(workers: int) -> float:
-    """Share of the wall time that is not the blocks' own, for blocks of a second."""
+    """Return the share of the wall time that blocks of a second do not take themselves."""
     import sweep
 
     with tempfile.TemporaryDirectory() as name, sweep_cluster_client(workers) as client:
@@ -328,19 +339,19 @@ def overhead_of_one_second_blocks(workers: int) -> float:
 
 
 def median_share(shares: list[IdealShares]) -> float:
-    """Median of the shares of the ideal."""
+    """Return the median of the wall-time shares of the ideal."""
     return statistics.median(share.wall for share in shares)
 
 
 def numbers_from_subprocess(*arguments: str) -> list[float]:
-    """Numbers that this program prints in a process of its own: contenders share nothing."""
+    """Run this script in a new process, so that contenders share nothing; return its numbers."""
     command = [sys.executable, __file__, *arguments]
     process = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(process.stdout.splitlines()[-1])
 
 
 def table_rows(shares: dict[str, list[IdealShares]], workers: int) -> list[list[str]]:
-    """Lines of the table, the fastest first."""
+    """Return the rows of the table, the fastest contender first."""
     table_lines = []
     for name, contender_shares in sorted(shares.items(), key=lambda item: -median_share(item[1])):
         rate, best = (
@@ -354,7 +365,7 @@ def table_rows(shares: dict[str, list[IdealShares]], workers: int) -> list[list[
 
 
 def main() -> None:
-    """Measure in turns, print, and put the table into the page."""
+    """Measure the contenders in turns, print the table and write it into docs/scale.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*CONTENDERS, []])
     parser.add_argument("--workers", type=int, default=2)

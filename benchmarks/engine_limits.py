@@ -1,8 +1,8 @@
-"""Limits of the engine: ``make scale`` writes its part of docs/scale.md.
+"""Measure limits of the engine: ``make scale`` writes a part of docs/scale.md.
 
-Blocks: what a plan, a log and the folders of up to ten million blocks cost to read, each in a
-process of its own. Workers: the engine's window over the real scheduler with a thousand worker
-slots whose tasks only wait, for tasks of several lengths: where it keeps them busy, and where not.
+Blocks: the time and memory to read the plan, the log and the folders of up to ten million blocks,
+each number of blocks in a process of its own. Workers: the share of time in which a thousand worker
+slots are busy, for tasks of several lengths that only wait, with the real scheduler.
 """
 
 import argparse
@@ -24,16 +24,16 @@ from benchmark_helpers import experiment_spec, markdown_table, replace_page_part
 BLOCK_NUMBERS = (10**4, 10**5, 10**6, 10**7)
 FILES_MAX = 10**6
 HARD_LINKS_MAX = 30_000
-"""Names of a file that a file system bears."""
+"""Maximum number of hard links to a file."""
 
 N_SLOTS = 1000
 TASK_SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 MEASURED_SECONDS = 30.0
-"""Seconds that each length is measured for."""
+"""Duration of the measurement for each length of tasks [s]."""
 
 
 class OneArrayStudy:
-    """A study of many blocks along one axis, of one array."""
+    """Stand-in for a study of many blocks along one axis, with one array."""
 
     points_noun, id = "points", "scale"
 
@@ -45,7 +45,7 @@ class OneArrayStudy:
 
 
 def make_receipt(block, points=65_536):
-    """A receipt as workers give it."""
+    """Return the receipt of a block, as a worker would."""
     from sweep.tasks.engine import study_store
     from sweep.tasks.engine.journal import Receipt
 
@@ -57,7 +57,10 @@ def make_receipt(block, points=65_536):
 
 
 def make_full_store(directory, n_blocks):
-    """A store's log, and its chunks as names of a few files, of so many blocks all done."""
+    """Make the log and the chunks of a store whose blocks are all done; return its path.
+
+    The chunks are hard links to a few files.
+    """
     store = Path(directory) / "line.zarr"
     (store / ".sweep").mkdir(parents=True)
     with open(store / ".sweep" / "receipts.jsonl", "wb") as log:
@@ -74,7 +77,7 @@ def make_full_store(directory, n_blocks):
 
 
 def iter_receipt_lines(n_blocks, points=65_536):
-    """Lines of a log, of so many blocks all done."""
+    """Yield the lines of the log of a store whose blocks are all done [bytes]."""
     from sweep.storage.store_format import append_line_digest
 
     record = {**vars(make_receipt(0, points)), "time": round(time.time(), 3)}
@@ -92,7 +95,7 @@ def time_call(function):
 
 
 def measure_blocks(n_blocks, store):
-    """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
+    """Print processor times [s] and memory [MB] that a number of blocks takes, as JSON."""
     from sweep.storage.store_format import read_receipt_totals
     from sweep.tasks.engine.journal import Journal, find_complete_blocks
     from sweep.tasks.engine.worker import BlockQueue
@@ -138,7 +141,7 @@ def measure_blocks(n_blocks, store):
 
 
 def iter_block_rows(directory):
-    """Rows of the table of blocks."""
+    """Yield the rows of the table of blocks."""
     for n_blocks in BLOCK_NUMBERS:
         store = make_full_store(directory, n_blocks)
         command = [sys.executable, __file__, "--blocks", str(n_blocks), "--store", str(store)]
@@ -150,7 +153,7 @@ def iter_block_rows(directory):
 
 
 def make_waiting_work(seconds):
-    """Work in place of computing: wait, and answer as for one long block a task."""
+    """Return a function that replaces the computing of a task: it waits `seconds`, then answers."""
 
     def wait_in_place_of_work(job, blocks):
         from sweep.tasks.engine.journal import Receipt
@@ -169,7 +172,7 @@ def make_waiting_work(seconds):
 
 
 def iter_worker_rows(slots, task_seconds, measured_seconds):
-    """Rows of the table of workers."""
+    """Yield the rows of the table of workers."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -198,7 +201,7 @@ def iter_worker_rows(slots, task_seconds, measured_seconds):
 
 
 def measure_throughput(client, seconds, measured_seconds):
-    """Tasks a second that go through, once all slots have work, and processor time of each."""
+    """Measure tasks per second once all slots have work, and processor time per task [s]."""
     from sweep.tasks.engine import dispatcher
     from sweep.tasks.engine.worker import TaskSettings
 
@@ -230,7 +233,7 @@ def measure_throughput(client, seconds, measured_seconds):
 
 
 def page_section(block_table, worker_table):
-    """Their part of the page."""
+    """Return the section of the page with both tables."""
     return f"""## Blocks
 
 {platform.processor() or platform.machine()}, {os.cpu_count()} processors, Python
@@ -255,7 +258,7 @@ them so (above).
 
 
 def main():
-    """All of it."""
+    """Measure blocks and workers, print both tables and write them into docs/scale.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--blocks", type=int)
     parser.add_argument("--store", type=Path)

@@ -1,13 +1,14 @@
-"""Answers of an earlier version, to hold this one against.
+"""Compare the results of this version with those of an earlier one.
 
     python benchmarks/frozen_answers.py write FILE.npz     # with the version that is installed
     python benchmarks/frozen_answers.py compare FILE.npz   # what differs from it, and by how much
 
 Points are drawn from every shipped study of a grid without draws and from random instruments whose
 echoes lie near DC and Nyquist, under effects on the record. The tolerance is 1e-9, so that two
-versions agree up to rounding wherever both are right. Laws that have changed since are left out.
-Only `sweep.load`, `run` and `open` are used: the script runs with any version. `--points` says how
-many of each, and names of studies look at those alone. `make frozen` does all of it.
+versions agree up to rounding wherever both are right. Effects whose laws have changed since are
+left out. Only `sweep.load`, `run` and `open` are used, so that the script runs with any version.
+`--points` sets the number of points of each study; names of studies restrict the comparison to
+these. `make frozen` writes and compares.
 """
 
 import argparse
@@ -25,26 +26,26 @@ from benchmark_helpers import experiment_mapping, load_mapping
 import sweep
 
 EXPERIMENTS = Path(sweep.__file__).parents[1] / "experiments"
-"""Those of the version that runs: each names the laws of the thesis as that version does."""
+"""Folder of the experiments of the installed version; specs name laws as their version does."""
 TOLERANCE = 1e-9
 SEED = 2029
 REDEFINED_VARIABLES = ("effects", "effects_error", "pfa_shot", "log10_pfa_shot", "beamlets_error")
-"""Variables with another meaning since: more effects, alarms of all segments of a shot, and a
-number of beamlets given by hand, whose error was 0 and is nan (not checked)."""
+"""Variables whose meaning has changed: there are more effects, the false alarms are those of all
+segments of a shot, and the error of a stated number of beamlets was 0 and is nan (not checked)."""
 DIFFERENCE_ALLOWED = 1e-6
-"""Difference beyond which a point is counted."""
+"""Largest difference of a point that does not count as a difference."""
 CHANGED_EFFECTS = ("doppler_spread", "segment_motion", "lag", "fading", "overlap")
-"""Effects whose laws are others since, or that are new: left out."""
+"""Effects that are new or whose laws have changed, and which are left out."""
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
 BINS_FROM_END_MAX = 40.0
-"""Bins from DC or Nyquist within which random echoes lie."""
+"""Largest distance of random echoes from DC or Nyquist [bins]."""
 SPEED_OF_LIGHT = 299792458.0
 
 
 def sampled_mapping(
     mapping: dict[str, Any], points: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """A study of so many points of a grid, drawn with replacement: one axis that varies all."""
+    """Return a study of `points` points of a grid, drawn with replacement, along one axis."""
     axes = mapping.get("axes", {})
     if not axes:
         return mapping
@@ -62,14 +63,14 @@ def sampled_mapping(
 
 
 def value_text(member: Any, index: int) -> str:
-    """A value of an axis as a spec has it."""
+    """Return a value of an axis as a spec states it."""
     values = member.display_values if hasattr(member, "display_values") else member.display
     value = values[index]
     return str(value) if isinstance(value, str) else f"{float(value)!r} {member.units}".strip()
 
 
 def iter_experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every shipped study of a grid without draws, exact and thinned."""
+    """Yield name and content of each experiment on a grid without draws, with fewer points."""
     for file in sorted(EXPERIMENTS.glob("*.yaml")):
         mapping = experiment_mapping(EXPERIMENTS, file.stem)
         if "draws" in mapping or "scene" in mapping:  # other random numbers and footprints since
@@ -83,7 +84,7 @@ def iter_experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def iter_random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Instruments whose up-chirp echo lies near DC or Nyquist, by window and phases."""
+    """Yield studies of random instruments with echoes near DC or Nyquist, by window and phases."""
     rng = np.random.default_rng(SEED)
     for window in WINDOWS:
         for phases, beamlets in (("coherent", 1), ("coherent", 37), ("incoherent", 37)):
@@ -112,7 +113,7 @@ def iter_random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]
 
 
 def random_instrument(rng: np.random.Generator) -> dict[str, str]:
-    """One instrument and target."""
+    """Return a random instrument and target, as values by path."""
     duration, bandwidth, wavelength = 2**12 / 100e6, rng.uniform(0.2e9, 1e9), 1.55e-6
     bins = rng.uniform(-BINS_FROM_END_MAX, BINS_FROM_END_MAX) + (2**11 if rng.random() < 0.5 else 0)
     velocity, beat_frequency = rng.uniform(2, 30), abs(bins) / duration
@@ -134,14 +135,14 @@ def random_instrument(rng: np.random.Generator) -> dict[str, str]:
 
 
 def changed_effects_off() -> dict[str, str]:
-    """Return the changed effects that the version knows, off."""
+    """Return the mode ``off`` of each changed effect that the installed version has."""
     from sweep.model.effects.catalogue import EFFECT_NAMES
 
     return {name: "off" for name in CHANGED_EFFECTS if name in EFFECT_NAMES}
 
 
 def study_answers(name: str, mapping: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Every number that a study's store has, and that means the same in both versions."""
+    """Run a study and return the stored variables that mean the same in both versions."""
     with tempfile.TemporaryDirectory() as folder:
         store_path = Path(folder) / "frozen.zarr"
         with warnings.catch_warnings():
@@ -159,7 +160,7 @@ def study_answers(name: str, mapping: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def relative_differences(frozen: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Absolute differences of values within 1, relative ones beyond; inf where one is nan."""
+    """Return differences, relative to values above 1; inf where only one value is nan."""
     with np.errstate(invalid="ignore"):
         difference = np.abs(current - frozen) / np.maximum(1.0, np.abs(frozen))
     difference = np.where(frozen == current, 0.0, difference)  # infinities
@@ -168,7 +169,7 @@ def relative_differences(frozen: np.ndarray, current: np.ndarray) -> np.ndarray:
 
 
 def print_differences(frozen: dict[str, np.ndarray], current: dict[str, np.ndarray]) -> int:
-    """Print what differs; the number of variables that do by more than is allowed."""
+    """Print the variables that differ by more than is allowed; return their number."""
     count = 0
     for key in sorted(frozen):
         if key not in current or frozen[key].shape != current[key].shape:
@@ -194,7 +195,7 @@ def print_differences(frozen: dict[str, np.ndarray], current: dict[str, np.ndarr
 
 
 def main() -> int:
-    """Write or compare; 1 where something differs."""
+    """Write or compare results; return 1 if something differs, else 0."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("what", choices=("write", "compare"))
     parser.add_argument("file", type=Path)

@@ -1,7 +1,7 @@
-"""Writes docs/instruments.md: what is published of each instrument of the library, and simulated.
+"""Write docs/instruments.md: published and simulated numbers of each instrument of the library.
 
-`make instruments`, a minute. Every number that an instrument's file names is computed here, by the
-function of its name; `tests/test_instruments.py` holds the same numbers to their limits.
+Run with `make instruments`, a minute. Each number in an instrument's file is computed by the
+function of its name; `tests/test_instruments.py` checks the same numbers against their limits.
 """
 
 import math
@@ -17,30 +17,30 @@ import sweep
 from sweep.model import beam, evaluation
 from sweep.spec import GridSpec
 from sweep.spec.axes import remove_fields_on_axes
-from sweep.spec.yaml_document import library_instruments, read_document
+from sweep.spec.yaml_document import library_instrument_files, read_document
 
 SPEED_OF_LIGHT = 299792458.0
 DRAWS_PER_PLACE = 400
-"""Shots of each of the places between bins that a standard deviation is drawn at."""
+"""Shots drawn at each place between bins, for a standard deviation."""
 N_PLACES = 64
 
 InstrumentFields = Mapping[str, Any]
 
 
 def instrument_file(name: str) -> dict[str, Any]:
-    """Content of the file of an instrument."""
-    return read_document(library_instruments()[name]).content
+    """Return the content of the file of an instrument of the library."""
+    return read_document(library_instrument_files()[name]).content
 
 
 def spec_before_target(instrument: Any, target: InstrumentFields, **sections: Any) -> GridSpec:
-    """A study of an instrument straight before a target."""
+    """Return the spec of an instrument that looks at a target along its normal."""
     mapping = {"title": "Published numbers", "instrument": instrument,
                "target": {"grazing_angle": "90 deg"} | dict(target)}  # fmt: skip
     return GridSpec.from_mapping(remove_fields_on_axes(mapping | sections))
 
 
 def run_study(spec: GridSpec) -> Any:
-    """Results of a study."""
+    """Run a study and return its dataset."""
     with tempfile.TemporaryDirectory() as folder:
         store_path = Path(folder) / "numbers.zarr"
         if not sweep.run(spec, store=store_path, scheduler="none", progress=False).complete:
@@ -51,7 +51,10 @@ def run_study(spec: GridSpec) -> Any:
 def random_place_axis(
     n_points: int, centre_range: float, bin_width: float, speed_max: float
 ) -> InstrumentFields:
-    """An axis of ranges within a bin [m] and radial velocities [m/s], drawn anew but the same."""
+    """Return an axis of random ranges within a bin [m] and radial velocities [m/s].
+
+    The random numbers are the same in every run.
+    """
     rng = np.random.default_rng(1)
     ranges = centre_range + bin_width * rng.uniform(-0.5, 0.5, n_points)
     velocities = rng.uniform(-speed_max, speed_max, n_points)
@@ -67,7 +70,7 @@ WALL_TARGET = {"range": "7.2 m", "reflectance": 0.05}
 
 
 def half_power_range(name: str) -> float:
-    """Range [m] at which the light that mixes is half of that at the lens."""
+    """Return the range at which half as much light mixes as at the lens [m]."""
     parameters = evaluation.PARAMETER_DEFAULTS | spec_before_target(name, WALL_TARGET).parameters()
     ranges = np.concatenate([[1e-3], np.linspace(1.0, 40.0, 39001)])
     mixed_power = beam.effective_collecting_area(parameters | {"target.range": ranges}) / ranges**2
@@ -75,7 +78,7 @@ def half_power_range(name: str) -> float:
 
 
 def noise_penalty(name: str) -> float:
-    """SNR over the SNR without the amplifier's noise [dB]."""
+    """Return the SNR over the SNR without the amplifier's noise [dB]."""
     without_amplifier_noise = {"like": name, "receiver": {"amplifier_noise_current": "0 A"}}
     snrs = [
         float(run_study(spec_before_target(instrument, WALL_TARGET)).snr_up)
@@ -85,7 +88,7 @@ def noise_penalty(name: str) -> float:
 
 
 def pd_of_snr(name: str) -> float:
-    """Largest departure of pd from the law of a Rayleigh magnitude and 4 times the mean."""
+    """Return the largest difference of pd from the Rayleigh law for a threshold of 4 means."""
     axes = {"instrument.laser.power": {"log": ["10 uW", "1 W"], "number": 50},
             "target.range": {"linear": ["7.1875 m", "7.2125 m"], "number": 26}}  # fmt: skip
     results = run_study(spec_before_target(name, WALL_TARGET, axes=axes))
@@ -97,9 +100,10 @@ def pd_of_snr(name: str) -> float:
 
 
 def drawn_standard_deviations(name: str, draws: int = DRAWS_PER_PLACE) -> dict[str, float]:
-    """Standard deviations of range [mm] and radial velocity [mm/s] of shots that are detected.
+    """Return standard deviations of range [mm] and radial velocity [mm/s] of detected shots.
 
-    Of a parabola through the peak, anywhere between bins; and of the bounds their ratio [s].
+    Peaks lie anywhere between bins and are estimated by a parabola. The result also has the ratio
+    of the bounds of range and velocity [s].
     """
     instrument = {"like": name, "processing": {"estimator": {"kind": "parabolic"}}}
     axes = random_place_axis(N_PLACES, 7.2, SPEED_OF_LIGHT / 12e9, 0.5)
@@ -127,7 +131,7 @@ def drawn_standard_deviations(name: str, draws: int = DRAWS_PER_PLACE) -> dict[s
 
 
 def pfa_bin(name: str, tnr: int) -> float:
-    """Chance of a false alarm in a bin."""
+    """Return the probability of a false alarm in a bin."""
     instrument = {"like": name, "processing": {"tnr": tnr}}
     return 10 ** float(run_study(spec_before_target(instrument, THESIS_TARGET)).log10_pfa_bin)
 
@@ -136,7 +140,7 @@ THESIS_TARGET = {"range": "3500 m", "reflectance": 0.1, "radial_velocity": "150 
 
 
 def pfa_both_chirps(name: str) -> float:
-    """Chance of a false alarm in both chirps, all bins counted."""
+    """Return the probability of a false alarm in both chirps, all bins counted."""
     instrument = {"like": name, "processing": {"bins_counted": "all"}}
     return 10 ** float(
         run_study(spec_before_target(instrument, THESIS_TARGET)).log10_pfa_both_chirps
@@ -144,7 +148,7 @@ def pfa_both_chirps(name: str) -> float:
 
 
 def power_over_table_4_1(name: str) -> float:
-    """SNR over that of Table 4.1 [dB]."""
+    """Return the SNR over that of the instrument of Table 4.1 [dB]."""
     snrs = [
         float(run_study(spec_before_target(instrument, THESIS_TARGET)).snr_up)
         for instrument in (name, "chester_2017_table_4_1")
@@ -156,14 +160,14 @@ def power_over_table_4_1(name: str) -> float:
 
 
 def range_bound(name: str) -> float:
-    """Least standard deviation of range [mm], target of 30 % at 75 m; of the mean echo."""
+    """Return the bound of the standard deviation of range, for a target of 30 % at 75 m [mm]."""
     target = {"range": "75 m", "reflectance": 0.3}
     results = run_study(spec_before_target(name, target, draws={"method": "spectra", "number": 1}))
     return 1e3 * float(results.range_bound)
 
 
 def shot_noise_share(name: str) -> float:
-    """Shot noise of the local oscillator over all noise."""
+    """Return the local oscillator's shot noise over all noise, as a ratio of variances."""
     without_amplifier_noise = {"like": name, "receiver": {"amplifier_noise_current": "0 A"}}
     target = {"range": "75 m", "reflectance": 0.3}
     shot_noise, all_noise = (
@@ -174,7 +178,7 @@ def shot_noise_share(name: str) -> float:
 
 
 def lander_at_5_km(name: str) -> dict[str, float]:
-    """Detection of ground of 10 %, and errors of range [m] and velocity [cm/s] by whole bins."""
+    """Return pd on ground of 10 %, and rms errors of quantised range [m] and velocity [cm/s]."""
     results = run_study(
         spec_before_target(
             name, {"reflectance": 0.1}, axes=random_place_axis(N_PLACES, 5000.0, 0.3, 100.0)
@@ -188,7 +192,7 @@ def lander_at_5_km(name: str) -> dict[str, float]:
 
 
 def car_on_a_road(name: str) -> dict[str, float]:
-    """Detection of 10 % at 200 m; the step of ranges [mm]; from where 60 m/s are read right [m]."""
+    """Return pd of a target of 10 % at 200 m, range step [mm] and least range for 60 m/s [m]."""
     target = {"reflectance": 0.1}
     results_at_200_m = run_study(
         spec_before_target(name, target, axes=random_place_axis(N_PLACES, 200.0, 0.1, 30.0))
@@ -211,7 +215,7 @@ def car_on_a_road(name: str) -> dict[str, float]:
 
 
 def simulate_numbers(name: str, draws: int = DRAWS_PER_PLACE) -> dict[str, float]:
-    """Every number of an instrument, by its key."""
+    """Compute all numbers in an instrument's file, by their keys."""
     function_by_key: dict[str, Callable[[str], float]]
     match name:
         case "settembrini_2026":
@@ -243,7 +247,7 @@ def simulate_numbers(name: str, draws: int = DRAWS_PER_PLACE) -> dict[str, float
 
 
 def is_within_allowed(number: InstrumentFields, simulated: float) -> bool:
-    """True where a number simulated lies within what its file allows."""
+    """Return True if a simulated number lies within the limits in the instrument's file."""
     match number:
         case {"within": within}:
             return bool(abs(simulated - number["published"]) <= within)
@@ -257,14 +261,14 @@ def is_within_allowed(number: InstrumentFields, simulated: float) -> bool:
 
 
 def allowed_text(number: InstrumentFields) -> str:
-    """Allowed difference of a number, in words."""
+    """Return the allowed difference of a number as text."""
     words = {"within": "+- {}", "factor": "factor {}", "at_least": ">= {}", "at_most": "<= {}"}
     ((key, value),) = [(key, number[key]) for key in words if key in number]
     return words[key].format(value)
 
 
 def instrument_section(name: str, simulated_by_key: InstrumentFields) -> str:
-    """Part of the page on one instrument."""
+    """Return the section of the page on one instrument."""
     description = instrument_file(name)
     doi = (
         f"[{description['doi']}](https://doi.org/{description['doi']})"
@@ -291,7 +295,7 @@ def instrument_section(name: str, simulated_by_key: InstrumentFields) -> str:
 
 
 def is_published_number(number: InstrumentFields) -> bool:
-    """True where what is published is a number, which its unit follows."""
+    """Return True if the published value is a number, to which its unit is added."""
     return isinstance(number["published"], int | float)
 
 
@@ -300,6 +304,6 @@ if __name__ == "__main__":
         "instruments.md",
         "instruments",
         "\n\n".join(
-            instrument_section(name, simulate_numbers(name)) for name in library_instruments()
+            instrument_section(name, simulate_numbers(name)) for name in library_instrument_files()
         ),
     )

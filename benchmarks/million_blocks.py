@@ -1,10 +1,10 @@
-"""A study of a million blocks, command by command: how soon each is at work, and its memory.
+"""Measure commands on a study of a million blocks: time to the first block, and memory.
 
-Run with `make million`, a minute or two. A study of a million points, one to a block, is begun,
-stopped by Ctrl-C after some hundred blocks, shown and resumed until more are done. Then its log is
-given receipts of 900,000 blocks, as a study that far on has (their 24 million files are not made:
-`status` does not look at them, and `resume` does so beside its work), and it is shown and resumed
-again. Memory is the largest of the command's own process, without its workers'.
+Run with `make million`, a minute or two. A study of a million points, one to a block, is started,
+stopped by Ctrl-C after some hundred blocks, shown and resumed until more are done. Then its log
+gets receipts of 900,000 blocks, and it is shown and resumed again. The 24 million files of these
+blocks are not made: `status` does not read them, and `resume` does so while it computes. Memory is
+the largest of the command's own process, without that of its workers.
 """
 
 import os
@@ -28,12 +28,12 @@ from engine_limits import iter_receipt_lines
 
 POINTS_PER_AXIS, BLOCKS_DONE = 1000, 900_000
 BLOCKS_TO_WAIT_FOR, RECEIPT_BYTES = 100, 330
-"""Blocks that are waited for; bytes of a receipt, some."""
+"""Number of blocks to wait for, and approximate size of a receipt [bytes]."""
 COMMAND_TIMEOUT = 300.0
 
 
 def write_spec(folder: Path) -> Path:
-    """A spec of a million points, a block each."""
+    """Write a spec of a million points, each a block; return its path."""
     axes = {
         "target.range": {"linear": ["10 m", "5 km"], "number": POINTS_PER_AXIS},
         "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": POINTS_PER_AXIS},
@@ -48,12 +48,12 @@ def write_spec(folder: Path) -> Path:
 
 
 def receipt_log(store: Path) -> Path:
-    """The log of receipts."""
+    """Return the path of a store's log of receipts."""
     return store / ".sweep" / "receipts.jsonl"
 
 
 def start_command(*words: str) -> subprocess.Popen:
-    """The command in a process of its own."""
+    """Start a command of `sweep` in a new process."""
     arguments = [sys.executable, "-c", "from sweep.cli import main; main()", *words]
     return subprocess.Popen(
         arguments,
@@ -65,7 +65,10 @@ def start_command(*words: str) -> subprocess.Popen:
 
 
 def time_to_first_blocks(store: Path, *arguments: str) -> list[str]:
-    """Time until a command's first blocks are committed, and its memory; then Ctrl-C."""
+    """Run a command until its first blocks are committed, then stop it by Ctrl-C.
+
+    Return cells with the time and the memory.
+    """
 
     def log_bytes() -> int:
         return receipt_log(store).stat().st_size if receipt_log(store).exists() else 0
@@ -87,7 +90,7 @@ def time_to_first_blocks(store: Path, *arguments: str) -> list[str]:
 
 
 def measure_status(store: Path) -> list[str]:
-    """Time that `sweep status` takes, and its memory; what it says is printed."""
+    """Run `sweep status` and print its output; return cells with the time and the memory."""
     start = time.perf_counter()
     child = start_command("status", str(store))
     assert child.stdout is not None
@@ -98,12 +101,12 @@ def measure_status(store: Path) -> list[str]:
 
 
 def table_cells(seconds: float, memory: float) -> list[str]:
-    """Time [s] and memory [B] as the table has them."""
+    """Format a time [s] and a memory size [bytes] as cells of the table."""
     return [f"{seconds:.1f} s", f"{memory / 1e6:.0f} MB"]
 
 
 def main() -> None:
-    """All of it."""
+    """Measure all commands, and write the table into docs/scale.md."""
     with tempfile.TemporaryDirectory() as name:
         spec, store = write_spec(Path(name)), Path(name) / "million.zarr"
         run_cells = time_to_first_blocks(store, "run", str(spec), "--store", str(store))

@@ -1,10 +1,10 @@
-"""CPU time of a shot by the number of its segments.
+"""Measure the CPU time of a shot by the number of its segments.
 
     python benchmarks/segment_timing.py [repeats]
 
-A shot of the triangle ``up down`` against two thirds of one of ``up doppler down``: both are sums
-over their segments, with what is done once a shot on top. Least process CPU times of alternating
-runs.
+A shot of the triangle ``up down`` is compared with two thirds of one of ``up doppler down``. Both
+times are sums over segments, plus the work that is done once a shot. The smallest process CPU times
+of alternating runs count.
 """
 
 import sys

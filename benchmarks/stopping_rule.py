@@ -1,8 +1,8 @@
-"""Coverage and bias of drawing until a tolerance is met, by simulation.
+"""Simulate coverage and bias of drawing until a tolerance is met.
 
-Run with `make stopping`, two minutes on one core: points of known pd, many of each, are drawn
-until their half-width is within the tolerance, by the shipped rule (sweep.model.sampling.samplers)
-and by looking after every batch. Writes the table in docs/draws.md.
+Run with `make stopping`, two minutes on one core. Many points of each known pd are drawn until
+their half-width is within the tolerance, by the package's rule (sweep.model.sampling.samplers) and
+by a check after every batch. Writes the table in docs/draws.md.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,28 +25,31 @@ from sweep.model.sampling.samplers import NOISE_DRAWS_PER_STEP, draw_until_accur
 CONFIDENCE_LEVEL, BATCH_DRAWS, DRAWS_MAX = 0.95, 100, 10**7
 TOLERANCES = (0.1, 0.03, 0.01)
 THRESHOLD_OVER_NOISE = 6.5
-"""Threshold over the noise of a bin: a TNR of 10."""
+"""Threshold over the noise sigma per quadrature of a bin, for a TNR of 10."""
 N_TRIALS_BY_METHOD = {"counts": 40_000, "means": 4_000}
 VALUES_AT_ONCE = 1 << 21
-"""Values that are drawn at once."""
+"""Number of values that are drawn at once."""
 
 Sampler = Callable[[tuple[int, int]], np.ndarray]
 
 
 def true_pd_values(tolerance: float) -> np.ndarray:
-    """True pd: where nothing and all is seen, where a miss begins to count, and between."""
+    """Return the true pd to simulate: 0, 1, near the tolerance on both sides, and between."""
     low_pd = np.array([1e-4, 1e-3, 0.3 * tolerance, tolerance, 1.3 * tolerance, 2 * tolerance])
     lower_half = np.unique(np.append(low_pd, [0.1, 0.3]).clip(1e-4, 0.4))
     return np.concatenate([[0.0], lower_half, [0.5], 1 - lower_half[::-1], [1.0]])
 
 
 def bernoulli_sampler(pd: float, rng: np.random.Generator) -> Sampler:
-    """Detections."""
+    """Return a function that draws detections, 0 or 1, of mean pd."""
     return lambda shape: (rng.random(shape) < pd).astype(float)
 
 
 def speckle_pd_sampler(pd: float, rng: np.random.Generator) -> Sampler:
-    """Conditional pd of a Swerling-1 target, whose mean is exp(-Th^2 / 2 (1 + SNR))."""
+    """Return a function that draws the pd of a Swerling-1 target given its amplitude.
+
+    The mean of these pd is exp(-Th^2 / (2 (1 + SNR))), which equals `pd`.
+    """
     if pd in (0.0, 1.0):
         return lambda shape: np.full(shape, pd)
     snr = THRESHOLD_OVER_NOISE**2 / (2 * np.log(1 / pd)) - 1
@@ -58,7 +61,7 @@ def speckle_pd_sampler(pd: float, rng: np.random.Generator) -> Sampler:
 
 
 def power_law_sampler(pd: float, rng: np.random.Generator) -> Sampler:
-    """Powers of a uniform number: fades, or flashes, of any depth."""
+    """Return a function that draws powers of a uniform random number, of mean pd."""
     if pd in (0.0, 1.0):
         return lambda shape: np.full(shape, pd)
     if pd > 0.5:
@@ -68,7 +71,7 @@ def power_law_sampler(pd: float, rng: np.random.Generator) -> Sampler:
 
 
 class RepeatedPoint:
-    """The same point many times: its values summed, as a sample keeps them."""
+    """Trials of one point: number, mean and squared deviations of the values of each trial."""
 
     def __init__(self, number: int, values: Sampler, method: str) -> None:
         self._values, self._method = values, method
@@ -76,11 +79,11 @@ class RepeatedPoint:
         self.mean, self.squared_deviations = np.zeros(number), np.zeros(number)
 
     def at_once(self, points: int) -> int:
-        """Draws of each of so many points that one `take` is for."""
+        """Return the number of draws of each trial that `take` should add at once."""
         return NOISE_DRAWS_PER_STEP
 
     def take(self, points: np.ndarray, n_more: int) -> None:
-        """Draw on, a stretch of points at a time [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""
+        """Add draws to trials; update their moments [Chan, Golub, LeVeque, Am. Stat. 37, 1983]."""
         for batch in np.array_split(points, -(-points.size * n_more // VALUES_AT_ONCE)):
             values = self._values((batch.size, n_more))
             mean, n_before = values.mean(axis=1), self.number[batch]
@@ -93,7 +96,7 @@ class RepeatedPoint:
             self.number[batch] += n_more
 
     def half_widths(self, points: np.ndarray) -> np.ndarray:
-        """Half-widths of some of the points."""
+        """Return the half-widths of the intervals of some trials."""
         mean, n = self.mean[points], self.number[points]
         interval: ConfidenceInterval
         if self._method == "means":
@@ -109,12 +112,12 @@ class RepeatedPoint:
         return interval_half_width(mean, interval)
 
     def missed(self, points: np.ndarray, accuracy: ErrorBudget) -> np.ndarray:
-        """By how much the tolerance is missed."""
+        """Return by how much the half-widths of trials exceed the tolerance; 0 if they do not."""
         return np.maximum(self.half_widths(points) - accuracy.tolerance, 0.0)
 
 
 class StoppingResult(NamedTuple):
-    """Result of one pd."""
+    """Coverage, bias and mean number of draws of one true pd."""
 
     pd: float
     coverage: float
@@ -125,7 +128,7 @@ class StoppingResult(NamedTuple):
 def simulate_stopping(
     pd: float, sampler: Sampler, method: str, tolerance: float, stopping_times: str
 ) -> StoppingResult:
-    """Coverage, bias and mean number of draws of one pd."""
+    """Simulate trials of one true pd; return coverage, bias and mean number of draws."""
     n_trials = N_TRIALS_BY_METHOD["means" if method == "means" else "counts"]
     trials, points = RepeatedPoint(n_trials, sampler, method), np.arange(n_trials)
     check_numbers = (
@@ -148,7 +151,7 @@ SAMPLER_KINDS = {
 
 
 def table_rows() -> Iterator[list[str]]:
-    """Rows of the table."""
+    """Yield the rows of the table."""
     cases = [
         (k, t, e) for k in SAMPLER_KINDS for t in TOLERANCES for e in ("shipped", "every batch")
     ]

@@ -1,9 +1,10 @@
-"""Points that are drawn until a tolerance is met, against the exact means over all draws.
+"""Compare points that are drawn until a tolerance is met with exact means over all draws.
 
-A footprint of one beamlet is one speckle: |g| multiplies all bins of a shot alike, and is Rice
-distributed. So a segment is detected with Q_1(m / s, b / s), m the steady signal over sigma and
-s^2 = 1 + P/2 with P the mean power of the diffuse one, and a shot, whose chirps see the same g,
-with the mean of Q_1(|g| a_up, b) Q_1(|g| a_down, b), one integral. Nothing is drawn for it.
+A footprint of one beamlet has one speckle amplitude |g|. It multiplies all bins of a shot and is
+Rice distributed. The pd of a segment is therefore Q_1(m / s, b / s). Here m is the steady signal
+over sigma, and s^2 = 1 + P/2 with the mean power P of the diffuse signal. Both chirps of a shot
+have the same g, so that pd_shot is the mean of Q_1(|g| a_up, b) Q_1(|g| a_down, b), a single
+integral. No draws are needed for it.
 """
 
 import os
@@ -28,9 +29,9 @@ from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 SEEDS_BY_TOLERANCE = {0.1: 11, 0.01: 11, 0.001: 2}
-"""Times that all points are drawn anew at a tolerance."""
+"""Number of seeds with which all points are drawn, by tolerance."""
 N_QUADRATURE_NODES, QUADRATURE_REACH_SIGMA = 400, 10.0
-"""Nodes of the integral over |g|, out to so many standard deviations."""
+"""Number of nodes of the integral over |g|, and its limits in standard deviations."""
 DRAW_UNTIL_MET = {"draws.number": 0, "draws.limit": 10**7}
 ALLOWED_SIGMAS = 5.0
 
@@ -53,26 +54,28 @@ COLUMNS = (
 
 
 class DrawnResults(NamedTuple):
-    """Results of a study's points at a tolerance, seeds one after the other."""
+    """Results of a study's points at a tolerance; n counts all points with each seed."""
 
     tolerance: float
     error: np.ndarray
-    """(4, n) |pd - exact|, by the names of PROMISED."""
+    """Differences |pd - exact| (4, n), in the order of `PD_OUTPUTS`."""
     half_width: np.ndarray
     is_decided_by_draws: np.ndarray
-    """(4, n) bool: where draws decide."""
+    """Mask (4, n) of values that depend on draws: pd varies, and is not close to 0 or 1."""
     draws: np.ndarray
     seconds_per_point: float
-    """A point."""
+    """Processor time per point [s]."""
 
 
 def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
-    """Means of pd over all draws, (4, points) by PROMISED, and how far off the integral may be.
+    """Return the exact means of pd (4, points), and the error of their integral.
+
+    The order is that of `PD_OUTPUTS`.
 
     Raises
     ------
     ValueError
-        Of studies that draw anything but speckle, or more than one of a footprint.
+        If the study draws anything but one speckle amplitude per footprint.
     """
     grid = ParameterBlockGrid(spec)
     parameters = grid.parameters_at(np.arange(grid.n_points))
@@ -108,7 +111,7 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
 
 
 def rice_quadrature(kappa: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes |g| and weights of the mean over a speckle with the coherent share kappa."""
+    """Return nodes |g| and weights of the mean over speckle of coherent power fraction `kappa`."""
     if kappa == 1:
         return np.ones(1), np.ones(1)
     sigma = np.sqrt((1 - kappa) / 2)
@@ -124,7 +127,7 @@ def rice_quadrature(kappa: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_at_tolerances(path: Path, spec: GridSpec) -> tuple[list[DrawnResults], float]:
-    """A study at its tolerances, and how far off the integral may be."""
+    """Draw a study at each tolerance; return the results, and the error of the exact integral."""
     means, integral_error = exact_means(spec)
     rows = []
     for tolerance, seeds in SEEDS_BY_TOLERANCE.items():
@@ -148,7 +151,7 @@ def draw_at_tolerances(path: Path, spec: GridSpec) -> tuple[list[DrawnResults], 
 def _draw_with_seed(
     run: tuple[Path, float, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """All points drawn with a seed: pd, half-widths, standard errors, draws; and the time."""
+    """Draw all points with a seed; return pd, half-widths, standard errors, draws and time [s]."""
     path, tolerance, seed = run
     overrides = DRAW_UNTIL_MET | {"accuracy.tolerance": tolerance, "seed": seed}
     study = GridStudy(
@@ -168,7 +171,7 @@ def _draw_with_seed(
 
 
 def missed_tolerances(name: str, rows: Sequence[DrawnResults], confidence: float) -> Iterator[str]:
-    """Tolerances that are not kept, in words."""
+    """Yield a line of text for each tolerance that is not kept."""
     for row in rows:
         within = (row.error <= row.tolerance).all(axis=0).mean()
         if within < confidence:
@@ -179,14 +182,17 @@ def missed_tolerances(name: str, rows: Sequence[DrawnResults], confidence: float
 
 
 def coverage(row: DrawnResults, confidence: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of points within their half-width where draws decide, and sigmas off, (4,) each."""
+    """Return the shares of drawn points within their half-width (4,).
+
+    Also return their differences from the confidence, in standard deviations (4,).
+    """
     number = row.is_decided_by_draws.sum(axis=1)
     share = ((row.error <= row.half_width) & row.is_decided_by_draws).sum(axis=1) / number
     return share, (share - confidence) / np.sqrt(confidence * (1 - confidence) / number)
 
 
 def table_rows(rows: Sequence[DrawnResults], confidence: float) -> Iterator[list[str]]:
-    """Rows of the table."""
+    """Yield the rows of the table."""
     for row in rows:
         shares, sigmas = coverage(row, confidence)
         within = (row.error <= row.tolerance).all(axis=0)
@@ -209,7 +215,7 @@ def table_rows(rows: Sequence[DrawnResults], confidence: float) -> Iterator[list
 def study_section(
     name: str, rows: Sequence[DrawnResults], integral_error: float, spec: GridSpec
 ) -> str:
-    """A study's part of the page."""
+    """Return a study's section of the page."""
     points = rows[0].error.shape[1] // SEEDS_BY_TOLERANCE[rows[0].tolerance]
     seeds = ", ".join(
         f"{number} times at {tolerance:g}" for tolerance, number in SEEDS_BY_TOLERANCE.items()

@@ -1,8 +1,9 @@
-"""Random instruments near DC and Nyquist whose lines are smeared over the record, each its own.
+"""Test tolerances with random instruments, whose smeared lines lie near DC or Nyquist.
 
-Drawn anew each time, under range walk, acceleration, a sweep that is not straight, line width and
-jitter of the beam; held at each tolerance against all effects on at the tightest. What is kept is
-what each point calls for by itself: no neighbour lends it an effect.
+Every run draws other instruments. Their lines are smeared by range walk, acceleration, a nonlinear
+sweep, line width and jitter of the beam. At each tolerance they are compared with all effects on at
+the tightest tolerance. Each point is planned by itself, so that it has only the effects that it
+needs.
 """
 
 from collections.abc import Iterator
@@ -24,10 +25,10 @@ WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
 FOOTPRINTS = (("coherent", 1), ("incoherent", 1), ("coherent", 37), ("incoherent", 37))
 REFERENCE_TOLERANCE = 1e-9
 BINS_FROM_END_MAX, N_DRAWS = 40.0, 4
-"""Bins from DC or Nyquist within which lines lie at the most; draws of what jitters."""
+"""Largest distance of lines from DC or Nyquist [bins], and draws of a jittering beam."""
 SAMPLE_RATE, SPEED_OF_LIGHT = 100e6, 299792458.0
 SHARE_WITHIN_MIN = 0.999
-"""Share of the points that shall keep a tolerance."""
+"""Share of the points that must keep a tolerance."""
 ERROR_QUANTITIES = ("pd", "magnitude", "leakage")
 COMPARED_OUTPUTS = (
     "pd_up", "pd_doppler", "pd_down", "pd_shot", "snr_up", "snr_doppler", "snr_down",
@@ -36,20 +37,20 @@ COMPARED_OUTPUTS = (
 
 
 class ToleranceErrors(NamedTuple):
-    """Errors of points at a tolerance, (n,) each."""
+    """Errors of points at a tolerance, (n,) each, and their bound."""
 
     pd: np.ndarray
-    """Of a segment or a shot."""
+    """Error of pd: the largest of the segments and the shot."""
     magnitude: np.ndarray
-    """|X| of the largest bins, relative to itself or to sigma; and so the root of snr."""
+    """Error of |X| in the largest bins, relative to |X|, or to sigma if that is larger."""
     leakage: np.ndarray
-    """Of either chirp, where it is asked for; else nan."""
+    """Error of the leakage probability of either chirp; nan if leakage is not requested."""
     error_bound: np.ndarray
-    """Bound on what effects that are left out may change."""
+    """Bound on the change of results by omitted effects."""
 
 
 def random_study_mappings(n_points: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """Specs of about so many points together, by window, footprint, and what is asked for."""
+    """Yield specs of random points, about `n_points` in all, by window, footprint and request."""
     kinds = [
         (window, *footprint, requested)
         for window in WINDOWS
@@ -80,13 +81,13 @@ def random_study_mappings(n_points: int, rng: np.random.Generator) -> Iterator[d
 
 
 def _random_point(rng: np.random.Generator, requested: str, fft_size: int) -> dict[str, str]:
-    """An instrument and a target; sizes of effects over many decades, some of them 0.
+    """Return an instrument and a target as values by path, with effects of very different sizes.
 
     Echoes arrive before the record, within it, or rarely after it.
     """
 
     def signed_log_uniform(low: float, high: float) -> float:
-        """Log-uniform between two powers of ten, of either sign, or 0."""
+        """Draw a number between two powers of ten, of either sign, or 0."""
         return float(rng.choice([-1, 0, 1], p=(0.4, 0.2, 0.4)) * 10 ** rng.uniform(low, high))
 
     duration = 2**14 / SAMPLE_RATE * rng.uniform(1.0, 1.5)
@@ -126,7 +127,7 @@ def _random_point(rng: np.random.Generator, requested: str, fft_size: int) -> di
 def errors_at_tolerances(
     mapping: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES
 ) -> list[ToleranceErrors]:
-    """Errors of a study's points at each tolerance."""
+    """Compute the errors of a study's points at each tolerance."""
     spec = load_mapping(mapping)
     grid = ParameterBlockGrid(spec)
     parameters = PARAMETER_DEFAULTS | grid.parameters_at(np.arange(grid.n_points))
@@ -216,7 +217,7 @@ over itself or sigma, and of leakage if the spec requests it.
 
 
 def instruments_section(n_points: int, rng: np.random.Generator) -> tuple[list[str], str]:
-    """Tolerances that are not kept, in words; and the part of the page."""
+    """Return lines of text on tolerances that are not kept, and the section of the page."""
     errors_by_study = [
         errors_at_tolerances(mapping) for mapping in random_study_mappings(n_points, rng)
     ]

@@ -1,8 +1,7 @@
-"""Test of every tolerance: 1,000 points of every experiment, at six tolerances.
+"""Test whether each of six tolerances is kept, at 1,000 points of every experiment.
 
-And of as many instruments drawn at random. Run with `make promise`, some twenty minutes; names of
-experiments, or `instruments`, as arguments look at those alone.
-Writes docs/promise.md.
+As many random instruments are tested too. Run with `make promise`, some twenty minutes. Names of
+experiments, or `instruments`, as arguments restrict the test to these. Writes docs/promise.md.
 """
 
 import argparse
@@ -49,20 +48,20 @@ from sweep.tasks.studies.parameter_grid import ParameterBlockGrid
 
 POINTS, SEED, ROUNDS = 1000, 2017, 5
 POINTS_TIMED_TOGETHER = 4096
-"""Points that are timed together: what one costs depends on those beside it in its block."""
+"""Number of points timed together, because the cost of a point depends on its block."""
 SHARE_WITHIN_MIN = 0.999
-"""Share of the points that shall keep a tolerance."""
+"""Share of the points that must keep a tolerance."""
 REPEATED_TRIAL_SECONDS_MAX = 0.5
-"""Seconds that a trial may take to be repeated: longer ones are timed well enough as it is."""
+"""Longest trial that is repeated [s]; longer ones are timed accurately enough by one run."""
 BEAMLETS = "footprint.beamlets"
 CHECK_RAYS = 31_987
-"""What the reference of flights is held against."""
+"""Number of rays with which the reference of flights is compared."""
 COHERENT_CHECK_RAYS = 4_009
-"""Rays that coherent flights are held against."""
+"""Number of rays with which coherent flights are compared."""
 COST_RATIO_MAX = 1.1
-"""What timings may be off."""
+"""Largest ratio of timings that counts as equal."""
 SAME_ERROR_RATIO, ZERO_ERROR = 1.1, 1e-9
-"""Errors that count as the same, relative to each other, and as none."""
+"""Largest ratio of errors that count as equal, and largest error that counts as zero."""
 ERROR_QUANTITIES = ("pd", "log10 pfa", "magnitude", "leakage")
 INSTRUMENTS_SECTION = "instruments"
 EXPERIMENT_VARIANTS = {
@@ -70,7 +69,7 @@ EXPERIMENT_VARIANTS = {
         "range_angle", {"footprint.phases": "incoherent", "footprint.beamlets": "auto"},
     ),
 }  # fmt: skip
-"""Experiments with some values put onto them."""
+"""Experiments with overrides, by the name of the variant."""
 PAGE_HEAD = """# Is the tolerance kept?
 
 Written by `make promise`. It computes 1,000 random points of each experiment (of flights, some
@@ -134,23 +133,27 @@ setting for a loose tolerance often serves for tighter ones too, at the same cos
 
 
 class ToleranceRow(NamedTuple):
-    """Result of an experiment at a tolerance."""
+    """Errors and times of an experiment at a tolerance."""
 
     tolerance: float
     errors: tuple[np.ndarray, ...]
-    """(points,) each, by :data:`ERROR_QUANTITIES`."""
+    """Errors (points,) of each quantity, in the order of `ERROR_QUANTITIES`."""
     seconds: float
     fixed_seconds: float = np.nan
-    """Time of the cheapest fixed setting that keeps the tolerance [s]; nan where there is none."""
+    """Time per point of the cheapest fixed setting that keeps the tolerance [s], or nan."""
     front_seconds: float = np.nan
-    """The same of the cheapest whose worst error is no larger."""
+    """Time per point of the cheapest fixed setting whose worst error is no larger [s]; nan without
+    one."""
     label: str = ""
-    """What stands in the place of a tolerance."""
+    """Text that a table shows in place of the tolerance."""
 
 
 def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int) -> list[Trial]:
-    """Rungs on all points of a sample: what they see, and the best of their times."""
-    parts = bench.split_into_parts(bench.size)
+    """Run each setting on all points of a sample; return results and the best times.
+
+    `rungs` are the settings.
+    """
+    parts = bench.split(bench.size)
     for rung in rungs:  # compiles what there is to compile
         bench.try_setting(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
     bench.clear_caches()
@@ -182,15 +185,18 @@ def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int
 
 
 class ExperimentResult(NamedTuple):
-    """Results of an experiment."""
+    """Rows of the tables for an experiment."""
 
     rows: list[ToleranceRow]
     ray_rows: list[ToleranceRow]
-    """Of a flight: its own number against many more; last, these against yet more."""
+    """Rows for the number of rays of a flight.
+
+    They compare its own numbers with many more rays; the last row compares these with even more.
+    """
 
 
 def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
-    """Tolerances of a study without draws."""
+    """Measure errors and times of a study without draws at each tolerance."""
     is_flight = isinstance(spec, SceneSpec)
     bench = (
         FlightSample(spec, POINTS) if is_flight else GridSample(spec, POINTS, random_points(spec))
@@ -272,19 +278,19 @@ def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
 
 
 def random_points(spec: GridSpec) -> np.ndarray:
-    """Numbers of points, each as likely, without repetition."""
+    """Draw the numbers of points of a study, uniformly and without repetition; sorted."""
     points = ParameterBlockGrid(spec).n_points
     chosen = np.random.default_rng(SEED).choice(points, min(POINTS, points), replace=False)
     return np.sort(chosen)
 
 
 def worst_error(errors: Sequence[np.ndarray]) -> float:
-    """The largest error of all that is promised."""
+    """Return the largest of the errors that the tolerance covers."""
     return float(np.nanmax(np.concatenate(errors[:N_PROMISED_ERRORS])))
 
 
 def rays_text(rays_by_shot: np.ndarray) -> str:
-    """Numbers of rays of shots, where they have any: the mean, and the most."""
+    """Return mean and maximum number of rays of the shots that have any, as text."""
     if not np.isfinite(rays_by_shot).any():
         return "nothing seen"
     return f"{np.nanmean(rays_by_shot):,.0f} rays, at most {np.nanmax(rays_by_shot):,.0f}"
@@ -293,8 +299,8 @@ def rays_text(rays_by_shot: np.ndarray) -> str:
 def reference_check_row(
     bench: StudySample, full_ladder: SettingLadder, timed_trial: Trial, label: str, more_rays: int
 ) -> ToleranceRow:
-    """The reference's number of rays against more of them, at a part of the sample."""
-    reference, part = full_ladder.reference, bench.split_into_parts(bench.size)[0]
+    """Compare the reference with more rays at a part of the sample; return the row."""
+    reference, part = full_ladder.reference, bench.split(bench.size)[0]
     finer = replace(
         reference, name=f"{more_rays} rays", overrides={**reference.overrides, BEAMLETS: more_rays}
     )
@@ -309,7 +315,10 @@ def reference_check_row(
 
 
 def error_cell(errors: np.ndarray, tolerance: float) -> str:
-    """The worst error; before it, where not all are within the tolerance, how many are."""
+    """Return a cell with the worst error, after the share of points within the tolerance.
+
+    The share is left out if all points are within.
+    """
     known_errors = errors[np.isfinite(errors)]
     if not known_errors.size:
         return "-"
@@ -322,12 +331,12 @@ def error_cell(errors: np.ndarray, tolerance: float) -> str:
 
 
 def error_text(error: float) -> str:
-    """An error as cells have it."""
+    """Return an error as text for a cell."""
     return "<1e-9" if error < 1e-9 else f"{error:.1e}"
 
 
 def error_spread_cell(errors: np.ndarray, tolerance: float) -> str:
-    """Share of the points within the tolerance, the error that 90 % keep, and the worst."""
+    """Return a cell with the share of points within the tolerance, 90 % quantile and maximum."""
     known_errors = errors[np.isfinite(errors)]
     if not known_errors.size:
         return "-"
@@ -341,7 +350,7 @@ def error_spread_cell(errors: np.ndarray, tolerance: float) -> str:
 
 
 def error_table_rows(name: str, rows: Sequence[ToleranceRow]) -> Iterator[list[str]]:
-    """Rows of the table."""
+    """Yield an experiment's rows of the table of errors."""
     for row in rows:
         cells = [error_cell(errors, row.tolerance) for errors in row.errors]
         times = [
@@ -352,14 +361,14 @@ def error_table_rows(name: str, rows: Sequence[ToleranceRow]) -> Iterator[list[s
 
 
 def ray_table_rows(name: str, rows: Sequence[ToleranceRow]) -> Iterator[list[str]]:
-    """Rows of the table of rays."""
+    """Yield an experiment's rows of the table of rays."""
     for row in rows:
         cells = [error_spread_cell(errors, row.tolerance) for errors in row.errors]
         yield [name, row.label or f"{row.tolerance:g}", *cells, f"{1e6 * row.seconds:.3g}"]
 
 
 def cost_row(name: str, ratios: Sequence[float]) -> list[str]:
-    """A row of a table of costs: ratios by tolerance, and whether they rise."""
+    """Return a row of a table of costs: ratios by tolerance, and whether they rise."""
     known_ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
     cost_rise = max(known_ratios) / max(known_ratios[0], 1.0) if known_ratios else np.nan
     verdict = "kept" if cost_rise <= COST_RATIO_MAX else f"NOT kept: {cost_rise:.2f} times"
@@ -368,7 +377,7 @@ def cost_row(name: str, ratios: Sequence[float]) -> list[str]:
 
 
 def missed_tolerances(name: str, rows: Sequence[ToleranceRow]) -> Iterator[str]:
-    """Quantities that do not keep their tolerance, in words."""
+    """Yield a line of text for each quantity that does not keep its tolerance."""
     for row in rows:
         for quantity, errors in zip(ERROR_QUANTITIES, row.errors, strict=True):
             known_errors = errors[np.isfinite(errors)]
@@ -384,7 +393,7 @@ def missed_tolerances(name: str, rows: Sequence[ToleranceRow]) -> Iterator[str]:
 
 
 class TolerancePage:
-    """The page, experiment by experiment."""
+    """The page docs/promise.md, to which experiments are added one by one."""
 
     def __init__(self) -> None:
         self._missed: list[str] = []
@@ -395,7 +404,7 @@ class TolerancePage:
         self._sections: dict[str, list[str]] = {"drawn": [], "instruments": []}
 
     def add_random_instruments(self) -> None:
-        """Look at instruments drawn at random."""
+        """Test random instruments and add their section."""
         missed_messages, section_text = tolerance_of_random_instruments.instruments_section(
             POINTS, np.random.default_rng()
         )
@@ -403,7 +412,7 @@ class TolerancePage:
         self._sections["instruments"].append(section_text)
 
     def add_experiment(self, stem: str) -> None:
-        """Look at an experiment."""
+        """Test an experiment, given by the stem of its file, and add its rows."""
         experiment, overrides = EXPERIMENT_VARIANTS.get(stem, (stem, {}))
         name, path = stem.replace("_", " "), EXPERIMENTS / f"{experiment}.yaml"
         try:
@@ -437,7 +446,7 @@ class TolerancePage:
         self._missed += missed_tolerances(name, result.rows)
 
     def page_text(self) -> str:
-        """The whole text."""
+        """Return the text of the page."""
         columns = ["experiment", "points", "tolerance", *ERROR_QUANTITIES, "us", "fixed", "front"]
         by_tolerance = [
             "experiment",
@@ -461,7 +470,7 @@ class TolerancePage:
 
 
 def main() -> None:
-    """The whole page, or some experiments' rows."""
+    """Write the page, or print the rows of the experiments named as arguments."""
     all_names = sorted([*EXPERIMENT_VARIANTS, *(path.stem for path in EXPERIMENTS.glob("*.yaml"))])
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*all_names, INSTRUMENTS_SECTION, []])

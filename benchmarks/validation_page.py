@@ -1,4 +1,4 @@
-"""Writes docs/validation.md: every table and figure of the thesis beside what our stores hold.
+"""Write docs/validation.md: every table and figure of the thesis, compared with our stores.
 
 ``make validation`` computes the stores that are missing first. Only facts and figures of the thesis
 stand here: what its tables print, and what its text says of its pictures, in our words.
@@ -24,21 +24,21 @@ TABLE_COLUMNS = ("shown", "experiment", "ours", "the thesis", "difference, and w
 
 # Where a verdict turns; each is made of the numbers beside it by one of these.
 SEEN_PD_MIN, LOST_PD_MAX = 0.9, 0.5
-"""pd from which on a target counts as seen, and below which as lost."""
+"""Least pd at which a target counts as seen, and pd below which it counts as lost."""
 NEAR_ZERO_PD_MAX = 0.1
-"""pd below which it counts as near zero."""
+"""Value below which a pd counts as near zero."""
 NEARLY_ALL_SHARE, HARDLY_ANY_SHARE = 0.95, 0.05
-"""Shares of points or shots that the thesis's "nearly everywhere" and "hardly" are held against."""
+"""Least share of points or shots for "nearly everywhere", and largest share for "hardly"."""
 HARDLY_FARTHER_RATIO = 1.1
-"""Growth of a reach up to which it is hardly more."""
+"""Largest ratio of reaches that counts as hardly more."""
 RAPID_LOSS_SHARE = 0.5
-"""Share of all losses that one kilometre must add to be called rapid."""
+"""Least share of all losses in one kilometre that counts as rapid."""
 PRINTING_SLIP_TOLERANCE = 0.05
-"""Relative difference from a tenth of a printed number that makes its power of ten a slip."""
+"""Largest relative difference from a tenth of a printed number, at which it is a misprint."""
 ALIKE_SHARE = 0.1
-"""Differences that count as none, as a share of the whole spread."""
+"""Largest difference that counts as none, as a share of the whole spread."""
 CYCLE_TOLERANCE = 1.0
-"""Cycles by which a flight's number may be off: the thesis does not say how its last one ends."""
+"""Allowed difference in a flight's number of cycles, as the thesis does not state how it ends."""
 
 INTRODUCTION = """# Validation: the published study and ours
 
@@ -70,22 +70,22 @@ NOT_REPRODUCED = """
 
 
 def store_path(name):
-    """The store of an experiment."""
+    """Return the path of an experiment's store."""
     return ROOT / "results" / f"{name}.zarr"
 
 
 def verdict_text(condition):
-    """The verdict in words."""
+    """Return the verdict as text."""
     return "agrees" if condition else "does not agree"
 
 
 def section_table(heading, columns, rows):
-    """A Markdown table under a heading."""
+    """Return a Markdown table under a heading."""
     return f"\n## {heading}\n\n{benchmark_helpers.markdown_table(columns, rows)}\n"
 
 
 def table_4_2():
-    """Table 4.2."""
+    """Return the comparison with Table 4.2 as a section."""
     study = GridResults.from_store(store_path("threshold"))
     (figure,) = [f for f in study.spec.figures if f.name == "table_4_2"]
     pfa_beyond_5_m = study.dataset.pfa_bin.sel(range=slice(5.1, None))
@@ -104,7 +104,7 @@ def table_4_2():
 
 
 def explain_printed_alarm(tnr, printed_pfa, our_pfa):
-    """Explanation of a printed false-alarm probability of a bin."""
+    """Explain the difference between a printed false-alarm probability of a bin and ours."""
     digits = len(f"{printed_pfa:e}".partition("e")[0].rstrip("0").replace(".", ""))
     if float(f"{our_pfa:.{digits - 1}e}") == printed_pfa:
         return f"the same in {labels.counted(digits, 'digit')}, which is all that is printed"
@@ -120,7 +120,7 @@ def explain_printed_alarm(tnr, printed_pfa, our_pfa):
 
 
 def shot_alarm_table(name, table_number):
-    """One of Tables 4.3 to 4.5."""
+    """Return the comparison with one of Tables 4.3 to 4.5 as a section."""
     study = GridResults.from_store(store_path(name))
     (figure,) = [f for f in study.spec.figures if f.kind == "false_alarm_table"]
     alarm_rows = false_alarm_records(study.points, study.spec, by=figure.by, printed=figure.printed)
@@ -144,7 +144,7 @@ def shot_alarm_table(name, table_number):
 
 
 def chapter_4_rows():
-    """Figures 4.2 to 4.8."""
+    """Return the rows on Figures 4.2 to 4.8."""
     return [
         figure_4_2_row(),
         figure_4_3_row(),
@@ -156,7 +156,7 @@ def chapter_4_rows():
 
 
 def figure_4_2_row():
-    """Fig. 4.2."""
+    """Return the row on Fig. 4.2."""
     spec = load(EXPERIMENTS / "single_shot_2000m.yaml")
     ((_, parameters),) = select_shot_parameters(spec, {})
     shot = simulate_shot(parameters)
@@ -180,24 +180,24 @@ def figure_4_2_row():
 
 
 def range_bin_width(parameters):
-    """Range [m] that a bin of the FFT is wide."""
+    """Return the width of a bin of the FFT as a range [m]."""
     chirp_rate = parameters["instrument.chirp.bandwidth"] / parameters["instrument.chirp.duration"]
     return bin_width(parameters) * SPEED_OF_LIGHT / (2 * chirp_rate)
 
 
 def velocity_bin_width(parameters):
-    """Radial velocity [m/s] that a bin of the FFT is wide."""
+    """Return the width of a bin of the FFT as a radial velocity [m/s]."""
     return bin_width(parameters) * parameters["instrument.laser.wavelength"] / 2
 
 
 def bin_width(parameters):
-    """Width of a bin [Hz]."""
+    """Return the width of a bin of the FFT [Hz]."""
     rate = parameters["instrument.processing.sample_rate"]
     return rate / parameters["instrument.processing.fft_size"]
 
 
 def figure_4_3_row():
-    """Fig. 4.3."""
+    """Return the row on Fig. 4.3."""
     ds = sweep.open(store_path("single_shot_45deg")).compute()
     loss_db = {
         segment: 10 * np.log10(float(ds[f"snr_{segment}"][0] / ds[f"snr_{segment}"][1]))
@@ -218,7 +218,7 @@ def figure_4_3_row():
 
 
 def figure_4_4_rows():
-    """Fig. 4.4."""
+    """Yield the rows on Fig. 4.4."""
     ds = sweep.open(store_path("range_angle"))[["pd_shot", "pd_up", "pd_doppler"]].compute()
     lost_above_45_deg, lost_to_10_deg = (
         lost_share_by_kilometre(ds.pd_shot, *angles) for angles in ((45, 90), (1, 10))
@@ -264,13 +264,13 @@ def figure_4_4_rows():
 
 
 def lost_share_by_kilometre(pd, lowest, highest):
-    """Share of points that are lost between two angles [deg], in each of ten kilometres."""
+    """Return the share of lost points between two angles [deg], for each of ten kilometres."""
     lost = (pd.sel(grazing_angle=slice(lowest, highest)) < LOST_PD_MAX).mean("grazing_angle")
     return lost.groupby_bins("range", np.arange(0, 10_001, 1000)).mean().values
 
 
 def figure_4_5_rows():
-    """Fig. 4.5."""
+    """Yield the rows on Fig. 4.5."""
     ds = sweep.open(store_path("threshold"))[["pd_shot"]].compute()
     thesis_words = {1: "high nearly everywhere", 15: "the largest area near zero, the deepest dips"}
     lost_before = -1.0
@@ -301,7 +301,7 @@ TRADE_OFFS = (
 
 
 def trade_off_rows():
-    """Figs. 4.6 to 4.8."""
+    """Yield the rows on Figs. 4.6 to 4.8."""
     for name, coordinate, figure_number, thesis_words in TRADE_OFFS:
         ds = sweep.open(store_path(name))[["pd_shot", "miss_shot"]].compute()
         units = GridResults.from_store(store_path(name)).spec.axis_parameter(coordinate).units
@@ -318,7 +318,7 @@ def trade_off_rows():
 
 
 def range_finding(cut, coordinate, names, thesis_words):
-    """Findings along a range, the thesis's words, and the verdict."""
+    """Return our numbers along the range, the thesis's words, and the verdict."""
     reaches = [typical_reach(cut.isel({coordinate: i})) for i in range(len(names))]
     lost_shares = (cut.pd_shot < LOST_PD_MAX).mean("cut").values
     reach_text = "; ".join(
@@ -346,7 +346,7 @@ def range_finding(cut, coordinate, names, thesis_words):
 
 
 def angle_finding(cut, names, thesis_words):
-    """The same along the angle."""
+    """Return our numbers along the grazing angle, the thesis's words, and the verdict."""
     angle_limits = cut.sweep.minimum_grazing_angle(SEEN_PD_MIN)
     n_below_seen = (cut.pd_shot < SEEN_PD_MIN).sum("cut").values
     angles = [
@@ -368,7 +368,7 @@ def angle_finding(cut, names, thesis_words):
 
 
 def typical_reach(cut):
-    """First range [m] where the median pd of 100 m is below `SEEN_PD_MIN`; inf if it never is."""
+    """Return the first range at which the median pd of 100 m is below `SEEN_PD_MIN` [m], or inf."""
     order = np.argsort(cut.range.values)
     pd, ranges = cut.pd_shot.values[order], cut.range.values[order]
     is_below = np.median(pd[: pd.size // 100 * 100].reshape(-1, 100), axis=1) < SEEN_PD_MIN
@@ -376,18 +376,18 @@ def typical_reach(cut):
 
 
 def without_repeated_values(dataset, name):
-    """The points of a cut, each value of the coordinate once."""
+    """Return the points of a cut with each value of a coordinate once."""
     _, first_index = np.unique(dataset[name].values, return_index=True)
     return dataset.isel(cut=np.sort(first_index))
 
 
 def range_text(value):
-    """A range in words."""
+    """Return a range [m] as text."""
     return "over 10 km" if math.isinf(value) else f"{value / 1000:.1f} km"
 
 
 def divergence_row():
-    """The study that the thesis announces and does not have."""
+    """Return the row on the study that the thesis announces and does not contain."""
     ds = sweep.open(store_path("beam_divergence"))[["pd_shot"]].compute()
     lost_share = (ds.pd_shot < LOST_PD_MAX).mean("cut")
     lost_text = "; ".join(
@@ -419,7 +419,7 @@ PUBLISHED_FLIGHTS = (
 
 
 def flight_rows():
-    """Figs. 3.8 and 5.1 to 5.7."""
+    """Return the rows on Figs. 3.8 and 5.1 to 5.7."""
     yield from figure_3_8_rows()
     for (
         figure_label,
@@ -464,7 +464,7 @@ def flight_rows():
 
 
 def figure_3_8_rows():
-    """Fig. 3.8."""
+    """Return the rows on Fig. 3.8."""
     ds = sweep.open_scene(store_path("forest_scan"))["sweep"].ds.compute()
     speed = ds.radial_velocity.where((ds.flags.astype(int) & 1) > 0)
     fore_speed, aft_speed = (
@@ -501,19 +501,19 @@ def figure_3_8_rows():
 
 
 def difference_of_first_returns(ds, name):
-    """Median difference of a quantity between the first two true returns of a shot."""
+    """Return the median difference of a quantity between the first two true returns of a shot."""
     is_true_point = (ds.flags.astype(int) & 1) > 0
     first, second = (ds[name].where(is_true_point).isel(return_number=i) for i in (0, 1))
     return float(abs(second - first).median())
 
 
 def load_experiment(name):
-    """The study of an experiment."""
+    """Load the spec of an experiment."""
     return load(EXPERIMENTS / f"{name}.yaml")
 
 
 def range_layer_row(ds, figure_label, name):
-    """Ranges in layers of whole bins."""
+    """Return the row on ranges in layers of whole bins."""
     is_true_point = np.isfinite(ds.range.values) & (ds.flags.values.astype(int) & 1 > 0)
     gaps = np.diff(np.unique(ds.range.values[is_true_point]))
     range_bin_m = range_bin_width(load_experiment(name).parameters())
@@ -530,7 +530,7 @@ def range_layer_row(ds, figure_label, name):
 
 
 def figure_5_3_d_row(ds):
-    """Fig. 5.3(d)."""
+    """Return the row on Fig. 5.3(d)."""
     is_lost = ~np.isfinite(ds.range).any("return_number").compute()
     lost_share = is_lost.mean(["shot", "draw"])
     lost_text = "; ".join(
@@ -565,7 +565,7 @@ def figure_5_3_d_row(ds):
 
 
 def figure_5_5_c_row(ds):
-    """Fig. 5.5(c)."""
+    """Return the row on Fig. 5.5(c)."""
     speed, beams = ds.true_radial_velocity.compute(), ds.beam.values
     medians = sorted(
         float(speed.isel(shot=np.flatnonzero(beams == beam)).median()) for beam in np.unique(beams)
@@ -591,7 +591,7 @@ THRESHOLD_PICTURE = """\
 
 
 def page_text():
-    """The whole page."""
+    """Return the text of the page."""
     alarm_tables = (("transmit_power", "4.3"), ("aperture", "4.4"), ("fft_size", "4.5"))
     return "".join([
         INTRODUCTION,

@@ -1,4 +1,4 @@
-"""Time a point, side by side with an earlier commit: both check-outs take turns in one run.
+"""Compare the time per point with that of an earlier commit: both versions take turns.
 
     python benchmarks/version_timing.py                        # all studies, some ten minutes
     python benchmarks/version_timing.py published rough_ground --rounds 9
@@ -33,23 +33,23 @@ from benchmark_helpers import ROOT, experiment_mapping
 EARLIER_COMMIT = "9b29f45"
 WORK_DIR = ROOT / "results" / "side_by_side"
 FLIGHT_RATIO_MAX = 1.3
-"""Ratio that flights may come to."""
+"""Largest ratio of times for flights."""
 
 
 class TimedStudy(NamedTuple):
-    """An experiment, what is put onto it for the whole and for its small part, and the aim."""
+    """An experiment to time, its overrides for the whole and for a small part, and the aim."""
 
     experiment: str | dict[str, Any]
-    """Name, or the spec itself."""
+    """Name of the experiment, or its spec as plain data."""
     ratio_max: float
     whole_overrides: dict[str, Any]
     part_overrides: dict[str, Any]
     against: str = ""
-    """Study of this version that it is compared with; of the earlier version where empty."""
+    """Study of this version to compare with; empty to compare with the earlier version."""
 
 
 def timed_flight(experiment: str, scanner: str, rate: float, **overrides: Any) -> TimedStudy:
-    """A flight measured at this rate [Hz], and at a tenth of it."""
+    """Return a flight to time at a scanner's `rate` [Hz], and at a tenth of it."""
     path = f"scanners.{scanner}.rate"
     return TimedStudy(
         experiment,
@@ -86,11 +86,11 @@ STUDIES = {
 
 
 DEVELOPED = 2.5
-"""Ratio that a point in developed speckle may come to against a smooth one."""
+"""Largest ratio of the time of a point in developed speckle to that of a smooth one."""
 
 
 def speckle_grid(rule: str, speckle: str, angle: int) -> dict[str, Any]:
-    """Spec of points at one grazing angle [deg], all of whose echoes are there in time."""
+    """Return the spec of points at one grazing angle [deg], whose echoes arrive in time."""
     return {
         "title": "Points in time",
         "instrument": {
@@ -108,7 +108,7 @@ def speckle_grid(rule: str, speckle: str, angle: int) -> dict[str, Any]:
 def speckle_flight(
     instrument: str, heights: tuple[int, int], draws: int, method: str
 ) -> TimedStudy:
-    """Descent from one height [m] to another, of a raster of 64 beams over a plane."""
+    """Return a descent between two heights [m] of a raster of 64 beams over a plane."""
     spec: dict[str, Any] = {
         "title": "Descent in time",
         "instrument": {"like": instrument},
@@ -132,7 +132,7 @@ def speckle_flight(
 
 
 def speckle_studies() -> dict[str, TimedStudy]:
-    """Return points and flights, and developed points against smooth ones."""
+    """Return the studies of points and flights with and without speckle, by name."""
     studies = {}
     for rule in ("any_bin", "peak_bin"):
         for angle in (90, 30, 5):
@@ -159,7 +159,7 @@ GROUPS = {"experiments": STUDIES, "speckle": speckle_studies()}
 def experiment_with_overrides(
     checkout: Path, study: TimedStudy, overrides: dict[str, Any]
 ) -> dict[str, Any]:
-    """The experiment of a check-out as plain data, with overrides."""
+    """Return the experiment of a check-out as plain data, with overrides."""
     if isinstance(study.experiment, str):
         spec = experiment_mapping(checkout / "experiments", study.experiment)
     else:
@@ -179,7 +179,7 @@ def experiment_with_overrides(
 
 
 def serve_runs() -> None:
-    """Run the spec files named on standard input; answer with processor time [s] and points."""
+    """Run the spec files named on standard input; print processor time [s] and points of each."""
     import sweep
 
     for line in sys.stdin:
@@ -194,7 +194,7 @@ def serve_runs() -> None:
 
 
 class Version:
-    """A process that runs studies by the check-out in a folder."""
+    """A process that runs studies with the version in a check-out's folder."""
 
     def __init__(self, name: str, checkout: Path) -> None:
         self.name, self._checkout = name, checkout
@@ -214,7 +214,7 @@ class Version:
         )
 
     def run(self, spec: Path) -> tuple[float, int]:
-        """Processor time [s] of a study, and its points."""
+        """Run a study; return processor time [s] and number of points."""
         assert self._process.stdin is not None and self._process.stdout is not None
         print(spec, file=self._process.stdin, flush=True)
         answer_line = self._process.stdout.readline()
@@ -224,7 +224,7 @@ class Version:
         return cpu_seconds, points
 
     def seconds_per_point(self, study: TimedStudy, folder: Path) -> float:
-        """Processor time of a point [s] that the whole study has and its part lacks."""
+        """Return the processor time per point [s], of the points that only the whole study has."""
         results = []
         for name, overrides in (("whole", study.whole_overrides), ("part", study.part_overrides)):
             file = folder / f"{name}_{self.name}.yaml"
@@ -235,14 +235,14 @@ class Version:
         return (whole_seconds - part_seconds) / (whole_points - part_points)
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
 
 
 def check_out_commit(commit: str) -> Path:
-    """The tree of a commit, made once."""
+    """Check out a commit into a worktree, unless it exists; return the folder."""
     checkout = WORK_DIR / commit
     if not checkout.exists():
         subprocess.run(
@@ -252,7 +252,7 @@ def check_out_commit(commit: str) -> Path:
 
 
 def measure_versions(versions: list[Version], study: TimedStudy, rounds: int) -> list[list[float]]:
-    """Times of a point [s], (rounds, versions), after a round that may compile."""
+    """Return times per point [s], (rounds, versions), without a first round that may compile."""
     with tempfile.TemporaryDirectory() as folder:
         seconds_by_round = []
         for count in range(rounds + 1):
@@ -268,9 +268,9 @@ def show_row(
     name: str, before: float, after: float, ratio: float, low: float, high: float, aim: float,
     against: str = "",
 ) -> None:  # fmt: skip
-    """Print times [us] and their ratio, and tell whether it is beyond the aim.
+    """Print times [us] and their ratio, and whether the ratio exceeds the aim.
 
-    A study that is compared with another of this version has the aim of that comparison alone.
+    A study that is compared with another one of this version has no aim against the earlier one.
     """
     goal = f"{'':8}" if against else f"{aim:8.2f}"
     missed = "" if against or ratio <= aim else "  missed"

@@ -2,8 +2,8 @@
 
 Run with `make scaling`, five minutes on two cores, on a quiet machine. Workers are up and have
 imported the model before the clock starts: a study long enough to need them has them up for most
-of its time. Rounds take turns, as the machine drifts; ratios are within a round. What the machine
-itself lets be had is told by plain loops over the same blocks in as many processes, nothing stored.
+of its time. Rounds take turns, as the machine drifts; ratios are within a round. Plain
+loops over the same blocks in as many processes, with nothing stored, show what the machine allows.
 """
 
 import argparse
@@ -23,14 +23,14 @@ from sweep.tasks.studies.grid_study import GridStudy
 
 
 def range_angle_spec(points: int, block_points: int) -> GridSpec:
-    """The published study over so many ranges a grazing angle."""
+    """Return the published study with `points` / 90 ranges for each grazing angle."""
     axes = experiment_spec("range_angle").to_yaml_mapping()["axes"]
     axes |= {"target.range": {"linear": ["1 m", "10 km"], "number": points // 90}}
     return experiment_spec("range_angle", axes=axes, storage={"block_points": block_points})
 
 
 def measure_run(spec: GridSpec, workers: int) -> tuple[float, float]:
-    """Seconds of wall time, and of the processor's in all."""
+    """Run a study on workers; return wall time and processor time in all [s]."""
     with tempfile.TemporaryDirectory() as name, sweep_cluster_client(workers) as client:
         options = {"client": client, "progress": False}
         sweep.run(
@@ -47,7 +47,7 @@ def measure_run(spec: GridSpec, workers: int) -> tuple[float, float]:
 
 
 def run_plain_loop(spec: GridSpec, first_block: int, block_step: int, barrier) -> None:
-    """Every so many-th block, in a plain loop."""
+    """Compute every `block_step`-th block in a plain loop, once all processes are ready."""
     study = GridStudy(spec)
     study.evaluate(first_block)
     barrier.wait()
@@ -56,7 +56,7 @@ def run_plain_loop(spec: GridSpec, first_block: int, block_step: int, barrier) -
 
 
 def measure_plain_loops(spec: GridSpec, n_processes: int) -> float:
-    """Seconds of plain loops over all blocks, in so many processes."""
+    """Return the wall time of plain loops over all blocks, in parallel processes [s]."""
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(n_processes + 1)
     processes = [
@@ -73,7 +73,7 @@ def measure_plain_loops(spec: GridSpec, n_processes: int) -> float:
 
 
 def main() -> None:
-    """Measure in turns, and print."""
+    """Measure the numbers of workers in turns, and write the table into docs/scale.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--most", type=int, default=cpu_count())
     parser.add_argument("--rounds", type=int, default=3)

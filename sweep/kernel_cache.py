@@ -43,17 +43,17 @@ from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from platformdirs import user_cache_dir
 
-#: Time without use after which the kernels of another fingerprint are deleted [s].
 UNUSED_CACHE_AGE_MAX = 30 * 86400.0
+"""Time without use after which the kernels of another fingerprint are deleted [s]."""
 
-#: Age of a cache folder's modification time at which a use renews it [s].
 USE_DATE_RENEWAL_INTERVAL = 86400.0
+"""Age of a cache folder's modification time at which a use renews it [s]."""
 
-#: Numba settings that do not change the compiled code, so the fingerprint leaves them out.
-NUMBA_SETTINGS_WITHOUT_EFFECT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
+NUMBA_SETTINGS_OUTSIDE_FINGERPRINT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
+"""Numba settings that do not change the compiled code, so the fingerprint leaves them out."""
 
-#: Default options of `numba.njit` for every kernel.
 DEFAULT_NJIT_OPTIONS = {"nogil": True}
+"""Default options of `numba.njit` for every kernel."""
 
 _numba_settings: Any = numba.config
 _MODEL_DIR = Path(__file__).parent / "model"
@@ -66,15 +66,19 @@ _declaration_lock = threading.RLock()
 class CacheFolder(NamedTuple):
     """Folder in which this process caches compiled kernels."""
 
-    path: Path | None  # None if kernels are not cached
-    reason: str = ""  # why kernels are not cached
+    path: Path | None
+    """The folder; None if kernels are not cached."""
+    reason: str = ""
+    """Why kernels are not cached; empty if they are."""
 
 
 class _CacheState:
     """Flags of this process: whether it may still read and write the kernel cache."""
 
-    can_read = True  # False once a model file has changed since the fingerprint was taken
+    can_read = True
+    """False once a model file has changed since the fingerprint was computed."""
     can_write = True
+    """False once a model file has changed, or the cache folder can't be written."""
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -129,6 +133,7 @@ class KernelCache(FunctionCache):
     """
 
     borrows = False
+    """True if the kernel neither creates nor returns arrays, as declared to `njit`."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the kernel compiled for a signature, or None if it is not cached."""
@@ -170,26 +175,26 @@ class KernelCache(FunctionCache):
                 super().save_overload(sig, data)
         except OSError as error:
             _CacheState.can_write = False
-            _log_uncached(f"{folder} can't be written ({error.strerror or error})")
+            _warn_not_cached(f"{folder} can't be written ({error.strerror or error})")
         else:
             _renew_use_date(folder)
             _remove_unused_caches(folder)
 
 
 def _holds_arrays(kind: Any) -> bool:
-    """Tell whether a numba type is an array type, or a tuple type that contains one."""
+    """Return True if a numba type is an array type, or a tuple type that contains one."""
     parts = getattr(kind, "types", ())  # member types of a tuple
     return isinstance(kind, types.Array) or any(map(_holds_arrays, parts))
 
 
 def _enable_cache(kernel: Any, borrows: bool) -> None:
-    """Cache a kernel in the folder of the fingerprint, if there is one.
+    """Let numba cache a kernel in this process's cache folder, if it has one.
 
-    ``borrows``: as in :func:`njit`.
+    `borrows` declares that the kernel neither creates nor returns arrays, as in `njit`.
     """
     folder = cache_folder()
     if folder.path is None:
-        _log_uncached(folder.reason)
+        _warn_not_cached(folder.reason)
         return
     if _file_has_changed(kernel.py_func.__code__.co_filename):
         # This process has loaded modules of different versions: no fingerprint describes them.
@@ -226,7 +231,7 @@ def cache_folder() -> CacheFolder:
     directory, the directory for temporary files.
     """
     with _declaration_lock:
-        if not (fingerprint := _fingerprint()):
+        if not (fingerprint := _model_fingerprint()):
             return CacheFolder(None, "the sources of the model are not files")
         reasons = []
         for find_base in (_configured_cache_base, user_cache_dir, tempfile.gettempdir):
@@ -234,7 +239,7 @@ def cache_folder() -> CacheFolder:
                 base = find_base()
                 if os.path.isabs(base):  # without a home directory, user_cache_dir is relative
                     root = Path(base) / f"sweep-kernels-{os.getuid()}"
-                    _make_private(root)
+                    _create_private_folder(root)
                     _log.info("compiled kernels are kept in %s", root / fingerprint)
                     return CacheFolder(root / fingerprint)
             except OSError as error:
@@ -254,7 +259,7 @@ def _configured_cache_base() -> str:
     return os.path.abspath(cache_dir) if cache_dir else ""
 
 
-def _make_private(root: Path) -> None:
+def _create_private_folder(root: Path) -> None:
     """Create a folder that no other user can write to; raise OSError if that is impossible."""
     root.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
@@ -270,7 +275,7 @@ def _make_private(root: Path) -> None:
 
 
 @cache
-def _sources() -> dict[str, tuple[str, int, int]]:
+def _model_file_stats() -> dict[str, tuple[str, int, int]]:
     """Return name, size [bytes] and modification time [ns] of each model file, by its path."""
     return {
         str(path): (path.relative_to(_MODEL_DIR).as_posix(), status.st_size, status.st_mtime_ns)
@@ -280,29 +285,29 @@ def _sources() -> dict[str, tuple[str, int, int]]:
 
 
 @cache
-def _fingerprint() -> str:
+def _model_fingerprint() -> str:
     """Return a digest of everything that determines compiled kernels; '' without source files."""
     digest = hashlib.sha256()
     parts = [numba.__version__, llvmlite.__version__, np.__version__, repr(DEFAULT_NJIT_OPTIONS)]
     parts += [
         f"{name}={value}"
         for name, value in sorted(os.environ.items())
-        if name.startswith("NUMBA_") and name not in NUMBA_SETTINGS_WITHOUT_EFFECT
+        if name.startswith("NUMBA_") and name not in NUMBA_SETTINGS_OUTSIDE_FINGERPRINT
     ]
     digest.update(repr(parts).encode())
-    for path, (name, *_) in _sources().items():
+    for path, (name, *_) in _model_file_stats().items():
         content = Path(path).read_bytes()
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
-    return digest.hexdigest()[:32] if _sources() else ""
+    return digest.hexdigest()[:32] if _model_file_stats() else ""
 
 
 def _file_has_changed(path: str) -> bool:
-    """Tell whether a model file has changed since the fingerprint was taken.
+    """Return True if a model file has changed since the fingerprint was computed.
 
     Files outside the model count as unchanged.
     """
-    if (fingerprinted := _sources().get(path)) is None:
+    if (fingerprinted := _model_file_stats().get(path)) is None:
         return False
     try:
         status = os.stat(path)
@@ -312,19 +317,22 @@ def _file_has_changed(path: str) -> bool:
 
 
 def _any_file_has_changed() -> bool:
-    """Tell whether any model file has changed since the fingerprint was taken."""
-    return any(map(_file_has_changed, _sources()))
+    """Return True if any model file has changed since the fingerprint was computed."""
+    return any(map(_file_has_changed, _model_file_stats()))
 
 
 @cache
 def _had_changed_at_first_load() -> bool:
-    """Tell whether any model file had changed at the first load of a kernel; once per process."""
+    """Return True if any model file had changed when this process first loaded a kernel."""
     return _any_file_has_changed()
 
 
 @cache
 def _renew_use_date(folder: Path) -> None:
-    """Renew a cache folder's modification time, so that others keep it; once per process."""
+    """Renew a cache folder's modification time, so that no process deletes it as unused.
+
+    Each process does this once per folder.
+    """
     with suppress(OSError):
         if time.time() - folder.stat().st_mtime > USE_DATE_RENEWAL_INTERVAL:
             os.utime(folder)
@@ -348,8 +356,8 @@ def _remove_unused_caches(used_folder: Path) -> None:
 
 
 @cache
-def _log_uncached(reason: str) -> None:
-    """Log that every process compiles its kernels anew, with the reason and the remedy."""
+def _warn_not_cached(reason: str) -> None:
+    """Warn in the log that every process compiles its kernels anew, with reason and remedy."""
     _log.warning(
         "compiled kernels are not cached, so that each start takes a minute more: %s. "
         "NUMBA_CACHE_DIR names another folder for them, of your own and with room",
@@ -358,7 +366,7 @@ def _log_uncached(reason: str) -> None:
 
 
 @intrinsic
-def high_word(typing_context, a, b):
+def multiply_high(typing_context, a, b):
     """Return the upper 64 bits of the 128-bit product of two unsigned 64-bit integers.
 
     The product compiles to one machine instruction.

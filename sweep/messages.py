@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 # Control characters (C0 except tab and line feed, DEL, C1), marks of text direction, invisible
 # characters, line separators, surrogates and tags.
-_UNPRINTABLE = re.compile(
+_UNPRINTABLE_PATTERN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f"
     "\ufeff\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e0fff]"
 )
@@ -32,7 +32,7 @@ def escape_unprintable(text: str) -> str:
     >>> print(escape_unprintable("lidar\x1b[2J\u202egnp.exe"))
     lidar\x1b[2J\u202egnp.exe
     """
-    return _UNPRINTABLE.sub(_escape_character, text.replace("\r\n", "\n"))
+    return _UNPRINTABLE_PATTERN.sub(_escape_character, text.replace("\r\n", "\n"))
 
 
 def _escape_character(match: re.Match[str]) -> str:
@@ -65,7 +65,7 @@ def counted(number: int, thing: str) -> str:
     return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
-class PrintableError(Exception):
+class EscapedTextError(Exception):
     """Base of errors whose text quotes stores, specs and file names.
 
     Unprintable characters are escaped.
@@ -75,7 +75,7 @@ class PrintableError(Exception):
         return escape_unprintable(super().__str__())
 
 
-class PrintableStream:
+class EscapingStream:
     """Text stream that escapes unprintable characters.
 
     It has no attribute `buffer`, so that no output bypasses it. Rich, which writes escape sequences
@@ -164,12 +164,12 @@ def shell_command(name: str, *arguments: object, **options: object) -> str:
 
 
 def _shell_word(value: object) -> str:
-    """Quote a value for the shell; a leading '-' gets './' so that it is no option."""
+    """Quote a value for the shell; put './' before a leading '-', so that it is no option."""
     word = str(value)
     return shlex.quote(f"./{word}" if word.startswith("-") else word)
 
 
-def suggestion(name: str, *arguments: object, **options: object) -> str:
+def suggested_call(name: str, *arguments: object, **options: object) -> str:
     """Return a command to type or a Python call to make, in backquotes.
 
     Parameters
@@ -181,10 +181,10 @@ def suggestion(name: str, *arguments: object, **options: object) -> str:
 
     Examples
     --------
-    >>> suggestion("resume", "a b.zarr", retry_failed=True)
+    >>> suggested_call("resume", "a b.zarr", retry_failed=True)
     "`sweep.resume('a b.zarr', retry_failed=True)`"
     >>> with suggest_shell_commands():
-    ...     suggestion("resume", "a b.zarr", retry_failed=True)
+    ...     suggested_call("resume", "a b.zarr", retry_failed=True)
     "`sweep resume 'a b.zarr' --retry-failed`"
     """
     if _runs_as_command:

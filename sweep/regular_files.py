@@ -42,7 +42,7 @@ def file_type(mode: int) -> str:
     return _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), "a plain file")
 
 
-def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
+def open_regular_file(path: str | Path, *, follow_links: bool = True) -> int:
     """Open a regular file for reading without blocking, and return its descriptor.
 
     Parameters
@@ -64,7 +64,7 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
     )
 
 
-def open_below(root: str | Path, name: str) -> int:
+def open_file_below_root(root: str | Path, name: str) -> int:
     """Open the regular file ``name`` below the directory ``root``, and return its descriptor.
 
     Parameters
@@ -142,33 +142,37 @@ def _open_refusing_irregular(
     return descriptor
 
 
-def read_regular(path: str | Path, bytes_max: int) -> bytes:
+def read_regular_file(path: str | Path, bytes_max: int) -> bytes:
     """Return the content of a regular file of at most ``bytes_max`` bytes.
 
     Symbolic links are followed.
     """
-    return _read(open_regular(path), bytes_max, str(path))
+    return _read_slice_and_close(open_regular_file(path), bytes_max, str(path))
 
 
-def read_below(
+def read_file_below_root(
     root: str | Path, name: str, bytes_max: int, byte_slice: slice = slice(None)
 ) -> bytes:
-    """Return the bytes ``byte_slice`` of a regular file opened as by :func:`open_below`.
+    """Return the bytes ``byte_slice`` of a regular file opened as by :func:`open_file_below_root`.
 
     Raises
     ------
     RefusedFileError
-        If the file has more than ``bytes_max`` bytes, or is refused by :func:`open_below`.
+        If the file has more than ``bytes_max`` bytes, or :func:`open_file_below_root` refuses it.
     """
-    return _read(open_below(root, name), bytes_max, f"{root}/{name}", byte_slice)
+    return _read_slice_and_close(
+        open_file_below_root(root, name), bytes_max, f"{root}/{name}", byte_slice
+    )
 
 
-def _read(
+def _read_slice_and_close(
     descriptor: int, bytes_max: int, path_in_messages: str, byte_slice: slice = slice(None)
 ) -> bytes:
     """Return a slice of an open file, and close it."""
     with open(descriptor, "rb", buffering=0) as file:
-        start, stop, _ = byte_slice.indices(checked_size(descriptor, bytes_max, path_in_messages))
+        start, stop, _ = byte_slice.indices(
+            file_size_within_limit(descriptor, bytes_max, path_in_messages)
+        )
         file.seek(start)
         pieces: list[bytes] = []
         remaining = stop - start
@@ -179,30 +183,30 @@ def _read(
 
 
 @contextmanager
-def stream_below(
+def stream_file_below_root(
     root: str | Path, name: str, bytes_max: int
 ) -> Iterator[tuple[int, Iterator[bytes]]]:
     """Context manager: yield the size of a file below a directory and its content in pieces.
 
-    The file is opened as by :func:`open_below` and has at most ``bytes_max`` bytes.
+    The file is opened as by :func:`open_file_below_root` and has at most ``bytes_max`` bytes.
     """
-    descriptor = open_below(root, name)
+    descriptor = open_file_below_root(root, name)
     with open(descriptor, "rb", buffering=0) as file:
-        size = checked_size(descriptor, bytes_max, f"{root}/{name}")
+        size = file_size_within_limit(descriptor, bytes_max, f"{root}/{name}")
         yield size, iter(lambda: file.read(READ_BUFFER_BYTES), b"")
 
 
-def checked_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
+def file_size_within_limit(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
     """Return the size of an open file [bytes].
 
     Raise `RefusedFileError` if the size exceeds ``bytes_max``.
     """
     size = os.fstat(descriptor).st_size
-    check_size(size, bytes_max, path_in_messages)
+    check_file_size(size, bytes_max, path_in_messages)
     return size
 
 
-def check_size(size: int, bytes_max: int, path_in_messages: str) -> None:
+def check_file_size(size: int, bytes_max: int, path_in_messages: str) -> None:
     """Raise `RefusedFileError` if the size of a file or object exceeds ``bytes_max``."""
     if size > bytes_max:
         problem = f"has {size:,} bytes, and can have no more than {bytes_max:,}"

@@ -38,7 +38,7 @@ dBc/Hz.
 """
 
 NO_VALUE_TEXT = "none"
-"""Text for nan, such as a fraction of nothing."""
+"""Text that stands for nan, such as the quotient 0 / 0."""
 
 _NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 """Pattern of a number in decimal notation."""
@@ -47,7 +47,7 @@ _POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
 _EXPONENT_MAX = 999
 """Largest magnitude of the exponent in a power, such as ``10^-3``."""
 _UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
-"""Pattern of the text after a number that may be a unit."""
+"""Pattern of text after a number, if that text may be a unit."""
 _QUANTITY_PATTERN = re.compile(
     rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
 )
@@ -98,7 +98,7 @@ _ATTENUATION_UNITS = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10
 centimetre."""
 _WATT_DIMENSION = {"gram": 1, "meter": 2, "second": -3}
 """Exponents of pint's root units in a watt."""
-_BASE_UNITS: dict[str, tuple[Fraction, dict[str, int]]] = {
+_BASE_UNIT_CONVERSIONS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "m": (Fraction(1), {"meter": 1}),
     "s": (Fraction(1), {"second": 1}),
     "Hz": (Fraction(1), {"second": -1}),
@@ -114,8 +114,8 @@ _BASE_UNITS: dict[str, tuple[Fraction, dict[str, int]]] = {
 """Factor to pint's root units, and exponents of the root units, of each unit known without pint."""
 _PREFIX_EXPONENTS = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
 """Power of ten of each metric prefix."""
-UNITS_KNOWN_WITHOUT_PINT = frozenset(_BASE_UNITS) | {
-    prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNITS
+UNITS_KNOWN_WITHOUT_PINT = frozenset(_BASE_UNIT_CONVERSIONS) | {
+    prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNIT_CONVERSIONS
 }
 """Units that are known without pint; factors and root units equal those of pint."""
 
@@ -166,7 +166,9 @@ class Unit:
             If the result exceeds the range of floats.
         """
         try:
-            scaled = self.factor * (_power_ratio(value) if self.is_logarithmic else value)
+            scaled = self.factor * (
+                _power_ratio_from_decibels(value) if self.is_logarithmic else value
+            )
             return float(scaled + self.offset)
         except OverflowError:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
@@ -223,7 +225,10 @@ def _pure_number_suggestion(
 ) -> str:
     """Suggest the pure number that a number with a unit probably means; '' if none is valid."""
     if unit == DECIBEL:
-        ratios = {"powers": _power_ratio(value), "amplitudes": _power_ratio(value / 2)}
+        ratios = {
+            "powers": _power_ratio_from_decibels(value),
+            "amplitudes": _power_ratio_from_decibels(value / 2),
+        }
         ratio_texts = {
             kind: _format_number(ratio) for kind, ratio in ratios.items() if is_valid(ratio)
         }
@@ -316,12 +321,12 @@ def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
             f"has the unit '{unit_text}', which cannot be read", f"write e.g. '{example}'"
         )
     for name, _ in factors:
-        if _in_root_units(name) is None:
+        if _root_unit_conversion(name) is None:
             raise QuantityError(
                 f"has an unknown unit '{name}'", _unit_suggestion(name, si_unit, example)
             )
-    scale, offset, dimension = _combine_factors(factors)
-    si_scale, _, si_dimension = _combine_factors(_parse_unit_factors(si_unit) or [])
+    scale, offset, dimension = _multiply_unit_factors(factors)
+    si_scale, _, si_dimension = _multiply_unit_factors(_parse_unit_factors(si_unit) or [])
     if dimension != si_dimension:
         raise QuantityError(*_wrong_dimension_error(unit_text, si_unit, example))
     return Unit(_format_unit(factors), scale / si_scale, offset / si_scale)
@@ -339,9 +344,8 @@ def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[
 def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
     """Return the exact number and the text of the unit of a written quantity.
 
-    The text may be empty.
-
-    An unreadable value raises a `QuantityError` with `rule`.
+    The text is empty if the quantity has no unit. Raise a `QuantityError` with the text `rule` if
+    the value is unreadable.
     """
     if isinstance(raw_value, bool) or not isinstance(raw_value, int | float | str):
         raise QuantityError(rule)
@@ -351,7 +355,7 @@ def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
     if _NOT_FINITE_PATTERN.match(text):
         raise QuantityError("must be a finite number")
     if grouped := _GROUPED_NUMBER_PATTERN.match(text):
-        raise QuantityError(*_grouping_error(text, grouped[0]))
+        raise QuantityError(*_grouped_digits_error(text, grouped[0]))
     match = _QUANTITY_PATTERN.fullmatch(text)
     if match is None:
         raise QuantityError(rule)
@@ -372,7 +376,7 @@ def _parse_power(base: int, exponent: str) -> Fraction:
     return Fraction(base) ** int(exponent)
 
 
-def _grouping_error(text: str, number: str) -> tuple[str, str]:
+def _grouped_digits_error(text: str, number: str) -> tuple[str, str]:
     """Return rule and suggestion for a number with grouped digits or a decimal comma."""
     *groups, last_group = re.split(r"[,_'\s]", number)
     remedies = []
@@ -448,17 +452,21 @@ def _pint_registry() -> Any:
 
 
 @cache
-def _in_root_units(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
+def _root_unit_conversion(
+    name: str,
+) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Return factor, offset and dimension of a unit in pint's root units; None if it is unknown."""
     if name in UNITS_KNOWN_WITHOUT_PINT:
-        base = name if name in _BASE_UNITS else name[1:]
-        factor, powers = _BASE_UNITS[base]
-        factor *= Fraction(10) ** (0 if name in _BASE_UNITS else _PREFIX_EXPONENTS[name[0]])
+        base = name if name in _BASE_UNIT_CONVERSIONS else name[1:]
+        factor, powers = _BASE_UNIT_CONVERSIONS[base]
+        factor *= Fraction(10) ** (
+            0 if name in _BASE_UNIT_CONVERSIONS else _PREFIX_EXPONENTS[name[0]]
+        )
         return factor, Fraction(0), tuple(sorted((k, Fraction(v)) for k, v in powers.items()))
-    return in_root_units_by_pint(name)
+    return root_unit_conversion_by_pint(name)
 
 
-def in_root_units_by_pint(
+def root_unit_conversion_by_pint(
     name: str,
 ) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Return factor, offset and dimension of a unit in root units according to pint.
@@ -484,14 +492,14 @@ def in_root_units_by_pint(
     return Fraction(one.magnitude) - offset, offset, tuple(sorted(dimension.items()))
 
 
-def _combine_factors(
+def _multiply_unit_factors(
     factors: list[tuple[str, Fraction]],
 ) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
-    """Return factor, offset and dimension of a product of known units."""
+    """Return factor, offset and dimension of a product of known units, in pint's root units."""
     scale, offset = Fraction(1), Fraction(0)
     dimension: dict[str, Fraction] = {}
     for name, exponent in factors:
-        root_unit = _in_root_units(name)
+        root_unit = _root_unit_conversion(name)
         assert root_unit is not None
         factor, offset, powers = root_unit
         scale *= _exact_power(factor, exponent)
@@ -519,7 +527,7 @@ def _exact_power(factor: Fraction, exponent: Fraction) -> Fraction:
     return Fraction(root) ** exponent.numerator
 
 
-def _power_ratio(decibels: Fraction) -> Fraction:
+def _power_ratio_from_decibels(decibels: Fraction) -> Fraction:
     """Return the power ratio of decibels to 50 digits, clipped to 1e-400 and 1e400."""
     with localcontext() as context:
         context.prec = 50
@@ -549,7 +557,7 @@ def number_text(value: float, format_spec: str = ".4g") -> str:
 
 
 def percent(share: float, format_spec: str = ".3g") -> str:
-    """Return a fraction in percent; ``none`` for nan, such as a fraction of nothing.
+    """Return a fraction as text in percent; ``none`` for nan, such as the quotient 0 / 0.
 
     Examples
     --------

@@ -393,25 +393,25 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
     ],
 )
 def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(processing, remedy):
-    from sweep.spec.noise_alarms import fewer_alarms_remedy
+    from sweep.spec.noise_alarms import false_alarm_remedy
 
     drawn = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
     spec = GridSpec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
-    assert fewer_alarms_remedy(spec) == remedy
+    assert false_alarm_remedy(spec) == remedy
 
 
 def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
-    from sweep.spec.noise_alarms import alarm_probabilities
+    from sweep.spec.noise_alarms import false_alarm_probabilities
 
     text = STUDY.replace("instrument.laser.power: [1 W, 3 W]", "instrument.processing.tnr: [7, 9]")
     text = text.replace("tnr: 8", "tnr: 7")
-    (any_, both), last = alarm_probabilities(GridSpec.from_mapping(yaml.safe_load(text)))
+    (any_, both), last = false_alarm_probabilities(GridSpec.from_mapping(yaml.safe_load(text)))
     p = 2.7183 ** (-(4 - 3.14159) / 4 * 49)
     assert any_ == pytest.approx(1 - (1 - p) ** 2**14, rel=1e-3)
     assert both == pytest.approx((1 - (1 - p) ** 2**13) ** 2, rel=1e-3) and last < (any_, both)
     cfar = STUDY.replace("tnr: 8", "tnr: 8, detector: {kind: ca_cfar, pfa: 1e-9}")
     drawn = yaml.safe_load(cfar + "draws: {method: spectra, number: 2}")
-    ((any_, _),) = alarm_probabilities(GridSpec.from_mapping(drawn))
+    ((any_, _),) = false_alarm_probabilities(GridSpec.from_mapping(drawn))
     assert any_ == pytest.approx(2**14 * 1e-9, rel=1e-4)
 
 

@@ -48,7 +48,7 @@ def _held(spec, axis):
     """Places of the values of a plain axis at which figures hold it."""
     written = [figure.where[axis.name] for figure in spec.figures
                if axis.name in getattr(figure, "where", {})]  # fmt: skip
-    held = [spec.read_coordinate(axis.name, value) for several in written
+    held = [spec.read_coordinate_value(axis.name, value) for several in written
             for value in (several if isinstance(several, list | tuple) else [several])]  # fmt: skip
     return np.flatnonzero(matches_any(np.asarray(axis.parameters[0].display_values), held))
 

@@ -14,14 +14,14 @@ from click.testing import CliRunner
 import sweep
 from sweep.cli import main
 from sweep.spec import GridSpec, SpecError, load
-from sweep.spec.yaml_document import library_instruments, read_document
+from sweep.spec.yaml_document import library_instrument_files, read_document
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import instruments_page as page  # noqa: E402
 
-NAMES = list(library_instruments())
+NAMES = list(library_instrument_files())
 DRAWS = 100
 """Shots at each of 64 places: some 300 are detected, and a deviation is known to 6 %."""
 
@@ -102,7 +102,7 @@ def test_a_store_holds_the_instrument_in_whole(tmp_path):
 
 
 def test_a_file_of_the_same_name_is_named_by_its_path(tmp_path):
-    own = read_document(library_instruments()["rogers_2021"]).content["instrument"]
+    own = read_document(library_instrument_files()["rogers_2021"]).content["instrument"]
     own["laser"]["power"] = "5 mW"
     study = {"title": "A study", "target": {"range": "20 m", "grazing_angle": "60 deg",
                                             "reflectance": 0.1}}  # fmt: skip

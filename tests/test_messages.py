@@ -15,11 +15,11 @@ import sweep
 from sweep.cli import main
 from sweep.cli.terminal import print_table
 from sweep.messages import (
-    PrintableStream,
+    EscapingStream,
     escape_to_one_line,
     escape_unprintable,
     suggest_shell_commands,
-    suggestion,
+    suggested_call,
 )
 from sweep.spec import SpecError
 from sweep.tasks.engine import progress
@@ -58,7 +58,7 @@ def test_text_of_one_line_cannot_forge_another():
 
 def test_a_stream_is_written_to_by_nothing_else_than_printable_text():
     raw = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
-    stream = PrintableStream(raw)
+    stream = EscapingStream(raw)
     print(HOSTILE, file=stream, flush=True)
     assert not OBEYED & set(raw.buffer.getvalue().decode())
     assert not hasattr(stream, "buffer")
@@ -149,7 +149,7 @@ def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
     def broken(*_):
         raise RuntimeError(HOSTILE)
 
-    monkeypatch.setattr("sweep.spec.yaml_document.library_instruments", broken)
+    monkeypatch.setattr("sweep.spec.yaml_document.library_instrument_files", broken)
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))  # put back afterwards
     with pytest.raises(RuntimeError) as caught:
@@ -166,12 +166,12 @@ def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
 def test_a_command_that_is_suggested_names_the_path_whatever_it_holds(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with suggest_shell_commands():
-        command = suggestion("resume", name, retry_failed=True).strip("`")
+        command = suggested_call("resume", name, retry_failed=True).strip("`")
     words = shlex.split(command)
     assert words[:2] == ["sweep", "resume"] and words[3:] == ["--retry-failed"]
     assert words[2].removeprefix("./") == name
     if not name.startswith("-"):
-        assert eval(suggestion("resume", name)[len("`sweep.resume(") : -2]) == name
+        assert eval(suggested_call("resume", name)[len("`sweep.resume(") : -2]) == name
 
 
 def test_commands_after_an_incomplete_run_work_for_a_path_with_blanks(tmp_path, monkeypatch):

@@ -209,7 +209,7 @@ def test_importing_the_package_and_its_units_leaves_pint_alone():
 
 @pytest.mark.parametrize("name", sorted(units.UNITS_KNOWN_WITHOUT_PINT))
 def test_usual_units_are_exactly_pints(name):
-    assert units._in_root_units(name) == units.in_root_units_by_pint(name)
+    assert units._root_unit_conversion(name) == units.root_unit_conversion_by_pint(name)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from sweep.analysis.answers import (
     provenance,
 )
 from sweep.analysis.answers.dataset_lookup import STUDY_ID, marker_name
-from sweep.messages import suggestion
+from sweep.messages import suggested_call
 from sweep.model.outputs import RUNNING_SUMS
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage import store_format
@@ -272,7 +272,7 @@ def refuse_lost_coordinates(store_path: Location) -> None:
                     continue
             raise NotAStoreError(
                 f"{store_path} has lost {name}, of a coordinate: "
-                f"{suggestion('verify', store_path, repair=True)} puts it back"
+                f"{suggested_call('verify', store_path, repair=True)} puts it back"
             )
 
 

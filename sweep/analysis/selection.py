@@ -235,7 +235,7 @@ def select_where(
     for name, raw_value in where.items():
         wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
         if name in points.dataset.coords:
-            wanted_values = [spec.read_coordinate(name, value) for value in wanted_values]
+            wanted_values = [spec.read_coordinate_value(name, value) for value in wanted_values]
         points = points.sel(name, wanted_values)
     return points
 
@@ -357,7 +357,8 @@ def study_cuts(spec: GridSpec) -> list[Cut]:
         fixed_values = _constant_runs(zipped_axis)
     else:
         published_values = [
-            (parameter_by_path[p], spec.read_coordinate(p, text)) for p, text in PUBLISHED_CUTS
+            (parameter_by_path[p], spec.read_coordinate_value(p, text))
+            for p, text in PUBLISHED_CUTS
         ]
         fixed_values = [
             (m, v) for m, v in published_values if np.isclose(m.display_values, float(v)).any()
@@ -408,7 +409,7 @@ def select_beyond(
     range_parameter = find_axis_parameter(spec, RANGE_PATH)
     if range_parameter is None:
         return points
-    range_min = float(spec.read_coordinate(RANGE_PATH, distance))
+    range_min = float(spec.read_coordinate_value(RANGE_PATH, distance))
     ranges = points.coordinate_values(range_parameter.coordinate)
     return points.isel(
         points.dim_of(range_parameter.coordinate),

@@ -696,7 +696,7 @@ def select_shot_parameters(
             for m in axis_parameters
         )
         labelled_parameters.append(
-            (label if draws_all_values else "", spec.parameters_with(raw_values))
+            (label if draws_all_values else "", spec.parameters_with_overrides(raw_values))
         )
     return labelled_parameters
 

@@ -33,7 +33,7 @@ from sweep.cli.terminal import (
     print_accuracy_measurement,
     print_echo_warnings,
     print_effects,
-    print_inconsistencies,
+    print_inconsistency_warnings,
     print_outcome_and_exit,
     print_spec_warnings,
     run_options,
@@ -41,7 +41,7 @@ from sweep.cli.terminal import (
     study_effects_table,
     wrap_text,
 )
-from sweep.messages import PrintableStream, suggest_shell_commands
+from sweep.messages import EscapingStream, suggest_shell_commands
 from sweep.storage.locations import Location
 from sweep.tasks.engine.text_streams import silence_failing_output
 
@@ -56,15 +56,15 @@ UNUSABLE_PATH_ERRNOS = {
 DISK_FULL_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
-def _make_output_printable() -> None:
+def _escape_output_streams() -> None:
     """Wrap standard output and standard error so that unprintable characters are escaped."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is not None and not isinstance(stream, PrintableStream):
-            setattr(sys, name, PrintableStream(stream))
+        if stream is not None and not isinstance(stream, EscapingStream):
+            setattr(sys, name, EscapingStream(stream))
 
 
-class _StandardError(logging.StreamHandler[Any]):
+class _StandardErrorHandler(logging.StreamHandler[Any]):
     """Log handler that writes to the current standard error, above a progress bar if any.
 
     Python's handler of last resort also looks up the stream at each write.
@@ -85,11 +85,11 @@ class _StandardError(logging.StreamHandler[Any]):
             super().emit(record)
 
 
-def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
+def _enable_logging(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
     """Write the package's log to standard error: steps with -v, and each task with -vv."""
     if not verbosity:
         return
-    log, handler = logging.getLogger("sweep"), _StandardError()
+    log, handler = logging.getLogger("sweep"), _StandardErrorHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     level, propagates = log.level, log.propagate
     log.addHandler(handler)
@@ -115,28 +115,28 @@ class CommandGroup(click.Group):
                 ["-v", "--verbose"],
                 count=True,
                 expose_value=False,
-                callback=_show_log,
+                callback=_enable_logging,
                 help="Log the steps of the command to standard error; -vv logs each task too.",
             )
         )
         super().add_command(cmd, name)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line; all output is printable, including tracebacks.
+        """Run the command line; escape unprintable characters in all output, also in tracebacks.
 
         The exit code is the same if output streams are closed. Streams stay wrapped, as Python
         prints the traceback of an error after this function.
         """
         try:
             with silence_failing_output():
-                _make_output_printable()
+                _escape_output_streams()
                 with suggest_shell_commands():
                     return super().main(*args, **options)
         finally:
-            _make_output_printable()
+            _escape_output_streams()
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; errors that are not the user's mistake keep their traceback."""
+        """Run a command; report a user's mistake as a message, and let other errors pass."""
         try:
             Path.cwd()
         except FileNotFoundError:
@@ -263,7 +263,7 @@ def run(
     from sweep.tasks import driver
 
     if overwrite and resuming:
-        raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
+        raise click.UsageError("--overwrite starts again, and --resume continues: give one of them")
     study_spec, path = load(spec), store or _default_store(spec)
     if can_create_store(path) or not resuming:  # else the user confirmed when the study began
         confirm_large_study(study_spec, path, yes=yes)
@@ -373,6 +373,7 @@ def shot(
 
 
 def _print_paths(files: Sequence[Location]) -> None:
+    """Print the path of each file on its own line, relative to the current folder if below it."""
     for file in files:
         click.echo(shorten_path(file))
 
@@ -503,7 +504,7 @@ def export(
 
             count = write_point_cloud(store, file, **options)
     click.echo(f"{shorten_path(file.absolute())}: {count:,} {form}")
-    print_inconsistencies(store, options["scanner"])
+    print_inconsistency_warnings(store, options["scanner"])
 
 
 @main.command()
@@ -543,11 +544,11 @@ def instruments(name: str | None) -> None:
       sweep instruments settembrini_2026
       sweep instruments lander_ndl > own.yaml
     """  # noqa: D301
-    from sweep.cli.terminal import instrument_lines
+    from sweep.cli.terminal import instrument_yaml_lines
     from sweep.spec.rules import suggest_similar_name
-    from sweep.spec.yaml_document import library_instruments, read_document
+    from sweep.spec.yaml_document import library_instrument_files, read_document
 
-    library_files = library_instruments()
+    library_files = library_instrument_files()
     if name is not None and name not in library_files:
         hint = suggest_similar_name(
             name, library_files, fallback=f"the library has {', '.join(library_files)}"
@@ -556,7 +557,7 @@ def instruments(name: str | None) -> None:
     for instrument_name in [name] if name else library_files:
         instrument_file = read_document(library_files[instrument_name]).content
         lines = (
-            instrument_lines(instrument_file)
+            instrument_yaml_lines(instrument_file)
             if name
             else [wrap_text(f"{instrument_name:<24} {instrument_file['title']}", 25)]
         )

@@ -30,7 +30,7 @@ EXIT_DAMAGED, EXIT_DIFFERENT = 1, 4
 """Exit codes of verify for a damaged store, and of compare for different results."""
 
 #: Largest number of damaged objects that are listed for a store.
-LISTED_OBJECTS_MAX = 20
+LISTED_DAMAGED_OBJECTS_MAX = 20
 
 
 @click.command()
@@ -143,7 +143,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
     from sweep.tasks.studies.store_verification import verify as verify_stores
 
     if spec_file and not repair:
-        raise click.UsageError("--spec is for --repair: what is whole says itself what it holds")
+        raise click.UsageError("--spec is for --repair: an undamaged store holds its own spec")
     reports = verify_stores(store, repair=repair, spec=load(spec_file) if spec_file else None)
     for report in reports:
         _print_verify_report(report)
@@ -187,17 +187,17 @@ def _print_verify_report(report: VerificationReport) -> None:
     store = shorten_path(report.store)
     for name in report.restored_objects:
         click.echo(f"{store}: {name} put back")
-    for damage in report.damages[:LISTED_OBJECTS_MAX]:
+    for damage in report.damages[:LISTED_DAMAGED_OBJECTS_MAX]:
         block = f"block {damage.block}: " if damage.block >= 0 else ""
         echo_wrapped(f"{store}: {block}{damage.object_name} {damage.description}", err=True)
-    if len(report.damages) > LISTED_OBJECTS_MAX:
-        click.echo(f"and {len(report.damages) - LISTED_OBJECTS_MAX:,} more", err=True)
+    if len(report.damages) > LISTED_DAMAGED_OBJECTS_MAX:
+        click.echo(f"and {len(report.damages) - LISTED_DAMAGED_OBJECTS_MAX:,} more", err=True)
     if report.foreign_objects:
-        listed_names = ", ".join(report.foreign_objects[:LISTED_OBJECTS_MAX])
-        omitted_text = f" and {len(report.foreign_objects) - LISTED_OBJECTS_MAX:,} more"
+        listed_names = ", ".join(report.foreign_objects[:LISTED_DAMAGED_OBJECTS_MAX])
+        omitted_text = f" and {len(report.foreign_objects) - LISTED_DAMAGED_OBJECTS_MAX:,} more"
         echo_wrapped(
             f"{store}: not sweep's, and left alone: {listed_names}"
-            f"{omitted_text if len(report.foreign_objects) > LISTED_OBJECTS_MAX else ''}"
+            f"{omitted_text if len(report.foreign_objects) > LISTED_DAMAGED_OBJECTS_MAX else ''}"
         )
     if report.blocks:
         echo_wrapped(

@@ -98,7 +98,7 @@ class StoreLocationType(click.ParamType):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
-        """Return the location of an address."""
+        """Return the location that a path or address names."""
         return parse_location(str(value))
 
     def shell_complete(
@@ -224,7 +224,10 @@ ALLOW_CODE_OPTION = click.option(
 
 
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a command with the options of all computing commands, passed on unchanged."""
+    """Add to a command the options that all computing commands share.
+
+    They are passed to the command as keyword arguments.
+    """
     options = (
         THREADS_OPTION,
         WORKERS_OPTION,
@@ -265,7 +268,7 @@ def echo_wrapped(text: str, *, err: bool = False) -> None:
     click.echo(wrap_text(text, err=err), err=err)
 
 
-def instrument_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
+def instrument_yaml_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of a library instrument as a YAML file that a spec may name.
 
     Descriptive text becomes comments of the YAML.
@@ -313,7 +316,7 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
         try:
             _print_summary(outcome.store)
             print_accuracy(outcome.store)
-            print_inconsistencies(outcome.store)
+            print_inconsistency_warnings(outcome.store)
         except Exception as error:  # without the tables the study is still computed
             echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
     for scanner, rays in outcome.rays_by_scanner.items():
@@ -397,6 +400,7 @@ def _print_grid_summary(store: Location) -> None:
 
 
 def _sampled_share_text(block_share: float) -> str:
+    """Return a note that a table covers only a part of the blocks; '' if it covers all."""
     return f", by {100 * block_share:.2g} % of the blocks" if block_share < 1 else ""
 
 
@@ -447,7 +451,7 @@ def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
     return ""
 
 
-def print_inconsistencies(store: Location, scanner: str | None = None) -> None:
+def print_inconsistency_warnings(store: Location, scanner: str | None = None) -> None:
     """Warn of quantities of a flight whose errors far exceed their standard errors."""
     from sweep.tasks.studies import study_loading
 
@@ -575,9 +579,9 @@ def _print_rows_as_lists(title: str, headings: list[str], rows: list[list[str]])
 
 
 def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
-    """Return the least width of a column in which no word is broken, and no number either.
+    """Return the least width of a column at which no word is broken [characters].
 
-    In a column of sentences only words count.
+    Cells with numbers are not broken either, except in a column of sentences.
     """
     heading, *cells = column
     numbers = [] if is_sentences else [cell for cell in cells if any(map(str.isdigit, cell))]
@@ -625,7 +629,9 @@ def plan_rows(
     )
     memory_share = " a worker" if study_plan.has_workers else ""
     yield "memory", f"about {decimal(study_plan.memory_bytes)}{memory_share}"
-    if reason := _excess_text(study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds):
+    if reason := _excessive_size_text(
+        study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds
+    ):
         yield "question", f"sweep run asks first, or takes --yes: {reason}"
 
 
@@ -669,7 +675,7 @@ def print_effects(table: EffectsTable) -> None:
     """Print where effects are simulated, and their cost; warn of effects that are forced off."""
     active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
-    print_table("Effects", headings, [_effect_cells(row) for row in active_rows], "called for")
+    print_table("Effects", headings, [_effect_row_cells(row) for row in active_rows], "called for")
     absent_effects = [row.name for row in table.rows if row not in active_rows]
     if absent_effects:
         echo_wrapped(f"Not in this study: {', '.join(absent_effects).replace('_', ' ')}.")
@@ -682,7 +688,7 @@ def print_effects(table: EffectsTable) -> None:
 
 def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: bool) -> None:
     """Ask for confirmation before a very large study starts; exit if the user declines."""
-    if yes or not (excess := _excess_text(*_study_size(spec, store))):
+    if yes or not (excess := _excessive_size_text(*_study_size(spec, store))):
         return
     if not (is_terminal(sys.stdin) and is_terminal(sys.stderr)):
         click.echo(f"This study takes {excess}: say --yes to begin it.", err=True)
@@ -702,12 +708,14 @@ def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, 
     computed_study = make_study(spec, store.absolute())
     points, size_bytes = computed_study.n_points, computed_study.nbytes
     draws = max(1, spec.draws.number, spec.draws.limit) if isinstance(spec, GridSpec) else 1
-    if points * draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excess_text(points, size_bytes, 0.0):
+    if points * draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excessive_size_text(
+        points, size_bytes, 0.0
+    ):
         return points, size_bytes, 0.0
     return points, size_bytes, plan_study(spec, store_path=store).cpu_seconds
 
 
-def _excess_text(points: int, size_bytes: int, seconds: float) -> str:
+def _excessive_size_text(points: int, size_bytes: int, seconds: float) -> str:
     """Return the sizes of a study that exceed the limits for asking, in words; '' for none."""
     from sweep.tasks.engine.progress import duration_text
 
@@ -721,9 +729,9 @@ def _excess_text(points: int, size_bytes: int, seconds: float) -> str:
 
 def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
     """Return the false-alarm probabilities of a shot in words; '' if they are not known."""
-    from sweep.spec.noise_alarms import alarm_probabilities
+    from sweep.spec.noise_alarms import false_alarm_probabilities
 
-    if not (alarms := alarm_probabilities(spec)):
+    if not (alarms := false_alarm_probabilities(spec)):
         return ""
     either_text, both_text = (
         " to ".join(
@@ -761,7 +769,7 @@ def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
 def study_effects_table(
     spec: GridSpec | SceneSpec, store: Location, *, costs: bool = True
 ) -> EffectsTable:
-    """Return the table of effects of a study; ``costs`` measures their share of the time."""
+    """Return the table of effects of a study; ``costs`` adds each effect's share of the time."""
     from sweep.tasks.studies.study_loading import make_study
     from sweep.tasks.studies.study_plan import effects_table
 
@@ -774,8 +782,8 @@ def print_effects_warnings(table: EffectsTable) -> None:
         echo_wrapped(f"warning: {warning}", err=True)
 
 
-def _effect_cells(row: EffectRow) -> list[str]:
-    """Return the row of an effect in the table of effects."""
+def _effect_row_cells(row: EffectRow) -> list[str]:
+    """Return the cells of one effect's row in the table of effects."""
     cost, mode_text = row.time_fraction, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + mode_text,

@@ -44,7 +44,7 @@ from sweep.report.html_page import (
     render_html,
 )
 from sweep.spec import GridSpec, SceneSpec, SlicesFigure, SurfaceFigure
-from sweep.spec.noise_alarms import alarm_probabilities
+from sweep.spec.noise_alarms import false_alarm_probabilities
 from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, parse_location, write_path_atomically
 from sweep.storage.store_format import parse_software_versions
@@ -180,7 +180,7 @@ def _answer_section(
         f"{np.nanmin(counts_by_statistic[3]):.3g}.",
         *further_sentences,
     ]
-    if alarms := alarm_probabilities(spec):
+    if alarms := false_alarm_probabilities(spec):
         alarm_probability_max = max(alarm_probability for alarm_probability, _ in alarms)
         alarm_text = f"{alarm_probability_max:.3g}" + " at the most" * (len(alarms) > 1)
         sentences.append(

@@ -15,12 +15,12 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from sweep.messages import PrintableError, counted
+from sweep.messages import EscapedTextError, counted
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
 
-class SceneError(PrintableError):
+class SceneError(EscapedTextError):
     """Error of a file or object that is unsuitable for a scene, with problem and remedy."""
 
     def __init__(self, file: str | Path, problem: str, remedy: str) -> None:

@@ -33,7 +33,7 @@ from sweep.spec.sections import (
     MODEL_BY_SECTION,
     SECTIONS_NOT_ON_AXES,
     parameter_rules,
-    short_name,
+    parameter_short_name,
     suggest_parameter,
 )
 from sweep.units import QuantityError, Unit
@@ -41,16 +41,15 @@ from sweep.units import QuantityError, Unit
 RESERVED_DIMENSIONS = ("batch", "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have in addition to its axes."""
 
-_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
-"""Pattern of the name of a marker coordinate: it identifies the study of each point in a
-dataset."""
+_STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
+"""Pattern of the name of the coordinate that marks which points of a dataset a study has."""
 
 _AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 """Pattern of the name of a zipped axis."""
-_LISTED_VALUES_MAX = 64
+_VALUES_LISTED_IN_IDENTITY_MAX = 64
 """Maximum number of values that the identity of an axis lists; longer axes are given by a
 digest."""
-_NAME_REMEDY = "take a word such as 'cut'"
+_AXIS_NAME_REMEDY = "take a word such as 'cut'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +85,12 @@ class Axis:
 
     @property
     def is_zipped(self) -> bool:
-        """True if the axis is zipped: the name of its dimension is not that of its parameter."""
+        """True if the axis is zipped: it has several parameters, or a name of its own."""
         return len(self.parameters) > 1 or self.parameters[0].coordinate != self.name
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Return the content of an axis for the study's identity.
+    """Return an axis as data for the study's identity.
 
     An axis of at most 64 values is listed value by value. A longer axis is given by the number of
     its values, the first and last value, and a digest of all values.
@@ -115,9 +114,9 @@ def axis_identity(axis: Axis) -> dict[str, Any]:
 
 
 def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
-    """Return the content of one parameter along an axis for the study's identity."""
+    """Return one parameter along an axis as data for the study's identity."""
     n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
-    if n_values <= _LISTED_VALUES_MAX:
+    if n_values <= _VALUES_LISTED_IN_IDENTITY_MAX:
         return {
             "values": list(parameter.values) if has_words else np.asarray(parameter.values).tolist()
         }
@@ -211,7 +210,10 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
-    """Return pairs of path and written values of an axis, piece by piece if it is zipped."""
+    """Return path and values, as written, of each parameter of an axis.
+
+    A zipped axis has one such pair for each parameter of each piece.
+    """
     if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
         return [(key, raw_axis)]
     pieces = raw_axis["zip"] if isinstance(raw_axis["zip"], list) else [raw_axis["zip"]]
@@ -229,20 +231,20 @@ def _first_raw_value(values: object) -> object:
 def _read_axis(key: str, raw_axis: object, location: Location) -> Axis:
     """Read one axis, plain or zipped; raise `FindingsError` if it can't be read."""
     if isinstance(raw_axis, dict) and "zip" in raw_axis:
-        return _read_zip(key, raw_axis, location)
+        return _read_zipped_axis(key, raw_axis, location)
     if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
         path, values_hint = _describe_first_field(key, raw_axis)
         problem = "is a section, and an axis is named by the whole path of a field"
         raise findings_error(location, problem, f"write '{path}: {values_hint}'")
     parameter = _make_axis_parameter(
-        key, read_pieces(raw_axis, _axis_rule(key, location), location), location
+        key, read_axis_pieces(raw_axis, _axis_rule(key, location), location), location
     )
     _check_duplicates(parameter, location)
     return Axis(parameter.coordinate, (parameter,))
 
 
 def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
-    """Return the dotted path of the first field in nested sections, and a form for its values.
+    """Return the dotted path of the first field in nested sections, and how to write its values.
 
     Both are for the remedy when a user writes a section under ``axes`` in place of a field's path.
     """
@@ -260,7 +262,7 @@ def _axis_rule(path: str, location: Location) -> Rule:
     """Return the rule of the parameter at a path; raise `FindingsError` if no axis may set it."""
     rule = parameter_rules().get(path)
     if rule is None:
-        raise findings_error(location, *_axis_refusal(path))
+        raise findings_error(location, *_axis_path_problem_and_remedy(path))
     if isinstance(rule, FrequencyErrorTableRule):
         raise findings_error(
             location, "is one table for a whole study", "put it into the instrument"
@@ -268,28 +270,33 @@ def _axis_rule(path: str, location: Location) -> Rule:
     return rule
 
 
-_FIXED_PROBLEM = "is the same for a whole study"
-"""Text of the finding for a parameter that no axis may set."""
+_NOT_ON_AXES_PROBLEM = "is the same for a whole study"
+"""Problem stated for a parameter that no axis may set."""
 
 
-def _axis_refusal(path: str) -> tuple[str, str]:
+def _axis_path_problem_and_remedy(path: str) -> tuple[str, str]:
     """Return the problem and the remedy for a path that no axis may set."""
     section, _, name = path.partition(".")
     if path == "seed":
-        problem = f"{_FIXED_PROBLEM}: each point and draw has random numbers of its own already"
+        problem = (
+            f"{_NOT_ON_AXES_PROBLEM}: each point and draw has random numbers of its own already"
+        )
         return problem, "leave it out, or run a study for each seed"
     if section == "effects" and name:
-        return _FIXED_PROBLEM, "run a study for each mode, and compare them with sweep compare"
+        return (
+            _NOT_ON_AXES_PROBLEM,
+            "run a study for each mode, and compare them with sweep compare",
+        )
     if path in ("instrument", "instrument.like", "instrument.file"):
-        return _FIXED_PROBLEM, "run a study for each, and compare them with sweep compare"
+        return _NOT_ON_AXES_PROBLEM, "run a study for each, and compare them with sweep compare"
     if section in SECTIONS_NOT_ON_AXES:
-        return _FIXED_PROBLEM, f"run a study for each value; {AXES_REMEDY}"
+        return _NOT_ON_AXES_PROBLEM, f"run a study for each value; {AXES_REMEDY}"
     return "is no parameter", suggest_parameter(path)
 
 
-def _make_axis_parameter(path: str, pieces: list[PieceValues], location: Location) -> AxisParameter:
+def _make_axis_parameter(path: str, pieces: list[AxisPiece], location: Location) -> AxisParameter:
     """Concatenate pieces of values into one parameter along an axis."""
-    name = short_name(path)
+    name = parameter_short_name(path)
     n_values = _number_of_values(pieces)
     if n_values > AXIS_VALUES_MAX:
         raise findings_error(
@@ -326,7 +333,7 @@ def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
 # Zipped axes: several parameters that vary together, written in pieces that are concatenated
 
 
-def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
+def _read_zipped_axis(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
     """Read a zipped axis; every piece must set the same parameters."""
     findings = Findings(
         Finding((*location, str(other)), "is no part of a zipped axis", "write {zip: [...]}")
@@ -336,9 +343,9 @@ def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
     if (
         _AXIS_NAME_PATTERN.fullmatch(key) is None
         or key in RESERVED_DIMENSIONS
-        or _MARKER_PATTERN.fullmatch(key)
+        or _STUDY_MARKER_PATTERN.fullmatch(key)
     ):
-        findings.append(Finding(location, "is no name for an axis", _NAME_REMEDY))
+        findings.append(Finding(location, "is no name for an axis", _AXIS_NAME_REMEDY))
     raw_pieces: dict[Location, object] = {(*location, "zip"): raw_axis["zip"]}
     if raw_axis["zip"] in ([], {}, None):
         findings.append(Finding((*location, "zip"), "holds no piece", "list at least one"))
@@ -347,10 +354,10 @@ def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
         raw_pieces = {
             (*location, "zip", i): raw_piece for i, raw_piece in enumerate(raw_axis["zip"])
         }
-    piece_values: list[dict[str, list[PieceValues]]] = []
+    piece_values: list[dict[str, list[AxisPiece]]] = []
     for piece_location, raw_piece in raw_pieces.items():
         with findings.collect():
-            piece_values.append(_read_piece(raw_piece, piece_location))
+            piece_values.append(_read_zipped_piece(raw_piece, piece_location))
             if differing_paths := ", ".join(sorted(set(piece_values[0]) ^ set(piece_values[-1]))):
                 problem = "must set the same parameters as the first piece"
                 raise findings_error(piece_location, problem, f"mind {differing_paths}")
@@ -367,7 +374,7 @@ def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
     )
 
 
-def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceValues]]:
+def _read_zipped_piece(raw_piece: object, location: Location) -> dict[str, list[AxisPiece]]:
     """Return the values of one piece of a zipped axis by path, all of equal length.
 
     A single value is repeated to the length of the piece's lists.
@@ -375,13 +382,13 @@ def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceVa
     if not isinstance(raw_piece, dict) or not raw_piece:
         raise findings_error(location, "must be a mapping of paths to values", "", raw_piece)
     findings = Findings()
-    values_by_path: dict[str, list[PieceValues]] = {}
+    values_by_path: dict[str, list[AxisPiece]] = {}
     for path, raw_value in raw_piece.items():
         value_location = (*location, str(path))
         with findings.collect():
             rule = _axis_rule(str(path), value_location)
             if isinstance(raw_value, dict | list):
-                values_by_path[path] = read_pieces(raw_value, rule, value_location)
+                values_by_path[path] = read_axis_pieces(raw_value, rule, value_location)
             else:
                 values_by_path[path] = [read_single_value(raw_value, rule, value_location)]
     lengths = {
@@ -391,7 +398,7 @@ def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceVa
     }
     if len(set(lengths.values())) > 1:
         lengths_text = ", ".join(f"{path} has {n}" for path, n in lengths.items())
-        findings.append(Finding(location, f"must give as many values of each: {lengths_text}"))
+        findings.append(Finding(location, f"must give equal numbers of values: {lengths_text}"))
     findings.raise_if_any()
     length = max(lengths.values(), default=1)
     return {
@@ -400,7 +407,7 @@ def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceVa
     }
 
 
-def _number_of_values(pieces: list[PieceValues]) -> int:
+def _number_of_values(pieces: list[AxisPiece]) -> int:
     """Return the total number of values in a list of pieces."""
     return sum(len(piece.si_values) for piece in pieces)
 
@@ -469,11 +476,11 @@ def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
         )
         if axis.is_zipped and axis.name in other_coordinates | own_coordinates:
             findings.append(
-                Finding(("axes", axis.name), "bears the name of a coordinate", _NAME_REMEDY)
+                Finding(("axes", axis.name), "has the name of a coordinate", _AXIS_NAME_REMEDY)
             )
         elif axis.is_zipped and axis.name in GRID_VARIABLE_NAMES:
-            problem = "bears the name of a variable of the store"
-            findings.append(Finding(("axes", axis.name), problem, _NAME_REMEDY))
+            problem = "has the name of a variable of the store"
+            findings.append(Finding(("axes", axis.name), problem, _AXIS_NAME_REMEDY))
     return findings
 
 
@@ -577,16 +584,18 @@ def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
     float
         The value in `unit_name`.
     """
-    number, unit = rule.read_exact(raw_value)
-    single_value = PieceValues(np.array([unit.to_si(number)]), unit, Progression(number))
-    return float(single_value.to_unit(rule.read_exact(f"1 {unit_name}" if unit_name else 1)[1])[0])
+    number, unit = rule.read_exact_number(raw_value)
+    single_value = AxisPiece(np.array([unit.to_si(number)]), unit, Progression(number))
+    return float(
+        single_value.to_unit(rule.read_exact_number(f"1 {unit_name}" if unit_name else 1)[1])[0]
+    )
 
 
 # Written values
 
 
 @dataclass(frozen=True)
-class PieceValues:
+class AxisPiece:
     """Values of one piece of an axis: a single value or a generator."""
 
     si_values: np.ndarray
@@ -605,14 +614,14 @@ class PieceValues:
         offset = (self.unit.offset - unit.offset) / unit.factor
         return self.progression.scale_and_shift(self.unit.factor / unit.factor, offset).values()
 
-    def repeat(self, number: int) -> PieceValues:
+    def repeat(self, number: int) -> AxisPiece:
         """Return a single value repeated `number` times."""
         progression = self.progression and replace(self.progression, number=number)
         return replace(self, si_values=np.repeat(self.si_values, number), progression=progression)
 
 
-def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[PieceValues]:
-    """Read the values of an axis over one field.
+def read_axis_pieces(raw_value: object, rule: Rule, location: Location) -> list[AxisPiece]:
+    """Read the values of one parameter along an axis.
 
     Parameters
     ----------
@@ -625,7 +634,7 @@ def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[Piece
 
     Returns
     -------
-    list of PieceValues
+    list of AxisPiece
         One entry for each element of the list.
 
     Raises
@@ -641,7 +650,7 @@ def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[Piece
         raise findings_error(location, "must be a list or a generator", remedy, raw_value)
     if not raw_value:
         raise findings_error(location, "holds no value", "list at least one")
-    pieces: list[PieceValues] = []
+    pieces: list[AxisPiece] = []
     findings = Findings()
     for i, piece in enumerate(raw_value):
         read_piece = _read_generator if isinstance(piece, dict) else read_single_value
@@ -651,7 +660,7 @@ def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[Piece
     return pieces
 
 
-def read_single_value(raw_value: object, rule: Rule, location: Location) -> PieceValues:
+def read_single_value(raw_value: object, rule: Rule, location: Location) -> AxisPiece:
     """Read one value: a number with its unit for numeric fields, else a word.
 
     Raises
@@ -662,16 +671,19 @@ def read_single_value(raw_value: object, rule: Rule, location: Location) -> Piec
     try:
         value = rule.read(raw_value)
         if not isinstance(rule, NumericRule):
-            return PieceValues(np.array([str(value)]), Unit(""))
-        number, unit = rule.read_exact(raw_value)
+            return AxisPiece(np.array([str(value)]), Unit(""))
+        number, unit = rule.read_exact_number(raw_value)
     except QuantityError as error:
         raise findings_error(location, error.rule, error.suggestion, raw_value) from None
     dtype = np.int64 if rule.is_integer else np.float64
-    return PieceValues(np.array([value], dtype=dtype), unit, Progression(number))
+    return AxisPiece(np.array([value], dtype=dtype), unit, Progression(number))
 
 
-def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> PieceValues:
-    """Read ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``; check the field's bounds."""
+def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> AxisPiece:
+    """Return the values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``.
+
+    Raise `FindingsError` if the generator is invalid or a value is outside the field's bounds.
+    """
     given_forms = [key for key in raw_generator if key in _GENERATOR_FORMS]
     if len(given_forms) != 1:
         name, value = next(iter(raw_generator.items()), ("", None))
@@ -695,7 +707,7 @@ def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Locatio
     elif form != "step":
         with findings.collect((*location, "number"), raw_generator["number"]):
             number = int(_NUMBER_OF_VALUES_RULE.read(raw_generator["number"]))
-    values: PieceValues | None = None
+    values: AxisPiece | None = None
     with findings.collect():
         # Read the bounds even if the number of values can't be read, to report all mistakes at
         # once.
@@ -709,7 +721,7 @@ def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Locatio
 
 def _generate_values(
     form: str, raw_bounds: object, number: int, rule: NumericRule, location: Location
-) -> PieceValues:
+) -> AxisPiece:
     """Return the values of a generator from its written bounds."""
     bounds, unit = _read_bounds(form, raw_bounds, rule, location)
     if form == "step":
@@ -743,7 +755,7 @@ def _read_bounds(
     findings = Findings()
     for i, raw_bound in enumerate(raw_bounds):
         with findings.collect((*location, i), raw_bound):
-            exact_values.append(rule.read_exact(raw_bound))
+            exact_values.append(rule.read_exact_number(raw_bound))
             if i < 2:
                 rule.read(raw_bound)
     findings.raise_if_any()
@@ -769,7 +781,10 @@ def _read_bounds(
 
 
 def _step_progression(bounds: list[Fraction], location: Location) -> Progression:
-    """Return the values from first to last, including last if a step ends there."""
+    """Return the progression of a step generator, whose bounds are first, last and step.
+
+    It includes the last value if a whole number of steps leads to it.
+    """
     first, last, step = bounds
     if step == 0:
         raise findings_error(location, "has a step of zero", "list the values")
@@ -785,28 +800,31 @@ def _step_progression(bounds: list[Fraction], location: Location) -> Progression
 
 def _progression_values(
     progression: Progression, unit: Unit, rule: NumericRule, location: Location
-) -> PieceValues:
-    """Return the values of an arithmetic progression, as integers if the field takes integers."""
+) -> AxisPiece:
+    """Return an arithmetic progression in `unit` as values of an axis.
+
+    The values are integers if the field takes integers.
+    """
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
-        return PieceValues(si_values, unit, progression)
+        return AxisPiece(si_values, unit, progression)
     si_progression = progression.scale_and_shift(unit.factor, unit.offset)
     if not rule.is_integer:
-        return PieceValues(si_progression.values(), unit, progression)
+        return AxisPiece(si_progression.values(), unit, progression)
     if si_progression.start.denominator != 1 or si_progression.increment.denominator != 1:
         raise findings_error(location, "gives values that are not whole", "list them")
     steps = np.arange(progression.number, dtype=np.int64)
-    return PieceValues(
+    return AxisPiece(
         int(si_progression.start) + int(si_progression.increment) * steps, unit, progression
     )
 
 
 def _geometric_values(
     bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: Location
-) -> PieceValues:
-    """Return values with a constant ratio.
+) -> AxisPiece:
+    """Return `number` values with a constant ratio, from the first to the second bound.
 
-    They are spaced in SI units, so that the unit of the bounds does not matter.
+    The ratio is constant in SI units, so that the unit of the bounds does not matter.
     """
     if unit.is_logarithmic:
         remedy = f"write {_GENERATOR_FORMS['linear']}"
@@ -817,15 +835,15 @@ def _geometric_values(
     si_values = _round_to_15_digits(np.geomspace(first, last, number))
     si_values[0], si_values[-1] = first, last
     if not rule.is_integer:
-        return PieceValues(si_values, unit)
+        return AxisPiece(si_values, unit)
     rounded = np.rint(si_values)
     if np.any(np.abs(si_values - rounded) > 1e-9 * rounded):
         raise findings_error(location, "gives values that are not whole", "list them")
-    return PieceValues(rounded.astype(np.int64), unit)
+    return AxisPiece(rounded.astype(np.int64), unit)
 
 
-def _check_bounds(values: PieceValues, rule: NumericRule, location: Location) -> None:
-    """Raise `FindingsError` that names the first value outside the bounds of the field."""
+def _check_bounds(values: AxisPiece, rule: NumericRule, location: Location) -> None:
+    """Raise `FindingsError` if a value of a generator is outside the bounds of the field."""
     violation = rule.first_out_of_bounds(values.si_values)
     if violation is not None:
         index, problem = violation

@@ -19,7 +19,7 @@ from sweep.spec.fields import SpecSection
 from sweep.spec.rules import CustomRule, Finding, NumericRule, SpecError, TextRule
 from sweep.spec.yaml_document import (
     Document,
-    drop_extensions,
+    drop_anchor_sections,
     read_document,
     to_plain_data,
     validation_findings,
@@ -30,10 +30,10 @@ LOOPBACK_ADDRESS = "127.0.0.1"
 """Address at which a service accepts connections from its own machine alone."""
 NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
 """Value for no dashboard, and the usual port of Dask's dashboard."""
-_WORKERS_RULE = NumericRule(
+_WORKER_COUNT_RULE = NumericRule(
     description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
 )
-_BOUNDS_REMEDY = "write e.g. {least: 2, most: 40}"
+_WORKER_BOUNDS_REMEDY = "write e.g. {least: 2, most: 40}"
 
 
 class WorkerBounds(NamedTuple):
@@ -49,17 +49,19 @@ def _read_worker_bounds(raw_value: object) -> WorkerBounds:
     """Read a number of workers, or a mapping with their minimum and maximum."""
     if not isinstance(raw_value, Mapping):
         try:
-            return WorkerBounds(_WORKERS_RULE.read(raw_value), _WORKERS_RULE.read(raw_value))
+            return WorkerBounds(
+                _WORKER_COUNT_RULE.read(raw_value), _WORKER_COUNT_RULE.read(raw_value)
+            )
         except QuantityError as error:
             raise QuantityError(error.rule, "write e.g. 8 or {least: 2, most: 40}") from None
     if raw_value.keys() != {"least", "most"}:
-        raise QuantityError("must have a least and a most", _BOUNDS_REMEDY)
+        raise QuantityError("must have a least and a most", _WORKER_BOUNDS_REMEDY)
     bounds = {}
     for name in ("least", "most"):
         try:
-            bounds[name] = _WORKERS_RULE.read(raw_value[name])
+            bounds[name] = _WORKER_COUNT_RULE.read(raw_value[name])
         except QuantityError as error:
-            raise QuantityError(f"has a {name} that {error.rule}", _BOUNDS_REMEDY) from None
+            raise QuantityError(f"has a {name} that {error.rule}", _WORKER_BOUNDS_REMEDY) from None
     if bounds["least"] > bounds["most"]:
         raise QuantityError("has a least above its most", "write the smaller number as least")
     return WorkerBounds(**bounds)
@@ -80,16 +82,16 @@ def _read_environment(raw_value: object) -> dict[str, str]:
     return {str(name): str(value) for name, value in raw_value.items()}
 
 
-_LINE_TEXT_ARGUMENTS = {
+_SINGLE_LINE_RULE_ARGUMENTS = {
     "description": "One line",
     "pattern": r"[^\n\r\0]{1,2000}",
     "remedy": "write one line",
 }
 """Arguments of `TextRule` for a text of one line."""
-_TEXTS_MAX = 100_000
+_LIST_TEXTS_MAX = 100_000
 """Maximum number of texts in a list."""
-_MEMORY_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
-"""Arguments of `declare.quantity` for an amount of memory: unit, example, lower and upper bound."""
+_MEMORY_FIELD_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
+"""Arguments of `declare.quantity_field` for an amount of memory: unit, example, and bounds."""
 
 
 class Security(SpecSection):
@@ -98,20 +100,20 @@ class Security(SpecSection):
     With this section all traffic of the cluster is encrypted.
     """
 
-    ca: str = declare.file_path("Certificate of the authority that signed the others")
-    certificate: str = declare.file_path("Certificate of scheduler, workers and client")
-    key: str = declare.file_path("Its private key")
+    ca: str = declare.file_path_field("Certificate of the authority that signed the others")
+    certificate: str = declare.file_path_field("Certificate of scheduler, workers and client")
+    key: str = declare.file_path_field("Private key of that certificate")
 
 
 class LocalWorkerConfig(SpecSection):
     """Threads and memory of a worker process on this machine."""
 
-    threads: int = declare.count(
-        "Threads, each with a block of its own", "1", at_most="1000", default=1
+    threads: int = declare.integer_field(
+        "Threads of a worker; each computes a block of its own", "1", at_most="1000", default=1
     )
-    memory: float | None = declare.quantity(
-        "Memory that it may take; without one, its share of 90 % of it",
-        *_MEMORY_ARGUMENTS,
+    memory: float | None = declare.quantity_field(
+        "Memory of a worker at most; by default its share of 90 % of the machine's memory",
+        *_MEMORY_FIELD_ARGUMENTS,
         default=None,
     )
 
@@ -119,7 +121,7 @@ class LocalWorkerConfig(SpecSection):
 class WorkerConfig(LocalWorkerConfig):
     """Threads and memory of a worker process; the memory is required."""
 
-    memory: float = declare.quantity("Memory that it may take", *_MEMORY_ARGUMENTS)
+    memory: float = declare.quantity_field("Memory of a worker at most", *_MEMORY_FIELD_ARGUMENTS)
 
 
 class SchedulerConfig(SpecSection):
@@ -128,10 +130,16 @@ class SchedulerConfig(SpecSection):
     Without a host or an interface the scheduler accepts connections from this machine alone.
     """
 
-    host: str = declare.word("Address that workers reach it by", "10.0.0.5", "")
-    interface: str = declare.word("Or the network interface that it has", "ib0", "")
-    port: int = declare.count("Port; 0 for any", "8786", "0", "65535", default=0)
-    dashboard: str = declare.text(
+    host: str = declare.command_word_field(
+        "Address at which workers reach the scheduler", "10.0.0.5", ""
+    )
+    interface: str = declare.command_word_field(
+        "Network interface of the scheduler, in place of its address", "ib0", ""
+    )
+    port: int = declare.integer_field(
+        "Port of the scheduler; 0 for any free port", "8786", "0", "65535", default=0
+    )
+    dashboard: str = declare.text_field(
         "Port of Dask's dashboard, 0 for any; none: no dashboard. It has no password, and listens "
         "to this machine alone: all users of this machine can see it",
         NO_DASHBOARD,
@@ -144,21 +152,22 @@ class SchedulerConfig(SpecSection):
 class BatchJobConfig(SpecSection):
     """Resources and options of one job of a batch system, which holds one worker or several."""
 
-    workers: int = declare.count("Workers of one job", "8", at_most="1000", default=1)
-    walltime: float = declare.duration(
-        "Time that a job may take; workers leave before it", "2 h", "1 min", "365 d"
+    workers: int = declare.integer_field("Workers of one job", "8", at_most="1000", default=1)
+    walltime: float = declare.duration_field(
+        "Longest time of a job; workers leave before it ends", "2 h", "1 min", "365 d"
     )
-    queue: str = declare.word("Queue or partition", "normal", "")
-    account: str = declare.word("Account that is charged", "lidar", "")
-    directives: tuple[str, ...] = declare.list_of(
-        TextRule(**_LINE_TEXT_ARGUMENTS, example="--exclusive"), 0, _TEXTS_MAX, (),
-        description="Further options of the job", noun="texts",
+    queue: str = declare.command_word_field("Queue or partition", "normal", "")
+    account: str = declare.command_word_field("Account that is charged", "lidar", "")
+    directives: tuple[str, ...] = declare.list_field(
+        TextRule(**_SINGLE_LINE_RULE_ARGUMENTS, example="--exclusive"), 0, _LIST_TEXTS_MAX, (),
+        description="Further options of the job", element_noun="texts",
     )  # fmt: skip
-    prologue: tuple[str, ...] = declare.list_of(
-        TextRule(**_LINE_TEXT_ARGUMENTS, example="module load python/3.12"), 0, _TEXTS_MAX, (),
-        description="Shell lines before the worker starts", noun="texts",
+    prologue: tuple[str, ...] = declare.list_field(
+        TextRule(**_SINGLE_LINE_RULE_ARGUMENTS, example="module load python/3.12"),
+        0, _LIST_TEXTS_MAX, (),
+        description="Shell lines before the worker starts", element_noun="texts",
     )  # fmt: skip
-    logs: str = declare.word("Directory for what jobs print", "logs", "logs")
+    logs: str = declare.command_word_field("Directory for the output of jobs", "logs", "logs")
 
 
 class ClusterConfig(SpecSection):
@@ -170,7 +179,7 @@ class ClusterConfig(SpecSection):
     """Folder that paths in the configuration are relative to."""
 
     def resolve_path(self, raw_path: str) -> str:
-        """Return the path of a file that the cluster's file names relative to its folder."""
+        """Return the path of a file whose path in the cluster's file is relative to its folder."""
         return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user is left as it is
 
     def certificate_paths(self) -> tuple[str, str, str] | None:
@@ -184,20 +193,23 @@ class ClusterConfig(SpecSection):
         return ca, certificate, key
 
 
-class StartedClusterConfig(ClusterConfig):
+class SessionStartedClusterConfig(ClusterConfig):
     """Base of the configurations of clusters whose workers the session starts."""
 
-    environment: dict[str, str] = declare.field_of_rule(
+    environment: dict[str, str] = declare.field_with_rule(
         CustomRule(description="Environment variables of workers", reader=_read_environment), {}
     )
 
 
-class LocalClusterConfig(StartedClusterConfig):
+class LocalClusterConfig(SessionStartedClusterConfig):
     """Cluster of worker processes on this machine."""
 
     kind: Literal["local"]
-    workers: WorkerBounds | None = declare.field_of_rule(
-        CustomRule(description="Workers; without a number, one a core", reader=_read_worker_bounds),
+    workers: WorkerBounds | None = declare.field_with_rule(
+        CustomRule(
+            description="Number of workers; by default one for each core",
+            reader=_read_worker_bounds,
+        ),
         None,
     )
     worker: LocalWorkerConfig = LocalWorkerConfig()
@@ -208,43 +220,58 @@ class ExistingSchedulerConfig(ClusterConfig):
     """Cluster of a Dask scheduler that is already running, with the workers that connect to it."""
 
     kind: Literal["scheduler"]
-    address: str = declare.text(
+    address: str = declare.text_field(
         "Address of the scheduler",
         pattern=r"(tcp|tls|ucx)://\S+:\d+",
         remedy="write e.g. 'tcp://10.0.0.5:8786', or tls:// with a security section",
     )
 
 
-class SSHClusterConfig(StartedClusterConfig):
+class SSHClusterConfig(SessionStartedClusterConfig):
     """Cluster of machines on which workers are started over SSH."""
 
     kind: Literal["ssh"]
-    hosts: tuple[str, ...] = declare.list_of(
-        declare.word_rule("A host", "node1"), 1, _TEXTS_MAX, description="Machines", noun="texts"
+    hosts: tuple[str, ...] = declare.list_field(
+        declare.command_word_rule("A host", "node1"),
+        1,
+        _LIST_TEXTS_MAX,
+        description="Machines",
+        element_noun="texts",
     )
-    workers: WorkerBounds = declare.field_of_rule(
-        CustomRule(description="Workers, dealt out over the machines", reader=_read_worker_bounds)
+    workers: WorkerBounds = declare.field_with_rule(
+        CustomRule(
+            description="Number of workers, distributed over the machines",
+            reader=_read_worker_bounds,
+        )
     )
     worker: WorkerConfig
     scheduler: SchedulerConfig
-    user: str = declare.word("User there; without one, as here", "lidar", "")
-    port: int = declare.count("Port of SSH", "22", at_most="65535", default=22)
-    identity: str = declare.file_path("Private key to log in with; without one, as ssh does", "")
-    known_hosts: str = declare.file_path("Keys of known machines; without one, as ssh does", "")
-    python: str = declare.word("Python there; without one, the path of this one", "python", "")
+    user: str = declare.command_word_field(
+        "User on the machines; by default the name of the user here", "lidar", ""
+    )
+    port: int = declare.integer_field("Port of SSH", "22", at_most="65535", default=22)
+    identity: str = declare.file_path_field(
+        "Private key for the login; by default the one that ssh takes", ""
+    )
+    known_hosts: str = declare.file_path_field(
+        "File of the keys of known machines; by default the one that ssh takes", ""
+    )
+    python: str = declare.command_word_field(
+        "Python on the machines; by default the path of this Python", "python", ""
+    )
 
 
-class BatchClusterConfig(StartedClusterConfig):
+class BatchClusterConfig(SessionStartedClusterConfig):
     """Base of the configurations of clusters whose workers are jobs of a batch system."""
 
-    workers: WorkerBounds = declare.field_of_rule(
+    workers: WorkerBounds = declare.field_with_rule(
         CustomRule(description="Workers, in whole jobs", reader=_read_worker_bounds)
     )
     worker: WorkerConfig
     job: BatchJobConfig
     scheduler: SchedulerConfig
-    python: str = declare.word(
-        "Python of the jobs; without one, the path of this one", "python", ""
+    python: str = declare.command_word_field(
+        "Python of the jobs; by default the path of this Python", "python", ""
     )
 
 
@@ -260,32 +287,38 @@ class PBSClusterConfig(BatchClusterConfig):
     kind: Literal["pbs"]
 
 
-class Volume(SpecSection):
+class PersistentVolume(SpecSection):
     """Persistent volume for stores and scenes, mounted at one path in all pods and here."""
 
-    claim: str = declare.word("Its claim", "studies")
-    path: str = declare.word("Where it is mounted, the same as here", "/data")
+    claim: str = declare.command_word_field("Claim of the persistent volume", "studies")
+    path: str = declare.command_word_field(
+        "Path at which the volume is mounted, in the pods and here", "/data"
+    )
 
 
-class KubernetesClusterConfig(StartedClusterConfig):
+class KubernetesClusterConfig(SessionStartedClusterConfig):
     """Cluster of pods that the Dask operator of a Kubernetes cluster starts."""
 
     kind: Literal["kubernetes"]
-    workers: WorkerBounds = declare.field_of_rule(
-        CustomRule(description="Workers, a pod each", reader=_read_worker_bounds)
+    workers: WorkerBounds = declare.field_with_rule(
+        CustomRule(
+            description="Number of workers, each in a pod of its own", reader=_read_worker_bounds
+        )
     )
     worker: WorkerConfig
-    image: str = declare.word("Image with sweep in it", "registry.example.org/sweep:0.1.0")
-    name: str = declare.text(
+    image: str = declare.command_word_field(
+        "Image with sweep in it", "registry.example.org/sweep:0.1.0"
+    )
+    name: str = declare.text_field(
         "Name of the cluster",
         "sweep",
         pattern=r"[a-z]([a-z0-9-]{0,50}[a-z0-9])?",
         remedy="take small letters, digits and '-', such as 'sweep'",
     )
-    namespace: str = declare.word("Namespace", "lidar", "default")
-    volume: Volume | None = None
-    secret: str = declare.word(
-        "Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls", ""
+    namespace: str = declare.command_word_field("Namespace", "lidar", "default")
+    volume: PersistentVolume | None = None
+    secret: str = declare.command_word_field(
+        "Secret with ca.pem, certificate.pem and key.pem, if TLS is used", "sweep-tls", ""
     )
 
 
@@ -345,7 +378,7 @@ def cluster_config_from_mapping(
         The error holds every mistake in the data.
     """
     return _read_cluster_config(
-        Document(drop_extensions(to_plain_data(mapping))), Path(base).absolute()
+        Document(drop_anchor_sections(to_plain_data(mapping))), Path(base).absolute()
     )
 
 
@@ -365,11 +398,11 @@ def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
 
 
 def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
-    """Yield mistakes in a cluster that involve several fields, or files."""
+    """Yield mistakes in a cluster's configuration that involve several fields, or missing files."""
     for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
         if not Path(path).is_file():
             remedy = "make certificates with 'sweep certificates DIRECTORY'"
-            yield Finding(("security", name), "names a file that is not there", remedy, path)
+            yield Finding(("security", name), "names a file that does not exist", remedy, path)
     if isinstance(cluster, LocalClusterConfig | SSHClusterConfig | BatchClusterConfig):
         yield from _scheduler_findings(
             cluster.scheduler, is_remote=not isinstance(cluster, LocalClusterConfig)
@@ -380,7 +413,7 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
             problem = "is encrypted, and no certificates are given"
             yield Finding(("address",), problem, "add a security section", address)
         if cluster.security and not is_encrypted:
-            problem = "is not encrypted, for all that there are certificates"
+            problem = "is not encrypted, although certificates are given"
             yield Finding(("address",), problem, "write 'tls://...'", address)
     if isinstance(cluster, SSHClusterConfig) and cluster.workers.least < cluster.workers.most:
         problem = "must be a number: machines reached by SSH are there or not"
@@ -393,9 +426,12 @@ def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
 
 
 def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Iterator[Finding]:
-    """Yield mistakes in the address of the scheduler; workers on other machines need one."""
+    """Yield mistakes in the address of the scheduler.
+
+    `is_remote` is True for workers on other machines, which need an address.
+    """
     if scheduler.host and scheduler.interface:
         yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")
     elif is_remote and not (scheduler.host or scheduler.interface):
-        problem = "must say where workers on other machines reach it"
+        problem = "must state where workers on other machines reach it"
         yield Finding(("scheduler",), problem, "write e.g. 'interface: ib0' or 'host: 10.0.0.5'")

@@ -19,7 +19,7 @@ LISTED_VALUES_MAX = 8
 """Maximum number of values that a list shows in full."""
 SHOWN_CHARACTERS_MAX = 200
 """Maximum number of characters of a text that are shown."""
-SCENE_SECTIONS: spec_fields.ModelClasses = (
+SCENE_SECTION_MODELS: spec_fields.ModelClasses = (
     Scene,
     Platform,
     ErrorFloor,
@@ -39,7 +39,7 @@ def rules_by_field_name() -> MappingProxyType[str, Rule]:
     """
     return MappingProxyType({
         name: rule
-        for model in spec_fields.reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTIONS)
+        for model in spec_fields.reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTION_MODELS)
         for name, field in spec_fields.fields_by_name(model).items()
         if (rule := spec_fields.rule_of_field(field))
     })  # fmt: skip
@@ -66,14 +66,14 @@ def describe_differences(a: Any, b: Any) -> list[str]:
     for path in [*left, *(path for path in right if path not in left)]:
         if left.get(path) != right.get(path):
             old_text, new_text = (
-                _format_leaf(path, identity.get(path)) for identity in (left, right)
+                _format_entry(path, identity.get(path)) for identity in (left, right)
             )
             lines.append(f"{path}: {old_text} -> {new_text}")
     return lines
 
 
 def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the leaves of an identity by dotted path; the values of an axis count as one leaf."""
+    """Return the entries of an identity by dotted path; all values of an axis are one entry."""
     leaves: dict[str, Any] = dict(identity.get("parameters", {}))
     for key, value in identity.items():
         if key == "axes":
@@ -90,8 +90,8 @@ def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
     return leaves
 
 
-def _format_leaf(path: str, value: Any) -> str:
-    """Return a leaf of an identity as text."""
+def _format_entry(path: str, value: Any) -> str:
+    """Return an entry of an identity, given by its dotted path, as text with its unit."""
     rule = rules_by_field_name().get(path.rsplit(".", 1)[-1])
     if value is None:
         return "(none)"

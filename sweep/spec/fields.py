@@ -33,11 +33,11 @@ from sweep.spec.rules import (
 )
 
 AUTO, ON, OFF = EFFECT_MODES
-"""Modes of an effect."""
+"""Modes of an effect: simulated if the tolerance requires it, always, or never."""
 ModelClasses = tuple[type[BaseModel], ...]
-"""Models that a value may be validated as."""
+"""Pydantic models, one of which validates a value."""
 KeyPath = tuple[str, ...]
-"""Names of the sections and the field that lead to a value."""
+"""Keys that lead to a value in a spec: the names of the sections around it and of its field."""
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 KIND_RULE = TextRule(description="Which of several a part is")
@@ -62,10 +62,10 @@ _SIGNED_QUANTITY_MAX = {
     "rad/s": "1e6 deg/s",
     "": "1e12",
 }
-"""Default bound of the magnitude of a signed quantity, by its SI unit."""
+"""Default bound on the magnitude of a signed quantity, by the quantity's SI unit."""
 
 
-def field_of_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
+def field_with_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
     """Declare a field with a rule.
 
     Parameters
@@ -73,7 +73,7 @@ def field_of_rule(rule: Rule, default: Any = ..., *, alias: str | None = None) -
     rule : Rule
         Rule of the field's values.
     default : object
-        SI value without one in the spec; the field is required without a default.
+        Value in SI units if the spec states none. Without a default the field is required.
     alias : str, optional
         Name of the field in a spec, if it differs from the attribute's.
     """
@@ -90,7 +90,7 @@ def quantity_rule(
     at_most: str = "",
     **rule_options: Any,
 ) -> NumericRule:
-    """Return the rule of a quantity within bounds.
+    """Return the rule of a number with a unit, within bounds.
 
     Parameters
     ----------
@@ -103,8 +103,8 @@ def quantity_rule(
     at_least, at_most : str
         Inclusive bounds with units; wide ones by default (`_SIGNED_QUANTITY_MAX`).
     **rule_options
-        Further fields of `NumericRule`. With `above` or `below`, `at_least` or `at_most` is not
-        used.
+        Further fields of `NumericRule`. `at_least` is ignored if `above` is given, and `at_most` if
+        `below` is given.
     """
     bounds = (
         {"at_least": at_least or f"-{_SIGNED_QUANTITY_MAX[unit]}"}
@@ -123,7 +123,7 @@ def quantity_rule(
     )
 
 
-def quantity(
+def quantity_field(
     description: str,
     unit: str,
     example: str,
@@ -141,26 +141,27 @@ def quantity(
     description, unit, example, at_least, at_most, **rule_options
         As in `quantity_rule`.
     default : object
-        SI value without one in the spec; the field is required without a default.
+        Value in SI units if the spec states none. Without a default the field is required.
     keyword : str
-        Word that stands for the default, or for the option `keyword_value`.
+        Word that a spec may hold in place of the number. It stands for `keyword_value` if that is
+        given, else for the default.
     """
     rule_options |= (
         {"keyword": keyword, "keyword_value": rule_options.get("keyword_value", default)}
         if keyword
         else {}
     )
-    return field_of_rule(
+    return field_with_rule(
         quantity_rule(description, unit, example, at_least, at_most, **rule_options), default
     )
 
 
-def number(description: str, example: str = "0.5", *bounds: str, **rule_options: Any) -> Any:
+def number_field(description: str, example: str = "0.5", *bounds: str, **rule_options: Any) -> Any:
     """Declare a field for a pure number."""
-    return quantity(description, "", example, *bounds, **rule_options)
+    return quantity_field(description, "", example, *bounds, **rule_options)
 
 
-def count(
+def integer_field(
     description: str,
     example: str = "3",
     at_least: str = "1",
@@ -168,30 +169,34 @@ def count(
     **rule_options: Any,
 ) -> Any:
     """Declare a field for an integer, from 1 to 1e6 by default."""
-    return quantity(description, "", example, at_least, at_most, is_integer=True, **rule_options)
+    return quantity_field(
+        description, "", example, at_least, at_most, is_integer=True, **rule_options
+    )
 
 
-def length(description: str, example: str = "10 m", *bounds: str, **rule_options: Any) -> Any:
+def length_field(description: str, example: str = "10 m", *bounds: str, **rule_options: Any) -> Any:
     """Declare a field for a length of either sign [m]."""
-    return quantity(description, "m", example, *bounds, **rule_options)
+    return quantity_field(description, "m", example, *bounds, **rule_options)
 
 
-def positive_length(description: str, example: str = "10 m", **rule_options: Any) -> Any:
+def positive_length_field(description: str, example: str = "10 m", **rule_options: Any) -> Any:
     """Declare a field for a length of at least 1 um [m]."""
-    return length(description, example, "1 um", **rule_options)
+    return length_field(description, example, "1 um", **rule_options)
 
 
-def angle(description: str, example: str = "10 deg", *bounds: str, **rule_options: Any) -> Any:
+def angle_field(
+    description: str, example: str = "10 deg", *bounds: str, **rule_options: Any
+) -> Any:
     """Declare a field for an angle of either sign [rad]."""
-    return quantity(description, "rad", example, *bounds, **rule_options)
+    return quantity_field(description, "rad", example, *bounds, **rule_options)
 
 
-def speed(description: str, **rule_options: Any) -> Any:
+def speed_field(description: str, **rule_options: Any) -> Any:
     """Declare a field for a speed of at least 0 [m/s]."""
-    return quantity(description, "m/s", "30 m/s", "0 m/s", **rule_options)
+    return quantity_field(description, "m/s", "30 m/s", "0 m/s", **rule_options)
 
 
-def duration(
+def duration_field(
     description: str,
     example: str = "10 s",
     at_least: str = "0 s",
@@ -199,15 +204,15 @@ def duration(
     **rule_options: Any,
 ) -> Any:
     """Declare a field for a duration, from 0 to 1e8 s by default [s]."""
-    return quantity(description, "s", example, at_least, at_most, **rule_options)
+    return quantity_field(description, "s", example, at_least, at_most, **rule_options)
 
 
-def frequency(description: str, example: str = "20 Hz") -> Any:
+def frequency_field(description: str, example: str = "20 Hz") -> Any:
     """Declare a field for a rate or frequency from 1e-6 to 1e9 Hz [Hz]."""
-    return quantity(description, "Hz", example, "1e-6 Hz", "1e9 Hz")
+    return quantity_field(description, "Hz", example, "1e-6 Hz", "1e9 Hz")
 
 
-def list_of(
+def list_field(
     element_rule: Rule, length_min: int, length_max: int, default: Any = ..., **rule_options: Any
 ) -> Any:
     """Declare a field for a list of values that have a common rule.
@@ -219,13 +224,13 @@ def list_of(
     length_min, length_max : int
         Bounds of the number of values.
     default : object
-        Tuple of SI values without a list in the spec; the field is required without a default.
+        Tuple of SI values if the spec states no list. Without a default the field is required.
     **rule_options
         Further fields of `ListRule`, such as `description`, and `alias`, the field's name in a
         spec.
     """
     alias = rule_options.pop("alias", None)
-    return field_of_rule(
+    return field_with_rule(
         ListRule(
             element_rule=element_rule, length_min=length_min, length_max=length_max, **rule_options
         ),
@@ -234,11 +239,11 @@ def list_of(
     )
 
 
-def vector(
+def vector_field(
     description: str, unit: str, example: str, *, dimensions: int = 3, **rule_options: Any
 ) -> Any:
     """Declare a field for the components of a vector of `dimensions` dimensions."""
-    return list_of(
+    return list_field(
         quantity_rule("Component", unit, example),
         dimensions,
         dimensions,
@@ -247,18 +252,18 @@ def vector(
     )
 
 
-def position(description: str, *, dimensions: int = 3, **rule_options: Any) -> Any:
+def position_field(description: str, *, dimensions: int = 3, **rule_options: Any) -> Any:
     """Declare a field for a position in `dimensions` dimensions [m]."""
-    return vector(description, "m", "10 m", dimensions=dimensions, **rule_options)
+    return vector_field(description, "m", "10 m", dimensions=dimensions, **rule_options)
 
 
-def seed(description: str = "Seed of its random numbers") -> Any:
+def seed_field(description: str = "Seed of its random numbers") -> Any:
     """Declare a field for the seed of random numbers, 0 by default."""
-    return count(description, "1", "0", "2^63", default=0)
+    return integer_field(description, "1", "0", "2^63", default=0)
 
 
-def name_rule(description: str, example: str = "ground") -> TextRule:
-    """Return the rule of the name of an object or scanner."""
+def object_name_rule(description: str, example: str = "ground") -> TextRule:
+    """Return the rule of the name of an object of a scene or of a scanner."""
     return TextRule(
         description=description,
         example=example,
@@ -267,49 +272,52 @@ def name_rule(description: str, example: str = "ground") -> TextRule:
     )
 
 
-def name(description: str, default: Any = ...) -> Any:
-    """Declare a field for the name of an object or scanner."""
-    return field_of_rule(name_rule(description), default)
+def object_name_field(description: str, default: Any = ...) -> Any:
+    """Declare a field for the name of an object of a scene or of a scanner."""
+    return field_with_rule(object_name_rule(description), default)
 
 
-def word_rule(description: str, example: str) -> TextRule:
+def command_word_rule(description: str, example: str) -> TextRule:
     """Return the rule of a word on a command line, without blanks, quotes or other shell syntax."""
     remedy = f"write one word, such as '{example}'"
     pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
     return TextRule(description=description, example=example, pattern=pattern, remedy=remedy)
 
 
-def word(description: str, example: str, default: Any = ...) -> Any:
+def command_word_field(description: str, example: str, default: Any = ...) -> Any:
     """Declare a field for a word on a command line."""
-    return field_of_rule(word_rule(description, example), default)
+    return field_with_rule(command_word_rule(description, example), default)
 
 
-def text(description: str, default: Any = ..., **rule_options: str) -> Any:
-    """Declare a field for a text; `rule_options` may restrict it by a pattern with a remedy."""
-    return field_of_rule(TextRule(description=description, **rule_options), default)
+def text_field(description: str, default: Any = ..., **rule_options: str) -> Any:
+    """Declare a field for a text; `rule_options` are further fields of `TextRule`."""
+    return field_with_rule(TextRule(description=description, **rule_options), default)
 
 
-def choice(description: str, options: tuple[str, ...], default: Any = MISSING) -> Any:
+def choice_field(description: str, options: tuple[str, ...], default: Any = MISSING) -> Any:
     """Declare a field for one of several words, the first by default."""
     rule = ChoiceRule(description=description, options=options)
-    return field_of_rule(rule, options[0] if default is MISSING else default)
+    return field_with_rule(rule, options[0] if default is MISSING else default)
 
 
-def flag(description: str, *, default: bool) -> Any:
+def flag_field(description: str, *, default: bool) -> Any:
     """Declare a field for a truth value."""
-    return field_of_rule(FlagRule(description=description), default)
+    return field_with_rule(FlagRule(description=description), default)
 
 
-def file_path(description: str, default: Any = ..., **rule_options: Any) -> Any:
+def file_path_field(description: str, default: Any = ..., **rule_options: Any) -> Any:
     """Declare a field for the path of a file."""
-    return field_of_rule(FilePathRule(description=description, **rule_options), default)
+    return field_with_rule(FilePathRule(description=description, **rule_options), default)
 
 
 # Fields of physical effects, declared by the model's catalogue
 
 
 def add_effect_parameters(section_path: str) -> Callable[[type[SectionT]], type[SectionT]]:
-    """Return a class decorator that adds effects' parameters to the section at a dotted path."""
+    """Return a class decorator that adds a field for each effect parameter of a section.
+
+    `section_path` is the dotted path of the section that is decorated.
+    """
     field_definitions = {
         parameter.path.removeprefix(f"{section_path}."): (
             Annotated[
@@ -353,7 +361,7 @@ def _parameter_rule(parameter: Parameter) -> Rule:
 
 
 def _extend_section(section: type[SectionT], field_definitions: dict[str, Any]) -> type[SectionT]:
-    """Return a section of equal name with further fields."""
+    """Return a subclass of a section, of the same name, with further fields."""
     if duplicate_names := sorted(set(field_definitions) & set(section.model_fields)):
         raise TypeError(f"{section.__name__} has {', '.join(duplicate_names)} already")
     extended: type[SectionT] = create_model(
@@ -375,7 +383,7 @@ def rule_of_field(field: Any) -> Rule | None:
 
 
 def yaml_name(name: str, field: Any) -> str:
-    """Return the name of a field in a spec: its alias, if any, for names such as `from`."""
+    """Return a field's name in a spec: its alias, such as `from`, else its attribute name."""
     return str(field.alias or name)
 
 
@@ -385,7 +393,10 @@ def fields_by_name(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
-    """Return the rules of a model's fields, including those of nested sections, by dotted path."""
+    """Return the rules of a model's fields and nested sections, by dotted path.
+
+    Every path begins with `prefix`, the path of the model itself.
+    """
     rules: dict[str, Rule] = {}
     for name, field in model.model_fields.items():
         path = f"{prefix}.{name}" if prefix else name
@@ -398,7 +409,7 @@ def rules_by_path(model: type[BaseModel], prefix: str) -> dict[str, Rule]:
 
 
 def models_of_annotation(annotation: Any) -> ModelClasses:
-    """Return the models of an annotation: several if the field ``kind`` selects one of a union."""
+    """Return the pydantic models in a type annotation: several if it is a union of models."""
     if get_origin(annotation) is Annotated:
         return models_of_annotation(get_args(annotation)[0])
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -458,7 +469,7 @@ class ResolvedLocation(NamedTuple):
     """Models that the section around the value may be validated as."""
 
 
-def resolve_location(pydantic_location: Location, root: Any) -> ResolvedLocation:
+def translate_error_location(pydantic_location: Location, root: Any) -> ResolvedLocation:
     """Translate a location of a pydantic error to a location in a spec.
 
     Parameters
@@ -489,7 +500,7 @@ def resolve_location(pydantic_location: Location, root: Any) -> ResolvedLocation
 # Traversal of the values of sections
 
 
-def read_or_none(annotation: Any, raw_value: object) -> Any:
+def validate_or_none(annotation: Any, raw_value: object) -> Any:
     """Validate a part of a spec by itself; return None if it is invalid.
 
     Parameters
@@ -511,7 +522,9 @@ def _type_adapter(annotation: Any) -> TypeAdapter[Any]:
     return TypeAdapter(annotation)
 
 
-def iter_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, Rule, Any]]:
+def iter_section_values(
+    section: BaseModel, prefix: KeyPath = ()
+) -> Iterator[tuple[KeyPath, Rule, Any]]:
     """Yield path, rule and SI value of every value in a section and its nested sections.
 
     Values that are None are skipped.
@@ -522,10 +535,10 @@ def iter_values(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyP
         if rule is not None and value is not None:
             yield key_path, rule, value
         elif isinstance(value, BaseModel):
-            yield from iter_values(value, key_path)
+            yield from iter_section_values(value, key_path)
         elif isinstance(value, dict):
             for entry_name, entry in value.items():
-                yield from iter_values(entry, (*key_path, entry_name))
+                yield from iter_section_values(entry, (*key_path, entry_name))
 
 
 def values_by_path(
@@ -540,11 +553,12 @@ def values_by_path(
     prefix : KeyPath
         Path of the section itself, with which the result's keys begin.
     digests : Mapping of str to str
-        Digests that replace the paths of files; other files keep their path.
+        Digests by path. In the result, a digest replaces the path of its file; a file without a
+        digest keeps its path.
     """
     return {
         ".".join(key_path): digests.get(value, value) if isinstance(rule, FilePathRule) else value
-        for key_path, rule, value in iter_values(section, prefix)
+        for key_path, rule, value in iter_section_values(section, prefix)
     }
 
 
@@ -594,10 +608,10 @@ class SpecFiles:
     base: Path
     """Folder that paths in the spec are relative to."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Digest of each file by its path as written."""
+    """Digest of each file's content, by the file's path as written in the spec."""
     time_origin: Decimal = Decimal(0)
-    """Time [s] in the tables of waypoints at which the flight begins: the first time of the
-    platform's table."""
+    """Time of the flight's start in the tables of waypoints [s]: the first time in the platform's
+    table."""
 
     def resolve(self, raw_path: str, digest_of: Callable[[Path], str] = file_digest) -> Path:
         """Return the path of a file, with ``~`` as the user's home folder.
@@ -627,6 +641,6 @@ class SpecFiles:
 
 def iter_file_paths(section: BaseModel) -> Iterator[tuple[KeyPath, FilePathRule, str]]:
     """Yield path, rule and written file path of every field of a section that names a file."""
-    for key_path, rule, value in iter_values(section):
+    for key_path, rule, value in iter_section_values(section):
         if isinstance(rule, FilePathRule):
             yield key_path, rule, value

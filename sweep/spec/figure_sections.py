@@ -14,7 +14,7 @@ from pydantic import Field
 import sweep.spec.fields as declare
 from sweep.model import outputs
 from sweep.spec.axes import Axis
-from sweep.spec.fields import SpecSection, read_or_none
+from sweep.spec.fields import SpecSection, validate_or_none
 from sweep.spec.flight_sections import AnyScanner, shots_per_cycle
 from sweep.spec.rules import ChoiceRule, CustomRule, Finding, Location, suggest_similar_name
 from sweep.spec.scene_sections import SceneDraws
@@ -29,8 +29,11 @@ CropLimits = tuple[float, ...]
 """Lower and upper limit of a scene's coordinate [m], or of time [s]."""
 
 
-def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:
-    """Read a mapping of coordinates to one value or several values each, kept as written."""
+def _read_coordinate_selection(raw_value: object) -> dict[str, CoordinateSelection]:
+    """Check a mapping of coordinates to a value or a list of values; return it as written.
+
+    Lists become tuples.
+    """
     if not isinstance(raw_value, dict):
         problem = "must be a mapping of coordinates to values"
         raise QuantityError(problem, "write e.g. {grazing_angle: 15 deg}")
@@ -43,7 +46,7 @@ def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:
 
 
 def _read_selected_value(raw_value: object) -> str | int | float:
-    """Read one value of a coordinate, kept as written."""
+    """Check that one value of a coordinate is text or a number; return it as written."""
     if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
         raise QuantityError("must hold a value, or a list of values, of each coordinate")
     return raw_value
@@ -56,12 +59,12 @@ def _read_published_numbers(raw_value: object) -> PublishedNumbers:
     return tuple(
         _read_published_numbers(raw_element)
         if isinstance(raw_element, list | tuple)
-        else _read_number(raw_element)
+        else _read_published_number(raw_element)
         for raw_element in raw_value
     )
 
 
-def _read_number(raw_value: object) -> float:
+def _read_published_number(raw_value: object) -> float:
     """Read one number; return its SI value."""
     value, unit = read_number(raw_value)
     return unit.to_si(value)
@@ -69,9 +72,9 @@ def _read_number(raw_value: object) -> float:
 
 _VALUE_SCHEMA = {"type": ["string", "number"]}
 _VALUES_SCHEMA = {"type": "array", "items": _VALUE_SCHEMA, "minItems": 1}
-_SELECTION_RULE = CustomRule(
+_COORDINATE_SELECTION_RULE = CustomRule(
     description="Values of coordinates that the figure is confined to",
-    reader=_read_selection,
+    reader=_read_coordinate_selection,
     value_schema={
         "type": "object",
         "additionalProperties": {"anyOf": [_VALUE_SCHEMA, _VALUES_SCHEMA]},
@@ -80,7 +83,7 @@ _SELECTION_RULE = CustomRule(
 )
 _NUMBER_SCHEMA = {"type": ["number", "string"]}
 _PUBLISHED_NUMBERS_RULE = CustomRule(
-    description="The numbers as published, row by row, to stand beside ours",
+    description="Published numbers, row by row, for comparison",
     reader=_read_published_numbers,
     value_schema={
         "type": "array",
@@ -89,21 +92,21 @@ _PUBLISHED_NUMBERS_RULE = CustomRule(
 )
 
 
-def _name_field(description: str, example: str, default: Any = ...) -> Any:
+def _store_name_field(description: str, example: str, default: Any = ...) -> Any:
     """Declare a field that holds the name of a coordinate or variable of a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
-    return declare.text(
+    return declare.text_field(
         f"Name of {description}", default, pattern=pattern, remedy=f"take {example}"
     )
 
 
-def _coordinate_field(default: Any = ...) -> Any:
+def _coordinate_name_field(default: Any = ...) -> Any:
     """Declare a field that holds the name of a coordinate."""
     example = "the last part of an axis's path, such as 'range'"
-    return _name_field("a coordinate: the last part of an axis's path", example, default)
+    return _store_name_field("a coordinate: the last part of an axis's path", example, default)
 
 
-_VARIABLE_FIELD = _name_field(
+_VARIABLE_NAME_FIELD = _store_name_field(
     "a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'"
 )
 
@@ -114,13 +117,13 @@ class FigureBase(SpecSection):
     FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
     """Names of the fields whose values make up the file name; other entries are used literally."""
 
-    name: str = declare.text(
+    name: str = declare.text_field(
         "Stem of the picture's file name",
         "",
         pattern=r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}",
         remedy="take letters, digits, '_', '-' and '.'",
     )
-    title: str = declare.text("Title of the figure", "")
+    title: str = declare.text_field("Title of the figure", "")
 
     @property
     def file_stem(self) -> str:
@@ -138,7 +141,9 @@ class GridFigureBase(FigureBase):
     """Base of all figures of grids."""
 
 
-_LEVEL_RULE = declare.quantity_rule("Level, in the quantity's unit", "", "0.9", "-1e30", "1e30")
+_CONTOUR_LEVEL_RULE = declare.quantity_rule(
+    "Level, in the quantity's unit", "", "0.9", "-1e30", "1e30"
+)
 
 
 class SurfaceFigure(GridFigureBase):
@@ -146,12 +151,17 @@ class SurfaceFigure(GridFigureBase):
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["surface"]
-    variable: str = _VARIABLE_FIELD
-    x: str = _coordinate_field()
-    y: str = _coordinate_field()
-    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
-    levels: tuple[float, ...] = declare.list_of(
-        _LEVEL_RULE, 1, 10, (), description="Levels at which contours are drawn", increasing=True
+    variable: str = _VARIABLE_NAME_FIELD
+    x: str = _coordinate_name_field()
+    y: str = _coordinate_name_field()
+    where: dict[str, CoordinateSelection] = declare.field_with_rule(_COORDINATE_SELECTION_RULE, {})
+    levels: tuple[float, ...] = declare.list_field(
+        _CONTOUR_LEVEL_RULE,
+        1,
+        10,
+        (),
+        description="Levels at which contours are drawn",
+        increasing=True,
     )
 
 
@@ -160,12 +170,12 @@ class SlicesFigure(GridFigureBase):
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["slices"]
-    variable: str = _VARIABLE_FIELD
-    x: str = _coordinate_field()
-    by: str = _coordinate_field("")
-    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
-    levels: tuple[float, ...] = declare.list_of(
-        _LEVEL_RULE,
+    variable: str = _VARIABLE_NAME_FIELD
+    x: str = _coordinate_name_field()
+    by: str = _coordinate_name_field("")
+    where: dict[str, CoordinateSelection] = declare.field_with_rule(_COORDINATE_SELECTION_RULE, {})
+    levels: tuple[float, ...] = declare.list_field(
+        _CONTOUR_LEVEL_RULE,
         1,
         10,
         (),
@@ -179,14 +189,14 @@ class TableFigure(GridFigureBase):
 
     FILE_NAME_PARTS = ("variable",)
     kind: Literal["table"]
-    variable: str = _VARIABLE_FIELD
-    rows: str = _coordinate_field()
-    columns: str = _coordinate_field("")
-    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
-    minimum_range: float = declare.length(
+    variable: str = _VARIABLE_NAME_FIELD
+    rows: str = _coordinate_name_field()
+    columns: str = _coordinate_name_field("")
+    where: dict[str, CoordinateSelection] = declare.field_with_rule(_COORDINATE_SELECTION_RULE, {})
+    minimum_range: float = declare.length_field(
         "Nearer ranges are left out", "5 m", "0 m", "1e15 m", default=0.0
     )
-    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+    printed: PublishedNumbers = declare.field_with_rule(_PUBLISHED_NUMBERS_RULE, ())
 
 
 class FalseAlarmTable(GridFigureBase):
@@ -197,16 +207,16 @@ class FalseAlarmTable(GridFigureBase):
     """
 
     kind: Literal["false_alarm_table"]
-    by: str = _coordinate_field()
-    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+    by: str = _coordinate_name_field()
+    printed: PublishedNumbers = declare.field_with_rule(_PUBLISHED_NUMBERS_RULE, ())
 
 
 class ThresholdTable(GridFigureBase):
     """Table of the false alarms of a bin by threshold, as in Table 4.2."""
 
     kind: Literal["threshold_table"]
-    by: str = _coordinate_field("tnr")
-    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+    by: str = _coordinate_name_field("tnr")
+    printed: PublishedNumbers = declare.field_with_rule(_PUBLISHED_NUMBERS_RULE, ())
 
 
 GridFigure = Annotated[
@@ -227,19 +237,22 @@ FIGURE_QUANTITIES = (
 
 SEVERAL_SURFACES_KEYWORD = "several_surfaces"
 """Keyword for the first shot whose footprint has several surfaces, in place of a shot's number."""
-_VIEW_WORD_RULE = ChoiceRule(
-    description="Where from", options=("oblique", "above", "side", "front")
+_VIEW_DIRECTION_RULE = ChoiceRule(
+    description="Direction from which the cloud is seen",
+    options=("oblique", "above", "side", "front"),
 )
 _EYE_ANGLE_RULES = {
-    "azimuth": declare.quantity_rule("Of the eye, from x towards y", "rad", "-60 deg"),
-    "elevation": declare.quantity_rule("Above the horizon", "rad", "30 deg", "-90 deg", "90 deg"),
+    "azimuth": declare.quantity_rule("Azimuth of the eye, from x towards y", "rad", "-60 deg"),
+    "elevation": declare.quantity_rule(
+        "Elevation of the eye above the horizon", "rad", "30 deg", "-90 deg", "90 deg"
+    ),
 }
 
 
-def _read_view(raw_value: object) -> str | dict[str, float]:
+def _read_view_direction(raw_value: object) -> str | dict[str, float]:
     """Read a view: a word, or azimuth and elevation of the eye, returned in rad."""
     if not isinstance(raw_value, dict):
-        return _VIEW_WORD_RULE.read(raw_value)
+        return _VIEW_DIRECTION_RULE.read(raw_value)
     if set(raw_value) != set(_EYE_ANGLE_RULES):
         problem = "must be a word or have an azimuth and an elevation"
         raise QuantityError(problem, "write e.g. {azimuth: -60 deg, elevation: 30 deg}")
@@ -247,11 +260,11 @@ def _read_view(raw_value: object) -> str | dict[str, float]:
 
 
 _VIEW_RULE = CustomRule(
-    description=_VIEW_WORD_RULE.description,
-    reader=_read_view,
+    description=_VIEW_DIRECTION_RULE.description,
+    reader=_read_view_direction,
     value_schema={
         "anyOf": [
-            {"type": "string", "enum": list(_VIEW_WORD_RULE.options)},
+            {"type": "string", "enum": list(_VIEW_DIRECTION_RULE.options)},
             {
                 "type": "object",
                 "properties": {name: rule.schema() for name, rule in _EYE_ANGLE_RULES.items()},
@@ -263,11 +276,11 @@ _VIEW_RULE = CustomRule(
 )
 
 
-def _quantity_field(description: str, default: Any = ...) -> Any:
+def _plotted_quantity_field(description: str, default: Any = ...) -> Any:
     """Declare a field that holds the name of a quantity of shots or points."""
     remedy = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
     problem = "is no quantity of shots or points"
-    return declare.field_of_rule(
+    return declare.field_with_rule(
         ChoiceRule(
             description=description, options=FIGURE_QUANTITIES, problem=problem, remedy=remedy
         ),
@@ -278,15 +291,15 @@ def _quantity_field(description: str, default: Any = ...) -> Any:
 def _crop_field(axis: str) -> Any:
     """Declare a field that holds the lower and upper limit of a scene's coordinate [m]."""
     rule = declare.quantity_rule("Coordinate", "m", "100 m")
-    return declare.list_of(rule, 2, 2, None, description=f"Part along {axis}", increasing=True)
+    return declare.list_field(rule, 2, 2, None, description=f"Part along {axis}", increasing=True)
 
 
-_SCANNER_FIELD = declare.name("Scanner; the first by default", None)
-_RANGES_FIELD = declare.choice(
-    "By whole bins, or interpolated between them", ("quantised", "interpolated")
+_SCANNER_FIELD = declare.object_name_field("Scanner; the first by default", None)
+_RANGES_FIELD = declare.choice_field(
+    "Ranges quantised to bins, or interpolated between bins", ("quantised", "interpolated")
 )
-_DRAW_FIELD = declare.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
-_TIME_FIELD = declare.list_of(
+_DRAW_FIELD = declare.integer_field("Number of the draw, from 0", "0", "0", "1e9", default=0)
+_TIME_FIELD = declare.list_field(
     declare.quantity_rule("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
     description="Part of the flight's time", increasing=True,
 )  # fmt: skip
@@ -295,7 +308,7 @@ _TIME_FIELD = declare.list_of(
 class SceneFigureBase(FigureBase):
     """Base of all figures of scenes."""
 
-    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
+    where: dict[str, CoordinateSelection] = declare.field_with_rule(_COORDINATE_SELECTION_RULE, {})
 
 
 class CloudFigure(SceneFigureBase):
@@ -304,16 +317,16 @@ class CloudFigure(SceneFigureBase):
     FILE_NAME_PARTS = ("scanner", "colour")
     kind: Literal["cloud"]
     scanner: str | None = _SCANNER_FIELD
-    colour: str = _quantity_field("What colours the points", "range")
+    colour: str = _plotted_quantity_field("Quantity that colours the points", "range")
     ranges: str = _RANGES_FIELD
-    view: str | dict[str, float] = declare.field_of_rule(_VIEW_RULE, "oblique")
+    view: str | dict[str, float] = declare.field_with_rule(_VIEW_RULE, "oblique")
     x: CropLimits | None = _crop_field("x")
     y: CropLimits | None = _crop_field("y")
     z: CropLimits | None = _crop_field("z")
     time: CropLimits | None = _TIME_FIELD
-    terrain: bool = declare.flag("Whether to draw the ground", default=True)
-    path: bool = declare.flag("Whether to draw the flight path", default=False)
-    dropouts: bool = declare.flag("Whether to mark shots without a point", default=False)
+    terrain: bool = declare.flag_field("Whether to draw the ground", default=True)
+    path: bool = declare.flag_field("Whether to draw the flight path", default=False)
+    dropouts: bool = declare.flag_field("Whether to mark shots without a point", default=False)
     draw: int = _DRAW_FIELD
 
 
@@ -323,9 +336,9 @@ class ScatterFigure(SceneFigureBase):
     FILE_NAME_PARTS = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
     scanner: str | None = _SCANNER_FIELD
-    x: str = _quantity_field("Quantity along x", "time")
-    y: str = _quantity_field("Quantity along y")
-    colour: str = _quantity_field("What colours the points", "beam")
+    x: str = _plotted_quantity_field("Quantity along x", "time")
+    y: str = _plotted_quantity_field("Quantity along y")
+    colour: str = _plotted_quantity_field("Quantity that colours the points", "beam")
     ranges: str = _RANGES_FIELD
     time: CropLimits | None = _TIME_FIELD
     draw: int = _DRAW_FIELD
@@ -337,7 +350,7 @@ class ShotSpectraFigure(SceneFigureBase):
     FILE_NAME_PARTS = ("scanner", "shot")
     kind: Literal["shot_spectra"]
     scanner: str | None = _SCANNER_FIELD
-    shot: int | str = declare.count(
+    shot: int | str = declare.integer_field(
         "Number of the shot, from 0, or the first whose footprint has several surfaces",
         "0", "0", "1e15", keyword=SEVERAL_SURFACES_KEYWORD, default=SEVERAL_SURFACES_KEYWORD,
     )  # fmt: skip
@@ -348,13 +361,13 @@ class _NavigationFigureBase(SceneFigureBase):
     """Base of the figure and the table of navigation."""
 
     FILE_NAME_PARTS = ("quantity", "show")
-    scanners: tuple[str, ...] | None = declare.list_of(
-        declare.name_rule("Scanner", "three"), 1, 10_000, None,
-        description="Scanners; all by default", noun="names", distinct=True,
+    scanners: tuple[str, ...] | None = declare.list_field(
+        declare.object_name_rule("Scanner", "three"), 1, 10_000, None,
+        description="Scanners; all by default", element_noun="names", distinct=True,
     )  # fmt: skip
-    quantity: str = declare.choice("Velocity vector or altitude", ("velocity", "altitude"))
-    show: str = declare.choice("Which statistics", ("all", "availability", "bias", "rmse"))
-    bins: int = declare.count("Bins of altitude", "12", "1", "1000", default=12)
+    quantity: str = declare.choice_field("Velocity vector or altitude", ("velocity", "altitude"))
+    show: str = declare.choice_field("Statistics to show", ("all", "availability", "bias", "rmse"))
+    bins: int = declare.integer_field("Bins of altitude", "12", "1", "1000", default=12)
 
 
 class NavigationFigure(_NavigationFigureBase):
@@ -404,12 +417,14 @@ def grid_figure_findings(
     """
     draws = raw_spec.get("draws")
     for location, figure in _iter_readable_figures(raw_spec, GridFigure):
-        yield from _coordinate_findings(figure, axes, location)
+        yield from _figure_coordinate_findings(figure, axes, location)
         if isinstance(draws, Mapping) and draws.get("method") == SPECTRA_METHOD:
-            yield from _spectra_findings(figure, location)
+            yield from _spectra_variable_findings(figure, location)
         else:
-            yield from _variable_findings(figure, draws, extra_variables, location)
-    yield from _name_findings(raw_spec, GridFigure, "makes the same picture file as another")
+            yield from _figure_variable_findings(figure, draws, extra_variables, location)
+    yield from _duplicate_file_name_findings(
+        raw_spec, GridFigure, "makes the same picture file as another"
+    )
 
 
 def scene_figure_findings(
@@ -432,10 +447,12 @@ def scene_figure_findings(
     scanners = raw_spec.get("scanners")
     scanners = scanners if isinstance(scanners, Mapping) else {}
     for location, figure in _iter_readable_figures(raw_spec, SceneFigure):
-        yield from _scanner_findings(figure, scanners, location)
-        yield from () if axes is None else _coordinate_findings(figure, axes, location)
-        yield from _draw_findings(figure, raw_spec.get("draws"), location)
-    yield from _name_findings(raw_spec, SceneFigure, "makes the same file as another")
+        yield from _figure_scanner_findings(figure, scanners, location)
+        yield from () if axes is None else _figure_coordinate_findings(figure, axes, location)
+        yield from _draw_number_findings(figure, raw_spec.get("draws"), location)
+    yield from _duplicate_file_name_findings(
+        raw_spec, SceneFigure, "makes the same file as another"
+    )
 
 
 def _iter_readable_figures(
@@ -444,11 +461,13 @@ def _iter_readable_figures(
     """Yield location and model of each figure that can be read."""
     figures = raw_spec.get("figures")
     for i, raw_figure in enumerate(figures if isinstance(figures, list | tuple) else ()):
-        if (figure := read_or_none(annotation, raw_figure)) is not None:
+        if (figure := validate_or_none(annotation, raw_figure)) is not None:
             yield ("figures", i), figure
 
 
-def _name_findings(raw_spec: Mapping[str, Any], annotation: Any, problem: str) -> Iterator[Finding]:
+def _duplicate_file_name_findings(
+    raw_spec: Mapping[str, Any], annotation: Any, problem: str
+) -> Iterator[Finding]:
     """Yield a finding for each figure that has the same file name as an earlier one."""
     stems: set[str] = set()
     for location, figure in _iter_readable_figures(raw_spec, annotation):
@@ -457,7 +476,7 @@ def _name_findings(raw_spec: Mapping[str, Any], annotation: Any, problem: str) -
         stems.add(figure.file_stem)
 
 
-def _coordinate_findings(
+def _figure_coordinate_findings(
     figure: Any, axes: tuple[Axis, ...], figure_location: Location
 ) -> Iterator[Finding]:
     """Yield mistakes in the coordinates that a figure names, and in values that it selects.
@@ -496,7 +515,7 @@ def _coordinate_findings(
                     yield Finding(location, error.rule, error.suggestion, value)
 
 
-def _variable_findings(
+def _figure_variable_findings(
     figure: Any, draws: object, extra_variables: Collection[str], location: Location
 ) -> Iterator[Finding]:
     """Yield a finding if a figure shows a variable that the study does not store."""
@@ -526,7 +545,7 @@ def _variable_findings(
     yield Finding((*location, "variable"), problem, remedy, variable)
 
 
-def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
+def _spectra_variable_findings(figure: Any, location: Location) -> Iterator[Finding]:
     """Yield a finding if a figure shows a closed form: studies of whole spectra store none."""
     stored_variables = (
         outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
@@ -545,7 +564,7 @@ def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
         )
 
 
-def _scanner_findings(
+def _figure_scanner_findings(
     figure: Any, scanners: Mapping[str, Any], location: Location
 ) -> Iterator[Finding]:
     """Yield a finding for each scanner that is missing or has too few beams for navigation."""
@@ -565,7 +584,7 @@ def _scanner_findings(
                 (*location, *relative_location), "is no scanner of this study", remedy, name
             )
     if isinstance(figure, NavigationFigure | NavigationTable):
-        has_navigation = {name: _has_navigation(scanner) for name, scanner in scanners.items()}
+        has_navigation = {name: _allows_navigation(scanner) for name, scanner in scanners.items()}
         for i, name in enumerate(figure.scanners or ()):
             if has_navigation.get(name, True) is False:
                 problem = f"has fewer than {NAVIGATION_SHOTS_MIN} shots a cycle, and no navigation"
@@ -575,21 +594,21 @@ def _scanner_findings(
             yield Finding(location, problem, "leave it out")
 
 
-def _has_navigation(raw_scanner: object) -> bool:
+def _allows_navigation(raw_scanner: object) -> bool:
     """Return True if a scanner has enough shots per cycle for navigation, or can't be read."""
-    scanner = read_or_none(AnyScanner, raw_scanner)
+    scanner = validate_or_none(AnyScanner, raw_scanner)
     try:
         return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN
     except ValueError:
         return True
 
 
-def _draw_findings(figure: Any, raw_draws: object, location: Location) -> Iterator[Finding]:
+def _draw_number_findings(figure: Any, raw_draws: object, location: Location) -> Iterator[Finding]:
     """Yield a finding if a figure shows a draw that the study does not make.
 
     Studies whose draws can't be read are skipped.
     """
-    draw, draws = getattr(figure, "draw", 0), read_or_none(SceneDraws, raw_draws or {})
+    draw, draws = getattr(figure, "draw", 0), validate_or_none(SceneDraws, raw_draws or {})
     if draws is not None and draw >= draws.number:
         problem = f"is beyond the study's draws, 0 to {draws.number - 1}"
         yield Finding((*location, "draw"), problem, "take one of them", draw)

@@ -17,7 +17,7 @@ from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as scan_patterns
 from sweep.model.geometry.scanner import ScanPattern
 from sweep.spec.fields import SpecFiles, SpecSection
-from sweep.spec.rules import Json, ListRule, Rule, read_element
+from sweep.spec.rules import JsonObject, ListRule, Rule, read_element
 from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
@@ -30,10 +30,12 @@ class StraightPath(SpecSection):
     """Straight path with constant acceleration along it."""
 
     kind: Literal["straight"]
-    begin: Vector = declare.position("Where it begins", alias="from")
-    to: Vector = declare.position("Where it ends")
-    initial_speed: float = declare.speed("Speed at the beginning")
-    final_speed: float | None = declare.speed("Speed at the end; the initial one", default=None)
+    begin: Vector = declare.position_field("Position of the start", alias="from")
+    to: Vector = declare.position_field("Position of the end")
+    initial_speed: float = declare.speed_field("Speed at the beginning")
+    final_speed: float | None = declare.speed_field(
+        "Speed at the end; by default the initial speed", default=None
+    )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the trajectory along the straight line; `files` and `span` are not used."""
@@ -49,10 +51,12 @@ class AccelerationPath(SpecSection):
     """Path of constant acceleration, 0 by default."""
 
     kind: Literal["acceleration"]
-    position: Vector = declare.position("Position at the beginning")
-    velocity: Vector = declare.vector("Velocity at the beginning", "m/s", "30 m/s")
-    acceleration: Vector = declare.vector("Acceleration", "m/s^2", "1 m/s^2", default=(0, 0, 0))
-    duration: float = declare.duration("How long it lasts", at_least="1 ns")
+    position: Vector = declare.position_field("Position at the beginning")
+    velocity: Vector = declare.vector_field("Velocity at the beginning", "m/s", "30 m/s")
+    acceleration: Vector = declare.vector_field(
+        "Acceleration", "m/s^2", "1 m/s^2", default=(0, 0, 0)
+    )
+    duration: float = declare.duration_field("Duration of the path", at_least="1 ns")
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the trajectory of constant acceleration; `files` and `span` are not used."""
@@ -64,8 +68,10 @@ class WaypointPath(SpecSection):
     """Path through the waypoints of a table."""
 
     kind: Literal["waypoints"]
-    file: str = declare.file_path("CSV table with time, x, y, z and, if it likes, attitude")
-    smooth: bool = declare.flag("Join them by a cubic spline, not by straight lines", default=True)
+    file: str = declare.file_path_field("CSV table with time, x, y, z and optionally attitude")
+    smooth: bool = declare.flag_field(
+        "Join the waypoints by a cubic spline, not by straight lines", default=True
+    )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
         """Return the trajectory through the waypoints of the table; `span` is not used."""
@@ -79,9 +85,9 @@ class StationaryPath(SpecSection):
     """Path of a body at rest."""
 
     kind: Literal["still"]
-    position: Vector = declare.position("Where it stays")
-    duration: float | None = declare.duration(
-        "How long; a target stays throughout the flight by default", at_least="1 ns", default=None
+    position: Vector = declare.position_field("Position of the body")
+    duration: float | None = declare.duration_field(
+        "Duration; by default a target stays throughout the flight", at_least="1 ns", default=None
     )
 
     def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Trajectory:
@@ -107,11 +113,19 @@ AnyPath = Annotated[
 class Orientation(SpecSection):
     """Rotation of a body relative to the world, or of an instrument relative to its body."""
 
-    heading: float = declare.angle("Of forward, from x, counter-clockwise from above", default=0.0)
-    pitch: float = declare.angle("Nose up", "10 deg", "-90 deg", "90 deg", default=0.0)
-    roll: float = declare.angle("Left side up", default=0.0)
-    quaternion: Vector | None = declare.vector(
-        "The turn as w, x, y, z, instead of angles", "", "0.5", dimensions=4, default=None
+    heading: float = declare.angle_field(
+        "Direction of the forward axis, from x, counter-clockwise seen from above", default=0.0
+    )
+    pitch: float = declare.angle_field(
+        "Angle by which the nose is up", "10 deg", "-90 deg", "90 deg", default=0.0
+    )
+    roll: float = declare.angle_field("Angle by which the left side is up", default=0.0)
+    quaternion: Vector | None = declare.vector_field(
+        "Rotation as a quaternion w, x, y, z, in place of angles",
+        "",
+        "0.5",
+        dimensions=4,
+        default=None,
     )
 
     def to_quaternion(self) -> np.ndarray:
@@ -133,8 +147,9 @@ class NadirAttitude(SpecSection):
     """Level attitude: a beam along -z points straight down."""
 
     kind: Literal["nadir"]
-    heading: float | str = declare.angle(
-        "Of forward, from x, counter-clockwise from above; 'track' follows the path",
+    heading: float | str = declare.angle_field(
+        "Direction of the forward axis, from x, counter-clockwise seen from above; 'track' follows "
+        "the path",
         keyword="track", keyword_value="track", default=0.0,
     )  # fmt: skip
 
@@ -147,7 +162,7 @@ class AlongTrackAttitude(SpecSection):
     """Attitude whose forward axis points along the velocity."""
 
     kind: Literal["along_track"]
-    roll: float = declare.angle("Left side up", default=0.0)
+    roll: float = declare.angle_field("Angle by which the left side is up", default=0.0)
 
     def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.AttitudeLaw:
         """Return the attitude law of a body whose forward axis points along its velocity."""
@@ -168,7 +183,7 @@ class SpinningAttitude(Orientation):
     """Attitude of constant angular velocity; the angles are those at the start of the path."""
 
     kind: Literal["spin"]
-    angular_velocity: Vector = declare.vector(
+    angular_velocity: Vector = declare.vector_field(
         "Angular velocity about the world's axes", "rad/s", "10 deg/s"
     )
 
@@ -181,7 +196,7 @@ class TabulatedAttitude(SpecSection):
     """Attitude from a table, that of the waypoints by default."""
 
     kind: Literal["track"]
-    file: str | None = declare.file_path(
+    file: str | None = declare.file_path_field(
         "CSV table with time, position and attitude; the path's by default", None
     )
 
@@ -218,7 +233,7 @@ class RigidMotion(SpecSection):
     path: AnyPath
     attitude: AnyAttitude = FixedAttitude(kind="fixed")
 
-    def build_flight(
+    def build_moving_body(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
         """Return the motion of the body: position and attitude as functions of time.
@@ -259,17 +274,17 @@ class Platform(RigidMotion):
     """Carrier of the instrument: path, attitude, mounting and pointing jitter."""
 
     attitude: AnyAttitude = NadirAttitude(kind="nadir")
-    lever_arm: Vector = declare.position(
+    lever_arm: Vector = declare.position_field(
         "The instrument's position in the body frame", default=(0.0, 0.0, 0.0)
     )
     mounting: Orientation = Orientation()
-    jitter: float = declare.angle(
+    jitter: float = declare.angle_field(
         "Standard deviation of random turns about each body axis", "20 urad", "0 rad", "10 deg",
         default=0.0,
     )  # fmt: skip
 
     def read_time_origin(self, files: SpecFiles) -> Decimal:
-        """Return the time [s] in the tables at which the flight begins, with all its digits.
+        """Return the time of the flight's start in the tables of waypoints [s], exactly.
 
         This is the first time of the path's table, or 0 if the path is not given by a table.
         """
@@ -279,10 +294,10 @@ class Platform(RigidMotion):
             return Decimal(0)
         return read_first_time(files.resolve(self.path.file))
 
-    def build_flight(
+    def build_moving_body(
         self, files: SpecFiles, span: TimeSpan | None = None
     ) -> motion_laws.MovingBody:
-        """Return the motion of the instrument: the platform's with lever arm and mounting applied.
+        """Return the motion of the instrument on its platform, with lever arm and mounting applied.
 
         Parameters
         ----------
@@ -339,10 +354,10 @@ class BeamDirectionsRule(Rule):
         )
 
     def format(self, value: Any) -> Any:
-        """Return lists that read back as exactly `value`."""
+        """Return the beams as a spec would hold them; `read` converts them back exactly."""
         return [beam_rule(beam).format(beam) for beam in value]
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         beam_schema = {"anyOf": [STEERING_ANGLES_RULE.schema(), _DIRECTION_VECTOR_RULE.schema()]}
         length_keywords = {"minItems": 1, "maxItems": BEAMS_MAX}
         return {"type": "array", "items": beam_schema} | length_keywords
@@ -359,11 +374,11 @@ def beam_rule(beam: object) -> ListRule:
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
 """Smallest and largest angle between a beam and nadir."""
-_CYCLE_RATE_FIELD = declare.frequency("Measurement cycles a second")
-_SIMULTANEOUS_INTERVAL_FIELD = declare.duration(
+_CYCLE_RATE_FIELD = declare.frequency_field("Measurement cycles a second")
+_INTERVAL_FIELD_ZERO_BY_DEFAULT = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
 )
-_EVEN_INTERVAL_FIELD = declare.duration(
+_INTERVAL_FIELD_EVEN_BY_DEFAULT = declare.duration_field(
     "Time from one beam of a cycle to the next; spread evenly over the cycle by default",
     "10 ms", default=None,
 )  # fmt: skip
@@ -373,11 +388,15 @@ class ConeScanner(SpecSection):
     """Beams at equal azimuth steps on a cone around nadir; all of them fire in every cycle."""
 
     kind: Literal["cone"]
-    beams: int = declare.count("Beams", "3", at_most=str(BEAMS_MAX))
-    half_angle: float = declare.angle("From nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
-    azimuth: float = declare.angle("Of the first beam, from forward to the left", default=0.0)
+    beams: int = declare.integer_field("Beams", "3", at_most=str(BEAMS_MAX))
+    half_angle: float = declare.angle_field(
+        "Angle between the beams and nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS
+    )
+    azimuth: float = declare.angle_field(
+        "Azimuth of the first beam, from forward towards the left", default=0.0
+    )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams on a cone around nadir."""
@@ -391,14 +410,14 @@ class FixedBeamsScanner(SpecSection):
     """Beams at given directions; all of them fire in every cycle."""
 
     kind: Literal["fixed"]
-    beams: tuple[Vector, ...] = declare.field_of_rule(
+    beams: tuple[Vector, ...] = declare.field_with_rule(
         BeamDirectionsRule(
             description="Angles towards forward and left, or vectors in the body frame, of each "
             "beam"
         )
     )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams at the given directions."""
@@ -415,9 +434,11 @@ class CornersScanner(SpecSection):
     """One beam steered to the corners of a square."""
 
     kind: Literal["corners"]
-    angle: float = declare.angle("Of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
+    angle: float = declare.angle_field(
+        "Angle of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS
+    )
     rate: float = _CYCLE_RATE_FIELD
-    interval: float | None = _EVEN_INTERVAL_FIELD
+    interval: float | None = _INTERVAL_FIELD_EVEN_BY_DEFAULT
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of a beam steered to the four corners of a square."""
@@ -430,12 +451,12 @@ class SquaresScanner(SpecSection):
     """One beam steered by stacked elements along squares; a cycle is a square."""
 
     kind: Literal["squares"]
-    elements: Vector = declare.list_of(
+    elements: Vector = declare.list_field(
         declare.quantity_rule("Angle", "rad", "15 deg", "1e-6 deg", "45 deg"), 1, 5,
         description="Angle by which each element of an axis throws the beam to either side",
     )  # fmt: skip
     rate: float = _CYCLE_RATE_FIELD
-    interval: float | None = _EVEN_INTERVAL_FIELD
+    interval: float | None = _INTERVAL_FIELD_EVEN_BY_DEFAULT
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of a beam steered along squares, one square per cycle."""
@@ -447,14 +468,14 @@ class RasterScanner(SpecSection):
     """One beam steered over a grid of directions; a cycle is a frame."""
 
     kind: Literal["raster"]
-    columns: int = declare.count("Directions across", "32", at_most=str(BEAMS_MAX))
-    rows: int = declare.count("Directions along", "32", at_most=str(BEAMS_MAX))
-    half_angles: Vector = declare.list_of(
+    columns: int = declare.integer_field("Directions across", "32", at_most=str(BEAMS_MAX))
+    rows: int = declare.integer_field("Directions along", "32", at_most=str(BEAMS_MAX))
+    half_angles: Vector = declare.list_field(
         declare.quantity_rule("Angle", "rad", "10 deg", *_NADIR_ANGLE_BOUNDS), 2, 2,
         description="Reach to each side of nadir, across and along",
     )  # fmt: skip
     rate: float = _CYCLE_RATE_FIELD
-    both_ways: bool = declare.flag("Every other row runs backwards", default=True)
+    both_ways: bool = declare.flag_field("Every other row runs backwards", default=True)
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of a beam steered over a grid, one grid per cycle."""
@@ -465,17 +486,17 @@ class LineScanner(SpecSection):
     """Beams swept together from side to side; a cycle is one measurement of each beam."""
 
     kind: Literal["line"]
-    half_angle: float = declare.angle(
+    half_angle: float = declare.angle_field(
         "Reach of the sweep to each side", "5 deg", *_NADIR_ANGLE_BOUNDS
     )
-    line_rate: float = declare.frequency("Lines a second; a sweep one way is a line")
+    line_rate: float = declare.frequency_field("Lines a second; a sweep one way is a line")
     rate: float = _CYCLE_RATE_FIELD
-    along: Vector = declare.list_of(
+    along: Vector = declare.list_field(
         declare.quantity_rule("Angle", "rad", "250 urad", "-89 deg", "89 deg"), 1, 1000, (0.0,),
         description="Angle of each beam from nadir towards forward",
     )  # fmt: skip
-    wave: str = declare.choice("Constant rate or resonant mirror", ("triangle", "sine"))
-    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+    wave: str = declare.choice_field("Constant rate or resonant mirror", ("triangle", "sine"))
+    interval: float = _INTERVAL_FIELD_ZERO_BY_DEFAULT
 
     def build_pattern(self) -> ScanPattern:
         """Return the scan pattern of beams swept from side to side."""

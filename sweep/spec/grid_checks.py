@@ -69,8 +69,8 @@ samples, and a window that exists with so many exists with more."""
 _SPECTRUM_BINS_MIN = 8
 """Minimum number of bins of a spectrum for detectors that examine the whole spectrum."""
 
-Condition = Callable[[Any], Any]
-"""Condition on a parameter, evaluated elementwise: values (n,) to bool (n,)."""
+ValueCondition = Callable[[Any], Any]
+"""Function that maps a parameter's values (n,) to bool (n,): True where a condition is met."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ class GridValues:
 
     def has_values(self, *paths: str) -> bool:
         """Return True if all given parameters could be read."""
-        return all(self.values_of(path).size for path in paths)
+        return all(self.parameter_values(path).size for path in paths)
 
-    def values_of(self, path: str) -> np.ndarray:
+    def parameter_values(self, path: str) -> np.ndarray:
         """Return a parameter's values (n,) over the grid; empty if it could not be read."""
         for axis in self.axes:
             for parameter in axis.parameters:
@@ -120,12 +120,12 @@ class GridValues:
         """Return a finding about a parameter, located at its axis, if any, else at its field."""
         return Finding(parameter_location(path, self.axes), problem, remedy)
 
-    def has_point(self, conditions: Mapping[str, Condition]) -> bool:
+    def any_point_meets(self, conditions: Mapping[str, ValueCondition]) -> bool:
         """Return True if at least one point of the grid meets all conditions.
 
         Parameters
         ----------
-        conditions : Mapping of str to Condition
+        conditions : Mapping of str to ValueCondition
             Conditions on single parameters, by dotted path.
         """
         paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
@@ -137,7 +137,7 @@ class GridValues:
     def argmin_of_sum(
         self,
         terms: Mapping[str, Callable[[Any], Any]],
-        conditions: Mapping[str, Condition] = MappingProxyType({}),
+        conditions: Mapping[str, ValueCondition] = MappingProxyType({}),
     ) -> dict[str, float]:
         """Return the point of the grid that minimises a sum of functions of single parameters.
 
@@ -147,7 +147,7 @@ class GridValues:
         ----------
         terms : Mapping of str to callable
             Terms of the sum: functions of the values (n,) of one parameter, by dotted path.
-        conditions : Mapping of str to Condition
+        conditions : Mapping of str to ValueCondition
             Conditions on single parameters that the point must meet.
 
         Returns
@@ -156,7 +156,7 @@ class GridValues:
             SI values of the parameters in `terms` at the minimum. Empty if no point meets the
             conditions, or if a parameter in `terms` could not be read.
         """
-        if not self.has_values(*terms) or not self.has_point(conditions):
+        if not self.has_values(*terms) or not self.any_point_meets(conditions):
             return {}
         minimum = {path: self.values[path] for path in terms if path in self.values}
         for axis in self.axes:
@@ -180,7 +180,7 @@ def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSI
     return default if raw_value is MISSING else raw_value
 
 
-def _meets_conditions(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
+def _meets_conditions(axis: Axis, conditions: Mapping[str, ValueCondition]) -> np.ndarray:
     """Return a mask (n,) of the points along an axis that meet the conditions on its parameters."""
     is_met = np.ones(axis.size, bool)
     for parameter in axis.parameters:
@@ -189,12 +189,12 @@ def _meets_conditions(axis: Axis, conditions: Mapping[str, Condition]) -> np.nda
     return is_met
 
 
-def _equals(expected: str | float) -> Condition:
+def _condition_equal_to(expected: str | float) -> ValueCondition:
     """Return the condition that values equal `expected`."""
     return lambda values: values == expected
 
 
-def _differs_from(unwanted: str | float) -> Condition:
+def _condition_different_from(unwanted: str | float) -> ValueCondition:
     """Return the condition that values differ from `unwanted`."""
     return lambda values: values != unwanted
 
@@ -212,15 +212,15 @@ def _is_zero(values: np.ndarray) -> np.ndarray:
 def grid_findings(grid: GridValues) -> list[Finding]:
     """Return the mistakes in combinations of values of a study's grid."""
     return [
-        *(list(_time_findings(grid)) or _window_findings(grid)),
-        *_photon_findings(grid),
-        *_table_findings(grid),
+        *(list(_echo_time_findings(grid)) or _window_findings(grid)),
+        *_responsivity_findings(grid),
+        *_sweep_error_table_findings(grid),
         *_beam_findings(grid),
-        *_nesting_findings(grid),
+        *_parent_effect_findings(grid),
         *_requirement_findings(grid),
-        *_record_findings(grid),
-        *_looks_findings(grid),
-        *_search_findings(grid),
+        *_record_and_filter_findings(grid),
+        *_multiple_looks_findings(grid),
+        *_search_band_findings(grid),
     ]
 
 
@@ -246,24 +246,24 @@ _ECHO_TIME_POINTS_MAX = 10**7
 """Maximum number of points of the grid of `ECHO_TIME_PATHS`; a larger grid is not checked."""
 
 
-def _time_findings(grid: GridValues) -> Iterator[Finding]:
+def _echo_time_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if no point of the grid has an echo in its record, or records are too short.
 
     A record needs two samples. A grid in which only some points lack an echo is valid: these points
     detect nothing.
     """
     lateness = _least_echo_lateness(grid)
-    if lateness is not None and lateness.chirp >= 0:
+    if lateness is not None and lateness.after_chirp_end >= 0:
         problem = "must exceed the echo's delay 2R/c, and falls short by "
-        problem += f"{lateness.chirp:.6g} s at its best"
+        problem += f"{lateness.after_chirp_end:.6g} s at its best"
         yield grid.make_finding(
             CHIRP_DURATION_PATH, problem, "shorten the range or lengthen the chirp"
         )
         return
-    if lateness is not None and lateness.record >= 0:
+    if lateness is not None and lateness.after_record_end >= 0:
         problem = (
             "must let records of fft_size samples last until an echo arrives, and the whole grid's "
-            f"end {lateness.record:.6g} s or more before the echo's delay 2R/c"
+            f"end {lateness.after_record_end:.6g} s or more before the echo's delay 2R/c"
         )
         yield grid.make_finding(
             ACQUISITION_DELAY_PATH,
@@ -271,7 +271,7 @@ def _time_findings(grid: GridValues) -> Iterator[Finding]:
             "raise it to the delay of the farthest echo, or fft_size",
         )
         return
-    samples = _fewest_samples(grid)
+    samples = _segment_samples_min(grid)
     if samples is not None and np.floor(samples + 1e-6) < 2:
         problem = f"must leave 2 samples after the acquisition delay, and leaves {samples:.3g}"
         yield grid.make_finding(
@@ -280,15 +280,16 @@ def _time_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 class _EchoLateness(NamedTuple):
-    """Smallest time over a grid from an end to the echo's arrival [s].
+    """Smallest times over a grid from the ends of chirp and record to the echo's arrival [s].
 
     Negative values mean that the echo arrives before the end.
     """
 
-    chirp: float
-    """Time from the end of the chirp [s]."""
-    record: float
-    """Time from the end of the record, or of the chirp if the effect `overlap` is off [s]."""
+    after_chirp_end: float
+    """Time from the end of the chirp to the echo's arrival [s]."""
+    after_record_end: float
+    """Time from the end of the record to the echo's arrival [s]; from the end of the chirp if the
+    effect `overlap` is off."""
 
 
 def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
@@ -327,7 +328,7 @@ def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
     return _EchoLateness(after_chirp, float(np.min(delay - end)))
 
 
-def _fewest_samples(grid: GridValues) -> float | None:
+def _segment_samples_min(grid: GridValues) -> float | None:
     """Return the smallest number of samples of a segment over the grid; None if it is not known.
 
     The number is (chirp duration - acquisition delay) * sample rate. An axis over the sample rate
@@ -358,20 +359,20 @@ def _fewest_samples(grid: GridValues) -> float | None:
     return float(
         np.min(
             ((span_elsewhere or 0.0) + span_on_rate_axis)
-            * values_on_rate_axis.get(SAMPLE_RATE_PATH, grid.values_of(SAMPLE_RATE_PATH))
+            * values_on_rate_axis.get(SAMPLE_RATE_PATH, grid.parameter_values(SAMPLE_RATE_PATH))
         )
     )
 
 
 def _window_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if a window function does not exist at the length of the shortest record."""
-    samples = _fewest_samples(grid)
+    samples = _segment_samples_min(grid)
     if samples is None or not grid.has_values(WINDOW_PATH, FFT_SIZE_PATH):
         return
     from sweep.model import window
 
-    length = int(min(grid.values_of(FFT_SIZE_PATH).min(), samples + 1e-6))
-    for name in dict.fromkeys(grid.values_of(WINDOW_PATH).tolist()):
+    length = int(min(grid.parameter_values(FFT_SIZE_PATH).min(), samples + 1e-6))
+    for name in dict.fromkeys(grid.parameter_values(WINDOW_PATH).tolist()):
         try:
             window.window_samples(name, min(length, _WINDOW_TRIAL_SAMPLES_MAX))
         except ValueError:
@@ -382,7 +383,7 @@ def _window_findings(grid: GridValues) -> Iterator[Finding]:
             return
 
 
-def _photon_findings(grid: GridValues) -> Iterator[Finding]:
+def _responsivity_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the responsivity exceeds one electron per photon, q lambda / (h c)."""
     responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
     least_margin = _least_weighted_sum(
@@ -398,14 +399,14 @@ def _photon_findings(grid: GridValues) -> Iterator[Finding]:
         )
 
 
-def _table_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding if the table of the sweep's error does not cover the longest chirp."""
+def _sweep_error_table_findings(grid: GridValues) -> Iterator[Finding]:
+    """Yield a finding if the table of the frequency error does not cover the longest chirp."""
     table_text = grid.values.get(ERROR_TABLE_PATH, NO_TABLE)
     if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
         return
     table, duration_max = (
         fit_sweep_error(table_text),
-        float(grid.values_of(CHIRP_DURATION_PATH).max()),
+        float(grid.parameter_values(CHIRP_DURATION_PATH).max()),
     )
     if table.first_time > 1e-9 * duration_max or table.last_time < (1 - 1e-9) * duration_max:
         problem = (
@@ -418,30 +419,30 @@ def _table_findings(grid: GridValues) -> Iterator[Finding]:
 # Beams
 
 _SINGLE_MODE_CONDITIONS = {
-    beam.COUPLING_PATH: _equals(beam.SINGLE_MODE),
-    beam.ARCHITECTURE_PATH: _differs_from("direct"),
+    beam.COUPLING_PATH: _condition_equal_to(beam.SINGLE_MODE),
+    beam.ARCHITECTURE_PATH: _condition_different_from("direct"),
 }
 """Conditions of a coherent receiver that couples a single mode."""
 
 
 def _beam_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the beam: given twice or not at all, too wide, or too narrow."""
+    """Yield mistakes in the beam's width: stated twice or not at all, too large, or too small."""
     if not grid.has_values(
         beam.WAVELENGTH_PATH, beam.APERTURE_DIAMETER_PATH, beam.DIVERGENCE_PATH, beam.WAIST_PATH
     ):
         return
-    if grid.has_point({beam.DIVERGENCE_PATH: _is_zero, beam.WAIST_PATH: _is_zero}):
+    if grid.any_point_meets({beam.DIVERGENCE_PATH: _is_zero, beam.WAIST_PATH: _is_zero}):
         problem = "must be given, or beam_waist in its place"
         yield grid.make_finding(beam.DIVERGENCE_PATH, problem, "write e.g. '50 urad'")
-    elif grid.has_point({beam.DIVERGENCE_PATH: _is_positive, beam.WAIST_PATH: _is_positive}):
-        problem = "stands beside beam_divergence, and each follows from the other"
+    elif grid.any_point_meets({beam.DIVERGENCE_PATH: _is_positive, beam.WAIST_PATH: _is_positive}):
+        problem = "is given in addition to beam_divergence, and each follows from the other"
         yield grid.make_finding(beam.WAIST_PATH, problem, "leave one of them out")
     else:
-        yield from _width_findings(grid)
+        yield from _beam_width_findings(grid)
 
 
-def _width_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the width of beams that their aperture or the paraxial limit exclude.
+def _beam_width_findings(grid: GridValues) -> Iterator[Finding]:
+    """Yield a finding for beams whose width the aperture or the paraxial limit excludes.
 
     Notes
     -----
@@ -504,8 +505,8 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
         Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D).
     """
     for conditions in (
-        {beam.COUPLING_PATH: _equals(beam.APERTURE)},
-        {beam.ARCHITECTURE_PATH: _equals("direct")},
+        {beam.COUPLING_PATH: _condition_equal_to(beam.APERTURE)},
+        {beam.ARCHITECTURE_PATH: _condition_equal_to("direct")},
     ):
         if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
             narrow_beam, limit = narrowest
@@ -520,7 +521,7 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
 
 
 def _narrowest_impossible_beam(
-    grid: GridValues, conditions: Mapping[str, Condition]
+    grid: GridValues, conditions: Mapping[str, ValueCondition]
 ) -> tuple[dict[str, float], float] | None:
     """Find the beam that is furthest below the divergence limit of its aperture.
 
@@ -552,15 +553,15 @@ def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: f
 
 
 def _argmax_of_product(
-    grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, Condition]
+    grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, ValueCondition]
 ) -> dict[str, float]:
     """Return the parameters that maximise a product of powers; empty if no point qualifies."""
-    terms = {path: partial(_log_of_power, -power) for path, power in powers.items()}
+    terms = {path: partial(_exponent_times_log, -power) for path, power in powers.items()}
     return grid.argmin_of_sum(terms, conditions)
 
 
-def _log_of_power(power: float, values: np.ndarray) -> np.ndarray:
-    """Return the logarithm of ``values ** power``; infinite at 0."""
+def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
+    """Return ``power * log(values)``; infinite where a value is 0."""
     with np.errstate(divide="ignore"):
         return np.asarray(power * np.log(values))
 
@@ -576,28 +577,31 @@ def _exceeds_one(number: np.ndarray) -> np.ndarray:
     return number > 1
 
 
-def _looks_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in multiple looks: contradictions, or an unknown detection probability."""
-    several_looks: dict[str, Condition] = {looks.LOOKS_NUMBER_PATH: _exceeds_one}
-    combined_by_bin: dict[str, Condition] = {
-        looks.LOOKS_COMBINE_PATH: _differs_from(looks.COMBINE_COHERENT),
+def _multiple_looks_findings(grid: GridValues) -> Iterator[Finding]:
+    """Yield mistakes in settings of several looks.
+
+    The settings contradict each other, or their detection probability is unknown.
+    """
+    several_looks: dict[str, ValueCondition] = {looks.LOOKS_NUMBER_PATH: _exceeds_one}
+    combined_by_bin: dict[str, ValueCondition] = {
+        looks.LOOKS_COMBINE_PATH: _condition_different_from(looks.COMBINE_COHERENT),
         **several_looks,
     }
-    added_in_amplitude: dict[str, Condition] = {
-        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_COHERENT),
+    added_in_amplitude: dict[str, ValueCondition] = {
+        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_COHERENT),
         **several_looks,
     }
-    voted_on: dict[str, Condition] = {
-        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_BINARY),
+    voted_on: dict[str, ValueCondition] = {
+        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_BINARY),
         **several_looks,
     }
-    if grid.has_point(combined_by_bin | {DETECTION_PATH: _equals("any_bin")}):
+    if grid.any_point_meets(combined_by_bin | {DETECTION_PATH: _condition_equal_to("any_bin")}):
         problem = "detects by the largest bin of an echo where several records are not added in "
         problem += "amplitude: the chance that any of its bins does is known for one record alone"
         yield grid.make_finding(
             DETECTION_PATH, problem, "write 'detection: peak_bin', or combine: coherent"
         )
-    if grid.has_point(
+    if grid.any_point_meets(
         voted_on | {looks.LOOKS_NUMBER_PATH: lambda number: number > VOTING_LOOKS_MAX}
     ):
         problem = f"counts the votes of at most {VOTING_LOOKS_MAX} records"
@@ -618,31 +622,33 @@ def _looks_findings(grid: GridValues) -> Iterator[Finding]:
             "instrument.looks.number"
         )
         yield grid.make_finding(looks.LOOKS_VOTES_PATH, problem, "lower it, or take more looks")
-    if grid.has_point(
-        added_in_amplitude | {looks.LOOKS_SPECKLE_PATH: _equals(looks.SPECKLE_INDEPENDENT)}
+    if grid.any_point_meets(
+        added_in_amplitude
+        | {looks.LOOKS_SPECKLE_PATH: _condition_equal_to(looks.SPECKLE_INDEPENDENT)}
     ):
         problem = "gives each record a phase of its own, in which amplitudes do not add up"
         yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, "take common, or combine: power")
-    if grid.has_point(
-        added_in_amplitude | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _equals("gaussian")}
+    if grid.any_point_meets(
+        added_in_amplitude
+        | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _condition_equal_to("gaussian")}
     ):
-        problem = "tells nothing of the phase from one record to the next, of which the sum is made"
+        problem = "does not determine the phase from one record to the next, which the sum needs"
         yield grid.make_finding(LINE_SHAPE_PATH, problem, "take lorentzian, or combine: power")
-    if grid.has_point(
+    if grid.any_point_meets(
         combined_by_bin
         | {
-            looks.LOOKS_SPECKLE_PATH: _equals(looks.SPECKLE_INDEPENDENT),
+            looks.LOOKS_SPECKLE_PATH: _condition_equal_to(looks.SPECKLE_INDEPENDENT),
             ROUGHNESS_PATH: _is_positive,
         }
     ):
         problem = "is drawn once a shot for a surface of stated roughness, for all its records"
         remedy = "take common, or footprint.speckle: developed without target.roughness"
         yield grid.make_finding(looks.LOOKS_SPECKLE_PATH, problem, remedy)
-    if grid.has_point(
+    if grid.any_point_meets(
         {
-            looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_POWER),
+            looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_POWER),
             **several_looks,
-            DETECTOR_PREFIX + "kind": _differs_from(FIXED_THRESHOLD),
+            DETECTOR_PREFIX + "kind": _condition_different_from(FIXED_THRESHOLD),
         }
     ):
         problem = "sets its threshold by the noise of one record, and here powers are averaged"
@@ -651,16 +657,16 @@ def _looks_findings(grid: GridValues) -> Iterator[Finding]:
 
 
 def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
-    """Yield a finding if noise is drawn with a leak line, or in the bins of several looks."""
-    if method != "probabilities" and grid.has_point(
+    """Yield a finding if draws of noise are requested with a leak line or several looks."""
+    if method != "probabilities" and grid.any_point_meets(
         {circulator_leak.LEAK_LENGTH_PATH: _is_positive}
     ):
         problem = "draws noise, and instrument.telescope.leak_path has a line that is not drawn"
         yield Finding(("draws", "method"), problem, "take draws.method: probabilities", method)
-    if method == "noise" and grid.has_point(
+    if method == "noise" and grid.any_point_meets(
         {
             looks.LOOKS_NUMBER_PATH: _exceeds_one,
-            looks.LOOKS_COMBINE_PATH: _differs_from(looks.COMBINE_COHERENT),
+            looks.LOOKS_COMBINE_PATH: _condition_different_from(looks.COMBINE_COHERENT),
         }
     ):
         problem = (
@@ -670,11 +676,11 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
         yield Finding(("draws", "method"), problem, remedy, method)
 
 
-def _search_findings(grid: GridValues) -> Iterator[Finding]:
+def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the search band: missing or swapped ends, or counted bins outside."""
-    missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.values_of(path).size]
+    missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.parameter_values(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
-        problem = "is left out, and a beat tells of range and velocity both"
+        problem = "is missing, and a beat depends on both range and velocity"
         yield Finding(tuple(missing_ends[0].split(".")), problem, "give all four ends, or none")
     for low, high in (SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS):
         least_span = _least_weighted_sum(grid, {high: 1.0, low: -1.0})
@@ -682,7 +688,7 @@ def _search_findings(grid: GridValues) -> Iterator[Finding]:
             yield grid.make_finding(
                 high, f"must exceed {low}, and is {-least_span:.6g} below", "raise it"
             )
-    if not missing_ends and grid.has_point({BINS_COUNTED_PATH: _equals("all")}):
+    if not missing_ends and grid.any_point_meets({BINS_COUNTED_PATH: _condition_equal_to("all")}):
         problem = "counts bins that instrument.processing.search leaves out"
         yield grid.make_finding(
             BINS_COUNTED_PATH, problem, "write 'bins_counted: half', or leave the band out"
@@ -697,11 +703,11 @@ class ParameterRequirement(NamedTuple):
 
     path: str
     """Dotted path of the parameter that has the requirement."""
-    needs_other: Condition
+    applies_to: ValueCondition
     """Condition on its values for which the requirement applies."""
     other_path: str
     """Dotted path of the required parameter."""
-    is_unmet: Condition
+    is_broken_by: ValueCondition
     """Condition on the values of the required parameter that break the requirement."""
     problem: str
     """Text of the finding: the end of a sentence about `path`."""
@@ -711,11 +717,13 @@ class ParameterRequirement(NamedTuple):
     """True if the requirement applies, at any value of the parameter, when its effect is ``on``."""
 
 
-def _require_positive(path: str, needs_other: Condition, other_path: str) -> ParameterRequirement:
+def _positive_value_requirement(
+    path: str, applies_to: ValueCondition, other_path: str
+) -> ParameterRequirement:
     """Return the requirement that another parameter is not 0."""
     return ParameterRequirement(
         path,
-        needs_other,
+        applies_to,
         other_path,
         _is_zero,
         f"needs {other_path}, which is 0",
@@ -727,10 +735,14 @@ _SINGLE_MODE_PROBLEM_AND_REMEDY = (
     "counts by the mode that a coherent receiver sees, and here all light in the aperture does",
     "take a coherent receiver of coupling: single_mode",
 )
-REQUIREMENTS = (
+EFFECT_PARAMETER_REQUIREMENTS = (
     *(
         ParameterRequirement(
-            path, lambda value: value != 0, other, _equals(word), *_SINGLE_MODE_PROBLEM_AND_REMEDY
+            path,
+            lambda value: value != 0,
+            other,
+            _condition_equal_to(word),
+            *_SINGLE_MODE_PROBLEM_AND_REMEDY,
         )
         for path in (beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH)
         for other, word in ((beam.COUPLING_PATH, beam.APERTURE), (beam.ARCHITECTURE_PATH, "direct"))
@@ -738,9 +750,9 @@ REQUIREMENTS = (
     *(
         ParameterRequirement(
             path,
-            _differs_from(default),
+            _condition_different_from(default),
             RECORD_PATH,
-            _equals("real"),
+            _condition_equal_to("real"),
             "is one of I and Q, and the record is real",
             "set instrument.receiver.record: complex",
         )
@@ -749,7 +761,7 @@ REQUIREMENTS = (
             (iq_imbalance.PHASE_IMBALANCE_PATH, 0.0),
         )
     ),
-    _require_positive("instrument.processing.bits", _is_positive, FULL_SCALE_PATH),
+    _positive_value_requirement("instrument.processing.bits", _is_positive, FULL_SCALE_PATH),
     ParameterRequirement(
         circulator_leak.LEAK_LENGTH_PATH,
         _is_positive,
@@ -774,15 +786,15 @@ REQUIREMENTS = (
         "is that of a line which masks bins, and no law joins that with a search band",
         "leave instrument.processing.search out",
     ),
-    _require_positive(
+    _positive_value_requirement(
         "atmosphere.profile", lambda p: np.isin(p, ("exponential", "layer")), EXTINCTION_PATH
     ),
     ParameterRequirement(
         "target.roughness",
         _is_positive,
         beam.ARCHITECTURE_PATH,
-        _equals("direct"),
-        "makes speckle, of which direct detection averages over an unknown number",
+        _condition_equal_to("direct"),
+        "makes speckle, and direct detection averages an unknown number of speckle grains",
         "take a coherent receiver",
         holds_if_forced_on=True,
     ),
@@ -790,8 +802,8 @@ REQUIREMENTS = (
         "target.roughness",
         _is_positive,
         "footprint.speckle",
-        _equals("developed"),
-        "says how rough the target is, which developed speckle takes to be without limit",
+        _condition_equal_to("developed"),
+        "states the roughness of the target, which is unlimited in developed speckle",
         "set footprint.speckle: none",
     ),
     ParameterRequirement(
@@ -806,7 +818,7 @@ REQUIREMENTS = (
 """Requirements of the parameters of effects on other parameters."""
 
 
-def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
+def _parent_effect_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for each effect that is on although its parent effect is off."""
     outer_of_effect = {effect.name: effect.parent for effect in EFFECTS}
     for name, outer in outer_of_effect.items():
@@ -819,7 +831,7 @@ def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
 
 def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for each broken requirement of an effect that is not off."""
-    for requirement in REQUIREMENTS:
+    for requirement in EFFECT_PARAMETER_REQUIREMENTS:
         owning_effect = next(
             effect
             for effect in EFFECTS
@@ -827,29 +839,34 @@ def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
         )
         mode = grid.effect_modes.get(owning_effect.name, OFF)
         remedy = f"{requirement.remedy}, or effects.{owning_effect.name}: off"
-        if mode != OFF and grid.has_point(
+        if mode != OFF and grid.any_point_meets(
             {
-                requirement.path: requirement.needs_other,
-                requirement.other_path: requirement.is_unmet,
+                requirement.path: requirement.applies_to,
+                requirement.other_path: requirement.is_broken_by,
             }
         ):
             yield grid.make_finding(requirement.path, requirement.problem, remedy)
         elif (
             requirement.holds_if_forced_on
             and mode == ON
-            and grid.has_point({requirement.other_path: requirement.is_unmet})
+            and grid.any_point_meets({requirement.other_path: requirement.is_broken_by})
         ):
             yield _mode_finding(owning_effect.name, requirement.problem, remedy)
 
 
-def _record_findings(grid: GridValues) -> Iterator[Finding]:
+def _record_and_filter_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in complex records of direct detection and in the anti-alias filter.
 
     A filter wider than the sample rate keeps no alias out, and ``noise_shape: white`` ignores the
     filter.
     """
-    if grid.has_point({RECORD_PATH: _equals("complex"), beam.ARCHITECTURE_PATH: _equals("direct")}):
-        problem = "samples I and Q, of which direct detection has one"
+    if grid.any_point_meets(
+        {
+            RECORD_PATH: _condition_equal_to("complex"),
+            beam.ARCHITECTURE_PATH: _condition_equal_to("direct"),
+        }
+    ):
+        problem = "samples I and Q, and direct detection has only one of them"
         yield grid.make_finding(RECORD_PATH, problem, "take a coherent receiver, or record: real")
     if (
         _least_weighted_sum(grid, {SAMPLE_RATE_PATH: 1.0, ANTIALIAS_BANDWIDTH_PATH: -1.0}) or 0.0
@@ -860,10 +877,10 @@ def _record_findings(grid: GridValues) -> Iterator[Finding]:
         yield grid.make_finding(
             ANTIALIAS_BANDWIDTH_PATH, f"{problem} out", "lower it, or write 'none'"
         )
-    if grid.has_point(
+    if grid.any_point_meets(
         {
             ANTIALIAS_BANDWIDTH_PATH: _is_positive,
-            "instrument.receiver.noise_shape": _equals("white"),
+            "instrument.receiver.noise_shape": _condition_equal_to("white"),
         }
     ):
         problem = "shapes the noise, which noise_shape: white leaves as it is"
@@ -913,14 +930,14 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
                 ": beams wander by platform.jitter" if effect.perturb_parameters is not None else ""
             )
             yield _mode_finding(effect.name, problem, f"leave it out{instead_text}")
-    yield from spectra_findings(draws, grid)
-    if grid.has_point({waveform.SHOT_DETECTION_PATH: _equals(waveform.ANY_TWO)}):
+    yield from spectrum_method_findings(draws, grid)
+    if grid.any_point_meets({waveform.SHOT_DETECTION_PATH: _condition_equal_to(waveform.ANY_TWO)}):
         problem, remedy = "is not known to flights, which pair peaks", "take both_chirps"
         yield grid.make_finding(
             waveform.SHOT_DETECTION_PATH, problem, f"{remedy}, or study a flat target"
         )
-    if not draws.draws_whole_spectra and grid.has_point(
-        {waveform.PEAKS_PATH: _equals(waveform.STRONGEST_PEAK)}
+    if not draws.draws_whole_spectra and grid.any_point_meets(
+        {waveform.PEAKS_PATH: _condition_equal_to(waveform.STRONGEST_PEAK)}
     ):
         problem = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
         yield grid.make_finding(
@@ -928,9 +945,9 @@ def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Find
         )
     voted_on = {
         looks.LOOKS_NUMBER_PATH: _exceeds_one,
-        looks.LOOKS_COMBINE_PATH: _equals(looks.COMBINE_BINARY),
+        looks.LOOKS_COMBINE_PATH: _condition_equal_to(looks.COMBINE_BINARY),
     }
-    if grid.has_point(voted_on | {"footprint.speckle": _equals("developed")}):
+    if grid.any_point_meets(voted_on | {"footprint.speckle": _condition_equal_to("developed")}):
         problem = "counts records, and flights draw no powers of echoes that fade in several"
         yield grid.make_finding(
             looks.LOOKS_COMBINE_PATH, problem, "take power, or footprint.speckle: none"
@@ -949,20 +966,22 @@ def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parame
             for parameter in effect.parameters:
                 # A parameter whose default is not neutral (0, 0 dB, none) configures its effect
                 # only.
-                is_not_default = _differs_from(parameter.default)  # type: ignore[arg-type]
-                if parameter.enables_effect and grid.has_point({parameter.path: is_not_default}):
+                is_not_default = _condition_different_from(parameter.default)  # type: ignore[arg-type]
+                if parameter.enables_effect and grid.any_point_meets(
+                    {parameter.path: is_not_default}
+                ):
                     yield effect, parameter
 
 
 # Detectors and estimators
 
 
-def is_detector_or_estimator(path: str) -> bool:
+def is_detector_or_estimator_parameter(path: str) -> bool:
     """Return True if a parameter belongs to the detector or the estimator of whole spectra."""
     return path.startswith((DETECTOR_PREFIX, ESTIMATOR_PREFIX))
 
 
-def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
+def spectrum_method_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in methods that examine whole spectra.
 
     Such a method needs ``draws.method: spectra`` and a number of draws, and CFAR windows must fit
@@ -978,8 +997,8 @@ def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Fi
     yield from _drawn_noise_findings(grid, draws.method)
     if not draws.draws_whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA_METHOD}, number: 1000}}, or leave it out"
-        problem = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"
-        for path in _changed_method_paths(grid):
+        problem = f"examines whole spectra, which draws.method {draws.method!r} does not draw"
+        for path in _changed_spectrum_method_paths(grid):
             yield grid.make_finding(path, problem, remedy)
     elif not draws.has_draws:
         problem, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
@@ -988,13 +1007,13 @@ def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Fi
         yield from _cfar_window_findings(grid)
 
 
-def _changed_method_paths(grid: GridValues) -> list[str]:
+def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
     """Return paths of detector and estimator parameters on axes or away from their defaults."""
     paths_on_axes = [
         parameter.path
         for axis in grid.axes
         for parameter in axis.parameters
-        if is_detector_or_estimator(parameter.path)
+        if is_detector_or_estimator_parameter(parameter.path)
     ]
     values = grid.values
     changed_paths = [
@@ -1008,7 +1027,7 @@ def _changed_method_paths(grid: GridValues) -> list[str]:
 def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding for odd or too wide CFAR windows, and for ranks beyond the window."""
     training, guard, rank = (
-        grid.values_of(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)
+        grid.parameter_values(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)
     )
     if (training % 2 == 1).any():
         yield grid.make_finding(TRAINING_PATH, "must be even", "half of them stand on either side")
@@ -1017,7 +1036,7 @@ def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
         yield grid.make_finding(RANK_PATH, problem, "lower it, or write 'auto'")
     if not grid.has_values(TRAINING_PATH, GUARD_PATH, FFT_SIZE_PATH):
         return
-    n_bins = int(grid.values_of(FFT_SIZE_PATH).min()) // 2 - 1
+    n_bins = int(grid.parameter_values(FFT_SIZE_PATH).min()) // 2 - 1
     n_bins_needed = max(int(training.max() + 2 * guard.max()) + 1, _SPECTRUM_BINS_MIN)
     if n_bins < n_bins_needed:
         problem = (

@@ -19,7 +19,7 @@ from sweep.spec.sections import REFLECTANCE_FIELD
 if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
 
-SQUARE_STEPS_MAX = 7000
+GRID_STEPS_PER_SIDE_MAX = 7000
 """Maximum number of grid steps along one side of a square."""
 _RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
 """Uses of random numbers; the index of a use selects its random stream."""
@@ -48,23 +48,25 @@ class Material(SpecSection):
     """Optical properties of a surface."""
 
     reflectance: float = REFLECTANCE_FIELD
-    reflectance_law: str = declare.choice("How it scatters", REFLECTANCE_LAWS, "lambert")
+    reflectance_law: str = declare.choice_field(
+        "Law by which the surface scatters light", REFLECTANCE_LAWS, "lambert"
+    )
 
 
 OPTICAL_FIELDS = tuple(Material.model_fields)
-"""Fields of a surface that do not change where its rays hit."""
+"""Names of the optical fields of a surface, which do not change where rays hit it."""
 
 
 class Relief(SpecSection):
     """Fractal relief at scales that a survey does not resolve."""
 
-    hurst: float = declare.number("Hurst exponent", "0.9", "1e-3", "0.999")
-    rms_slope: float = declare.number(
+    hurst: float = declare.number_field("Hurst exponent", "0.9", "1e-3", "0.999")
+    rms_slope: float = declare.number_field(
         "Standard deviation of height differences over the baseline, divided by it",
         "0.1", "0", "10",
     )  # fmt: skip
-    baseline: float = declare.positive_length("Distance at which the slope is stated", "10 m")
-    seed: int = declare.seed()
+    baseline: float = declare.positive_length_field("Distance at which the slope is stated", "10 m")
+    seed: int = declare.seed_field()
 
     def draw_heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
         """Draw fractal heights with mean 0 on a grid.
@@ -95,16 +97,18 @@ class Relief(SpecSection):
 class Craters(SpecSection):
     """Simple craters with the lunar size-frequency law."""
 
-    smallest: float = declare.positive_length("Smallest diameter, three grid steps or more", "20 m")
-    largest: float = declare.positive_length("Largest diameter", "300 m")
-    least_fresh: float = declare.number(
-        "Freshness of the most worn, against 1", "0.1", "0", "1", default=0.1
+    smallest: float = declare.positive_length_field(
+        "Smallest diameter, three grid steps or more", "20 m"
     )
-    equilibrium_diameter: float | None = declare.positive_length(
+    largest: float = declare.positive_length_field("Largest diameter", "300 m")
+    least_fresh: float = declare.number_field(
+        "Freshness of the most worn craters; 1 is fresh", "0.1", "0", "1", default=0.1
+    )
+    equilibrium_diameter: float | None = declare.positive_length_field(
         "Diameter up to which craters have worn each other down; all by default", "100 m",
         default=None,
     )  # fmt: skip
-    seed: int = declare.seed()
+    seed: int = declare.seed_field()
 
     def carve_into(self, terrain: Terrain) -> Terrain:
         """Return the terrain with randomly drawn craters carved into it."""
@@ -131,18 +135,18 @@ def _check_memory(n_nodes: int) -> None:
 class Ground(Material, ABC):
     """Base of all grounds: heights on a grid, then smoothing, refining, relief and craters."""
 
-    smoothing: float = declare.length(
+    smoothing: float = declare.length_field(
         "Standard deviation of a Gaussian that the heights are blurred by", "10 m", "0 m",
         default=0.0,
     )  # fmt: skip
-    factor: int = declare.count(
-        "New grid steps to each old one, by a cubic spline", "8", "1", "1000", default=1
+    factor: int = declare.integer_field(
+        "Number of new grid steps for each old one, by a cubic spline", "8", "1", "1000", default=1
     )
     relief: Relief | None = None
     craters: Craters | None = None
 
     def build_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the processed ground in its own coordinates.
+        """Return the ground in its own coordinates, after smoothing, refining, relief and craters.
 
         Raises
         ------
@@ -151,9 +155,9 @@ class Ground(Material, ABC):
         ValueError
             If the grid is invalid, or can't hold the craters.
         """
-        return self.process(self.unprocessed_terrain(files))
+        return self.process_terrain(self.unprocessed_terrain(files))
 
-    def process(self, terrain: Terrain) -> Terrain:
+    def process_terrain(self, terrain: Terrain) -> Terrain:
         """Smooth and refine a terrain, then add relief and craters.
 
         Parameters
@@ -191,21 +195,24 @@ class Ground(Material, ABC):
 
     @abstractmethod
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
-        """Return the ground before smoothing, refining, relief and craters."""
+        """Return the ground before smoothing, refining, relief and craters are applied."""
 
     def check_grid(self) -> None:
         """Raise `ValueError` if the fields of the section define an invalid grid."""
 
     def grid_step(self) -> float | None:
-        """Return the larger grid step after refining [m]; None if only a file defines it."""
+        """Return the larger of the two grid steps, after refining [m].
+
+        The result is None if only a file defines the grid.
+        """
         return None
 
 
 class PlacedGround(Ground):
     """Base of grounds whose grid has no coordinates: `position` places its middle."""
 
-    position: Vector = declare.position(
-        "Where the middle of its grid lies, its heights above that", default=(0.0, 0.0, 0.0)
+    position: Vector = declare.position_field(
+        "Position of the grid's middle; heights are relative to its z", default=(0.0, 0.0, 0.0)
     )
 
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
@@ -230,11 +237,14 @@ class JacksboroGround(PlacedGround):
     """
 
     kind: Literal["jacksboro"]
-    size: float | None = declare.length(
-        "Side of the square cut from it; all of it by default", "3 km", "1 km", default=None
+    size: float | None = declare.length_field(
+        "Side of the square cut from the survey; by default all of the survey",
+        "3 km",
+        "1 km",
+        default=None,
     )
-    middle: Vector = declare.position(
-        "Middle of that square, eastwards and northwards from that of the survey",
+    middle: Vector = declare.position_field(
+        "Middle of that square, eastwards and northwards from the middle of the survey",
         dimensions=2, default=(0.0, 0.0),
     )  # fmt: skip
 
@@ -253,16 +263,16 @@ class JacksboroGround(PlacedGround):
         self.unplaced_terrain(None)
 
     def grid_step(self) -> float | None:
-        """Return the larger grid step after refining [m]."""
+        """Return the larger of the two grid steps, after refining [m]."""
         return max(abs(step) for step in self.unplaced_terrain(None).spacing) / self.factor
 
 
-_NO_DATA_FIELD = declare.number(
-    "Value that stands for a missing height, where the file does not declare it",
+_NO_DATA_FIELD = declare.number_field(
+    "Value that stands for a missing height, if the file does not declare it",
     "-9999", "-1e39", "1e39", default=None,
 )  # fmt: skip
-_HEIGHT_SCALE_FIELD = declare.number(
-    "Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0
+_HEIGHT_SCALE_FIELD = declare.number_field(
+    "Metres per unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0
 )
 
 
@@ -270,29 +280,29 @@ class RasterGround(Ground):
     """Heights of a georeferenced raster, such as a GeoTIFF, in its own coordinates."""
 
     kind: Literal["raster"]
-    file: str = declare.file_path(
-        "The raster: GeoTIFF or another format of GDAL", digest=raster_digest
+    file: str = declare.file_path_field(
+        "The raster: GeoTIFF or another format of GDAL", compute_digest=raster_digest
     )
-    band: int = declare.count("Band that holds the heights", "1", default=1)
+    band: int = declare.integer_field("Band that holds the heights", "1", default=1)
     scale: float = _HEIGHT_SCALE_FIELD
-    window: Vector | None = declare.list_of(
+    window: Vector | None = declare.list_field(
         declare.quantity_rule("Coordinate", "", "500000"), 4, 4, None,
         description="West, south, east and north of the part to read, in the raster's coordinates",
     )  # fmt: skip
-    metres_per_degree: Vector | None = declare.list_of(
+    metres_per_degree: Vector | None = declare.list_field(
         declare.quantity_rule("Metres", "", "110900", "1e-6"), 2, 2, None,
         description="Metres of a degree eastwards and northwards, of a raster in degrees",
     )  # fmt: skip
-    metres_per_unit: Vector | None = declare.list_of(
+    metres_per_unit: Vector | None = declare.list_field(
         declare.quantity_rule("Metres", "", "0.5", "1e-6"), 2, 2, None,
         description="Metres on the ground to a unit of the raster's coordinates, eastwards and "
         "northwards, of a map whose scale differs from that of the ground",
     )  # fmt: skip
-    height_unit: str | None = declare.text(
-        "Unit of the heights, where the file does not tell it: m, ft, sft (US survey foot)", None
+    height_unit: str | None = declare.text_field(
+        "Unit of the heights, if the file does not state it: m, ft, sft (US survey foot)", None
     )
     no_data: float | None = _NO_DATA_FIELD
-    pixel: float | None = declare.positive_length(
+    pixel: float | None = declare.positive_length_field(
         "Size of a pixel, of a raster that states no scale", "1 m", default=None
     )
 
@@ -311,13 +321,13 @@ class ArrayGround(PlacedGround):
     """Heights from a NumPy file."""
 
     kind: Literal["array"]
-    file: str = declare.file_path("The file, .npy or .npz")
-    spacing: Vector = declare.vector(
+    file: str = declare.file_path_field("The file, .npy or .npz")
+    spacing: Vector = declare.vector_field(
         "Step from column to column and from row to row; the second is below 0 where row 0 "
         "is the northern one",
         "m", "5 m", dimensions=2,
     )  # fmt: skip
-    name: str | None = declare.text("Array of an .npz that holds the heights", None)
+    name: str | None = declare.text_field("Array of an .npz that holds the heights", None)
     no_data: float | None = _NO_DATA_FIELD
     scale: float = _HEIGHT_SCALE_FIELD
 
@@ -335,10 +345,10 @@ class ImageGround(PlacedGround):
     """Heights from a grey image; row 0 is the northern one."""
 
     kind: Literal["image"]
-    file: str = declare.file_path("The image, of 8 or 16 bits")
-    pixel: float = declare.positive_length("Size of a pixel", "2 m")
-    white: float = declare.length("Height of full white", "49 m")
-    black: float = declare.length("Height of black", "0 m", default=0.0)
+    file: str = declare.file_path_field("The image, of 8 or 16 bits")
+    pixel: float = declare.positive_length_field("Size of a pixel", "2 m")
+    white: float = declare.length_field("Height of full white", "49 m")
+    black: float = declare.length_field("Height of black", "0 m", default=0.0)
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
         """Return the heights of the image, linear in the grey level between `black` and `white`."""
@@ -359,7 +369,7 @@ def _nodes_per_side(side: float, step: float) -> int:
 class SquareGround(PlacedGround):
     """Base of square grounds on a regular grid."""
 
-    size: float = declare.positive_length("Side of the square", "3 km")
+    size: float = declare.positive_length_field("Side of the square", "3 km")
 
     def unrefined_step(self) -> float:
         """Return the grid step before refining [m]; the side of the square without a spacing."""
@@ -378,10 +388,10 @@ class SquareGround(PlacedGround):
     def check_grid(self) -> None:
         """Raise `ValueError` if the number of grid steps is 0 or too large."""
         n_steps = _nodes_per_side(self.size, self.unrefined_step()) - 1
-        if not 1 <= n_steps <= SQUARE_STEPS_MAX:
+        if not 1 <= n_steps <= GRID_STEPS_PER_SIDE_MAX:
             raise ValueError(
                 f"a side of {self.size:g} m has {n_steps} steps of {self.unrefined_step():g} m, "
-                f"and takes {SQUARE_STEPS_MAX} at most"
+                f"and takes {GRID_STEPS_PER_SIDE_MAX} at most"
             )
 
     def grid_step(self) -> float | None:
@@ -393,10 +403,12 @@ class PlaneGround(SquareGround):
     """Square plane with an optional slope."""
 
     kind: Literal["plane"]
-    height: float = declare.length("Height of its middle", "0 m", default=0.0)
-    slope: float = declare.angle("Angle from the level", "10 deg", "0 deg", "80 deg", default=0.0)
-    uphill: float = declare.angle("Heading in which it rises", "90 deg", default=0.0)
-    spacing: float | None = declare.positive_length(
+    height: float = declare.length_field("Height of the plane's middle", "0 m", default=0.0)
+    slope: float = declare.angle_field(
+        "Angle from the level", "10 deg", "0 deg", "80 deg", default=0.0
+    )
+    uphill: float = declare.angle_field("Heading in which the plane rises", "90 deg", default=0.0)
+    spacing: float | None = declare.positive_length_field(
         "Grid step, for relief and craters; one cell by default", "5 m", default=None
     )
 
@@ -416,7 +428,7 @@ class ReliefGround(Relief, SquareGround):
     """Fractal ground with mean height 0."""
 
     kind: Literal["relief"]
-    spacing: float = declare.positive_length("Grid step", "5 m")
+    spacing: float = declare.positive_length_field("Grid step", "5 m")
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
         """Return the fractal ground, drawn from its seed."""
@@ -429,12 +441,12 @@ class HillsGround(SquareGround):
     """Smooth rolling ground of mean height 0."""
 
     kind: Literal["hills"]
-    spacing: float = declare.positive_length("Grid step", "1 m")
-    rms_height: float = declare.length("Standard deviation of the height", "10 m", "0 m")
-    correlation_length: float = declare.positive_length(
+    spacing: float = declare.positive_length_field("Grid step", "1 m")
+    rms_height: float = declare.length_field("Standard deviation of the height", "10 m", "0 m")
+    correlation_length: float = declare.positive_length_field(
         "Distance at which the correlation of heights is 1/e", "80 m"
     )
-    seed: int = declare.seed()
+    seed: int = declare.seed_field()
 
     def check_grid(self) -> None:
         """Raise `ValueError` if the grid has too many steps, or too coarse ones for the hills."""

@@ -17,7 +17,7 @@ from sweep.model.threshold import THRESHOLD_PATHS, tnr_from_parameters
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-ALARM_PROBABILITY_MAX = 0.01
+PFA_SHOT_WARNING_ABOVE = 0.01
 """False-alarm probability of a shot above which the user is warned."""
 
 SAMPLED_SETTINGS_MAX = 400
@@ -25,7 +25,7 @@ SAMPLED_SETTINGS_MAX = 400
 computed."""
 
 
-def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]:
+def false_alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]:
     """Compute the false-alarm probabilities of a shot, due to noise alone, over a study's settings.
 
     Parameters
@@ -79,21 +79,21 @@ def alarm_probabilities(spec: GridSpec | SceneSpec) -> list[tuple[float, float]]
     return probabilities
 
 
-def iter_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
+def iter_false_alarm_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
     """Yield one sentence if noise alone raises a false alarm in more than 1 % of the shots.
 
     The sentence states the largest probability over the study's settings and the fields to change.
     """
-    pfa_max = max((pfa_any for pfa_any, _ in alarm_probabilities(spec)), default=0.0)
-    if pfa_max > ALARM_PROBABILITY_MAX:
+    pfa_max = max((pfa_any for pfa_any, _ in false_alarm_probabilities(spec)), default=0.0)
+    if pfa_max > PFA_SHOT_WARNING_ABOVE:
         yield (
             f"noise alone raises a false alarm in either chirp with probability {pfa_max:.3g} "
-            f"(more than {ALARM_PROBABILITY_MAX:g}): {fewer_alarms_remedy(spec)}"
+            f"(more than {PFA_SHOT_WARNING_ABOVE:g}): {false_alarm_remedy(spec)}"
         )
 
 
-def fewer_alarms_remedy(spec: GridSpec | SceneSpec) -> str:
-    """Return the change of fields that reduces false alarms, as an imperative clause."""
+def false_alarm_remedy(spec: GridSpec | SceneSpec) -> str:
+    """Return advice on which fields to change for fewer false alarms, as an imperative clause."""
     parameters, kind_path = spec.parameters(), f"{DETECTOR_PREFIX}kind"
     values_by_path = {
         member.path: member.values for axis in spec.axes for member in axis.parameters

@@ -37,7 +37,7 @@ Location = tuple[str | int, ...]
 """Keys and list indices that lead to a value in a spec."""
 
 MISSING = object()
-"""Stands for a value that is not written."""
+"""Sentinel for a value that the spec does not contain."""
 _SHOWN_VALUE_CHARACTERS_MAX = 60
 """Maximum number of characters of a value that are shown."""
 _PARTIAL_NAME_CHARACTERS_MIN, _SUGGESTIONS_MAX = 4, 3
@@ -60,7 +60,7 @@ class Mistake:
     value: str = ""
     """Value as the user wrote it."""
     suggestion: str = ""
-    """Similar name or remedy."""
+    """Advice to the user: a similar name, or a remedy."""
     line: int | None = None
     """Line in the file, from 1."""
     file: str = ""
@@ -100,7 +100,7 @@ class Finding:
     problem: str
     """The broken rule, as the end of a sentence about the location."""
     suggestion: str = ""
-    """Similar name or remedy; may be empty."""
+    """Advice to the user: a similar name, or a remedy; may be empty."""
     raw_value: object = MISSING
     """Value as read from the file, if it is to be shown; else `MISSING`."""
 
@@ -125,7 +125,7 @@ class Findings(list[Finding]):
 
     @contextmanager
     def collect(self, location: Location = (), raw_value: object = MISSING) -> Iterator[None]:
-        """Context manager that appends errors of reading a part to this list.
+        """Context manager that appends the reading errors of its body to this list.
 
         A `QuantityError` becomes a finding at `location` that shows `raw_value`; a `FindingsError`
         adds its own findings.
@@ -152,7 +152,7 @@ def dotted_path(location: Location) -> str:
 
 
 def format_raw_value(raw_value: object) -> str:
-    """Return a written value as one short line; empty for `MISSING`, mappings and lists."""
+    """Return a value of a spec as one short line; empty for `MISSING`, mappings and lists."""
     if raw_value is MISSING or isinstance(raw_value, dict | list | tuple):
         return ""
     if raw_value is None:
@@ -198,7 +198,7 @@ def suggest_similar_name(name: str, known_names: Iterable[str], *, fallback: str
 RULE_ERROR_TYPE = "broken_rule"
 """Type of pydantic errors that are raised by rules."""
 
-Json = dict[str, Any]
+JsonObject = dict[str, Any]
 """JSON object."""
 
 
@@ -227,7 +227,7 @@ class Rule:
         return ""
 
     def read(self, raw_value: object) -> Any:
-        """Convert a value as written to the value inside the program, in SI units.
+        """Convert a value as written in a spec to SI units, or check it if it has no unit.
 
         Raises
         ------
@@ -237,21 +237,23 @@ class Rule:
         raise QuantityError("holds nothing that can be read")
 
     def format(self, value: Any) -> Any:
-        """Return text or a number that reads back as exactly `value`."""
+        """Return a value as a spec would hold it; `read` converts it back to exactly `value`."""
         return value
 
-    def schema(self) -> Json:
+    def schema(self) -> JsonObject:
         """Return the JSON Schema of a value as written."""
         return {"description": self.description} | self._value_schema()
 
-    def _value_schema(self) -> Json:
-        """Return the JSON Schema without the description."""
+    def _value_schema(self) -> JsonObject:
+        """Return the JSON Schema of a value as written, without the description."""
         return {}
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self._validate)
 
-    def __get_pydantic_json_schema__(self, _: CoreSchema, handler: GetJsonSchemaHandler) -> Json:
+    def __get_pydantic_json_schema__(
+        self, _: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonObject:
         return self.schema()
 
     def _validate(self, raw_value: object) -> Any:
@@ -268,14 +270,14 @@ class CustomRule(Rule):
 
     reader: Callable[[Any], Any]
     """Function that reads a value as written, or raises a `QuantityError`."""
-    value_schema: Json = dataclasses.field(default_factory=dict, compare=False)
+    value_schema: JsonObject = dataclasses.field(default_factory=dict, compare=False)
     """JSON Schema of a value as written."""
 
     def read(self, raw_value: object) -> Any:
-        """Convert a value as written by `reader`."""
+        """Convert a value as written in a spec with the function `reader`."""
         return self.reader(raw_value)
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return self.value_schema
 
 
@@ -285,8 +287,11 @@ _BOUND_KINDS = {
     "below": ("less than", np.greater_equal, "exclusiveMaximum"),
     "at_most": ("at most", np.greater, "maximum"),
 }
-"""Kinds of bounds of a number: the words for it, the comparison that breaks it, its JSON Schema
-keyword."""
+"""Kinds of bounds of a number, by the names of `NumericRule`'s fields.
+
+Each has its words in messages, a comparison that is True outside the bound, and its JSON Schema
+keyword.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,13 +304,13 @@ class NumericRule(Rule):
     example: str = ""
     """A valid value as a user would write it."""
     above: str | None = None
-    """Exclusive lower bound; None for none."""
+    """Exclusive lower bound; None if there is none."""
     at_least: str | None = None
-    """Inclusive lower bound; None for none."""
+    """Inclusive lower bound; None if there is none."""
     below: str | None = None
-    """Exclusive upper bound; None for none."""
+    """Exclusive upper bound; None if there is none."""
     at_most: str | None = None
-    """Inclusive upper bound; None for none."""
+    """Inclusive upper bound; None if there is none."""
     is_integer: bool = False
     """True for integers."""
     is_power_ratio: bool = False
@@ -322,13 +327,13 @@ class NumericRule(Rule):
 
     @property
     def bounds(self) -> dict[str, str]:
-        """Bounds as written, by kind; only those that are set."""
+        """Text of each bound that is set, by its kind, such as ``at_least``."""
         bound_texts = {name: getattr(self, name) for name in _BOUND_KINDS}
         return {
             name: bound_text for name, bound_text in bound_texts.items() if bound_text is not None
         }
 
-    def read_exact(self, raw_value: object) -> tuple[Fraction, Unit]:
+    def read_exact_number(self, raw_value: object) -> tuple[Fraction, Unit]:
         """Return the exact number and the unit of a written value, without a check of the bounds.
 
         Raises
@@ -389,7 +394,7 @@ class NumericRule(Rule):
 
         The value is an int if the rule requires integers.
         """
-        number, unit = self.read_exact(raw_value)
+        number, unit = self.read_exact_number(raw_value)
         if self.is_integer and number.denominator != 1:
             raise QuantityError("must be a whole number")
         value = unit.to_si(number)
@@ -419,9 +424,9 @@ class NumericRule(Rule):
         return None
 
     def format(self, value: Any) -> str | int | float:
-        """Return a number, or text such as ``0.001 W``, that reads back as exactly `value`.
+        """Return a number, or text such as ``0.001 W``; `read` converts it back exactly.
 
-        Decibels read back to 15 digits.
+        Decibels are converted back to 15 digits.
         """
         if self.keyword and value == self.keyword_value:
             return self.keyword
@@ -430,12 +435,12 @@ class NumericRule(Rule):
             return f"{repr(number).removesuffix('.0')} {self.si_unit}"
         return int(value) if self.is_integer else float(value)
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         bounds = [
             f"{_BOUND_KINDS[name][0]} {bound_text}" for name, bound_text in self.bounds.items()
         ]
         description = "; ".join([self.description, *([", ".join(bounds)] if bounds else [])])
-        base_schema: Json = {"description": description, "examples": [self.example]}
+        base_schema: JsonObject = {"description": description, "examples": [self.example]}
         if self.si_unit:
             pattern = r"^\s*[-+−.0-9].*[^\s0-9.]\S*\s*$"
             pattern += rf"|^{self.keyword}$" if self.keyword else ""
@@ -445,7 +450,7 @@ class NumericRule(Rule):
             for name, limit_text in self.bounds.items()
         }
         unit_pattern = "(%|dB)?" if self.is_power_ratio else "%?"
-        schemas: list[Json] = [
+        schemas: list[JsonObject] = [
             {"type": "integer" if self.is_integer else "number"} | bound_keywords,
             {"type": "string", "pattern": rf"^\s*[-+.0-9][-+.0-9eE^*_ ]*{unit_pattern}\s*$"},
         ]
@@ -454,15 +459,15 @@ class NumericRule(Rule):
 
 
 def _first_clause(description: str) -> str:
-    """Return the first clause of a description, in a form that can end a sentence."""
+    """Return the first clause of a description, with a small first letter, to end a sentence."""
     clause = re.split(r"[;:,.(] ?", description)[0].strip()
     return clause[:1].lower() + clause[1:] if clause[1:2].islower() else clause
 
 
 @lru_cache(maxsize=1024)
 def _bound_in_si(rule: NumericRule, bound_text: str) -> float:
-    """Return a rule's bound in SI units."""
-    number, unit = rule.read_exact(bound_text)
+    """Convert a bound of a rule, such as ``1 um``, to SI units."""
+    number, unit = rule.read_exact_number(bound_text)
     return unit.to_si(number)
 
 
@@ -480,7 +485,7 @@ class ChoiceRule(Rule):
     options: tuple[str, ...]
     """Valid words."""
     problem: str = ""
-    """Text of the finding for other words; by default a list of the options."""
+    """Problem stated for a word that is no option; by default a list of the options."""
     remedy: str = ""
     """Remedy for words that resemble none of the options."""
 
@@ -505,14 +510,17 @@ class ChoiceRule(Rule):
             problem, suggest_similar_name(str(raw_value), self.options, fallback=self.remedy)
         )
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         if "on" in self.options:
             return {"enum": [*self.options, True, False]}
         return {"type": "string", "enum": list(self.options)}
 
 
 class ChoiceOrFunctionRule(ChoiceRule):
-    """Rule of one of several words, or of a function ``module:function``; does not import it."""
+    """Rule of one of several words, or of a function's name ``module:function``.
+
+    The function is not imported.
+    """
 
     def read(self, raw_value: object) -> str:
         """Return the word or the name of the function."""
@@ -524,7 +532,7 @@ class ChoiceOrFunctionRule(ChoiceRule):
             problem = f"{error.rule}, or a function as module:function"
             raise QuantityError(problem, error.suggestion) from None
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return {
             "anyOf": [
                 super()._value_schema(),
@@ -542,7 +550,7 @@ class FlagRule(Rule):
             raise QuantityError("must be true or false", "write 'true' or 'false'")
         return raw_value
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return {"type": "boolean"}
 
 
@@ -567,10 +575,10 @@ class TextRule(Rule):
             )
             raise QuantityError("must be text", remedy)
         if re.fullmatch(self.pattern, str(raw_value)) is None:
-            raise QuantityError("is no text that can stand here", self.remedy)
+            raise QuantityError("is no valid text for this field", self.remedy)
         return str(raw_value)
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return {"type": "string", "pattern": f"^{self.pattern}$"}
 
 
@@ -578,18 +586,18 @@ class TextRule(Rule):
 class FilePathRule(Rule):
     """Rule of a file's path, relative to the file that names it."""
 
-    digest: Callable[[Path], str] = file_digest
+    compute_digest: Callable[[Path], str] = file_digest
     """Function that returns the digest of all that is read from the file."""
 
     def read(self, raw_value: object) -> str:
-        """Return the path as written."""
+        """Return the path as written, after a check that it may be the path of a file."""
         if not isinstance(raw_value, str) or not 0 < len(raw_value.strip()) <= 4096:
             raise QuantityError("must be the path of a file", "write it relative to this file")
         if "\0" in raw_value:
             raise QuantityError("holds a character that no path has")
         return raw_value
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return {"type": "string", "minLength": 1}
 
 
@@ -603,7 +611,7 @@ class ListRule(Rule):
     """Minimum number of values."""
     length_max: int = 3
     """Maximum number of values."""
-    noun: str = "values"
+    element_noun: str = "values"
     """Noun for the values in messages."""
     increasing: bool = False
     """True if each value must exceed the previous one."""
@@ -629,9 +637,9 @@ class ListRule(Rule):
         ):
             length_text = f"{self.length_min} " if self.length_min == self.length_max else ""
             length_text = length_text or (
-                f"at least {self.length_min} " if self.noun == "values" else ""
+                f"at least {self.length_min} " if self.element_noun == "values" else ""
             )
-            raise QuantityError(f"must be a list of {length_text}{self.noun}", remedy)
+            raise QuantityError(f"must be a list of {length_text}{self.element_noun}", remedy)
         values = tuple(
             read_element(self.element_rule, i, value) for i, value in enumerate(raw_value)
         )
@@ -642,10 +650,10 @@ class ListRule(Rule):
         return values
 
     def format(self, value: Any) -> Any:
-        """Return a list that reads back as exactly `value`."""
+        """Return the list as a spec would hold it; `read` converts it back exactly."""
         return [self.element_rule.format(element) for element in value]
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         length_keywords = {"minItems": self.length_min, "maxItems": self.length_max}
         distinct_keyword = {"uniqueItems": True} if self.distinct else {}
         return (
@@ -667,7 +675,7 @@ def read_element(rule: Rule, index: int, raw_value: object) -> Any:
         raise QuantityError(problem, error.suggestion or f"write e.g. {rule.example}") from None
 
 
-_TIME_RULE = NumericRule(
+_CHIRP_TIME_RULE = NumericRule(
     description="Time in the up-chirp",
     si_unit="s",
     example="10 us",
@@ -706,7 +714,7 @@ class FrequencyErrorTableRule(Rule):
         for i, row in enumerate(raw_value):
             if not isinstance(row, list | tuple) or len(row) != 2:
                 raise QuantityError(f"has a row {i} that is no time with its error", remedy)
-            rules = zip((_TIME_RULE, _FREQUENCY_ERROR_RULE), row, strict=True)
+            rules = zip((_CHIRP_TIME_RULE, _FREQUENCY_ERROR_RULE), row, strict=True)
             rows.append([read_element(rule, i, value) for rule, value in rules])
         if any(b[0] <= a[0] for a, b in pairwise(rows)):
             raise QuantityError("has times that do not rise", "sort the rows by time")
@@ -718,16 +726,16 @@ class FrequencyErrorTableRule(Rule):
         return table_text
 
     def format(self, value: Any) -> Any:
-        """Return rows that read back as exactly `value`."""
+        """Return the rows as a spec would hold them; `read` converts them back exactly."""
         if value == NO_TABLE:
             return value
-        rules = (_TIME_RULE, _FREQUENCY_ERROR_RULE)
+        rules = (_CHIRP_TIME_RULE, _FREQUENCY_ERROR_RULE)
         return [
             [rule.format(float(number)) for rule, number in zip(rules, row.split(), strict=True)]
             for row in value.split(",")
         ]
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         row_schema = {"minItems": 2, "maxItems": 2, "items": {"type": "string"}}
         rows_schema = {"type": "array", "minItems": 3, "items": {"type": "array"} | row_schema}
         return {"anyOf": [rows_schema, {"type": "string"}]}
@@ -751,7 +759,7 @@ class WindowFunctionRule(Rule):
     """Rule of a window function with its parameters, such as ``hamming`` or ``kaiser(8.6)``."""
 
     def read(self, raw_value: object) -> str:
-        """Return the window's name and parameters in normal form."""
+        """Return the window as its name, with parameters in parentheses if it has any."""
         match = (
             _WINDOW_PATTERN.fullmatch(raw_value.strip().lower())
             if isinstance(raw_value, str)
@@ -773,7 +781,7 @@ class WindowFunctionRule(Rule):
         _check_scipy_window(name, tuple(parameters))
         return f"{name}({','.join(map(repr, parameters))})" if parameters else name
 
-    def _value_schema(self) -> Json:
+    def _value_schema(self) -> JsonObject:
         return {
             "type": "string",
             "pattern": r"^\s*[A-Za-z_]+\s*(\([-+.,eE0-9\s]*\))?\s*$",
@@ -783,7 +791,7 @@ class WindowFunctionRule(Rule):
 
 @lru_cache(maxsize=256)
 def _check_scipy_window(name: str, parameters: tuple[float, ...]) -> None:
-    """Compute a window with scipy.
+    """Check a window's name and parameters by computing it with scipy.
 
     Raise `QuantityError` if the window is unknown or its parameters are invalid.
     """

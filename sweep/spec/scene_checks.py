@@ -30,7 +30,7 @@ from sweep.model.outputs import (
 from sweep.scenes.map_frames import metres_per_height_unit
 from sweep.scenes.scene_files import SceneError
 from sweep.spec.axes import parameter_location
-from sweep.spec.fields import SpecFiles, iter_file_paths, read_or_none
+from sweep.spec.fields import SpecFiles, iter_file_paths, validate_or_none
 from sweep.spec.grid_checks import GridValues, raw_value_at
 from sweep.spec.ground_sections import Craters, Ground, JacksboroGround, RasterGround
 from sweep.spec.rules import Finding, Location, suggest_similar_name
@@ -42,12 +42,12 @@ SHOTS_PER_SCANNER_MAX = 10**9
 
 RESERVED_SCANNER_NAMES = ("scene_map",)
 """Names of groups in a store that are not scanners."""
-_POSITIONED_SOLIDS = (scene_sections.Sphere, scene_sections.Box)
+_SOLIDS_WITH_REQUIRED_POSITION = (scene_sections.Sphere, scene_sections.Box)
 """Models of solids that need a position or a motion."""
 OBJECTS_LOCATION: Location = ("scene", "objects")
 """Location of the section of objects in a spec."""
-_ATTITUDE_TRIAL_TIMES = 257
-"""Number of times along a path at which its attitude is evaluated as a trial."""
+_N_ATTITUDE_TRIAL_TIMES = 257
+"""Number of instants of a path at which its attitude is evaluated as a trial."""
 
 
 def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any
 
 def _read_sections(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
     """Return the sections that can be read as a model, by name."""
-    sections = {name: read_or_none(annotation, value) for name, value in raw_sections.items()}
+    sections = {name: validate_or_none(annotation, value) for name, value in raw_sections.items()}
     return {name: section for name, section in sections.items() if section is not None}
 
 
@@ -76,7 +76,7 @@ def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Findi
         _raw_section(raw_spec, *OBJECTS_LOCATION), scene_sections.AnySceneObject
     )
     scanners = _read_sections(_raw_section(raw_spec, "scanners"), flight_sections.AnyScanner)
-    platform = read_or_none(flight_sections.Platform, raw_spec.get("platform"))
+    platform = validate_or_none(flight_sections.Platform, raw_spec.get("platform"))
     findings = [
         *_name_findings(
             raw_spec, OBJECTS_LOCATION, lambda name: name == scene_sections.WORLD_ORIGIN, "scene"
@@ -111,7 +111,7 @@ def _name_findings(
     raw_sections = _raw_section(raw_spec, *section_location)
     for name in raw_sections:
         try:
-            declare.name_rule("Name").read(name)
+            declare.object_name_rule("Name").read(name)
         except QuantityError as error:
             yield Finding((*section_location, name), "is no name", error.suggestion)
         if is_taken(name):
@@ -125,7 +125,10 @@ def _name_findings(
 def _reference_findings(
     raw_spec: Mapping[str, Any], objects: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """Yield findings for references to missing grounds, and for a position of the origin."""
+    """Yield findings for references to missing grounds, and for a ground at the origin.
+
+    The ground that is the scene's origin may state no position.
+    """
     raw_objects = _raw_section(raw_spec, *OBJECTS_LOCATION)
     if not raw_objects:
         return
@@ -179,7 +182,7 @@ def _file_findings(
         for key_path, rule, file in iter_file_paths(section):
             path = SpecFiles(base).resolve(file)
             try:
-                rule.digest(path)
+                rule.compute_digest(path)
             except SceneError as error:
                 is_companion = error.file != str(path)
                 companion_text = f"needs {error.file}, which " if is_companion else ""
@@ -266,10 +269,10 @@ def _solid_findings(
     """Yield mistakes in a solid: two positions or none, an invalid rotation, an unknown unit."""
     position_location = (*location, "position")
     if scene_object.motion is not None and scene_object.position is not None:
-        problem = "stands beside a motion, whose path places the object"
+        problem = "is given in addition to a motion, whose path places the object"
         yield Finding(position_location, problem, "leave one of them out")
     if (
-        isinstance(scene_object, _POSITIONED_SOLIDS)
+        isinstance(scene_object, _SOLIDS_WITH_REQUIRED_POSITION)
         and scene_object.motion is None
         and scene_object.position is None
     ):
@@ -303,7 +306,7 @@ def _flight_findings(
             path = platform.path.build_path(files)
             span = path.start, path.stop
     for name, scanner in scanners.items():
-        findings += _scanner_findings(scanner, ("scanners", name), span)
+        findings += _scan_pattern_findings(scanner, ("scanners", name), span)
     for name, scene_object in objects.items():
         motion = getattr(scene_object, "motion", None)
         if motion is not None and span is not None and (base or not _reads_tables(motion)):
@@ -332,9 +335,9 @@ def _motion_findings(
         field_name = "attitude"
         motion.build_attitude(files, path)
         field_name = "mounting"
-        flight = motion.build_flight(files, span)
+        flight = motion.build_moving_body(files, span)
         field_name = "attitude"
-        flight.state(np.linspace(path.start, path.stop, _ATTITUDE_TRIAL_TIMES))
+        flight.state(np.linspace(path.start, path.stop, _N_ATTITUDE_TRIAL_TIMES))
     except SceneError as error:
         yield Finding(
             (*location, field_name, "file"), f"names a file that {error.problem}", error.remedy
@@ -351,7 +354,7 @@ def _motion_findings(
         yield Finding((*location, "path"), problem, "make it last throughout the flight")
 
 
-def _scanner_findings(
+def _scan_pattern_findings(
     scanner: Any, location: Location, span: flight_sections.TimeSpan | None
 ) -> Iterator[Finding]:
     """Yield a finding for an invalid scan pattern, less than a full cycle, or too many shots."""
@@ -380,7 +383,7 @@ def _scanner_findings(
 # Axes: parameters that may vary without moving a beamlet
 
 
-def stored_names() -> frozenset[str]:
+def store_array_and_dimension_names() -> frozenset[str]:
     """Return the names of a store's arrays and dimensions."""
     output_tables = (
         SHOT_VARIABLES,
@@ -394,7 +397,7 @@ def stored_names() -> frozenset[str]:
 
 
 _OTHER_STUDY_REMEDY = "make another study of it"
-_BEAM_PATHS = (
+_BEAM_WIDTH_PATHS = (
     beam.DIVERGENCE_PATH,
     beam.WAIST_PATH,
     beam.QUALITY_PATH,
@@ -403,7 +406,7 @@ _BEAM_PATHS = (
     beam.COUPLING_PATH,
 )
 """Parameters of the beam from which its width follows."""
-_ARRANGEMENT_PATHS = (
+_BEAMLET_POSITION_PATHS = (
     PATTERN_PATH,
     "footprint.phases",
     beam.ARCHITECTURE_PATH,
@@ -420,7 +423,7 @@ _MOVES_BEAMLETS_REFUSAL = (
 _AXIS_REFUSALS = {
     "footprint.speckle": ("", ""),  # moves no beamlet, unlike other fields of footprint
     "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
-    **dict.fromkeys((*_BEAM_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
+    **dict.fromkeys((*_BEAM_WIDTH_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
     "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY),
 }
 """Problem and remedy of axes by prefix of the parameter's path; the first match applies."""
@@ -485,15 +488,19 @@ def variation_findings(
 
 
 def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield a finding for axes that a single set of rays can't serve, or a pattern for planes."""
-    parameters = {path: default_value(path) for path in _ARRANGEMENT_PATHS} | dict(grid.values)
+    """Yield a finding for each axis that a single set of rays can't serve.
+
+    Also yield one for a beamlet pattern that only suits a plane, and for an axis whose name the
+    store uses.
+    """
+    parameters = {path: default_value(path) for path in _BEAMLET_POSITION_PATHS} | dict(grid.values)
     if parameters[PATTERN_PATH] in ("line", "square"):
-        problem = "stands for a plane alone, and the ground of a scene is none"
+        problem = "is only for a plane, and the ground of a scene is none"
         yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN_PATH])
     for axis in grid.axes:
         for parameter in axis.parameters:
             location = parameter_location(parameter.path, grid.axes)
             yield from variation_findings(parameters, parameter.path, parameter.values, location)
-        if axis.is_zipped and axis.name in stored_names():
-            problem = "bears the name of something stored"
+        if axis.is_zipped and axis.name in store_array_and_dimension_names():
+            problem = "has the name of an array or dimension of the store"
             yield Finding(("axes", axis.name), problem, "take a word such as 'cut'")

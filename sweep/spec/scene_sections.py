@@ -56,8 +56,9 @@ class SolidObject(Material, ABC):
     body's frame.
     """
 
-    position: Vector | None = declare.position(
-        "Where its own zero lies; its coordinates as they are", default=None
+    position: Vector | None = declare.position_field(
+        "Position of the object's own origin; by default its coordinates stay as they are",
+        default=None,
     )
     rotation: Orientation = Orientation()
     motion: RigidMotion | None = None
@@ -81,12 +82,16 @@ class MeshObject(SolidObject):
     """Mesh from a file."""
 
     kind: Literal["mesh"]
-    file: str = declare.file_path(
+    file: str = declare.file_path_field(
         "The mesh: STL, OBJ, PLY, OFF or glTF; polygons are cut into triangles"
     )
-    unit: str | None = declare.text("Unit of its lengths; the file's own, or m", None)
-    up: str | None = declare.choice("Its vertical axis; y for glTF, else z", ("y", "z"), None)
-    scale: float = declare.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
+    unit: str | None = declare.text_field(
+        "Unit of the file's lengths; by default the unit that the file states, or m", None
+    )
+    up: str | None = declare.choice_field(
+        "Vertical axis of the file; by default y for glTF, else z", ("y", "z"), None
+    )
+    scale: float = declare.number_field("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
         """Return the facets of the file before rotation [m]."""
@@ -99,9 +104,13 @@ class Sphere(SolidObject):
     """Sphere of triangles whose vertices lie on its surface."""
 
     kind: Literal["sphere"]
-    radius: float = declare.positive_length("Radius", "1 m")
-    subdivisions: int = declare.count(
-        "Times that an icosahedron's faces are cut in four", "4", "0", "8", default=4
+    radius: float = declare.positive_length_field("Radius", "1 m")
+    subdivisions: int = declare.integer_field(
+        "Number of times that each face of an icosahedron is divided into four",
+        "4",
+        "0",
+        "8",
+        default=4,
     )
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
@@ -115,7 +124,7 @@ class Box(SolidObject):
     """Box with given side lengths."""
 
     kind: Literal["box"]
-    size: Vector = declare.vector("Length along x, y and z", "m", "2 m")
+    size: Vector = declare.vector_field("Length along x, y and z", "m", "2 m")
 
     def unrotated_facets(self, files: SpecFiles) -> Facets:
         """Return the facets of the box, relative to its centre [m]."""
@@ -128,7 +137,9 @@ class MartianRocks(SpecSection):
     """Size-frequency law of rocks on the Martian plains (Golombek and Rapp 1997)."""
 
     kind: Literal["martian_rocks"]
-    abundance: float = declare.number("Fraction of the ground under rocks", "5 %", "1e-9", "0.9")
+    abundance: float = declare.number_field(
+        "Fraction of the ground under rocks", "5 %", "1e-9", "0.9"
+    )
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
         """Return the size-frequency law of Golombek and Rapp (1997)."""
@@ -141,10 +152,10 @@ class PowerLaw(SpecSection):
     """Size-frequency law whose number per area falls with a power of the diameter."""
 
     kind: Literal["power"]
-    density: float = declare.quantity(
+    density: float = declare.quantity_field(
         "Number per area of 1 m or larger", "m^-2", "0.01 m^-2", "1e-12 m^-2", "1e6 m^-2"
     )
-    exponent: float = declare.number("Exponent", "2.5", "1e-3", "20")
+    exponent: float = declare.number_field("Exponent", "2.5", "1e-3", "20")
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
         """Return the power law of the number of boulders per area over their diameter."""
@@ -157,22 +168,30 @@ class Boulders(Material):
     """Half-ellipsoids on a ground, with random positions and sizes."""
 
     kind: Literal["boulders"]
-    on: str = declare.name("Ground that they lie on")
+    on: str = declare.object_name_field("Ground on which the boulders lie")
     law: Annotated[MartianRocks | PowerLaw, Field(discriminator="kind")]
-    smallest: float = declare.positive_length("Smallest diameter", "0.5 m")
-    largest: float = declare.positive_length("Largest diameter", "3 m")
-    centre: Vector = declare.position(
-        "Middle of the square that they lie in", dimensions=2, default=(0.0, 0.0)
+    smallest: float = declare.positive_length_field("Smallest diameter", "0.5 m")
+    largest: float = declare.positive_length_field("Largest diameter", "3 m")
+    centre: Vector = declare.position_field(
+        "Middle of the square in which the boulders lie", dimensions=2, default=(0.0, 0.0)
     )
-    within: float | None = declare.positive_length(
+    within: float | None = declare.positive_length_field(
         "Side of that square; all of the ground by default", "200 m", default=None
     )
-    height_ratio: float = declare.number("Height over diameter", "0.5", "1e-6", "10", default=0.5)
-    elongation: float = declare.number(
+    height_ratio: float = declare.number_field(
+        "Height over diameter", "0.5", "1e-6", "10", default=0.5
+    )
+    elongation: float = declare.number_field(
         "Largest ratio of long to short axis", "1.5", "1", "10", default=1.5
     )
-    subdivisions: int = declare.count("Refinement of their shape", "2", "0", "4", default=2)
-    seed: int = declare.seed()
+    subdivisions: int = declare.integer_field(
+        "Number of times that the triangles of a boulder are divided into four",
+        "2",
+        "0",
+        "4",
+        default=2,
+    )
+    seed: int = declare.seed_field()
 
     def build_facets(self, ground: Terrain) -> Facets:
         """Draw boulders on a ground and return their facets in the scene's frame.
@@ -200,20 +219,32 @@ class Boulders(Material):
         )
 
 
-class TreeMeasures(SpecSection):
+class TreeDimensions(SpecSection):
     """Mean dimensions of the trees of a clump."""
 
-    height: float = declare.positive_length("From the ground to the top", "12 m", default=12.0)
-    crown_diameter: float = declare.positive_length("Across", "7 m", default=7.0)
-    crown_base: float = declare.length("Height of its lower end", "3 m", "0 m", default=3.0)
-    trunk_diameter: float = declare.positive_length("At the ground", "40 cm", default=0.4)
-    leaf_length: float = declare.positive_length("Long diagonal of a leaf", "30 cm", default=0.30)
-    leaf_width: float = declare.positive_length("Short diagonal of a leaf", "20 cm", default=0.20)
-    leaf_area_index: float = declare.number(
+    height: float = declare.positive_length_field(
+        "Height from the ground to the top", "12 m", default=12.0
+    )
+    crown_diameter: float = declare.positive_length_field(
+        "Diameter of the crown", "7 m", default=7.0
+    )
+    crown_base: float = declare.length_field(
+        "Height of the crown's lower end", "3 m", "0 m", default=3.0
+    )
+    trunk_diameter: float = declare.positive_length_field(
+        "Diameter of the trunk at the ground", "40 cm", default=0.4
+    )
+    leaf_length: float = declare.positive_length_field(
+        "Long diagonal of a leaf", "30 cm", default=0.30
+    )
+    leaf_width: float = declare.positive_length_field(
+        "Short diagonal of a leaf", "20 cm", default=0.20
+    )
+    leaf_area_index: float = declare.number_field(
         "One-sided leaf area over that of the outline", "2", "0", "20", default=2.0
     )
-    variation: float = declare.number(
-        "Share by which sizes vary to each side", "0.25", "0", "0.99", default=0.25
+    variation: float = declare.number_field(
+        "Fraction by which sizes vary to either side", "0.25", "0", "0.99", default=0.25
     )
 
 
@@ -221,14 +252,16 @@ class Trees(SpecSection):
     """Clump of broad-leaved trees on a ground, with materials for leaves and trunks."""
 
     kind: Literal["trees"]
-    on: str = declare.name("Ground that they grow on")
-    centre: Vector = declare.position("Middle of the clump", dimensions=2, default=(0.0, 0.0))
-    radius: float = declare.positive_length("Trunks stand within it", "15 m")
-    number: int = declare.count("Trees", "7", at_most="10000")
-    tree: TreeMeasures = TreeMeasures()
+    on: str = declare.object_name_field("Ground on which the trees grow")
+    centre: Vector = declare.position_field("Middle of the clump", dimensions=2, default=(0.0, 0.0))
+    radius: float = declare.positive_length_field(
+        "Radius of the circle in which trunks stand", "15 m"
+    )
+    number: int = declare.integer_field("Trees", "7", at_most="10000")
+    tree: TreeDimensions = TreeDimensions()
     leaf: Material
     trunk: Material
-    seed: int = declare.seed()
+    seed: int = declare.seed_field()
 
     def build_facets(self, ground: Terrain) -> Facets:
         """Draw trees on a ground and return their facets in the scene's frame.
@@ -284,7 +317,7 @@ def has_relief(scene_object: SpecSection) -> bool:
     return isinstance(scene_object, Ground | Boulders | Trees)
 
 
-def named_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Material]]:
+def surface_names_and_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Material]]:
     """Return name and material of each surface of an object, in the order of surface numbers."""
     if isinstance(scene_object, Trees):
         return [(f"{name}.leaf", scene_object.leaf), (f"{name}.trunk", scene_object.trunk)]
@@ -295,23 +328,25 @@ def named_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Mat
 class Scene(SpecSection):
     """Objects below the instrument, and the sunlight on them."""
 
-    origin: str = declare.name(
+    origin: str = declare.object_name_field(
         "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN
     )
-    objects: dict[str, AnySceneObject] = Field(description="What there is, by name")
+    objects: dict[str, AnySceneObject] = Field(description="Objects of the scene, by name")
     solar_irradiance: float = sunlight_field("scene")
 
 
 class SceneDraws(SpecSection):
     """Random realisations of the flight's radiometry."""
 
-    number: int = declare.count("Draws", "1000", at_most="1e9", default=1)
-    method: str = declare.choice(
+    number: int = declare.integer_field("Draws", "1000", at_most="1e9", default=1)
+    method: str = declare.choice_field(
         "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
-        "shot for instrument.processing.detector and .estimator to look at",
+        "shot for instrument.processing.detector and .estimator to examine",
         ("probabilities", "noise", SPECTRA_METHOD),
     )
-    returns: int = declare.count("Points kept of a shot at most", "4", at_most="64", default=4)
+    returns: int = declare.integer_field(
+        "Largest number of points kept of a shot", "4", at_most="64", default=4
+    )
 
     @property
     def has_draws(self) -> bool:
@@ -327,31 +362,31 @@ class SceneDraws(SpecSection):
 class Navigation(SpecSection):
     """Estimation of velocity and altitude from each measurement cycle."""
 
-    test_level: float = declare.number(
+    test_level: float = declare.number_field(
         "Chance that a test for faulty beams rejects a good cycle; 0 leaves it out",
         "0.001", "0", "0.5", default=0.0,
     )  # fmt: skip
-    ground_slope: float = declare.number(
+    ground_slope: float = declare.number_field(
         "Standard deviation of the ground's slope, as far as it is known beforehand; 10 leaves "
         "the slope to the points, 0 says that the ground is level",
         "0.1", "0", "10", default=10.0,
     )  # fmt: skip
-    relief: float = declare.length(
+    relief: float = declare.length_field(
         "Standard deviation of the ground's height about a plane; 0 says that it is a plane",
         "1 m", "0 m", default=0.0,
     )  # fmt: skip
-    terrain_slope: float = declare.number(
+    terrain_slope: float = declare.number_field(
         "Standard deviation of the slope of the surface that a single beam meets, as far as it is "
         "known beforehand: it moves the range unseen while the beam slides, and is in the standard "
         "errors of points",
         "0.1", "0", "10", default=0.2,
     )  # fmt: skip
-    target_speed: float = declare.quantity(
+    target_speed: float = declare.quantity_field(
         "Standard deviation of each component of the velocity of what the beams hit, as far as it "
         "is known beforehand; it is in the standard errors of points",
         "m/s", "10 m/s", "0 m/s", "10 km/s", default=0.0,
     )  # fmt: skip
-    target_acceleration: float = declare.quantity(
+    target_acceleration: float = declare.quantity_field(
         "Standard deviation of the acceleration of what the beams hit, as far as it is known "
         "beforehand; it is in the standard errors of points",
         "m/s^2", "3 m/s^2", "0 m/s^2", "1000 m/s^2", default=0.0,
@@ -361,25 +396,25 @@ class Navigation(SpecSection):
 class ErrorFloor(SpecSection):
     """Standard deviations of instrument errors that do not decrease with signal strength."""
 
-    pointing_error: float = declare.angle(
+    pointing_error: float = declare.angle_field(
         "Error of each beam's known direction, on each of two axes; the same all flight long, and "
         "independent from beam to beam. Moves points, and velocities by as much of the velocity "
         "across the beam",
         "0.1 mrad", "0 rad", "10 deg", default=0.0,
     )  # fmt: skip
-    clock_error: float = declare.number(
+    clock_error: float = declare.number_field(
         "Relative error of the sampling clock, common to all beams: scales ranges and velocities",
         "1e-6", "0", "0.1", default=0.0,
     )  # fmt: skip
-    wavelength_error: float = declare.number(
+    wavelength_error: float = declare.number_field(
         "Relative error of the known wavelength, common to all beams: scales velocities",
         "1e-7", "0", "0.1", default=0.0,
     )  # fmt: skip
-    vibration: float = declare.quantity(
+    vibration: float = declare.quantity_field(
         "Velocity of the instrument's vibration along the beam, independent from shot to shot",
         "m/s", "1 cm/s", "0 m/s", "1 km/s", default=0.0,
     )  # fmt: skip
-    range_noise: float = declare.length(
+    range_noise: float = declare.length_field(
         "Error of ranges, independent from shot to shot", "1 cm", "0 m", "1 km", default=0.0
     )
 
@@ -395,39 +430,39 @@ class Interface(SpecSection):
     ``sweep export --as reports`` makes reports from stored points, without a new simulation.
     """
 
-    range_quantum: float | None = declare.length(
+    range_quantum: float | None = declare.length_field(
         "Step in which ranges are reported", "2 mm", "1 nm", "1 km", default=None
     )
-    radial_velocity_quantum: float | None = declare.quantity(
+    radial_velocity_quantum: float | None = declare.quantity_field(
         "Step in which radial velocities are reported",
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
-    min_range: float | None = declare.length(
-        f"Least range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
+    min_range: float | None = declare.length_field(
+        f"Smallest range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
     )
-    max_range: float | None = declare.length(
+    max_range: float | None = declare.length_field(
         f"Largest range that a report can hold; {_CLIPPING_NOTE}", "5 km", "0 m", default=None
     )
-    min_radial_velocity: float | None = declare.quantity(
-        f"Least radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+    min_radial_velocity: float | None = declare.quantity_field(
+        f"Smallest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
         "m/s", "-60 m/s", default=None,
     )  # fmt: skip
-    max_radial_velocity: float | None = declare.quantity(
+    max_radial_velocity: float | None = declare.quantity_field(
         f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
         "m/s", "220 m/s", default=None,
     )  # fmt: skip
-    rate: float | None = declare.quantity(
+    rate: float | None = declare.quantity_field(
         "Reports of each beam per second; without it every shot is a report",
         "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,
     )  # fmt: skip
-    value: str = declare.choice(
-        "What a report holds of the valid shots in its period: their mean, or the last",
+    value: str = declare.choice_field(
+        "Value of a report: the mean of the valid shots in its period, or the last of them",
         ("mean", "last"),
     )
-    valid_shots: int = declare.count(
+    valid_shots: int = declare.integer_field(
         "Valid shots in its period that a report needs to be valid", "3", default=1
     )
-    latency: float = declare.duration(
+    latency: float = declare.duration_field(
         "Age of the measurement at the report's time stamp", "40 ms", "0 s", "1e4 s", default=0.0
     )
 
@@ -450,11 +485,11 @@ class Interface(SpecSection):
 class SceneStorage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
-    block_shots: int = declare.count(
+    block_shots: int = declare.integer_field(
         "Shots that one block holds at most; 0 for 256 to 4096, by the time that they take",
         "4096", "0", default=0,
     )  # fmt: skip
-    block_draws: int = declare.count(
+    block_draws: int = declare.integer_field(
         "Draws that one block holds at most; 0 for up to 64, by the time that they take",
         "64", "0", default=0,
     )  # fmt: skip
@@ -467,35 +502,35 @@ class BuiltScene(NamedTuple):
     """Scene as bodies at which rays can be cast, in the scene's frame."""
 
     caster: RayCaster
-    """Ray caster of the bodies: all objects at rest form the first body, if there are any.
+    """Ray caster of the bodies.
 
-    Each moving
-    object is a body of its own.
+    All objects at rest form the first body, if there are any. Each moving object is a body of its
+    own.
     """
     surfaces: tuple[SurfaceMaterial, ...]
     """Materials of the surfaces by surface number."""
-    body_flights: tuple[MovingBody | None, ...]
-    """Motion of each body of the caster; None for the body at rest."""
+    body_motions: tuple[MovingBody | None, ...]
+    """Motion of each body of the ray caster; None for the body at rest."""
     mesh_reports: tuple[str, ...]
     """One line per object: the size of its mesh, and the repairs made on loading."""
     origin: np.ndarray
     """Origin (3,) that was subtracted from the objects' own coordinates [m]."""
     warnings: tuple[str, ...] = ()
-    """Doubts about the scene's files, as sentences."""
+    """Warnings about the scene's files, as sentences."""
 
 
-def scene_surfaces(scene: Scene) -> tuple[SurfaceMaterial, ...]:
+def scene_surface_materials(scene: Scene) -> tuple[SurfaceMaterial, ...]:
     """Return the materials of a scene's surfaces, in the order of their numbers."""
     from sweep.model.geometry.mesh import SurfaceMaterial
 
     return tuple(
         SurfaceMaterial(name, material.reflectance, material.reflectance_law)
         for key, scene_object in scene.objects.items()
-        for name, material in named_materials(key, scene_object)
+        for name, material in surface_names_and_materials(key, scene_object)
     )
 
 
-def scene_projection(scene: Scene, files: SpecFiles) -> str:
+def scene_projection_wkt(scene: Scene, files: SpecFiles) -> str:
     """Return the map projection of a scene's coordinates as WKT.
 
     Coordinates in a store are relative to the scene's origin: add the origin to obtain coordinates
@@ -569,18 +604,18 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
             if motion is None:
                 resting_meshes.append(mesh)
             else:
-                moving_meshes.append((mesh, motion.build_flight(files, span)))
+                moving_meshes.append((mesh, motion.build_moving_body(files, span)))
         except (ValueError, ArithmeticError) as error:
             raise _object_error(name, error) from None
         del mesh
         reports.append(f"{name}: {report.summary()}")
-        first_surface += len(named_materials(name, scene_object))
+        first_surface += len(surface_names_and_materials(name, scene_object))
     del grounds  # free the grids before the ray caster builds its trees, which need the most memory
     merged_meshes = [merge_meshes(resting_meshes)] if resting_meshes else []
     resting_meshes.clear()
     return BuiltScene(
         RayCaster([*merged_meshes, *(mesh for mesh, _ in moving_meshes)]),
-        scene_surfaces(scene),
+        scene_surface_materials(scene),
         (*(None for _ in merged_meshes), *(flight for _, flight in moving_meshes)),
         tuple(reports),
         origin,
@@ -634,7 +669,7 @@ def _build_grounds(
     for name, terrain in (terrains | joined_terrains).items():
         warnings += [f"scene.objects.{name}: {warning}" for warning in terrain.warnings]
         try:
-            terrains[name] = ground_sections[name].process(terrain)
+            terrains[name] = ground_sections[name].process_terrain(terrain)
         except (ValueError, ArithmeticError) as error:
             raise _object_error(name, error) from None
     origin = np.zeros(3)

@@ -9,26 +9,26 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from sweep.spec.fields import fields_by_name, reachable_models, rule_of_field
-from sweep.spec.rules import Json, NumericRule, Rule
+from sweep.spec.rules import JsonObject, NumericRule, Rule
 from sweep.spec.sections import parameter_rules
 from sweep.spec.specs import GridSpec, SceneSpec
-from sweep.spec.yaml_document import library_instruments
+from sweep.spec.yaml_document import library_instrument_files
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
+JSON_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """URI of the JSON Schema dialect that the schema uses."""
 
 _INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
 """Names of the models of an instrument's sections."""
 
 
-def json_schema() -> Json:
+def json_schema() -> JsonObject:
     """Return the JSON Schema (2020-12) of spec files, for a flat target or a scene.
 
     Values of parameters are described field by field. Fields that an axis or an instrument's file
     may supply are not required by the schema, although `sweep.load` requires them.
     """
     _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
-    definitions: Json = schema["$defs"]
+    definitions: JsonObject = schema["$defs"]
     for model in reachable_models(GridSpec, SceneSpec):
         _format_defaults(definitions[model.__name__]["properties"], model)
     for name in (*_INSTRUMENT_MODEL_NAMES, "Instrument", "Target"):
@@ -37,12 +37,14 @@ def json_schema() -> Json:
         definitions["Instrument"],
         "YAML file of the instrument, relative to this one",
     )
-    instrument["description"] = "A Doppler lidar: in whole, or fields set anew of a known one"
+    instrument["description"] = (
+        "A Doppler lidar: all of its fields, or changes to a known instrument"
+    )
     instrument["properties"] = {
         "like": {
-            "enum": list(library_instruments()),
-            "description": "Instrument of the library, which has all fields that are not given "
-            "here; sweep instruments tells of each",
+            "enum": list(library_instrument_files()),
+            "description": "Instrument of the library that supplies all fields not given "
+            "here; sweep instruments describes each",
         },
         "file": {"type": "string", "description": file_description},
         **instrument["properties"],
@@ -55,7 +57,7 @@ def json_schema() -> Json:
     _complete_study_schema(definitions["GridSpec"], rules, ())
     _complete_study_schema(definitions["SceneSpec"], scene_rules, ("scene", "platform", "scanners"))
     return {
-        "$schema": DIALECT,
+        "$schema": JSON_SCHEMA_DIALECT,
         "title": "sweep study",
         "if": {"required": ["scene"]},
         "then": {"$ref": "#/$defs/SceneSpec"},
@@ -65,12 +67,12 @@ def json_schema() -> Json:
 
 
 def _complete_study_schema(
-    study_schema: Json, rules: Mapping[str, Rule], required: tuple[str, ...]
+    study_schema: JsonObject, rules: Mapping[str, Rule], required: tuple[str, ...]
 ) -> None:
     """Add instrument, axes and required sections to the schema of a study."""
     study_schema["properties"]["instrument"] = {
         "description": "The instrument: its name in the library (sweep instruments), the path of "
-        "its file, one of these with fields set anew, or all of it",
+        "its file, one of these with changed fields, or all of its fields",
         "anyOf": [
             {"type": "string", "examples": ["settembrini_2026", "instruments/table_4_1.yaml"]},
             {"$ref": "#/$defs/Instrument"},
@@ -83,8 +85,11 @@ def _complete_study_schema(
     study_schema["required"] = ["title", "instrument", *required]
 
 
-def _format_defaults(properties: Json, model: type[BaseModel]) -> None:
-    """Replace the defaults of scalar fields in SI units by values as users write them."""
+def _format_defaults(properties: JsonObject, model: type[BaseModel]) -> None:
+    """Replace the defaults of a model's fields, in SI units, by values as users write them.
+
+    `properties` is the JSON Schema of the fields, which is changed in place.
+    """
     for name, field in fields_by_name(model).items():
         field_schema, rule = properties[name], rule_of_field(field)
         if rule is not None and field_schema.get("default") not in (None, "", [], {}):
@@ -93,12 +98,12 @@ def _format_defaults(properties: Json, model: type[BaseModel]) -> None:
             field_schema.pop("default", None)
 
 
-def _definition_reference(path: str, suffix: str) -> Json:
-    """Return a reference to the definition of a field's value or values."""
+def _definition_reference(path: str, suffix: str) -> JsonObject:
+    """Return the reference to the schema of a field; `suffix` is ``value`` or ``values``."""
     return {"$ref": f"#/$defs/{path}.{suffix}"}
 
 
-def _object_schema(properties: Json, *required: str, **keywords: Any) -> Json:
+def _object_schema(properties: JsonObject, *required: str, **keywords: Any) -> JsonObject:
     """Return the schema of a mapping with the given properties only."""
     required_keyword = {"required": list(required)} if required else {}
     return (
@@ -108,12 +113,12 @@ def _object_schema(properties: Json, *required: str, **keywords: Any) -> Json:
     )
 
 
-def _list_schema(items: Json, length_min: int = 1, **keywords: Any) -> Json:
+def _list_schema(items: JsonObject, length_min: int = 1, **keywords: Any) -> JsonObject:
     """Return the schema of a list."""
     return {"type": "array", "items": items, "minItems": length_min} | keywords
 
 
-def _values_schema(path: str, rule: Rule) -> Json:
+def _values_schema(path: str, rule: Rule) -> JsonObject:
     """Return the schema of a list of values and generators, or of one generator."""
     value_schema = _definition_reference(path, "value")
     generator_schemas = (
@@ -123,7 +128,7 @@ def _values_schema(path: str, rule: Rule) -> Json:
     return {"description": rule.schema()["description"], "anyOf": [list_schema, *generator_schemas]}
 
 
-def _generator_schemas(value_schema: Json) -> Iterator[Json]:
+def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
     """Yield the schemas of the generators linear, log and step."""
     number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
     for form in ("linear", "log"):
@@ -133,7 +138,7 @@ def _generator_schemas(value_schema: Json) -> Iterator[Json]:
     yield _object_schema({"step": steps_schema}, "step")
 
 
-def _axes_schema(rules: Mapping[str, Rule]) -> Json:
+def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
     """Return the schema of ``axes``: plain axes by path, zipped axes by other names."""
     value_schemas = {
         path: {

@@ -44,9 +44,9 @@ from sweep.spec.fields import (
     SpecSection,
     identity_digest,
     iter_file_paths,
-    iter_values,
-    read_or_none,
+    iter_section_values,
     set_if_absent,
+    validate_or_none,
     values_by_path,
 )
 from sweep.spec.figure_sections import (
@@ -58,13 +58,13 @@ from sweep.spec.figure_sections import (
 )
 from sweep.spec.flight_sections import AnyScanner, Platform, shots_per_cycle
 from sweep.spec.grid_checks import (
-    Condition,
     GridValues,
+    ValueCondition,
     flight_effect_findings,
     grid_findings,
-    is_detector_or_estimator,
+    is_detector_or_estimator_parameter,
     raw_value_at,
-    spectra_findings,
+    spectrum_method_findings,
     undrawn_effect_findings,
 )
 from sweep.spec.ground_sections import OPTICAL_FIELDS
@@ -88,7 +88,7 @@ from sweep.spec.scene_checks import (
 from sweep.spec.yaml_document import (
     Document,
     InstrumentErrorFloor,
-    drop_extensions,
+    drop_anchor_sections,
     missing_instrument_remedy,
     parse_document,
     read_document,
@@ -106,17 +106,17 @@ if TYPE_CHECKING:
 
 GRID_POINTS_MAX = 10**15
 """Maximum number of points of a grid."""
-DRIFT_BINS_MIN = 2.0
+WARNED_LINE_DRIFT_BINS_MIN = 2.0
 """Smallest drift of a speckled line within a record that raises a warning [bins]. From this drift
 on the stated standard errors are too small."""
 
-_DRIFT_SAMPLES = 1000
-"""Number of times of a flight at which its acceleration is evaluated."""
+_N_ACCELERATION_SAMPLES = 1000
+"""Number of instants of a flight at which its acceleration is evaluated."""
 
-FILES_KEY = "files"
+FILE_DIGESTS_KEY = "files"
 """Key of a stored spec that holds the digest of each file by the file's path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections of a spec whose defaults are not written out."""
+"""Sections whose defaults the complete spec of `to_yaml_mapping` leaves out."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
 """Rule of the field `axes`: `read_axes` has read the axes before pydantic validates the spec."""
 
@@ -129,23 +129,23 @@ class BaseSpec(SpecSection):
 
     model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
 
-    title: str = declare.text("What the study is called")
-    question: str = declare.text("The question that the study answers", "")
+    title: str = declare.text_field("Title of the study")
+    question: str = declare.text_field("The question that the study answers", "")
     instrument: sections.Instrument
     atmosphere: sections.Atmosphere = sections.Atmosphere()
     footprint: sections.Footprint = sections.Footprint()
     effects: sections.Effects = sections.Effects()
     accuracy: sections.Accuracy = sections.Accuracy()
-    seed: int = declare.seed("Seed of all random draws")
+    seed: int = declare.seed_field("Seed of all random draws")
     execution: sections.Execution = sections.Execution()
-    axes: tuple[Axis, ...] = declare.field_of_rule(_AXES_RULE, ())
+    axes: tuple[Axis, ...] = declare.field_with_rule(_AXES_RULE, ())
 
     _yaml_mapping: dict[str, Any] = PrivateAttr(default_factory=dict)
     """The spec with all defaults, as a user would write it."""
     _base: Path = PrivateAttr(default=Path())
     """Folder that paths in the spec are relative to."""
     _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
-    """Digest of each file by its path as written."""
+    """Digest of each file's content, by the file's path as written in the spec."""
     _instrument_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
     """Fields of the error floor that come from the instrument; None if the spec states all of
     them."""
@@ -173,7 +173,7 @@ class BaseSpec(SpecSection):
         """
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", format_raw_value(mapping))])
-        document = Document.from_plain_data(drop_extensions(to_plain_data(mapping)))
+        document = Document.from_plain_data(drop_anchor_sections(to_plain_data(mapping)))
         return cls.from_document(document, Path(base))
 
     @classmethod
@@ -198,7 +198,7 @@ class BaseSpec(SpecSection):
         raw_spec = to_plain_data(parse_json(json_text))
         if not isinstance(raw_spec, dict):
             raise SpecError([Mistake("", "must be a mapping", format_raw_value(raw_spec))])
-        digests = raw_spec.pop(FILES_KEY, {})
+        digests = raw_spec.pop(FILE_DIGESTS_KEY, {})
         spec = cls.from_document(Document(raw_spec), None)
         spec._base, spec._file_digests = Path(base or "."), digests
         return spec
@@ -241,9 +241,13 @@ class BaseSpec(SpecSection):
             findings += validation_findings(error, cls)
         grid = GridValues.from_raw_spec(raw_spec, axes)
         findings += grid_findings(grid)
-        findings += [*_size_findings(axes), *_segment_findings(grid), *_strongest_findings(grid)]
-        findings += cls.extra_findings(raw_spec, grid, base, all_axes_read)
-        findings += _contradiction_findings(user_values, axes)
+        findings += [
+            *_grid_size_findings(axes),
+            *_segment_slope_findings(grid),
+            *_strongest_peak_findings(grid),
+        ]
+        findings += cls.class_specific_findings(raw_spec, grid, base, all_axes_read)
+        findings += _field_axis_contradiction_findings(user_values, axes)
         # Mistakes in an axis or in an instrument's file have findings of their own: drop findings
         # for the fields that were filled in from these.
         findings = [
@@ -268,10 +272,10 @@ class BaseSpec(SpecSection):
         return True
 
     @classmethod
-    def extra_findings(
+    def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Return mistakes beyond single fields and the grid that depend on the class of spec.
+        """Return the mistakes that only this class of spec can have.
 
         Parameters
         ----------
@@ -303,7 +307,9 @@ class BaseSpec(SpecSection):
         """Return the mode of each effect, `auto`, `on` or `off`, by the effect's name."""
         return values_by_path(self.effects)
 
-    def parameters_with(self, overrides: Mapping[str, object]) -> dict[str, float | int | str]:
+    def parameters_with_overrides(
+        self, overrides: Mapping[str, object]
+    ) -> dict[str, float | int | str]:
         """Return the parameters with new values for some of them.
 
         Parameters
@@ -344,13 +350,16 @@ class BaseSpec(SpecSection):
             findings += self.value_findings(path, parameters[path], (name,))
         if not findings:
             grid = GridValues(parameters, effect_modes=self.effect_modes())
-            findings = [*grid_findings(grid), *_strongest_findings(grid)]
+            findings = [*grid_findings(grid), *_strongest_peak_findings(grid)]
         if findings:
             raise SpecError(Document({}).to_mistake(finding) for finding in findings)
         return parameters
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
-        """Return mistakes in giving a parameter a value, for this class of spec; none for grids."""
+        """Return the reasons why a parameter may not take an SI value; none for grids.
+
+        `location` is the location of the value in the spec, for findings.
+        """
         return []
 
     def axis_parameter(self, name: str) -> AxisParameter:
@@ -367,8 +376,8 @@ class BaseSpec(SpecSection):
                     return parameter
         raise KeyError(name)
 
-    def read_coordinate(self, name: str, raw_value: object) -> float | int | str:
-        """Read a value of a coordinate and convert it to the unit of the coordinate's display.
+    def read_coordinate_value(self, name: str, raw_value: object) -> float | int | str:
+        """Read a value of a coordinate and convert it to the unit in which the axis was written.
 
         Parameters
         ----------
@@ -455,7 +464,7 @@ class BaseSpec(SpecSection):
         mapping = copy.deepcopy(
             {name: value for name, value in raw_spec.items() if name != "execution"}
         )
-        for path, rule, value in iter_values(self):
+        for path, rule, value in iter_section_values(self):
             if path[0] not in _SECTIONS_WITHOUT_DEFAULTS:
                 set_if_absent(mapping, list(path), rule.format(value))
         return remove_fields_on_axes(mapping)
@@ -463,7 +472,7 @@ class BaseSpec(SpecSection):
     def to_json(self) -> str:
         """Return the spec as JSON text for a store, with the digests of its files."""
         mapping = self.to_yaml_mapping() | (
-            {FILES_KEY: self._file_digests} if self._file_digests else {}
+            {FILE_DIGESTS_KEY: self._file_digests} if self._file_digests else {}
         )
         return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
 
@@ -474,59 +483,59 @@ def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, 
     If none or several match, return the name itself and None.
     """
     rules = sections.parameter_rules()
-    paths = [path for path in known_paths if name in (path, sections.short_name(path))]
+    paths = [path for path in known_paths if name in (path, sections.parameter_short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
-def _segment_findings(grid: GridValues) -> Iterator[Finding]:
+def _segment_slope_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the slopes of segments do not separate range and velocity."""
-    if grid.has_point({waveform.DOWN_SLOPE_PATH: lambda slope: slope == 1.0}):
+    if grid.any_point_meets({waveform.DOWN_SLOPE_PATH: lambda slope: slope == 1.0}):
         problem = "is the slope of the segment 'up': range and velocity need two slopes"
         yield grid.make_finding(
             waveform.DOWN_SLOPE_PATH, problem, "write another, or -1 for a triangle"
         )
-    any_two_condition: dict[str, Condition] = {
+    any_two_condition: dict[str, ValueCondition] = {
         waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO
     }
-    slopes = {1.0, *grid.values_of(waveform.DOWN_SLOPE_PATH)}
-    if grid.has_point(
+    slopes = {1.0, *grid.parameter_values(waveform.DOWN_SLOPE_PATH)}
+    if grid.any_point_meets(
         any_two_condition
         | {waveform.DOPPLER_SLOPE_PATH: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
     ):
-        problem = "is another segment's too, and these two tell neither range nor velocity: any_two"
+        problem = "is another segment's too, and these two give neither range nor velocity: any_two"
         yield grid.make_finding(
             waveform.DOPPLER_SLOPE_PATH, problem, "write another, or take both_chirps"
         )
 
 
-STRONGEST_PEAK_CONDITION: dict[str, Condition] = {
+STRONGEST_PEAK_CONDITION: dict[str, ValueCondition] = {
     waveform.PEAKS_PATH: lambda peaks: peaks == waveform.STRONGEST_PEAK
 }
 """Condition on points at which each segment reports its strongest peak alone."""
 
 
-def _strongest_findings(grid: GridValues) -> Iterator[Finding]:
+def _strongest_peak_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield a finding if the strongest peak is reported in a case without a known probability."""
-    several_looks: dict[str, Condition] = {
+    several_looks: dict[str, ValueCondition] = {
         looks.LOOKS_NUMBER_PATH: lambda number: number > 1,
         looks.LOOKS_COMBINE_PATH: lambda combination: combination != looks.COMBINE_COHERENT,
     }
-    refused_combinations: tuple[tuple[dict[str, Condition], str, str], ...] = (
+    refused_combinations: tuple[tuple[dict[str, ValueCondition], str, str], ...] = (
         (several_looks, "is that of one record, and instrument.looks.number asks for several",
          "combine: coherent"),
         ({circulator_leak.LEAK_LENGTH_PATH: lambda path: path > 0},
          "may be the line of instrument.telescope.leak_path, whose noise has no law",
          "leave the leak's path out"),
         ({waveform.SHOT_DETECTION_PATH: lambda rule: rule == waveform.ANY_TWO},
-         "may be wrong in one of three segments, and shot_detection: any_two cannot tell in which",
+         "may be wrong in one of three segments, and shot_detection: any_two cannot show in which",
          "shot_detection: both_chirps"),
     )  # fmt: skip
     for conditions, problem, remedy in refused_combinations:
-        if grid.has_point(STRONGEST_PEAK_CONDITION | conditions):
+        if grid.any_point_meets(STRONGEST_PEAK_CONDITION | conditions):
             yield grid.make_finding(waveform.PEAKS_PATH, problem, f"take all, or {remedy}")
 
 
-def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
+def _grid_size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
     """Yield a finding if the grid has more than `GRID_POINTS_MAX` points."""
     n_points = math.prod(axis.size for axis in axes)
     if n_points > GRID_POINTS_MAX:
@@ -548,29 +557,36 @@ class GridSpec(BaseSpec):
     )
 
     @classmethod
-    def extra_findings(
+    def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
-        """Return mistakes in figures, random effects without draws, and draws set in two ways."""
-        extra_variables = STRONGEST_PEAK_OUTPUTS if grid.has_point(STRONGEST_PEAK_CONDITION) else ()
+        """Return mistakes in figures and draws, and random effects of a study without draws."""
+        extra_variables = (
+            STRONGEST_PEAK_OUTPUTS if grid.any_point_meets(STRONGEST_PEAK_CONDITION) else ()
+        )
         findings = (
             list(grid_figure_findings(raw_spec, grid.axes, extra_variables))
             if all_axes_read
             else []
         )
-        draws = read_or_none(sections.Draws, raw_spec.get("draws", {}))
+        draws = validate_or_none(sections.Draws, raw_spec.get("draws", {}))
         if draws is not None:
-            findings += spectra_findings(draws, grid)
-            if draws.has_draws and grid.has_point(STRONGEST_PEAK_CONDITION):
+            findings += spectrum_method_findings(draws, grid)
+            if draws.has_draws and grid.any_point_meets(STRONGEST_PEAK_CONDITION):
                 problem = "has chances in closed form alone, and the study has draws"
                 findings.append(
                     grid.make_finding(waveform.PEAKS_PATH, problem, "take all, or no draws")
                 )
             findings += () if draws.has_draws else undrawn_effect_findings(grid)
             if draws.number and draws.limit:
-                problem = f"stands beside draws.number, {draws.number}: only one of them can say "
-                remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw "
-                problem, remedy = f"{problem}how much to draw", f"{remedy}so many times"
+                problem = (
+                    f"is given in addition to draws.number, {draws.number}: only one of them can "
+                    "set how much to draw"
+                )
+                remedy = (
+                    "keep limit to draw until accuracy.tolerance is met, or number to draw so many "
+                    "times"
+                )
                 findings.append(Finding(("draws", "limit"), problem, remedy, draws.limit))
         return findings
 
@@ -584,7 +600,7 @@ class GridSpec(BaseSpec):
     @property
     def reports_strongest_peak(self) -> bool:
         """True if segments report their strongest peak alone at any point."""
-        return GridValues(self.parameters(), self.axes).has_point(STRONGEST_PEAK_CONDITION)
+        return GridValues(self.parameters(), self.axes).any_point_meets(STRONGEST_PEAK_CONDITION)
 
     def identity(self) -> dict[str, Any]:
         """Return the content that identifies the study, in SI values.
@@ -594,7 +610,9 @@ class GridSpec(BaseSpec):
         identity = super().identity()
         if not self.draws.draws_whole_spectra:
             counted_parameters = {
-                p: v for p, v in identity["parameters"].items() if not is_detector_or_estimator(p)
+                p: v
+                for p, v in identity["parameters"].items()
+                if not is_detector_or_estimator_parameter(p)
             }
             identity["parameters"] = counted_parameters
         return identity
@@ -641,17 +659,17 @@ class SceneSpec(BaseSpec):
             spec._base = base
             paths_and_rules = [(file, rule) for _, rule, file in iter_file_paths(spec)]
             spec._file_digests = {
-                file: rule.digest(files.resolve(file)) for file, rule in paths_and_rules
+                file: rule.compute_digest(files.resolve(file)) for file, rule in paths_and_rules
             }
         return spec
 
     @classmethod
-    def extra_findings(
+    def class_specific_findings(
         cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
     ) -> list[Finding]:
         """Return mistakes in scene, flight, files, random effects and figures."""
         draws = (
-            read_or_none(scene_sections.SceneDraws, raw_spec.get("draws", {}))
+            validate_or_none(scene_sections.SceneDraws, raw_spec.get("draws", {}))
             or scene_sections.SceneDraws()
         )
         return [
@@ -663,11 +681,11 @@ class SceneSpec(BaseSpec):
 
     @classmethod
     def may_be_on_axis(cls, path: str) -> bool:
-        """Return True if an axis may set the parameter at a dotted path without moving beamlets."""
+        """Return True if an axis may set the parameter at a dotted path: it moves no beamlet."""
         return not axis_refusal(path)[0]
 
     def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
-        """Return mistakes in giving a parameter a value while the geometry stays fixed."""
+        """Return the reasons why a parameter may not take an SI value with fixed rays."""
         return variation_findings(self.parameters(), path, [value], location)
 
     @property
@@ -689,7 +707,9 @@ class SceneSpec(BaseSpec):
         """
         parameters = super().parameters()
         if not self.draws.draws_whole_spectra:
-            parameters = {p: v for p, v in parameters.items() if not is_detector_or_estimator(p)}
+            parameters = {
+                p: v for p, v in parameters.items() if not is_detector_or_estimator_parameter(p)
+            }
         n_rays = initial_ray_count(parameters, error_budget.ErrorBudget.from_parameters(parameters))
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,
@@ -706,7 +726,7 @@ class SceneSpec(BaseSpec):
 
         No file is read.
         """
-        return scene_sections.scene_surfaces(self.scene)
+        return scene_sections.scene_surface_materials(self.scene)
 
     def build_scene(self) -> scene_sections.BuiltScene:
         """Return the scene as bodies at which rays can be cast.
@@ -727,7 +747,7 @@ class SceneSpec(BaseSpec):
         SceneError
             If the table of waypoints is unsuitable.
         """
-        return self.platform.build_flight(self.files)
+        return self.platform.build_moving_body(self.files)
 
     def scan_pattern(self, name: str) -> ScanPattern:
         """Return the scan pattern of the scanner `name`."""
@@ -802,7 +822,7 @@ class SceneSpec(BaseSpec):
         -----
         Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda within a record
         of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda bins. The result
-        is 0 below `DRIFT_BINS_MIN`, and for ground without developed speckle.
+        is 0 below `WARNED_LINE_DRIFT_BINS_MIN`, and for ground without developed speckle.
         """
         p = self.parameters()
         if p["footprint.speckle"] != "developed":
@@ -813,10 +833,10 @@ class SceneSpec(BaseSpec):
         )
         record_duration = float(np.max(waveform.record_length(p))) / sample_rate
         flight = self.build_flight()
-        state = flight.state(np.linspace(flight.start, flight.stop, _DRIFT_SAMPLES))
+        state = flight.state(np.linspace(flight.start, flight.stop, _N_ACCELERATION_SAMPLES))
         acceleration_max = float(np.sqrt((state.acceleration**2).sum(axis=1)).max())
         drift = 2 * acceleration_max * record_duration**2 / wavelength
-        return drift if drift > DRIFT_BINS_MIN else 0.0
+        return drift if drift > WARNED_LINE_DRIFT_BINS_MIN else 0.0
 
     def number_of_cycles(self, name: str) -> int:
         """Return the number of complete measurement cycles of the scanner `name` in the flight."""
@@ -829,7 +849,7 @@ class SceneSpec(BaseSpec):
         return beamlet_pattern(self.parameters())
 
     def footprint_angles(self) -> Callable[[np.ndarray], beam.FootprintAngles] | None:
-        """Return the function from range to footprint angles.
+        """Return the function that computes the angles of a footprint from its range [m].
 
         The result is None if the divergence is constant.
         """
@@ -840,7 +860,7 @@ class SceneSpec(BaseSpec):
             else partial(beam.footprint_angles, parameters)
         )
 
-    def interface_with(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
+    def interface_with_overrides(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
         """Return the section ``interface`` with new values for some fields, written as in a spec.
 
         Raises
@@ -849,7 +869,8 @@ class SceneSpec(BaseSpec):
             The error holds every mistake in the new values.
         """
         raw_fields = {
-            path[-1]: rule.format(value) for path, rule, value in iter_values(self.interface)
+            path[-1]: rule.format(value)
+            for path, rule, value in iter_section_values(self.interface)
         }
         try:
             return scene_sections.Interface.model_validate({**raw_fields, **overrides})
@@ -980,7 +1001,7 @@ def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
     return {path: copy.deepcopy(value) for path, value in raw_values.items() if value is not None}
 
 
-def _contradiction_findings(
+def _field_axis_contradiction_findings(
     user_values: Mapping[str, object], axes: Sequence[Axis]
 ) -> Iterator[Finding]:
     """Yield a finding for each field whose value is not among the values of its axis."""

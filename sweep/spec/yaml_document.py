@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 import sweep.spec.fields as spec_fields
 from sweep.model.effects.phase_errors import ERROR_TABLE_PATH, NO_TABLE
 from sweep.model.threshold import PROCESSING_PREFIX, THRESHOLD_PATHS
-from sweep.regular_files import RefusedFileError, open_regular
+from sweep.regular_files import RefusedFileError, open_regular_file
 from sweep.safe_json import is_utf8_encodable
 from sweep.scenes.scene_files import SceneError, read_csv_columns
 from sweep.spec.figure_sections import GridFigure, SceneFigure
@@ -44,18 +44,27 @@ FILE_BYTES_MAX = 1_000_000
 NESTING_MAX = 30
 """Maximum depth of nested mappings and lists."""
 YAML_NODES_MAX = 200_000
-"""Maximum number of YAML nodes in a document, counted once for each repetition by an alias."""
+"""Maximum number of YAML nodes in a document; each repetition by an alias counts again."""
 
 _INSTRUMENT_LOCATION: Location = ("instrument",)
 _EXAMPLE_INSTRUMENT = "settembrini_2026"
 """Instrument of the library that remedies use as an example."""
-_FLOOR_SECTION = "error_floor"
+_ERROR_FLOOR_SECTION = "error_floor"
 """Name of the section with an instrument's error floor."""
 _INSTRUMENT_FILE_SECTIONS = frozenset(
-    {"title", "source", "doi", "published", "assumed", "numbers", _FLOOR_SECTION, "instrument"}
+    {
+        "title",
+        "source",
+        "doi",
+        "published",
+        "assumed",
+        "numbers",
+        _ERROR_FLOOR_SECTION,
+        "instrument",
+    }
 )
 """Sections of an instrument's file. A study uses `error_floor` and `instrument`."""
-_LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
+_INSTRUMENT_LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
 """Folder of the instruments that come with this package."""
 _THRESHOLD_FIELDS = {way.removeprefix(PROCESSING_PREFIX) for way in THRESHOLD_PATHS}
 """Fields of ``instrument.processing`` that set the threshold, of which a spec may use one."""
@@ -75,7 +84,7 @@ _YAML_REMEDIES = {
     "another document": "keep one of them: a file holds one document, without lines '---' in it",
     "unexpected end of stream": "close the quotes of the text that begins there",
 }
-"""Remedies by phrases in the messages of the YAML parser."""
+"""Remedy for a YAML error, by a phrase in the parser's message."""
 _STANDARD_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
@@ -83,7 +92,7 @@ _STANDARD_TAGS = frozenset(
 """YAML tags that are read; all others are mistakes."""
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _MERGE_KEY = "<<"
-_EXTENSION_PREFIX = "x-"
+_ANCHOR_SECTION_PREFIX = "x-"
 """Prefix of the names of sections that only hold anchors for other sections."""
 
 
@@ -93,7 +102,8 @@ class InstrumentErrorFloor(NamedTuple):
     instrument: str
     """Name of the instrument in the library, or path as written."""
     fields: dict[str, Any]
-    """Values, as in the instrument's file, of the fields that the study does not state."""
+    """Fields of the error floor that the study does not state, with values as written in the
+    instrument's file."""
 
 
 @dataclass
@@ -109,7 +119,7 @@ class Document:
     file: str = ""
     """Path of the file; empty for plain data."""
     n_nodes: int = 0
-    """Number of YAML nodes read, counted once for each repetition by an alias."""
+    """Number of YAML nodes read; each repetition by an alias counts again."""
     open_nodes: list[yaml.Node] = field(default_factory=list)
     """Mappings that are being read, from the outermost to the innermost."""
     instrument_floor: InstrumentErrorFloor | None = None
@@ -182,18 +192,17 @@ class Document:
                 values[key] = self.read_node(value_node, key_location)
         fields: dict[str, Any] = {}
         for merged_node in reversed(merged_nodes):  # earlier mappings override later ones
-            fields |= self._merged_fields(merged_node, location, values)
+            fields |= self._read_merged_fields(merged_node, location, values)
         self.open_nodes.pop()
         return fields | values
 
-    def _merged_fields(
+    def _read_merged_fields(
         self, node: yaml.Node, location: Location, written_fields: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the fields of a mapping under a merge key.
+        """Return the fields of a mapping under a merge key, and record their positions.
 
-        Record the positions of fields that are not overridden.
-
-        Mistakes in the merged mapping are reported where it is defined, and not here.
+        Fields in `written_fields` override merged fields, and keep their own positions. Mistakes in
+        the merged mapping are reported where it is defined, and not here.
         """
         merge_location = (*location, _MERGE_KEY)
         if not isinstance(node, yaml.MappingNode):
@@ -216,7 +225,9 @@ class Document:
         return fields
 
     def to_mistake(self, finding: Finding) -> Mistake:
-        """Return a finding with the file and line of its location, or of the section around it.
+        """Convert a finding to a mistake with the file and line of its location.
+
+        If the location is not in a file, the line is that of the section around it.
 
         Instruments of the library are valid by themselves. A mistake in a field of the library is
         therefore located at the user's field that causes it.
@@ -230,7 +241,7 @@ class Document:
             format_raw_value(finding.raw_value),
             finding.problem,
         )
-        if Path(file).parent == _LIBRARY_FOLDER and file != self.file:
+        if Path(file).parent == _INSTRUMENT_LIBRARY_FOLDER and file != self.file:
             library_value = _value_at(self.content, location)
             rule += (
                 ""
@@ -351,7 +362,7 @@ def parse_document(text: str, path: Path) -> Document:
     text : str
         YAML text.
     path : Path
-        Path that mistakes are reported with.
+        Path of the file that the text is from, for mistakes.
 
     Returns
     -------
@@ -387,14 +398,16 @@ def parse_document(text: str, path: Path) -> Document:
     if not isinstance(root, yaml.MappingNode):
         problem = "holds nothing" if root is None else "must hold a mapping of fields to values"
         raise _file_error(path, problem, "write e.g. 'title: A study', and a field on each line")
-    document.content = drop_extensions(document.read_node(root, ()))
+    document.content = drop_anchor_sections(document.read_node(root, ()))
     return document
 
 
-def drop_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
+def drop_anchor_sections(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a file without its sections ``x-...``, which hold anchors only."""
     return {
-        name: value for name, value in content.items() if not name.startswith(_EXTENSION_PREFIX)
+        name: value
+        for name, value in content.items()
+        if not name.startswith(_ANCHOR_SECTION_PREFIX)
     }
 
 
@@ -404,7 +417,7 @@ def _read_text(path: Path) -> str:
     Raise `SpecError` if the file is unreadable.
     """
     try:
-        with open(open_regular(path), "rb") as file:
+        with open(open_regular_file(path), "rb") as file:
             content = file.read(FILE_BYTES_MAX + 1)
     except FileNotFoundError:
         raise _file_error(path, "does not exist", suggest_similar_file(path)) from None
@@ -504,7 +517,7 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
     reference, location = raw_instrument, _INSTRUMENT_LOCATION
     overrides: dict[str, Any] = {}
     if isinstance(raw_instrument, dict):
-        _read_error_table(document, raw_instrument, base)
+        _load_frequency_error_table(document, raw_instrument, base)
         if "like" in raw_instrument and "file" in raw_instrument:
             problem = "names another instrument, besides instrument.like"
             document.findings.append(Finding(("instrument", "file"), problem, "keep one of them"))
@@ -522,12 +535,14 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
         document.findings += error.findings
         return False
     instrument_fields = instrument_document.content["instrument"]
-    _read_error_table(document, instrument_fields, Path(instrument_document.file).parent)
+    _load_frequency_error_table(document, instrument_fields, Path(instrument_document.file).parent)
     document.content["instrument"] = merge_mappings(
-        _drop_threshold(instrument_fields, overrides), overrides
+        _drop_overridden_threshold(instrument_fields, overrides), overrides
     )
-    if takes_floor and _FLOOR_SECTION in instrument_document.content:
-        _merge_error_floor(document, instrument_document.content[_FLOOR_SECTION], str(reference))
+    if takes_floor and _ERROR_FLOOR_SECTION in instrument_document.content:
+        _merge_error_floor(
+            document, instrument_document.content[_ERROR_FLOOR_SECTION], str(reference)
+        )
     kept_positions = {
         value_location: position
         for value_location, position in document.positions.items()
@@ -536,7 +551,7 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
     instrument_positions = {
         value_location: position
         for value_location, position in instrument_document.positions.items()
-        if value_location[:1] in (_INSTRUMENT_LOCATION, (_FLOOR_SECTION,))
+        if value_location[:1] in (_INSTRUMENT_LOCATION, (_ERROR_FLOOR_SECTION,))
         and value_location != _INSTRUMENT_LOCATION
     }
     document.positions = document.positions | instrument_positions | kept_positions
@@ -545,24 +560,27 @@ def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = Fa
 
 
 def _merge_error_floor(document: Document, instrument_floor: object, instrument_name: str) -> None:
-    """Fill in the fields of an instrument's error floor that the study does not state."""
-    study_floor = document.content.get(_FLOOR_SECTION, {})
+    """Add the fields of an instrument's error floor that the study does not state."""
+    study_floor = document.content.get(_ERROR_FLOOR_SECTION, {})
     if not isinstance(study_floor, Mapping):  # validation reports this mistake
         return
     if not isinstance(instrument_floor, Mapping):
         document.content.setdefault(
-            _FLOOR_SECTION, instrument_floor
+            _ERROR_FLOOR_SECTION, instrument_floor
         )  # mistakes in it are reported as the study's
         return
-    document.content[_FLOOR_SECTION] = merge_mappings(instrument_floor, study_floor)
+    document.content[_ERROR_FLOOR_SECTION] = merge_mappings(instrument_floor, study_floor)
     if added_fields := {
         name: value for name, value in instrument_floor.items() if name not in study_floor
     }:
         document.instrument_floor = InstrumentErrorFloor(instrument_name, added_fields)
 
 
-def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
-    """Replace the path of a CSV file with the sweep's frequency error by the file's rows."""
+def _load_frequency_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
+    """Replace the path of a CSV file in an instrument's fields by the rows of the file.
+
+    The file holds the sweep's frequency error. Mistakes in it are added to the document's findings.
+    """
     chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE_PATH.split(".")
     if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
         return
@@ -582,16 +600,19 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
 
 
 def _read_instrument(reference: object, location: Location, base: Path) -> Document:
-    """Return the document of an instrument, given by name or path, in the sections of a spec."""
+    """Read the file of an instrument, given by its name in the library or by a path.
+
+    The document that is returned has the sections of a library file.
+    """
     if not isinstance(reference, str):
         if "file" in location:
             remedy = "write it relative to this file"
             raise findings_error(location, "must be the path of a YAML file", remedy, reference)
         problem = "must be the name of an instrument of the library"
         raise findings_error(
-            location, problem, f"the library has {', '.join(library_instruments())}", reference
+            location, problem, f"the library has {', '.join(library_instrument_files())}", reference
         )
-    file, files_by_name = base / os.path.expanduser(reference), library_instruments()
+    file, files_by_name = base / os.path.expanduser(reference), library_instrument_files()
     if "file" not in location and reference in files_by_name:
         return read_document(files_by_name[reference])
     is_plain_word = not re.search(r"[/\\]|\.ya?ml$", reference) and not os.path.exists(file)
@@ -610,21 +631,21 @@ def _read_instrument(reference: object, location: Location, base: Path) -> Docum
 
 
 def _normalise_instrument_file(document: Document) -> Document:
-    """Return the document of a user's instrument in the sections of a library file.
+    """Return a user's instrument as a document with the sections of a library file.
 
     The user's file may have these sections, or the fields of the instrument at its root.
     """
     if "instrument" not in document.content:
         floor_section = (
-            {_FLOOR_SECTION: document.content.pop(_FLOOR_SECTION)}
-            if _FLOOR_SECTION in document.content
+            {_ERROR_FLOOR_SECTION: document.content.pop(_ERROR_FLOOR_SECTION)}
+            if _ERROR_FLOOR_SECTION in document.content
             else {}
         )
 
         def move_below_instrument(location: Location) -> Location:
             return (
                 location
-                if location[:1] == (_FLOOR_SECTION,)
+                if location[:1] == (_ERROR_FLOOR_SECTION,)
                 else (*_INSTRUMENT_LOCATION, *location)
             )
 
@@ -659,21 +680,21 @@ def _normalise_instrument_file(document: Document) -> Document:
     return Document(document.content, places, findings, document.file)
 
 
-def library_instruments() -> dict[str, Path]:
+def library_instrument_files() -> dict[str, Path]:
     """Return the files of the library's instruments by name.
 
     Each file also names its publication, and the numbers that it must reproduce.
 
     Examples
     --------
-    >>> "settembrini_2026" in library_instruments()
+    >>> "settembrini_2026" in library_instrument_files()
     True
     """
-    return {file.stem: file for file in sorted(_LIBRARY_FOLDER.glob("*.yaml"))}
+    return {file.stem: file for file in sorted(_INSTRUMENT_LIBRARY_FOLDER.glob("*.yaml"))}
 
 
-def _drop_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an instrument without its threshold if the overrides set a threshold in any way."""
+def _drop_overridden_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an instrument's fields, without its threshold if the overrides set one in any way."""
     base_processing, new_processing = instrument.get("processing"), overrides.get("processing")
     if not (
         isinstance(base_processing, Mapping)
@@ -687,7 +708,7 @@ def _drop_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, 
 
 
 def to_plain_data(data: Any, location: Location = ()) -> Any:
-    """Copy data as YAML would give it: dicts with text keys, and lists.
+    """Copy data into the types that a YAML parser returns: dicts with text keys, and lists.
 
     Parameters
     ----------
@@ -760,7 +781,7 @@ _PROBLEM_BY_ERROR_TYPE = {
     "tuple_type": "must be a list",
     "invalid_key": "must be a word",
 }
-"""Text of a finding by pydantic's type of error."""
+"""Problem stated in a finding, by the type of pydantic's error."""
 _SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
 """Remedy for a section of scenes in the spec of a grid."""
 _OTHER_SPEC_REMEDIES = {
@@ -776,11 +797,11 @@ _SPEC_OF_FIGURE_KIND = {
     for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
     for model in spec_fields.models_of_annotation(kind)
 }
-"""Class of spec, in words, that may have a kind of figure, by the kind."""
+"""What a study must have to draw a figure, ``a target`` or ``a scene``, by the figure's kind."""
 
 
 def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
-    """Return the findings of a pydantic error.
+    """Convert a pydantic error to findings.
 
     Parameters
     ----------
@@ -795,9 +816,9 @@ def validation_findings(error: ValidationError, annotation: Any) -> list[Finding
 
 
 def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
-    """Return the finding of one entry of `ValidationError.errors`."""
+    """Convert one entry of `ValidationError.errors` to a finding."""
     error_type, raw_value = detail["type"], detail["input"]
-    resolved = spec_fields.resolve_location(detail["loc"], annotation)
+    resolved = spec_fields.translate_error_location(detail["loc"], annotation)
     location = resolved.location
     if error_type == RULE_ERROR_TYPE:
         context, path = detail["ctx"], dotted_path(location)
@@ -831,7 +852,7 @@ def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
         return Finding(
             location, "lacks its kind", f"write {_kind_hint(resolved.value_models)}", raw_value
         )
-    problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has a value that cannot stand here")
+    problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has an invalid value")
     remedy = (
         _missing_field_remedy(resolved)
         if resolved.value_models
@@ -852,7 +873,7 @@ def _list_remedy(resolved: spec_fields.ResolvedLocation, error_type: str) -> str
 
 
 def _kind_hint(models: spec_fields.ModelClasses) -> str:
-    """Return how to write the field ``kind`` of a section that has several models."""
+    """Return advice that lists the values of the field ``kind`` which select these models."""
     return f"kind: and one of {', '.join(map(spec_fields.kind_of_model, models))}"
 
 
@@ -904,13 +925,13 @@ def missing_instrument_remedy() -> str:
     """Return the remedy for a spec without an instrument."""
     return (
         f"write e.g. 'instrument: {{like: {_EXAMPLE_INSTRUMENT}}}' (the library has "
-        f"{', '.join(library_instruments())}), "
+        f"{', '.join(library_instrument_files())}), "
         "or all of its sections"
     )
 
 
 def _suggest_field(resolved: spec_fields.ResolvedLocation, root_model: type[BaseModel]) -> str:
-    """Return a suggestion for an unknown field, from the same section or else from all fields."""
+    """Suggest a known field for an unknown one: of the same section, else of the whole spec."""
     name = str(resolved.location[-1])
     sibling_names = [
         field for model in resolved.section_models for field in spec_fields.fields_by_name(model)

@@ -15,7 +15,7 @@ from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
-from sweep.regular_files import read_below
+from sweep.regular_files import read_file_below_root
 from sweep.safe_json import parse_json
 from sweep.storage.size_checks import METADATA_BYTES_MAX
 
@@ -65,10 +65,10 @@ def _read_node_names(store: Path) -> set[str]:
     """Return the names of a store's arrays and groups, as far as its documents can be read."""
     node_names: set[str] = set()
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        root_metadata = parse_json(read_below(store, "zarr.json", METADATA_BYTES_MAX))
+        root_metadata = parse_json(read_file_below_root(store, "zarr.json", METADATA_BYTES_MAX))
         node_names |= set(root_metadata["consolidated_metadata"]["metadata"])
     with suppress(OSError):
-        manifest = read_below(store, f"{_JOURNAL_DIR}/template.jsonl", METADATA_BYTES_MAX)
+        manifest = read_file_below_root(store, f"{_JOURNAL_DIR}/template.jsonl", METADATA_BYTES_MAX)
         for line in manifest.splitlines():
             with suppress(ValueError, TypeError, AttributeError):
                 object_name = str(parse_json(line).get("object", ""))

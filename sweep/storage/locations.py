@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sweep.messages import escape_unprintable
-from sweep.regular_files import check_size, open_below, read_below
+from sweep.regular_files import check_file_size, open_file_below_root, read_file_below_root
 
 #: URL schemes of object stores; `memory` is for tests, and exists only within its process.
 URL_SCHEMES = ("s3", "gs", "az", "memory")
@@ -180,7 +180,7 @@ class ObjectPath:
         with translate_errors(self):
             response = self.client.get(self.key)
             if bytes_max is not None:
-                check_size(response.meta["size"], bytes_max, str(self))
+                check_file_size(response.meta["size"], bytes_max, str(self))
             try:
                 return bytes(response.bytes())
             except BaseError:
@@ -449,7 +449,7 @@ def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
     """
     if isinstance(location, ObjectPath):
         return (location / object_name).read_bytes(bytes_max)
-    return read_below(location, object_name, bytes_max)
+    return read_file_below_root(location, object_name, bytes_max)
 
 
 def iter_names_below(location: Location) -> Iterator[str]:
@@ -715,7 +715,7 @@ def store_fingerprint(location: Location) -> tuple[int, ...] | None:
     if not isinstance(location, Path):
         return None
     try:
-        descriptor = open_below(location, "zarr.json")  # opening asks a file server anew
+        descriptor = open_file_below_root(location, "zarr.json")  # opening asks a file server anew
     except OSError:
         return None
     try:

@@ -21,8 +21,8 @@ from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteReques
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import LocalStore, ObjectStore
 
-from sweep.messages import suggestion
-from sweep.regular_files import RefusedFileError, check_size, read_below
+from sweep.messages import suggested_call
+from sweep.regular_files import RefusedFileError, check_file_size, read_file_below_root
 
 #: Largest size of the metadata document of a group or an array [bytes].
 METADATA_BYTES_MAX = 64 << 20
@@ -233,7 +233,7 @@ class SizeCheckedLocalStore(LocalStore):
         """Return the bytes of a file, or of a part of it; None if the file does not exist."""
         bytes_max = self._limits.file_bytes_max(key)
         try:
-            content = read_below(self.root, key, bytes_max, _to_slice(byte_range))
+            content = read_file_below_root(self.root, key, bytes_max, _to_slice(byte_range))
             if byte_range is None or isinstance(byte_range, RangeByteRequest):
                 path_in_messages = f"{self.root}/{key}"
                 self._limits.check_decoded_size(
@@ -243,7 +243,7 @@ class SizeCheckedLocalStore(LocalStore):
             return None
         except RefusedFileError as error:
             problem_and_remedy = (
-                f"{error.strerror}: {suggestion('verify', self.root)} names what is damaged"
+                f"{error.strerror}: {suggested_call('verify', self.root)} names what is damaged"
             )
             raise RefusedFileError(error.errno, problem_and_remedy, error.filename) from None
         return content
@@ -301,7 +301,7 @@ class SizeCheckedObjectStore(ObjectStore[Any]):
         file_name = key.removeprefix(f"{self._key_prefix}/")
         bytes_max = self._limits.file_bytes_max(file_name)
         if isinstance(byte_range, RangeByteRequest):
-            check_size(byte_range.end - byte_range.start, bytes_max, key)
+            check_file_size(byte_range.end - byte_range.start, bytes_max, key)
         if byte_range is not None:
             buffer = await super().get(key, prototype, byte_range)
         else:
@@ -309,7 +309,7 @@ class SizeCheckedObjectStore(ObjectStore[Any]):
                 response = await obstore.get_async(self.store, key)
             except FileNotFoundError:
                 return None
-            check_size(response.meta["size"], bytes_max, key)
+            check_file_size(response.meta["size"], bytes_max, key)
             buffer = prototype.buffer.from_bytes(await response.bytes_async())
         if buffer is not None and (byte_range is None or isinstance(byte_range, RangeByteRequest)):
             self._limits.check_decoded_size(

@@ -33,11 +33,16 @@ from zarr.storage import StorePath
 from sweep.messages import (
     SPEC_PLACEHOLDER,
     STORE_PLACEHOLDER,
-    PrintableError,
+    EscapedTextError,
     escape_to_one_line,
-    suggestion,
+    suggested_call,
 )
-from sweep.regular_files import RefusedFileError, file_type, open_regular, stream_below
+from sweep.regular_files import (
+    RefusedFileError,
+    file_type,
+    open_regular_file,
+    stream_file_below_root,
+)
 from sweep.safe_json import parse_json
 from sweep.storage.locations import (
     CONCURRENT_REQUESTS_MAX,
@@ -124,7 +129,7 @@ _SHARD_INDEX_CONFIGURATION = {
 """Configuration of the index of a shard."""
 
 
-class StoreError(PrintableError):
+class StoreError(EscapedTextError):
     """Error of a store that can't be used as requested."""
 
 
@@ -253,12 +258,12 @@ def _read_root_document(path: Location) -> dict[str, Any]:
     if detail:
         raise NotAStoreError(f"{path / 'zarr.json'} is damaged{detail}")
     if isinstance(path, Path) and path.is_file():
-        run_suggestion = suggestion("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
+        run_suggestion = suggested_call("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
         description = (
             f"a file, and no Zarr store of sweep's: {run_suggestion} computes a spec into one"
         )
         raise NotAStoreError(f"{path} is {description}{_nearby_stores_hint(path)}")
-    run_suggestion = suggestion("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
+    run_suggestion = suggested_call("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
     description = "is not a Zarr store of sweep's"
     if names := _first_file_names_text(path):
         raise NotAStoreError(
@@ -340,8 +345,8 @@ def repair_hint(path: Location) -> str:
     if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
         return ""
     if read_manifest_attributes(path):
-        return f": {suggestion('verify', path, repair=True)} puts it back"
-    command = suggestion("verify", path, repair=True, spec=SPEC_PLACEHOLDER)
+        return f": {suggested_call('verify', path, repair=True)} puts it back"
+    command = suggested_call("verify", path, repair=True, spec=SPEC_PLACEHOLDER)
     return f": {command}, with the study's spec, puts it back"
 
 
@@ -487,7 +492,7 @@ def find_irregular_journal_files(path: Location) -> dict[str, str]:
     }
 
 
-class StoreReplacedError(PrintableError, ValueError):
+class StoreReplacedError(EscapedTextError, ValueError):
     """Error of reading a store that was extended, replaced or removed after it was opened."""
 
 
@@ -630,7 +635,7 @@ def stored_objects_digest(
         return contents_digest(zip(object_names, contents, strict=True))
     hasher = hashlib.blake2b(digest_size=16)
     for name in object_names:
-        with stream_below(path, name, bytes_max(name)) as (size, pieces):
+        with stream_file_below_root(path, name, bytes_max(name)) as (size, pieces):
             hasher.update(f"{name}\0{size}\0".encode())
             for piece in pieces:
                 hasher.update(piece)
@@ -811,7 +816,7 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
             yield from content.splitlines(keepends=True)
     else:
         try:
-            descriptor = open_regular(path, follow_links=False)
+            descriptor = open_regular_file(path, follow_links=False)
         except OSError as error:
             if error.errno in _NO_LOG_ERRNOS:
                 return

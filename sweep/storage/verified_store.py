@@ -21,7 +21,7 @@ import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import StorePath, WrapperStore
 
-from sweep.messages import STORE_PLACEHOLDER, suggestion
+from sweep.messages import STORE_PLACEHOLDER, suggested_call
 from sweep.storage import store_format
 from sweep.storage.locations import (
     JOURNAL_DIR,
@@ -255,20 +255,19 @@ class VerifiedStore(WrapperStore[Any]):
         block = block_map.block_of_chunk(name)
         chunk_text = f"{location}: block {block}: {name}" if block >= 0 else f"{location}: {name}"
         if block_map.is_packed:
-            remedy = (
-                f"{suggestion('verify', location)} names all that is damaged; copy the store anew"
-            )
+            verify_command = suggested_call("verify", location)
+            remedy = f"{verify_command} names all that is damaged; copy the store anew"
         elif name in block_map.template_objects:
-            remedy = f"{suggestion('verify', location, repair=True)} puts it back"
+            remedy = f"{suggested_call('verify', location, repair=True)} puts it back"
         elif block_map.kind == "eyepoints":
             remedy = (
-                f"{suggestion('verify', STORE_PLACEHOLDER)} and "
-                f"{suggestion('resume', STORE_PLACEHOLDER)} of the study that uses them mend it"
+                f"{suggested_call('verify', STORE_PLACEHOLDER)} and "
+                f"{suggested_call('resume', STORE_PLACEHOLDER)} of the study that uses them mend it"
             )
         else:
             remedy = (
-                f"{suggestion('verify', location)} marks what is damaged, "
-                f"and {suggestion('resume', location)} computes it again"
+                f"{suggested_call('verify', location)} marks what is damaged, "
+                f"and {suggested_call('resume', location)} computes it again"
             )
         return f"{chunk_text} {damage}: {remedy}"
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import counted, option_text, suggestion
+from sweep.messages import counted, option_text, suggested_call
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
@@ -357,7 +357,7 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
     """Raise a StoreError if something is at a path, or is being prepared for it."""
     staging_path, remedy = (
         find_pending_replacement(store_path),
-        f"{suggestion('resume', store_path)} goes on with it",
+        f"{suggested_call('resume', store_path)} goes on with it",
     )
     if not can_create_store(store_path):
         attributes, stored_study = _read_resumable_study(store_path)
@@ -368,7 +368,7 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
             f"{counted(study.n_blocks, 'block')} done"
         )
         if n_blocks_done == study.n_blocks:
-            remedy = f"{suggestion('status', store_path)} tells about it"
+            remedy = f"{suggested_call('status', store_path)} tells about it"
     elif staging_path:
         problem = f"a study is under way in {staging_path}"
     else:

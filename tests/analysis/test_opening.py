@@ -177,7 +177,7 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
             beam_divergence=spec.instrument.laser.beam_divergence,
             n_beamlets=spec.footprint.beamlets,
             pattern=spec.beamlet_pattern,
-            body_motions=world.body_flights,
+            body_motions=world.body_motions,
         )
         for field, array in cast._asdict().items():
             equal_nan = array.dtype.kind == "f"

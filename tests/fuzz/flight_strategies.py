@@ -79,10 +79,10 @@ FLIGHT_BOUNDS: dict[str, Any] = {
     "Craters.largest": {"example": "900 m"},
     "JacksboroGround.size": {"at_most": "6 km"},
     "Trees.number": {"at_most": "3", "example": "2"},
-    "TreeMeasures.crown_diameter": {"at_most": "8 m", "example": "6 m"},
-    "TreeMeasures.leaf_length": {"at_least": "60 cm", "example": "80 cm"},
-    "TreeMeasures.leaf_width": {"at_least": "50 cm", "example": "60 cm"},
-    "TreeMeasures.leaf_area_index": {"at_most": "1.5", "example": "1"},
+    "TreeDimensions.crown_diameter": {"at_most": "8 m", "example": "6 m"},
+    "TreeDimensions.leaf_length": {"at_least": "60 cm", "example": "80 cm"},
+    "TreeDimensions.leaf_width": {"at_least": "50 cm", "example": "60 cm"},
+    "TreeDimensions.leaf_area_index": {"at_most": "1.5", "example": "1"},
     "Boulders.smallest": {"at_least": "1 m", "example": "2 m"},
     "Boulders.within": {"at_most": "60 m", "example": "50 m"},
     "Boulders.subdivisions": {"at_most": "1", "example": "1"},
@@ -102,7 +102,7 @@ mostly see something."""
 COSTLY_DEFAULTS = {
     "Footprint.beamlets", "JacksboroGround.size", "Boulders.within", "Sphere.subdivisions",
     "Trees.tree",
-    "TreeMeasures.leaf_length", "TreeMeasures.leaf_width", "StationaryPath.duration",
+    "TreeDimensions.leaf_length", "TreeDimensions.leaf_width", "StationaryPath.duration",
     "SceneDraws.number",
 }  # fmt: skip
 SECTION_STRATEGIES = SectionStrategies(STUDY_BOUNDS | FLIGHT_BOUNDS, FILE_BY_FIELD, COSTLY_DEFAULTS)

@@ -255,13 +255,13 @@ def axis_generator(draw: st.DrawFn, rule: NumericRule, kind: str, decades: float
 
 def _all_distinct(rule: NumericRule, raw_values: list[Any]) -> bool:
     """Tell whether a mixed list holds no value twice."""
-    from sweep.spec.axes import read_pieces
+    from sweep.spec.axes import read_axis_pieces
     from sweep.spec.rules import FindingsError
 
     try:
         si_values = [
             value
-            for piece in read_pieces(raw_values, rule, ())
+            for piece in read_axis_pieces(raw_values, rule, ())
             for value in piece.si_values.tolist()
         ]
     except (FindingsError, QuantityError):

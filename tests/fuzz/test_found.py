@@ -53,7 +53,7 @@ def test_direct_detection_with_draws_is_planned_though_it_knows_no_speckle(tmp_p
     direct = base_study_mapping({"instrument.receiver.architecture": "direct", "draws.number": 3})
     assert plan_study(GridSpec.from_mapping(direct)).n_points == 1
     assert not judged(tmp_path, direct).refusals
-    assert "averages over an unknown number" in refused(direct | {"effects": {"speckle": "on"}})
+    assert "averages an unknown number" in refused(direct | {"effects": {"speckle": "on"}})
 
 
 BEYOND = {

@@ -50,7 +50,7 @@ def usual_units(rule: NumericRule) -> list[str]:
 
 def parse_unit(rule: NumericRule, unit_text: str) -> Unit:
     """A unit by its text, as the rule reads it."""
-    return rule.read_exact(f"1 {unit_text}".strip())[1]
+    return rule.read_exact_number(f"1 {unit_text}".strip())[1]
 
 
 def is_within_bounds(rule: NumericRule, values: list[float]) -> bool:
@@ -62,7 +62,7 @@ def si_bound(rule: NumericRule, raw_bound: str | None, default: float) -> float:
     """SI value of a bound as the rule writes it."""
     if raw_bound is None:
         return default
-    number, unit = rule.read_exact(raw_bound)
+    number, unit = rule.read_exact_number(raw_bound)
     return unit.to_si(number)
 
 

@@ -14,7 +14,7 @@ WIDE = {DIVERGENCE: "100 urad"}
 WRONG = [
     (WAIST, {}, DIVERGENCE, "must be given, or beam_waist in its place"),
     ({"instrument.laser.beam_waist": "5 mm"}, {}, "instrument.laser.beam_waist",
-     "stands beside beam_divergence"),
+     "is given in addition to beam_divergence"),
     (MODE, {}, DIVERGENCE, "at least 78.9 urad, 4 M^2 lambda / (pi D)"),
     (MODE | WIDE | {"instrument.laser.beam_quality": 2}, {}, DIVERGENCE, "at least 158 urad"),
     (MODE, {DIVERGENCE: ["1 mrad", "78 urad"]}, f"axes.{DIVERGENCE}", "at least 78.9 urad"),

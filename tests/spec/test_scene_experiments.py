@@ -29,7 +29,7 @@ def flown(name):
             flight=spec.build_flight(),
             scanner=spec.scan_pattern(scanner),
             caster=world.caster,
-            body_motions=world.body_flights,
+            body_motions=world.body_motions,
             beam_divergence=spec.instrument.laser.beam_divergence,
             n_beamlets=spec.footprint.beamlets,
             pattern=spec.beamlet_pattern,

@@ -240,7 +240,7 @@ def test_jitter_and_sunlight_are_handed_on():
 
 def test_parameters_are_set_anew_where_the_rays_stay_the_same():
     spec = spec_of()
-    assert spec.parameters_with({"power": "3 W"})["instrument.laser.power"] == 3.0
+    assert spec.parameters_with_overrides({"power": "3 W"})["instrument.laser.power"] == 3.0
     for at, words in (
         ({"beam_divergence": "1 mrad"}, "moves the beamlets"),
         ({"architecture": "direct"}, "moves the beamlets"),
@@ -249,7 +249,7 @@ def test_parameters_are_set_anew_where_the_rays_stay_the_same():
         ({"power": "3 s"}, "needs a unit like W"),
     ):
         with pytest.raises(Exception, match=words):
-            spec.parameters_with(at)
+            spec.parameters_with_overrides(at)
 
 
 def test_a_scene_is_told_from_a_target_by_what_the_file_holds(tmp_path):
@@ -281,7 +281,7 @@ def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_
     )  # fmt: skip
     spec = SceneSpec.from_mapping(mapping, base=tmp_path)
     assert spec.files.time_origin == first
-    flight, (ball,) = spec.build_flight(), spec.build_scene().body_flights
+    flight, (ball,) = spec.build_flight(), spec.build_scene().body_motions
     assert (flight.start, flight.stop) == (0, 1)
     state = flight.state(np.linspace(0, 1, 333))
     assert np.abs(state.acceleration).max() < 1e-8

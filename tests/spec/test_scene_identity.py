@@ -20,8 +20,8 @@ from base_scene_spec import (
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec, describe_differences, from_stored
 from sweep.spec.axes import remove_fields_on_axes
-from sweep.spec.differences import SCENE_SECTIONS, rules_by_field_name
-from sweep.spec.fields import fields_by_name, iter_values, reachable_models, rule_of_field
+from sweep.spec.differences import SCENE_SECTION_MODELS, rules_by_field_name
+from sweep.spec.fields import fields_by_name, iter_section_values, reachable_models, rule_of_field
 from sweep.spec.ground_sections import OPTICAL_FIELDS
 from sweep.spec.sections import MODEL_BY_SECTION
 
@@ -129,7 +129,7 @@ def test_every_field_of_a_scene_is_in_its_geometry_unless_it_is_optical():
     spec = spec_of(SCENE_WITH_EVERYTHING)
     text = json.dumps(spec.geometry_identity("three"))
     for part in (*spec.scene.objects.values(), spec.platform, spec.scanners["three"]):
-        for path, _, _ in iter_values(part):
+        for path, _, _ in iter_section_values(part):
             told = f'"{".".join(path)}"' in text
             assert told is (path[-1] not in OPTICAL_FIELDS), path
 
@@ -192,7 +192,7 @@ def test_a_stored_study_is_the_same_again(mapping):
 def test_every_default_is_written_out_so_that_a_store_keeps_it():
     spec = spec_of(SCENE_WITH_EVERYTHING)
     whole = spec.to_yaml_mapping()
-    for path, rule, value in iter_values(spec):
+    for path, rule, value in iter_section_values(spec):
         if path[0] in ("title", "question", "execution", "axes", "figures"):
             continue
         if ".".join(path) in spec.to_yaml_mapping()["axes"]:
@@ -332,13 +332,13 @@ def test_differences_are_told_with_units():
 
 
 def test_a_name_has_one_unit_wherever_it_stands():
-    for model in reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTIONS):
+    for model in reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTION_MODELS):
         for name, field in fields_by_name(model).items():
             rule = rule_of_field(field)
             assert rule is None or rules_by_field_name()[name].value_unit == rule.value_unit, name
     assert (
         rules_by_field_name()["half_angle"].value_unit == "rad"
-        and len(reachable_models(*SCENE_SECTIONS)) > 30
+        and len(reachable_models(*SCENE_SECTION_MODELS)) > 30
     )
 
 

@@ -68,7 +68,7 @@ FIELDS = [
     ("scanners.s", {"kind": "squares", "elements": ["5 deg", "5 deg"], "rate": "1 Hz"},
      "as many different angles"),
     ("scanners.s", {"kind": "corners", "angle": "1 deg", "rate": "10 s"}, "unit like Hz"),
-    ("footprint.pattern", "line", "stands for a plane alone"),
+    ("footprint.pattern", "line", "is only for a plane"),
     ("draws.batch", 3, "is no field; the fields here are number, method, returns"),
     ("instrument.processing.peaks", "strongest", "set draws.method: spectra, or take all"),
     ("interface.rate", "none", "write e.g. '20 Hz'"),
@@ -116,7 +116,7 @@ OBJECTS = [
         "is 3 m by default, and must lie below the top, 2 m; lower it",
     ),
     (BOULDERS_OBJECT, {"largest": "0.5 m"}, "largest", "must exceed the smallest diameter, 0.5 m"),
-    (SPHERE_OBJECT, {"motion": MOVING}, "position", "stands beside a motion"),
+    (SPHERE_OBJECT, {"motion": MOVING}, "position", "is given in addition to a motion"),
     (
         BOX_OBJECT,
         {"motion": SHORT},
@@ -262,7 +262,7 @@ AXES = [
     ({"cut": {"zip": {"instrument.laser.power": ["1 W"], "target.reflectance": 1}}}, "cut",
      "is given by the scene"),
     ({"snr": {"zip": {"instrument.laser.power": ["1 W", "2 W"]}}}, "snr",
-     "bears the name of something stored"),
+     "has the name of an array or dimension"),
     ({"draw": {"zip": {"instrument.laser.power": ["1 W", "2 W"]}}}, "draw", "is no name for an"),
 ]  # fmt: skip
 
@@ -286,11 +286,11 @@ def test_an_axis_of_radiometry_is_read_and_stands_in_for_its_field():
 
 
 def test_no_parameter_that_may_vary_bears_the_name_of_an_array():
-    from sweep.spec.scene_checks import stored_names
+    from sweep.spec.scene_checks import store_array_and_dimension_names
     from sweep.spec.sections import parameter_rules
 
     free = {p.rsplit(".", 1)[-1] for p in parameter_rules() if SceneSpec.may_be_on_axis(p)}
-    assert len(free) > 20 and not free & stored_names()
+    assert len(free) > 20 and not free & store_array_and_dimension_names()
 
 
 PAIR = {"kind": "fixed", "beams": [["0 deg", "0 deg"], ["1 deg", "0 deg"]], "rate": "1 Hz"}

@@ -38,7 +38,7 @@ def seen(spec, world, name="three"):
         flight=spec.build_flight(),
         scanner=spec.scan_pattern(name),
         caster=world.caster,
-        body_motions=world.body_flights,
+        body_motions=world.body_motions,
         beam_divergence=spec.instrument.laser.beam_divergence,
         n_beamlets=spec.footprint.beamlets,
         pattern=spec.beamlet_pattern,
@@ -49,7 +49,7 @@ def straight_down(world, x, y, height=1000.0, time=0.0):
     """Heights [m] and surfaces straight below places (n,)."""
     places = np.column_stack(np.broadcast_arrays(np.asarray(x, float), y, height))
     down = np.broadcast_to([0.0, 0.0, -1.0], places.shape)
-    poses = [None if b is None else b.state(np.array([time])) for b in world.body_flights]
+    poses = [None if b is None else b.state(np.array([time])) for b in world.body_motions]
     poses = [None if p is None else Pose(p.position[0], p.attitude[0]) for p in poses]
     hits = world.caster.cast_bundles(places, down[:, None], poses=poses)
     return height - hits.range, hits.surface_index[:, 0]
@@ -62,7 +62,7 @@ def test_a_plane_is_seen_at_its_distance_and_closing_speed():
     np.testing.assert_allclose(eyes.range, eyes.position[:, 2] / slant, rtol=1e-9)
     np.testing.assert_allclose(eyes.radial_velocity, -eyes.velocity[:, 2] * slant, rtol=1e-9)
     np.testing.assert_allclose(np.arccos(eyes.cos_incidence[:, 0]), math.radians(20), rtol=1e-9)
-    assert (eyes.surface == 0).all() and world.body_flights == (None,)
+    assert (eyes.surface == 0).all() and world.body_motions == (None,)
     assert world.surfaces == spec.surfaces() and world.surfaces[0].reflectance == 0.1
 
 
@@ -326,7 +326,7 @@ def test_a_moving_box_is_met_where_it_is_and_closes_at_its_own_speed():
     }  # fmt: skip
     nadir = {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}}
     spec, world = built(scene_with_object(BOX_OBJECT, motion=rising) | {"scanners": nadir})
-    assert [body is None for body in world.body_flights] == [True, False]
+    assert [body is None for body in world.body_motions] == [True, False]
     eyes = seen(spec, world, "down")
     top = 50 + 5 * eyes.time + 3
     aloft = eyes.position[:, 2] > top
@@ -360,7 +360,7 @@ def test_nothing_at_rest_makes_a_world_of_moving_bodies_alone():
         {"scene.objects": {"crate": BOX_OBJECT | {"motion": motion}}, "scene.origin": "world"}
     )
     _, world = built(mapping)
-    assert len(world.body_flights) == 1 and world.body_flights[0] is not None
+    assert len(world.body_motions) == 1 and world.body_motions[0] is not None
 
 
 def test_a_report_tells_of_each_object_what_was_mended(tmp_path):

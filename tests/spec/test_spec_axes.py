@@ -203,7 +203,7 @@ def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     found = GridStudy(spec).evaluate(0)
     # all but the few bins that the target takes
     assert found["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
-    at = spec.parameters_with({"tnr": 10})
+    at = spec.parameters_with_overrides({"tnr": 10})
     assert at[TNR_PATH] == 10 and DESIGN_PFA_SHOT_PATH not in at
     first = tnr_from_parameters(spec.parameters() | {DESIGN_PFA_SHOT_PATH: 1e-9})
     assert noise_only_reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
@@ -233,5 +233,5 @@ def test_no_coordinate_bears_the_name_of_a_variable(tmp_path):
     assert beamlets.coordinate == "footprint_beamlets"
     pieces = [{"target.range": f"{r} km", "target.grazing_angle": "45 deg"} for r in (1, 2)]
     for name in ("pd_shot", "range_error", "effects", "n_draws", "range_bias"):
-        with pytest.raises(SpecError, match=f"axes.{name}: bears the name of a variable"):
+        with pytest.raises(SpecError, match=f"axes.{name}: has the name of a variable"):
             GridSpec.from_mapping(changed_spec(axes={name: {"zip": pieces}}))

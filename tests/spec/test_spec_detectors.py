@@ -23,7 +23,10 @@ def test_they_may_vary_and_their_coordinates_bear_their_names():
     }
     study = spec(axes=axes, draws=SPECTRA)
     assert [axis.name for axis in study.axes] == ["detector", "estimator", "training"]
-    assert study.parameters_with({"detector": "ca_cfar"})[PROCESSING + "detector.kind"] == "ca_cfar"
+    assert (
+        study.parameters_with_overrides({"detector": "ca_cfar"})[PROCESSING + "detector.kind"]
+        == "ca_cfar"
+    )
     jsonschema.validate(study.to_yaml_mapping(), json_schema())
     assert GridSpec.from_stored(study.to_json()).id == study.id
 

@@ -93,7 +93,7 @@ def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
     (axis,) = GridSpec.from_mapping(mapping).axes
     rule = parameter_rules()[parameter.path]
     assert list(axis.parameters[0].values) == [rule.read(value) for value in written_values]
-    coordinate = GridSpec.from_mapping(mapping).read_coordinate(axis.name, written_values[-1])
+    coordinate = GridSpec.from_mapping(mapping).read_coordinate_value(axis.name, written_values[-1])
     assert coordinate == axis.parameters[0].display_values[-1]
 
 
@@ -264,7 +264,7 @@ def test_speckle_is_refused_for_direct_detection(on_axis):
         changes["axes"] = {"instrument.receiver.architecture": ["homodyne", "direct"]}
     else:
         changes |= receiver
-    with pytest.raises(SpecError, match="makes speckle, of which direct detection averages"):
+    with pytest.raises(SpecError, match="makes speckle, and direct detection averages"):
         spec(changes)
     assert spec(changes | {"effects.speckle": "off"}).effect_modes()["speckle"] == "off"
 
@@ -301,8 +301,8 @@ def test_a_need_is_held_against_the_points_of_the_grid_and_no_others():
 
 def test_a_point_asked_for_later_is_held_to_the_same_needs():
     with pytest.raises(SpecError, match=f"needs {FULL_SCALE}"):
-        spec().parameters_with({"bits": 12})
-    at = spec().parameters_with({"bits": 12, "full_scale": "1 V", "roughness": "1 um"})
+        spec().parameters_with_overrides({"bits": 12})
+    at = spec().parameters_with_overrides({"bits": 12, "full_scale": "1 V", "roughness": "1 um"})
     assert at["target.roughness"] == 1e-6
 
 
@@ -319,9 +319,9 @@ def test_a_grid_has_a_point_just_when_one_of_its_points_meets_all_conditions(a, 
     conditions = {one: lambda v: v > x, two: lambda v: v < y, three: lambda v: v == 1}
     points = zip(a, b, strict=True) if zipped else [(i, j) for i in a for j in b]
     expected = any(i > x and j < y for i, j in points)
-    assert GridValues({three: 1.0}, axes).has_point(conditions) == expected
-    assert not GridValues({three: 2.0}, axes).has_point(conditions)
-    assert not GridValues({}, axes).has_point(conditions)
+    assert GridValues({three: 1.0}, axes).any_point_meets(conditions) == expected
+    assert not GridValues({three: 2.0}, axes).any_point_meets(conditions)
+    assert not GridValues({}, axes).any_point_meets(conditions)
 
 
 # Decibels beside a plain unit
@@ -333,8 +333,8 @@ def test_an_axis_in_decibels_per_hertz_is_shown_in_them():
     study = spec(axes={path: steps})
     member = study.axes[0].parameters[0]
     assert member.values.tolist() == [1e-16, 1e-15, 1e-14] and member.units == "dB/Hz"
-    assert study.read_coordinate("relative_intensity_noise", "-150 dB/Hz") == -150
-    assert study.read_coordinate("relative_intensity_noise", "1e-15 1/Hz") == -150
+    assert study.read_coordinate_value("relative_intensity_noise", "-150 dB/Hz") == -150
+    assert study.read_coordinate_value("relative_intensity_noise", "1e-15 1/Hz") == -150
     mixed = spec(axes={path: ["-160 dB/Hz", "0 1/Hz"]}).axes[0].parameters[0]
     assert mixed.display_values.tolist() == [1e-16, 0] and mixed.units == "1/Hz"
 

@@ -18,7 +18,7 @@ from sweep.model.threshold import (
 )
 from sweep.model.waveform import PEAKS_PATH, SEARCH_BAND_PATHS
 from sweep.spec import GridSpec, describe_differences
-from sweep.spec.grid_checks import is_detector_or_estimator
+from sweep.spec.grid_checks import is_detector_or_estimator_parameter
 from sweep.spec.rules import ChoiceRule
 from sweep.spec.sections import MODEL_BY_SECTION, default_value, parameter_rules
 
@@ -173,7 +173,9 @@ def other_value(path):
 def test_every_parameter_is_part_of_the_id(path):
     # What looks at whole spectra is one of studies that draw some.
     spectra = (
-        {"draws.method": "spectra", "draws.number": 5} if is_detector_or_estimator(path) else {}
+        {"draws.method": "spectra", "draws.number": 5}
+        if is_detector_or_estimator_parameter(path)
+        else {}
     )
     every = EVERY | spectra
     if path == "instrument.laser.beam_waist":  # one of the two that say how wide a beam is
@@ -318,7 +320,9 @@ def test_parameters_are_all_there_in_si():
 
 def test_parameters_at_another_point_are_read_like_a_spec():
     base = spec()
-    at = base.parameters_with({"range": "3 km", "instrument.laser.power": "5 W", "window": "hann"})
+    at = base.parameters_with_overrides(
+        {"range": "3 km", "instrument.laser.power": "5 W", "window": "hann"}
+    )
     assert (at["target.range"], at["instrument.laser.power"]) == (3000.0, 5.0)
     assert at["instrument.processing.window"] == "hann"
     assert base.parameters()["target.range"] == 2000.0
@@ -328,10 +332,10 @@ def test_a_written_coordinate_is_found_in_the_unit_of_its_axis():
     cut = {"zip": {"target.grazing_angle": ["15 deg", "85 deg"], "target.range": "3.5 km"}}
     study = spec(axes={"cut": cut, "footprint.phases": ["coherent"]})
     assert (
-        study.read_coordinate("grazing_angle", "15 deg")
+        study.read_coordinate_value("grazing_angle", "15 deg")
         == study.axis_parameter("grazing_angle").display_values[0]
     )
-    assert study.read_coordinate("range", "3500 m") == 3.5
-    assert study.read_coordinate("phases", "coherent") == "coherent"
+    assert study.read_coordinate_value("range", "3500 m") == 3.5
+    assert study.read_coordinate_value("phases", "coherent") == "coherent"
     with pytest.raises(KeyError):
-        study.read_coordinate("power", "1 W")
+        study.read_coordinate_value("power", "1 W")

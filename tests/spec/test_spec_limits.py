@@ -140,9 +140,9 @@ def test_the_grid_is_refused_just_when_a_point_of_it_is(
 def test_a_point_asked_for_later_is_held_to_the_same_rules():
     spec = GridSpec.from_mapping(changed_spec())
     with pytest.raises(SpecError, match="echo's delay"):
-        spec.parameters_with({"range": "80 km"})
+        spec.parameters_with_overrides({"range": "80 km"})
     with pytest.raises(SpecError) as caught:
-        spec.parameters_with({"rnge": "2 km", "power": 3})
+        spec.parameters_with_overrides({"rnge": "2 km", "power": 3})
     assert "did you mean 'target.range'?" in str(caught.value)
     assert "needs a unit (you wrote 3)" in str(caught.value)
 

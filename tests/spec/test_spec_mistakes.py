@@ -251,7 +251,7 @@ AXES = [
     ({"cut": {"zip": [{"target.range": "1 m"}], "by": 1}}, "cut.by", "is no part of a zipped axis"),
     ({"a.b": {"zip": [{"target.range": "1 m"}]}}, "a.b", "is no name for an axis"),
     ({"cut": {"zip": [{"target.range": ["1 m", "2 m"], "target.reflectance": [0.1]}]}},
-     "cut.zip[0]", "as many values of each: target.range has 2, target.reflectance has 1"),
+     "cut.zip[0]", "equal numbers of values: target.range has 2, target.reflectance has 1"),
     ({"cut": {"zip": [{"target.range": "1 m"}, {"target.reflectance": 1}]}}, "cut.zip[1]",
      "the same parameters as the first piece"),
     ({"cut": {"zip": {"target.rnge": "1 m"}}}, "cut.zip.target.rnge",
@@ -259,7 +259,7 @@ AXES = [
     ({"cut": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}},
       "target.range": ["1 m", "2 m"]}, "target.range", "which the axis 'cut' sets too"),
     ({"power": {"zip": {"target.range": "1 m", "target.reflectance": 0.1}},
-      "instrument.laser.power": ["1 W"]}, "power", "bears the name of a coordinate"),
+      "instrument.laser.power": ["1 W"]}, "power", "has the name of a coordinate"),
     ({"footprint.beamlets": ["auto", 9]}, "footprint.beamlets[0]",
      "is one value for a whole study, no point of an axis (you wrote 'auto'); leave it out"),
 ]  # fmt: skip
@@ -327,9 +327,9 @@ def test_two_figures_of_one_file_are_refused():
 def test_a_fixed_number_of_draws_and_a_limit_exclude_each_other():
     (mistake,) = mistakes_of(changed_spec({"draws.number": 5000, "draws.limit": "1e6"}))
     assert str(mistake) == (
-        "draws.limit: stands beside draws.number, 5000: only one of them can say how much to draw "
-        "(you wrote 1000000); keep limit to draw until accuracy.tolerance is met, or number to "
-        "draw so many times"
+        "draws.limit: is given in addition to draws.number, 5000: only one of them can set how "
+        "much to draw (you wrote 1000000); keep limit to draw until accuracy.tolerance is met, "
+        "or number to draw so many times"
     )
     for draws in ({"number": 0, "limit": 5}, {"number": 5, "limit": 0}, {"limit": "1e12"}):
         assert GridSpec.from_mapping(changed_spec(draws=draws)).draws.has_draws
@@ -404,7 +404,7 @@ BAND = {
 @pytest.mark.parametrize(
     ("band", "message"),
     [
-        ({"min_range": "1 m", "max_range": "9 m"}, "range and velocity both; give all four ends"),
+        ({"min_range": "1 m", "max_range": "9 m"}, "both range and velocity; give all four ends"),
         (BAND | {"max_range": "4 m"}, "must exceed instrument.processing.search.min_range"),
         (BAND, "counts bins that instrument.processing.search leaves out"),
     ],
@@ -437,7 +437,7 @@ def test_search_bands_have_four_ends_and_count_what_they_search(band, message):
                 "instrument.processing.shot_detection": "any_two",
                 "instrument.chirp.doppler_slope": 0.5,
             },
-            "any_two cannot tell in which; take all, or shot_detection: both_chirps",
+            "any_two cannot show in which; take all, or shot_detection: both_chirps",
         ),
     ],
 )  # fmt: skip

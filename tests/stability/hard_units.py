@@ -191,12 +191,12 @@ STUDY_MAPPING = {
 )
 def spec_in_other_units() -> float:
     plain_spec = GridSpec.from_mapping(STUDY_MAPPING, base=ROOT)
-    expected, n_different = plain_spec.parameters_with({}), 0
+    expected, n_different = plain_spec.parameters_with_overrides({}), 0
     for power in (-30, -18, -12, -9, -3, 0, 3, 9, 12, 30):
         respelled_study = respell_section(STUDY_MAPPING, power)
         assert respelled_study["instrument"]["telescope"]["aperture"] != "25 mm" or power == -3
         spec = GridSpec.from_mapping(respelled_study, base=ROOT)
-        parameters = spec.parameters_with({})
+        parameters = spec.parameters_with_overrides({})
         n_different += sum(parameters[path] != value for path, value in expected.items())
         n_different += spec.id != plain_spec.id
     return float(n_different)

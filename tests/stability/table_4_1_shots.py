@@ -37,9 +37,9 @@ def study_mapping(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _table_4_1() -> dict[str, Any]:
-    return PARAMETER_DEFAULTS | GridSpec.from_mapping(study_mapping({}), base=ROOT).parameters_with(
-        {}
-    )
+    return PARAMETER_DEFAULTS | GridSpec.from_mapping(
+        study_mapping({}), base=ROOT
+    ).parameters_with_overrides({})
 
 
 def table_4_1_parameters(**changes: Any) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from small_studies import STUDY_MAPPING, file_digests, run_serially, small_mappi
 
 import sweep
 from sweep.cli import main
-from sweep.regular_files import RefusedFileError, open_regular, read_below
+from sweep.regular_files import RefusedFileError, open_regular_file, read_file_below_root
 from sweep.safe_json import parse_json
 from sweep.storage.locations import parse_location
 from sweep.storage.size_checks import ArrayFileLayout, zstd_content_bytes
@@ -426,19 +426,19 @@ def test_a_loop_of_links_ends_in_words(made, tmp_path, monkeypatch):
 
 def test_plain_files_are_opened_as_they_are(tmp_path):
     (tmp_path / "file").write_bytes(b"0123456789")
-    assert read_below(tmp_path, "file", 10) == b"0123456789"
-    assert read_below(tmp_path, "file", 10, slice(-3, None)) == b"789"
-    assert read_below(tmp_path, "file", 10, slice(2, 4)) == b"23"
-    assert read_below(tmp_path, "file", 10, slice(8, 99)) == b"89"
+    assert read_file_below_root(tmp_path, "file", 10) == b"0123456789"
+    assert read_file_below_root(tmp_path, "file", 10, slice(-3, None)) == b"789"
+    assert read_file_below_root(tmp_path, "file", 10, slice(2, 4)) == b"23"
+    assert read_file_below_root(tmp_path, "file", 10, slice(8, 99)) == b"89"
     for name in ("../file", "a/../file", "./file", "a//file"):
         with pytest.raises(RefusedFileError, match="leads out"):
-            read_below(tmp_path, name, 10)
+            read_file_below_root(tmp_path, name, 10)
     with pytest.raises(RefusedFileError, match="no more than 9"):
-        read_below(tmp_path, "file", 9)
+        read_file_below_root(tmp_path, "file", 9)
     with pytest.raises(IsADirectoryError):
-        open_regular(tmp_path)
+        open_regular_file(tmp_path)
     with pytest.raises(RefusedFileError) as refusal:
-        open_regular("/dev/null")
+        open_regular_file("/dev/null")
     assert refusal.value.errno == errno.EINVAL and "is a device" in str(refusal.value)
 
 

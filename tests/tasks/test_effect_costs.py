@@ -5,7 +5,7 @@ from itertools import count, cycle
 
 import pytest
 
-from sweep.cli.terminal import _effect_cells
+from sweep.cli.terminal import _effect_row_cells
 from sweep.tasks.studies import study_plan
 from sweep.tasks.studies.study_plan import EffectRow, reproducible_time_fraction
 
@@ -74,5 +74,5 @@ def test_a_plan_says_what_is_known_of_a_cost(share, cost, text):
         largest_change_region="the point",
         time_fraction=cost,
     )
-    assert _effect_cells(row)[2] == text
-    assert not any("nan" in cell for cell in _effect_cells(row))
+    assert _effect_row_cells(row)[2] == text
+    assert not any("nan" in cell for cell in _effect_row_cells(row))

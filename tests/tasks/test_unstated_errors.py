@@ -13,7 +13,7 @@ from sweep.cli import main
 from sweep.report.study_report import write_report
 from sweep.spec import GridSpec, SpecError
 from sweep.spec.specs import SceneSpec
-from sweep.spec.yaml_document import library_instruments
+from sweep.spec.yaml_document import library_instrument_files
 from sweep.tasks import driver
 from sweep.tasks.studies.study_loading import make_study
 
@@ -153,7 +153,7 @@ def test_plan_and_run_tell_of_the_floor_that_an_instrument_brings(command, tmp_p
     ],
 )
 def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
-    fields = yaml.safe_load(library_instruments()["lander_ndl"].read_text())["instrument"]
+    fields = yaml.safe_load(library_instrument_files()["lander_ndl"].read_text())["instrument"]
     root = yaml.safe_dump(fields)
     indented = "".join(f"  {line}\n" for line in root.splitlines())
     (tmp_path / "own.yaml").write_text(text.replace("{fields}", indented).replace("{root}", root))
@@ -175,7 +175,7 @@ def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
     ],
 )
 def test_mistakes_in_the_floor_of_a_file_are_told_where_they_stand(written, told, tmp_path):
-    fields = yaml.safe_load(library_instruments()["lander_ndl"].read_text())["instrument"]
+    fields = yaml.safe_load(library_instrument_files()["lander_ndl"].read_text())["instrument"]
     text = f"{written}\n{yaml.safe_dump({'instrument': fields})}"
     (tmp_path / "own.yaml").write_text(text)
     with pytest.raises(SpecError) as refused:

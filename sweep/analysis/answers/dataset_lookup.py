@@ -29,7 +29,7 @@ JOIN_REMEDY = (
 )
 """Part of error messages: how to join stores so that answers are per design."""
 
-_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
+_STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 
 SPECS_ATTRIBUTE = "specs"
 """Attribute of a join of studies: JSON of specs and variable names, by study id."""
@@ -50,7 +50,7 @@ def marker_name(study_ids: Iterable[str]) -> str:
 
 def marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
     """Return the names of a dataset's marker coordinates, as defined by :func:`marker_name`."""
-    return [name for name in map(str, dataset.coords) if _MARKER_PATTERN.fullmatch(name)]
+    return [name for name in map(str, dataset.coords) if _STUDY_MARKER_PATTERN.fullmatch(name)]
 
 
 def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
@@ -189,7 +189,7 @@ def to_si(coord: xr.DataArray) -> xr.DataArray:
         )
     if not isinstance(rule, NumericRule) or not units:
         return coord
-    unit = rule.read_exact(f"1 {units}")[1]
+    unit = rule.read_exact_number(f"1 {units}")[1]
     if unit.is_logarithmic:
         return float(unit.factor) * 10 ** (coord / 10)
     return coord * float(unit.factor) + float(unit.offset)

@@ -19,7 +19,7 @@ from sweep.analysis import labels
 from sweep.analysis.scene_results.point_export import resolve_recording
 from sweep.analysis.scene_results.recordings import INTERPOLATED, Recording, array_name
 from sweep.analysis.study_figures import SceneResults
-from sweep.messages import STORE_PLACEHOLDER, suggestion
+from sweep.messages import STORE_PLACEHOLDER, suggested_call
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.spec import Mistake, SpecError
 from sweep.spec.scene_sections import Interface
@@ -104,7 +104,9 @@ def reports(
         mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
     recording, _ = resolve_recording(results, scanner, draw, ranges, where or {}, mistakes)
     shot_columns = _read_shots(recording, draw, ranges)
-    report_columns = make_reports(shot_columns, results.spec.interface_with(interface or {}))
+    report_columns = make_reports(
+        shot_columns, results.spec.interface_with_overrides(interface or {})
+    )
     if file is not None:
         with write_path_atomically(Path(file), replace=True) as draft_path:
             headers = {
@@ -137,7 +139,7 @@ def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
         column_parts.append(column_arrays)
     if not any(column_part["time"].size for column_part in column_parts):
         problem = f"holds no shot of {recording.scanner} and draw {draw} yet"
-        remedy = f"{suggestion('resume', STORE_PLACEHOLDER)} goes on with it"
+        remedy = f"{suggested_call('resume', STORE_PLACEHOLDER)} goes on with it"
         raise SpecError([Mistake("store", problem, "", remedy)])
     return {
         name: np.concatenate([column_part[name] for column_part in column_parts])

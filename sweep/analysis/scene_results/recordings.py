@@ -437,7 +437,7 @@ def _match_axis_values(
         for axis_parameter in axis.parameters:
             if name == axis_parameter.coordinate:
                 coordinate_values: list[object] = [
-                    spec.read_coordinate(name, value) for value in wanted_values
+                    spec.read_coordinate_value(name, value) for value in wanted_values
                 ]
                 value_texts = [
                     labels.format_quantity(value, axis_parameter.units)

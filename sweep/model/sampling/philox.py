@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from sweep.kernel_cache import high_word, njit
+from sweep.kernel_cache import multiply_high, njit
 
 # Streams, one per physical cause; causes that act in each segment have three: up, Doppler, down.
 # Every stored draw depends on these numbers: add numbers, never change any.
@@ -84,7 +84,7 @@ def four_words(key0, key1, draw, stream, block):
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
     for _ in range(10):
         x0, x1, x2, x3 = (
-            high_word(_M1, x2) ^ x1 ^ k0, _M1 * x2, high_word(_M0, x0) ^ x3 ^ k1, _M0 * x0,
+            multiply_high(_M1, x2) ^ x1 ^ k0, _M1 * x2, multiply_high(_M0, x0) ^ x3 ^ k1, _M0 * x0,
         )  # fmt: skip
         k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
     return x0, x1, x2, x3

@@ -19,7 +19,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
-from sweep.messages import EXIT_INCOMPLETE, STORE_PLACEHOLDER, is_run_as_command, suggestion
+from sweep.messages import EXIT_INCOMPLETE, STORE_PLACEHOLDER, is_run_as_command, suggested_call
 from sweep.tasks.engine.progress import Progress
 
 #: Signals that end a run after its running blocks; a second one ends it at once.
@@ -216,7 +216,7 @@ class InterruptHandler:
             self._listener.end()
             self._listener.say(
                 "stopped at once, while compiled code ran: what was committed stays, and "
-                f"{suggestion('resume', STORE_PLACEHOLDER)} goes on"
+                f"{suggested_call('resume', STORE_PLACEHOLDER)} goes on"
             )
             for stream in (sys.stdout, sys.stderr):
                 with suppress(Exception):

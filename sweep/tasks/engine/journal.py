@@ -41,8 +41,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.messages import SPEC_PLACEHOLDER, escape_to_one_line, suggestion
-from sweep.regular_files import RefusedFileError, open_regular
+from sweep.messages import SPEC_PLACEHOLDER, escape_to_one_line, suggested_call
+from sweep.regular_files import RefusedFileError, open_regular_file
 from sweep.safe_json import parse_json
 from sweep.storage.locations import (
     CONCURRENT_REQUESTS_MAX,
@@ -238,7 +238,7 @@ def refuse_damaged_recipe(store_path: Location) -> None:
     if any(record is None for _, record in iter_lines_and_records(recipe_path)):
         raise StoreError(
             f"{recipe_path} is damaged, and with it where the files of the study are: "
-            f"{suggestion('resume', store_path, spec=SPEC_PLACEHOLDER)} puts it down anew"
+            f"{suggested_call('resume', store_path, spec=SPEC_PLACEHOLDER)} puts it down anew"
         )
 
 
@@ -638,7 +638,7 @@ class _FileLock:
     def heartbeat_version(self) -> object:
         """Return a value that changes with every heartbeat; None if the lock is free."""
         try:
-            descriptor = open_regular(
+            descriptor = open_regular_file(
                 self._lock_path, follow_links=False
             )  # opening makes a file server return the current status
         except FileNotFoundError:
@@ -756,7 +756,7 @@ class _FileLock:
 def _read_lock_file(lock_path: Path) -> str | None:
     """Return the text of a lock file; None if it is missing."""
     try:
-        descriptor = open_regular(lock_path, follow_links=False)
+        descriptor = open_regular_file(lock_path, follow_links=False)
     except FileNotFoundError:
         return None
     with open(descriptor, "rb") as file:
@@ -963,7 +963,8 @@ class StoreLock:
         )
         return BusyError(
             f"{self._store_path} is being written by {holder_text}: "
-            f"wait for it, or stop it; {suggestion('status', self._store_path)} shows how far it is"
+            f"wait for it, or stop it; {suggested_call('status', self._store_path)} shows how far "
+            "it is"
         )
 
     def _send_heartbeats(self) -> None:

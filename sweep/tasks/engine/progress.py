@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from sweep.messages import PrintableError, counted, escape_unprintable
+from sweep.messages import EscapedTextError, counted, escape_unprintable
 from sweep.regular_files import RefusedFileError
 from sweep.storage.store_format import StoreError as StoreError
 from sweep.tasks.engine.text_streams import PatientStream, is_terminal
@@ -33,7 +33,7 @@ ACTIVITY_SHOWN_AFTER_SECONDS = 2.0
 _logger = logging.getLogger("sweep")
 
 
-class TaskError(PrintableError):
+class TaskError(EscapedTextError):
     """Error of a study that can't be run as requested; the message has reason and remedy."""
 
 

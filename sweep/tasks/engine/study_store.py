@@ -28,7 +28,7 @@ import zarr
 from numcodecs.zstd import Zstd
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from sweep.messages import option_name, option_text, suggestion
+from sweep.messages import option_name, option_text, suggested_call
 from sweep.regular_files import RefusedFileError
 from sweep.storage import locations, store_format
 from sweep.storage.foreign_files import is_ignorable_file, list_foreign_files
@@ -520,7 +520,7 @@ def refuse_damaged_template(store_path: Location) -> None:
         )
         raise StoreError(
             f"{store_path} is not as it was made:\n{problem_lines}\n"
-            f"{suggestion('verify', store_path, repair=True)} puts back what was there."
+            f"{suggested_call('verify', store_path, repair=True)} puts back what was there."
         )
 
 

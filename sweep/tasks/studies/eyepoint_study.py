@@ -209,7 +209,7 @@ class EyepointStudy(BlockStudy):
         return observe_eyepoints(
             shot_numbers,
             caster=world.caster,
-            body_motions=world.body_flights,
+            body_motions=world.body_motions,
             **self._observation_arguments,
         )
 
@@ -293,7 +293,7 @@ def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
     from sweep.model.geometry.ray_casting import Pose
 
     states = [
-        None if body is None else body.state(np.atleast_1d(time)) for body in world.body_flights
+        None if body is None else body.state(np.atleast_1d(time)) for body in world.body_motions
     ]
     return [None if state is None else Pose(state.position, state.attitude) for state in states]
 
@@ -338,7 +338,7 @@ def terrain_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
     x, y = _map_nodes(low - margin, high + margin)
     mesh_tops = [
         float(mesh.vertices[:, 2].max() + mesh.origin[2])
-        for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True)
+        for mesh, body in zip(world.caster.meshes, world.body_motions, strict=True)
         if body is None
     ]
     view_height = max(max(mesh_tops, default=0.0), positions[:, 2].max()) + MAP_VIEWPOINT_CLEARANCE

@@ -146,7 +146,7 @@ def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
 def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
     """Return corners (n, 3) [m] of boxes that contain all bodies, moving ones at all times."""
     corners = []
-    for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True):
+    for mesh, body in zip(world.caster.meshes, world.body_motions, strict=True):
         box = _bounding_box(mesh.vertices) + mesh.origin
         if body is not None:
             radius = np.sqrt((np.abs(box).max(axis=0) ** 2).sum())

@@ -29,7 +29,7 @@ from sweep.model.outputs import (
     SHOT_VARIABLES,
 )
 from sweep.spec.rules import Mistake, SpecError
-from sweep.spec.scene_sections import scene_projection
+from sweep.spec.scene_sections import scene_projection_wkt
 from sweep.storage.locations import Location, eyepoint_store_location
 from sweep.storage.store_format import TERRAIN_MAP_GROUP
 from sweep.storage.verified_store import open_verified_group
@@ -256,7 +256,7 @@ class FlightStudy(ExtendableStudy):
             "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
             "origin": np.asarray(build_world(self.spec).origin, float).tolist(),
-            "projection": scene_projection(self.spec.scene, self.spec.files),
+            "projection": scene_projection_wkt(self.spec.scene, self.spec.files),
             "time_origin": f"{self.spec.files.time_origin.normalize():f}",
         }
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
-from sweep.messages import counted, suggestion
+from sweep.messages import counted, suggested_call
 from sweep.storage import store_format
 from sweep.storage.foreign_files import list_foreign_files
 from sweep.storage.locations import (
@@ -157,8 +157,8 @@ def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> 
         return study_loading.make_study(spec, store_path)
     if spec and attributes["study_id"] != spec.id:
         raise StoreError(
-            f"{store_path} holds another study than the spec: {suggestion('status', store_path)} "
-            "names it"
+            f"{store_path} holds another study than the spec: "
+            f"{suggested_call('status', store_path)} names it"
         )
     if (
         attributes["kind"] == study_loading.ACCURACY_STORE_KIND

@@ -22,12 +22,12 @@ from sweep.messages import (
     option_name,
     option_text,
     shell_command,
-    suggestion,
+    suggested_call,
 )
 from sweep.model import VERSION
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import GridSpec, SceneSpec, SpecError, describe_differences, from_stored
-from sweep.spec.grid_checks import is_detector_or_estimator
+from sweep.spec.grid_checks import is_detector_or_estimator_parameter
 from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.storage import store_format
@@ -322,7 +322,7 @@ def parameters_ignored_in_matching(source_spec: AnySpec, target_spec: AnySpec) -
     method_paths = [
         path
         for path in target_spec.parameters()
-        if is_detector_or_estimator(path) and not draws_spectra
+        if is_detector_or_estimator_parameter(path) and not draws_spectra
     ]
     has_fixed_tolerances = (
         _fixed_tolerance(source_spec) is not None and _fixed_tolerance(target_spec) is not None
@@ -407,7 +407,7 @@ def refuse_not_larger_study(
             f"{source_path} can't be extended to this study: a flight over a scene and a study "
             "over a "
             "grid have nothing in common. Run it into a store of its own: "
-            f"{suggestion('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
+            f"{suggested_call('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
         )
     obstacles = extension_obstacles(source_spec, target_spec)
     if obstacles:
@@ -418,7 +418,7 @@ def refuse_not_larger_study(
             f"for):\n{listed}\n"
             f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
             "accuracy.tolerance. Any other study needs a store of its own: "
-            f"{suggestion('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
+            f"{suggested_call('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
         )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from sweep.messages import is_run_as_command
 from sweep.spec import SceneSpec
 from sweep.spec.grid_checks import describe_narrow_beam
-from sweep.spec.noise_alarms import iter_alarm_warnings
+from sweep.spec.noise_alarms import iter_false_alarm_warnings
 from sweep.tasks.studies.echo_warnings import echo_warnings
 from sweep.tasks.studies.eyepoint_study import below_surface_warning, build_world
 from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits, sample_coverage
@@ -47,7 +47,7 @@ def iter_spec_warnings(spec: GridSpec | SceneSpec) -> Iterator[str]:
             yield path_warning
         refuse_flight_without_hits(spec)
         yield from sample_coverage(spec).warnings()
-    yield from iter_alarm_warnings(spec)
+    yield from iter_false_alarm_warnings(spec)
 
 
 def iter_result_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
