@@ -199,14 +199,14 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
 
 
 def test_boulders_beside_the_ground_are_refused():
-    from sweep.scenes.terrain import square_bounds
+    from sweep.scenes.terrain import clipped_square_bounds
     from sweep.spec.fields import SpecFiles
     from sweep.spec.ground_sections import PlaneGround
 
     ground = PlaneGround(kind="plane", size="100 m", reflectance=0.1).build_terrain(SpecFiles("."))
-    assert square_bounds(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
+    assert clipped_square_bounds(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
     with pytest.raises(ValueError, match="there is no ground within 10 m"):
-        square_bounds(ground, centre=(90.0, 0.0), size=20.0)
+        clipped_square_bounds(ground, centre=(90.0, 0.0), size=20.0)
 
 
 def test_a_ground_is_not_blurred_by_more_than_its_own_size():
