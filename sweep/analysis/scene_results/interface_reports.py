@@ -225,7 +225,7 @@ def quantise_and_clip(
     ``quantisation_step`` and the limits ``low`` and ``high`` are optional (None). Limits are
     rounded to the nearest step, so that a value within them changes by at most half a step.
 
-    >>> values, beyond = quantise(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
+    >>> values, beyond = quantise_and_clip(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
     >>> values.tolist(), beyond.tolist()
     ([0.5, 2.5, 4.0], [False, False, True])
     """
