@@ -105,7 +105,7 @@ class MeasuredSetting:
     The tolerance does not limit it, because it jumps where a bin reaches the threshold.
     """
     error_quantile: float
-    """Fraction of the points by which `largest_error` is defined; 1 without draws."""
+    """Quantile of pd's errors over the points that counts as `largest_error`; 1 without draws."""
 
     @property
     def fastest_round_seconds(self) -> float:

@@ -326,7 +326,7 @@ class AxisAlignedView:
         return self.inches_per_unit * np.array(self.plot_coordinates(positions))
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw the ground: relief and contours from above, or its lowest to highest heights.
+        """Draw the ground: from above as relief with contours, from the side as an area.
 
         Return True if the legend needs an entry for the ground.
         """

@@ -193,7 +193,7 @@ def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
 
 
 LAS_COORDINATE_STEP_MIN = 1e-4
-"""Least quantisation step of coordinates in a LAS file [m]; a cloud of large extent needs more."""
+"""Least quantisation step of coordinates in a LAS file [m]; a large cloud needs a larger step."""
 
 LAS_COORDINATE_STEPS_MAX = 2.0**31 - 1
 """Largest distance of a coordinate from the file's offset in a LAS file [quantisation steps]."""
