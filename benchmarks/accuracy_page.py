@@ -176,9 +176,14 @@ def study_section(name: str, study: MeasuredStudy, time_limit: float) -> str:
         "\n".join(
             f"- {sentence}" for sentence in accuracy_results.conclusion_sentences(dataset, settings)
         ),
-        markdown_table(accuracy_results.CHEAPEST_COLUMNS, accuracy_results.cheapest_rows(settings)),
+        markdown_table(
+            accuracy_results.CHEAPEST_SETTING_COLUMNS,
+            accuracy_results.cheapest_setting_rows(settings),
+        ),
         "All settings; `front`: none is both as fast and as accurate.",
-        markdown_table(accuracy_results.SETTING_COLUMNS, accuracy_results.setting_rows(settings)),
+        markdown_table(
+            accuracy_results.SETTING_TABLE_COLUMNS, accuracy_results.setting_table_rows(settings)
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 

@@ -41,7 +41,7 @@ def source(picture: Picture) -> str:
     """Return what a picture says of its source if it is drawn now."""
     spec = sweep.load(EXPERIMENTS / f"{picture.experiment}.yaml")
     (figure,) = (figure for figure in spec.figures if figure.file_stem == picture.figure)
-    return study_figures.picture_source(spec.id, figure)
+    return study_figures.picture_source_text(spec.id, figure)
 
 
 def is_current(picture: Picture) -> bool:

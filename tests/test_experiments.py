@@ -7,7 +7,7 @@ import pytest
 from figure_files import has_content
 
 import sweep
-from sweep.analysis.selection import matches_any
+from sweep.analysis.selection import matches_any_value
 from sweep.analysis.study_figures import draw_figures
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
@@ -50,7 +50,7 @@ def _held(spec, axis):
                if axis.name in getattr(figure, "where", {})]  # fmt: skip
     held = [spec.read_coordinate_value(axis.name, value) for several in written
             for value in (several if isinstance(several, list | tuple) else [several])]  # fmt: skip
-    return np.flatnonzero(matches_any(np.asarray(axis.parameters[0].display_values), held))
+    return np.flatnonzero(matches_any_value(np.asarray(axis.parameters[0].display_values), held))
 
 
 def _kept(spec, axis):

@@ -1,4 +1,4 @@
-"""Results of `sweep accuracy`: comparison of settings by time and error, in tables and a figure.
+"""Results of `sweep accuracy`: time and error of the settings of accuracy, in tables and a figure.
 
 The thesis's way is the method of [T], the thesis that :mod:`sweep.model` names; docs/accuracy.md
 describes it.
@@ -25,11 +25,11 @@ from sweep.storage.locations import Location, derived_files_dir
 from sweep.storage.store_format import OPEN_ZARR_KWARGS
 from sweep.storage.verified_store import open_verified_store
 
-#: Errors for which the table shows the cheapest setting.
 TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+"""Errors for each of which a table shows the fastest setting that is as accurate."""
 
 NEGLIGIBLE_ERROR = 1e-9
-"""Error below which settings count as equally accurate: the error of the reference itself."""
+"""Error below which settings count as equally accurate, because the reference has such errors."""
 
 AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
     "as written",
@@ -37,13 +37,20 @@ AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
     "thesis",
     "reference",
 )
+"""Kinds of settings: the spec as written, adaptive, the thesis's way, and the reference."""
 CLOSED_FORM_KIND, IMPROVED_THESIS_KIND = "closed form", "thesis improved"
+"""Kinds of settings: the thesis's effects in closed form, and the thesis's way, improved."""
 BEAMLETS_KIND, LINE_PATTERN_KIND = "beamlets", "in a line"
+"""Kinds of settings with a fixed number of beamlets, in a lattice or in a line."""
 MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
     "means of draws",
     "draws counted",
     "draws in noise",
 )
+"""Kinds of settings with a fixed number of draws.
+
+They average pd over draws, count detections, or count detections with noise in every bin.
+"""
 FIXED_KINDS = (
     "fixed effects",
     BEAMLETS_KIND,
@@ -56,19 +63,19 @@ FIXED_KINDS = (
 )
 """Kinds of settings that are the same at every point of a study."""
 
-FIXED_SPEEDUP_MIN, THESIS_SPEEDUP_MIN = 1 / 1.1, 5.0
-"""Required speed-up of adaptive settings over the best fixed setting, and over the thesis's way."""
+REQUIRED_SPEEDUP_OVER_FIXED, REQUIRED_SPEEDUP_OVER_THESIS = 1 / 1.1, 5.0
+"""Required time of the best fixed setting, and of the thesis's way, over that of adaptive ones."""
 
 THESIS_BEAMLETS = 109
-"""Number of beamlets in the thesis."""
+"""Number of beamlets that the thesis simulates."""
 
 MEDIAN_ROUNDS_MIN = 3
-"""Least number of rounds for a median that one slow round does not change."""
+"""Least number of rounds of measurement from which speed-ups are medians over the rounds."""
 
 RANDOM_ERROR_QUANTILE = 0.95
-"""Quantile of the errors over the points that counts as the error of a setting with draws.
+"""Fraction of the points whose errors are no larger than the error of a setting with draws.
 
-Without draws the largest error counts.
+Without draws the error of a setting is the largest one.
 """
 
 
@@ -77,50 +84,66 @@ class MeasuredSetting:
     """Measured times and errors of one accuracy setting, relative to the reference setting."""
 
     name: str
+    """Name of the setting."""
     kind: str
+    """Kind of the setting, one of those above."""
     tolerance: float
-    seconds_by_round: np.ndarray  # time per point [s], (rounds,)
-    planning_seconds: float  # planning time per point in the best round [s]
-    pd_error: np.ndarray  # largest error of pd at each point, (points,)
-    log10_pfa_error: float  # largest over the points; nan if there is none
-    magnitude_error: float  # largest relative error of |X| over the points; nan if there is none
-    # Largest over the points; nan if there is none. It is not covered by the tolerance, because it
-    # jumps if a bin reaches the threshold.
+    """Tolerance of an adaptive setting."""
+    seconds_by_round: np.ndarray
+    """Time per point in each round of measurement (rounds,) [s]."""
+    planning_seconds: float
+    """Time per point for planning, in the fastest round [s]."""
+    pd_error: np.ndarray
+    """Largest error of pd at each point (points,)."""
+    log10_pfa_error: float
+    """Largest error of log10 pfa at any point; nan if there is none."""
+    magnitude_error: float
+    """Largest relative error of |X| at any point; nan if there is none."""
     leakage_error: float
-    error_quantile: float  # quantile over the points that is :attr:`largest_error`
+    """Largest error of a leakage probability at any point; nan if there is none.
+
+    The tolerance does not limit it, because it jumps where a bin reaches the threshold.
+    """
+    error_quantile: float
+    """Quantile of pd's errors over the points that counts as `largest_error`; 1 without draws."""
 
     @property
-    def best_seconds(self) -> float:
-        """Time per point in the fastest round [s]."""
+    def fastest_round_seconds(self) -> float:
+        """Time per point in the fastest round of measurement [s]."""
         return float(np.min(self.seconds_by_round))
 
     @property
     def largest_error(self) -> float:
-        """Largest error covered by the tolerance; a quantile of pd's errors if they are random."""
+        """Largest error that the tolerance limits: of pd, log10 pfa or magnitude.
+
+        With draws it is a quantile of pd's errors over the points.
+        """
         if self.error_quantile < 1.0:
             return self.pd_error_quantile(self.error_quantile)
         promised_errors = self.pd_error_quantile(1.0), self.log10_pfa_error, self.magnitude_error
         return float(np.fmax.reduce(promised_errors))
 
     @property
-    def is_complete(self) -> bool:
-        """False if the setting is the closed form, and its missing leakage is its largest error."""
+    def covers_leakage_error(self) -> bool:
+        """False for a closed form whose missing leakage is larger than its other errors."""
         return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
             self.largest_error, NEGLIGIBLE_ERROR
         )
 
     def pd_error_quantile(self, fraction: float) -> float:
-        """Return a quantile of pd's errors over the points."""
+        """Return a quantile of pd's errors over the points; `fraction` is 0..1."""
         return float(np.nanquantile(self.pd_error, fraction))
 
     def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
-        """Return the time of another setting over that of this one: the median over the rounds.
+        """Return the time of another setting over the time of this one.
 
-        If there are few rounds, the ratio of the fastest rounds is returned. ``extra_seconds``:
-        time per point that is added to both [s].
+        It is the median of the rounds of measurement, or the ratio of the fastest rounds if there
+        are few. ``extra_seconds`` is a time per point that is added to both [s].
         """
         if self.seconds_by_round.size < MEDIAN_ROUNDS_MIN:
-            return (other.best_seconds + extra_seconds) / (self.best_seconds + extra_seconds)
+            return (other.fastest_round_seconds + extra_seconds) / (
+                self.fastest_round_seconds + extra_seconds
+            )
         return float(
             np.median(
                 (other.seconds_by_round + extra_seconds) / (self.seconds_by_round + extra_seconds)
@@ -129,7 +152,7 @@ class MeasuredSetting:
 
 
 def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
-    """Return the settings in a store of `sweep accuracy`, in the store's order."""
+    """Return the settings in the dataset of a store of `sweep accuracy`, in their order."""
     array_by_name = {name: array.values for name, array in dataset.variables.items()}
     error_quantile = (
         RANDOM_ERROR_QUANTILE if np.isfinite(array_by_name["standard_error"]).any() else 1.0
@@ -153,20 +176,22 @@ def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
     ]
 
 
-def select_kinds(settings: Iterable[MeasuredSetting], *kinds: str) -> list[MeasuredSetting]:
+def select_settings_of_kinds(
+    settings: Iterable[MeasuredSetting], *kinds: str
+) -> list[MeasuredSetting]:
     """Return the settings of the given kinds."""
     return [setting for setting in settings if setting.kind in kinds]
 
 
-def without_reference(settings: Iterable[MeasuredSetting]) -> list[MeasuredSetting]:
+def drop_reference_setting(settings: Iterable[MeasuredSetting]) -> list[MeasuredSetting]:
     """Return all settings except the reference, which has no error by definition."""
     return [setting for setting in settings if setting.kind != REFERENCE_KIND]
 
 
 def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
-    """Return the settings that no other setting beats in both time and error, fastest first."""
+    """Return the settings for which no other is both faster and more accurate, fastest first."""
     front_settings: list[MeasuredSetting] = []
-    for setting in sorted(settings, key=lambda s: (s.best_seconds, s.largest_error)):
+    for setting in sorted(settings, key=lambda s: (s.fastest_round_seconds, s.largest_error)):
         if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
             front_settings[-1].largest_error, NEGLIGIBLE_ERROR
         ):
@@ -174,60 +199,68 @@ def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
     return front_settings
 
 
-def cheapest_within_error(
+def fastest_setting_within_error(
     settings: Sequence[MeasuredSetting], error_max: float
 ) -> MeasuredSetting | None:
     """Return the fastest setting whose error is at most ``error_max``, or None."""
     error_limit = max(error_max, NEGLIGIBLE_ERROR)
     accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
-    return min(accurate_settings, key=lambda s: s.best_seconds, default=None)
+    return min(accurate_settings, key=lambda s: s.fastest_round_seconds, default=None)
 
 
 class SettingComparison(NamedTuple):
-    """Adaptive setting, and another setting (or None) whose error is no larger than a limit."""
+    """Adaptive setting and another setting of comparable error."""
 
     adaptive: MeasuredSetting
+    """Adaptive setting."""
     other: MeasuredSetting | None
+    """Other setting; None if no other setting is accurate enough."""
 
     def speedup(self, extra_seconds: float = 0.0) -> float:
-        """Return the time of the other setting over that of the adaptive one; inf without another.
+        """Return the time of the other setting over the time of the adaptive one.
 
-        ``extra_seconds``: time per point that is added to both [s].
+        Without another setting it is infinite. ``extra_seconds`` is a time per point that is added
+        to both [s].
         """
         return self.adaptive.speedup_over(self.other, extra_seconds) if self.other else math.inf
 
 
-def compare_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
-    """Compare the fastest adaptive with the fastest fixed setting at each adaptive error."""
-    adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
+def compare_adaptive_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
+    """Compare, for the error of each adaptive setting, the fastest adaptive and fixed settings.
+
+    The errors of both are no larger than that error.
+    """
+    adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     fixed_settings = [
-        setting for setting in select_kinds(settings, *FIXED_KINDS) if setting.is_complete
+        setting
+        for setting in select_settings_of_kinds(settings, *FIXED_KINDS)
+        if setting.covers_leakage_error
     ]
     errors = sorted(
         {max(setting.largest_error, NEGLIGIBLE_ERROR) for setting in adaptive_settings},
         reverse=True,
     )
     cheapest_by_error = (
-        (cheapest_within_error(adaptive_settings, error), error) for error in errors
+        (fastest_setting_within_error(adaptive_settings, error), error) for error in errors
     )
     return [
-        SettingComparison(cheapest_adaptive, cheapest_within_error(fixed_settings, error))
+        SettingComparison(cheapest_adaptive, fastest_setting_within_error(fixed_settings, error))
         for cheapest_adaptive, error in cheapest_by_error
         if cheapest_adaptive is not None
     ]
 
 
-def compare_with_thesis(
+def compare_adaptive_with_thesis(
     settings: Sequence[MeasuredSetting], kind: str = THESIS_KIND
 ) -> list[SettingComparison]:
-    """Compare each form of the thesis's way with the fastest adaptive setting of its error.
+    """Compare each setting of the thesis's way with the fastest equally accurate adaptive setting.
 
-    The error of the adaptive setting is no larger.
+    `kind` is the kind of the thesis's settings.
     """
-    adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
+    adaptive_settings = select_settings_of_kinds(settings, ADAPTIVE_KIND)
     cheapest_by_thesis = (
-        (cheapest_within_error(adaptive_settings, thesis_form.largest_error), thesis_form)
-        for thesis_form in select_kinds(settings, kind)
+        (fastest_setting_within_error(adaptive_settings, thesis_form.largest_error), thesis_form)
+        for thesis_form in select_settings_of_kinds(settings, kind)
     )
     return [
         SettingComparison(cheapest_adaptive, thesis)
@@ -236,28 +269,33 @@ def compare_with_thesis(
     ]
 
 
-SETTING_COLUMNS = ("setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
-           "magnitude", "leakage", "front")  # fmt: skip
-"""Columns of a setting: time, planning time, quantiles of pd's error, and largest other errors."""
+SETTING_TABLE_COLUMNS = (
+    "setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
+    "magnitude", "leakage", "front",
+)  # fmt: skip
+"""Columns of the table of settings: times, quantiles of pd's error, largest other errors, front."""
 
 
-SHORT_SETTING_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
-"""Columns of a setting in the terminal's shorter table."""
+SHORT_SETTING_TABLE_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
+"""Columns of the shorter table of settings in the terminal."""
 
-CHEAPEST_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
-"""Columns of the table of the cheapest setting for each error."""
+CHEAPEST_SETTING_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
+"""Columns of the table of the fastest setting for each tolerance."""
 
-STORING_ATTRIBUTE = "storing_seconds"
-"""Attribute with the time of storing the study [s]; stores of earlier versions lack it."""
+STORING_SECONDS_ATTRIBUTE = "storing_seconds"
+"""Name of the attribute with the time that storing the study takes [s].
+
+Stores of earlier versions lack it.
+"""
 
 
-def setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return a row for each setting, in the columns of `SETTING_COLUMNS`."""
-    front_settings = pareto_front(without_reference(settings))
+def setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return a table row for each setting, in the columns of `SETTING_TABLE_COLUMNS`."""
+    front_settings = pareto_front(drop_reference_setting(settings))
     return [
         [
             s.name,
-            format_microseconds(s.best_seconds),
+            format_microseconds(s.fastest_round_seconds),
             format_microseconds(s.planning_seconds) if s.planning_seconds else "-",
             *(format_error(s.pd_error_quantile(fraction)) for fraction in (0.5, 0.9, 1.0)),
             *map(format_error, (s.log10_pfa_error, s.magnitude_error, s.leakage_error)),
@@ -267,22 +305,25 @@ def setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
     ]
 
 
-def short_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return rows in the columns of `SHORT_SETTING_COLUMNS`; a star marks the Pareto front."""
+def short_setting_table_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return a row for each setting, in the columns of `SHORT_SETTING_TABLE_COLUMNS`.
+
+    A star marks the settings of the Pareto front.
+    """
     return [
         [f"{front_mark or ' '} {name}", f"{time} us", *errors]
-        for name, time, _, _, *errors, front_mark in setting_rows(settings)
+        for name, time, _, _, *errors, front_mark in setting_table_rows(settings)
     ]
 
 
-def cheapest_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
-    """Return the cheapest setting for each tolerance: tolerance, setting, its time, its error."""
+def cheapest_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return a row for each tolerance with the fastest setting, in `CHEAPEST_SETTING_COLUMNS`."""
     table_rows = []
     for tolerance in TABULATED_TOLERANCES:
-        cheapest_setting = cheapest_within_error(without_reference(settings), tolerance)
+        cheapest_setting = fastest_setting_within_error(drop_reference_setting(settings), tolerance)
         cells = cheapest_setting and [
             cheapest_setting.name,
-            format_microseconds(cheapest_setting.best_seconds),
+            format_microseconds(cheapest_setting.fastest_round_seconds),
             format_error(cheapest_setting.largest_error),
         ]
         table_rows.append([f"{tolerance:g}", *(cells or ["none", "", ""])])
@@ -290,10 +331,10 @@ def cheapest_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
 
 
 def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
-    """Return the conclusions from a measurement as sentences."""
+    """Return sentences with the conclusions from a measurement of accuracy."""
     attributes = dataset.attrs
     conclusions = [_as_written_sentence(dataset, settings)]
-    conclusions += _fixed_sentences(compare_with_fixed(settings), attributes)
+    conclusions += _fixed_sentences(compare_adaptive_with_fixed(settings), attributes)
     conclusions += _thesis_sentences(
         settings, attributes["thesis_beamlets"]
     ) + _closed_form_sentences(settings)
@@ -308,10 +349,14 @@ def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting
 
 
 def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> TablePage:
-    """Return the tables and conclusions as a page with the study's title."""
+    """Return a page with the tables and conclusions of a measurement of accuracy."""
     page_tables = [
-        PageTable("Settings", SETTING_COLUMNS, setting_rows(settings)),
-        PageTable("Cheapest setting for each error", CHEAPEST_COLUMNS, cheapest_rows(settings)),
+        PageTable("Settings", SETTING_TABLE_COLUMNS, setting_table_rows(settings)),
+        PageTable(
+            "Cheapest setting for each error",
+            CHEAPEST_SETTING_COLUMNS,
+            cheapest_setting_rows(settings),
+        ),
     ]
     return TablePage(
         f"{dataset.attrs['title']}: accuracy",
@@ -322,17 +367,19 @@ def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> T
 
 
 def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
-    """Return the sentence on time and error of the spec as written, and on a faster setting."""
-    (as_written,) = select_kinds(settings, AS_WRITTEN_KIND)
+    """Return the sentences on the spec as written: its time and error, and a faster setting."""
+    (as_written,) = select_settings_of_kinds(settings, AS_WRITTEN_KIND)
     n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
-    cheapest_setting = cheapest_within_error(without_reference(settings), as_written.largest_error)
+    cheapest_setting = fastest_setting_within_error(
+        drop_reference_setting(settings), as_written.largest_error
+    )
     subject = f"All {n_points:,} {unit} take" if n_points > 1 else "The study takes"
     text = (
-        f"As written: {format_microseconds(as_written.best_seconds)} us a point, error "
+        f"As written: {format_microseconds(as_written.fastest_round_seconds)} us a point, error "
         f"{format_error(as_written.largest_error)}. "
-        f"{subject} {_format_duration(n_points * as_written.best_seconds)} on one core"
+        f"{subject} {_format_duration(n_points * as_written.fastest_round_seconds)} on one core"
     )
-    if (storing_seconds := dataset.attrs.get(STORING_ATTRIBUTE)) is not None:
+    if (storing_seconds := dataset.attrs.get(STORING_SECONDS_ATTRIBUTE)) is not None:
         text += (
             f"; storing them takes at least {_format_duration(storing_seconds)} more with any "
             "setting"
@@ -359,7 +406,7 @@ def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict)
         return ["No fixed setting is as accurate as any adaptive one."]
     verdict_text = (
         "met"
-        if worst_comparison.speedup() >= FIXED_SPEEDUP_MIN
+        if worst_comparison.speedup() >= REQUIRED_SPEEDUP_OVER_FIXED
         else _slowdown_text(worst_comparison, comparisons, attributes)
     )
     speedups = [f"{comparison.speedup():.2g}" for comparison in comparisons if comparison.other]
@@ -376,18 +423,20 @@ def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict)
 def _slowdown_text(
     worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
 ) -> str:
-    """Return how much time the slowest adaptive setting loses, in words.
+    """Return a text on the time that adaptive settings lose where fixed settings are faster.
 
-    The time is also compared with the time of the whole study, including storing.
+    `worst_comparison` is the comparison with the smallest speed-up among `comparisons`.
     """
     n_points = attributes["study_points"]
-    extra_seconds = worst_comparison.adaptive.best_seconds * (1 - worst_comparison.speedup())
+    extra_seconds = worst_comparison.adaptive.fastest_round_seconds * (
+        1 - worst_comparison.speedup()
+    )
     lost_text, planning_text = (
         _format_duration(n_points * point_seconds)
         for point_seconds in (extra_seconds, worst_comparison.adaptive.planning_seconds)
     )
     shortfall_text = f"NOT met, by {lost_text} in all; planning takes {planning_text}"
-    if (storing_seconds := attributes.get(STORING_ATTRIBUTE)) is None:
+    if (storing_seconds := attributes.get(STORING_SECONDS_ATTRIBUTE)) is None:
         return shortfall_text
     speedup_with_store = min(
         comparison.speedup(storing_seconds / n_points) for comparison in comparisons
@@ -396,24 +445,28 @@ def _slowdown_text(
 
 
 def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> list[str]:
-    """Return the sentences that compare adaptive settings with the thesis's way, also improved."""
-    comparisons = compare_with_thesis(settings)
+    """Return the sentences that compare adaptive settings with the thesis's way.
+
+    Improved versions of the thesis's way are compared too. `beamlets` is the study's number of
+    beamlets.
+    """
+    comparisons = compare_adaptive_with_thesis(settings)
     if not comparisons:
         return []
     verdict_text = " and ".join(
-        f"{'met' if comparison.speedup() >= THESIS_SPEEDUP_MIN else 'NOT met'} over "
+        f"{'met' if comparison.speedup() >= REQUIRED_SPEEDUP_OVER_THESIS else 'NOT met'} over "
         f"{comparison.other.name}"
         for comparison in comparisons
         if comparison.other
     )
-    requirement_note = f"Requirement, at least {THESIS_SPEEDUP_MIN:g}: {verdict_text}."
+    requirement_note = f"Requirement, at least {REQUIRED_SPEEDUP_OVER_THESIS:g}: {verdict_text}."
     if beamlets != THESIS_BEAMLETS:
         requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLETS}."
     statements = [
         f"The thesis's way is compared at its own error. {_speedup_sentences(comparisons)} "
         f"{requirement_note}"
     ]
-    if improved_comparisons := compare_with_thesis(settings, IMPROVED_THESIS_KIND):
+    if improved_comparisons := compare_adaptive_with_thesis(settings, IMPROVED_THESIS_KIND):
         statements.append(
             "Improved versions of it are compared likewise. "
             f"{_speedup_sentences(improved_comparisons)}"
@@ -422,7 +475,7 @@ def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> lis
 
 
 def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
-    """Return a sentence with the speed-ups of each adaptive setting and error."""
+    """Return sentences with the speed-ups of comparisons, by adaptive setting and error."""
     speedups_by_case: dict[str, list[str]] = {}
     for comparison in comparisons:
         if comparison.other:
@@ -440,13 +493,13 @@ def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
 def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
     """Return the sentences that compare the closed form with the thesis's way.
 
-    Both have the same beamlets and effects.
+    Beamlets and effects of both are the same.
     """
     described_text, improved_text = (
         "; ".join(
             f"{closed_form_setting.speedup_over(thesis_setting):.2g} over {thesis_setting.name}"
-            for closed_form_setting in select_kinds(settings, CLOSED_FORM_KIND)
-            for thesis_setting in select_kinds(settings, kind)
+            for closed_form_setting in select_settings_of_kinds(settings, CLOSED_FORM_KIND)
+            for thesis_setting in select_settings_of_kinds(settings, kind)
         )
         for kind in (THESIS_KIND, IMPROVED_THESIS_KIND)
     )
@@ -460,7 +513,7 @@ def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
 
 
 def _reference_sentence(attributes: dict) -> str:
-    """Return the sentence on the reference setting, and on its difference from the time domain."""
+    """Return the sentences on the reference setting and its difference from the time domain."""
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
         return text + ". It is not compared with the time domain."
@@ -478,6 +531,7 @@ def _reference_sentence(attributes: dict) -> str:
 
 
 def _format_duration(seconds: float) -> str:
+    """Return a duration [s] as text in seconds, minutes or hours."""
     if seconds < 100:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:,.0f} min" if seconds < 6000 else f"{seconds / 3600:,.0f} h"
@@ -507,10 +561,10 @@ NUMBERED_KINDS = (
     COUNTED_DRAWS_KIND,
     DRAWS_IN_NOISE_KIND,
 )
-"""Kinds whose settings have names that begin with their number of beamlets or draws."""
+"""Kinds whose settings have names that begin with a number of beamlets or draws."""
 
 CONNECTED_KINDS = (ADAPTIVE_KIND, *NUMBERED_KINDS)
-"""Kinds whose settings differ only in resolution, so that a line connects their marks."""
+"""Kinds whose settings differ only in tolerance or number; a line connects their marks."""
 
 MARK_BY_KIND = {
     ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
@@ -526,15 +580,15 @@ MARK_BY_KIND = {
     IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
     AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
 }
-"""Marker, colour and legend text of each kind."""
+"""Marker, colour and legend text of each kind of setting."""
 
 
 def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
-    """Return the figure of a store of `sweep accuracy`: error over time of all settings."""
-    plotted_settings = without_reference(settings)
+    """Return the sheet of a measurement of accuracy: errors of all settings over their times."""
+    plotted_settings = drop_reference_setting(settings)
     sheet, (axes,) = canvas.sheet_with_axes(10.0, 6.2, 1, 1)
     axes.step(
-        *zip(*map(_plot_position, pareto_front(plotted_settings)), strict=True),
+        *zip(*map(_setting_plot_position, pareto_front(plotted_settings)), strict=True),
         where="post",
         color="0.35",
         linewidth=1.2,
@@ -543,38 +597,40 @@ def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]
         label="Pareto front of time and error",
     )
     for kind, (marker, colour, label) in MARK_BY_KIND.items():
-        kind_settings = select_kinds(plotted_settings, kind)
+        kind_settings = select_settings_of_kinds(plotted_settings, kind)
         for i, setting in enumerate(kind_settings):
-            _draw_mark(axes, setting, marker, colour, label if i == 0 else "")
+            _draw_setting_mark(axes, setting, marker, colour, label if i == 0 else "")
         if kind in CONNECTED_KINDS and kind_settings:
-            polyline = zip(*map(_plot_position, kind_settings), strict=True)
+            polyline = zip(*map(_setting_plot_position, kind_settings), strict=True)
             axes.plot(*polyline, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
             kind_settings = kind_settings[:1] + kind_settings[1:][-1:]
         for setting in kind_settings:
             axes.annotate(
-                _short_name(setting),
-                _plot_position(setting),
+                _short_setting_name(setting),
+                _setting_plot_position(setting),
                 xytext=(6, 5),
                 textcoords="offset points",
                 fontsize=7.5,
                 color=colour,
             )
-    _set_axes(
+    _set_time_and_error_axes(
         axes,
         min(setting.pd_error_quantile(0.5) for setting in plotted_settings),
         max(s.largest_error for s in plotted_settings),
     )
     canvas.set_title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
-    canvas.set_caption(sheet, _sheet_note(dataset, plotted_settings))
+    canvas.set_caption(sheet, _sheet_caption(dataset, plotted_settings))
     return sheet
 
 
-def _draw_mark(axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str) -> None:
-    """Draw a setting: a mark at its largest error, and quantiles of pd's errors.
+def _draw_setting_mark(
+    axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str
+) -> None:
+    """Draw a setting: a mark at its largest error, and quantiles of pd's errors below it.
 
-    A bar leads down to the 90 % quantile, and a dot is at the median.
+    A bar reaches down to the 90 % quantile, and a dot marks the median.
     """
-    time, largest_error = _plot_position(setting)
+    time, largest_error = _setting_plot_position(setting)
     error_90, error_median = (
         max(setting.pd_error_quantile(fraction), NEGLIGIBLE_ERROR) for fraction in (0.9, 0.5)
     )
@@ -597,12 +653,12 @@ def _draw_mark(axes: Axes, setting: MeasuredSetting, marker: str, colour: str, l
     )  # fmt: skip
 
 
-def _plot_position(setting: MeasuredSetting) -> tuple[float, float]:
+def _setting_plot_position(setting: MeasuredSetting) -> tuple[float, float]:
     """Return the time [us] and the error at which a setting is drawn."""
-    return 1e6 * setting.best_seconds, max(setting.largest_error, NEGLIGIBLE_ERROR)
+    return 1e6 * setting.fastest_round_seconds, max(setting.largest_error, NEGLIGIBLE_ERROR)
 
 
-def _short_name(setting: MeasuredSetting) -> str:
+def _short_setting_name(setting: MeasuredSetting) -> str:
     """Return a short name that distinguishes a setting within its kind."""
     if setting.kind == ADAPTIVE_KIND:
         return f"{setting.tolerance:.0e}".replace("e-0", "e-")
@@ -613,7 +669,7 @@ def _short_name(setting: MeasuredSetting) -> str:
     return ""
 
 
-def _set_axes(axes: Axes, error_min: float, error_max: float) -> None:
+def _set_time_and_error_axes(axes: Axes, error_min: float, error_max: float) -> None:
     """Set logarithmic axes of time and error, with limits, labels and legend."""
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -630,8 +686,8 @@ def _set_axes(axes: Axes, error_min: float, error_max: float) -> None:
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
-    """Return the caption that explains the marks, the reference and the study."""
+def _sheet_caption(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+    """Return the caption of the figure: the marks, the reference and the study."""
     attributes = dataset.attrs
     error_quantile = settings[0].error_quantile
     mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
@@ -654,7 +710,7 @@ def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str
 
 
 def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetting]]:
-    """Load a store of `sweep accuracy`: its dataset and its settings.
+    """Load a store of `sweep accuracy`; return its dataset and its settings.
 
     Raise NotAStoreError if the store is of another kind.
     """
@@ -667,7 +723,11 @@ def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetti
 def write_sheet_and_tables(
     store: Location, directory: Path | None = None, picture_format: str = "png"
 ) -> list[Path]:
-    """Write the figure as NAME.png (or pdf, svg) and the tables as NAME.txt; return both paths."""
+    """Write the figure and the tables of a store NAME.zarr of `sweep accuracy`.
+
+    The files are NAME.png (or pdf, svg) and NAME.txt in the directory, or next to the store. Their
+    paths are returned.
+    """
     dataset, settings = open_accuracy_store(store)
     stem = store.name.removesuffix(".zarr")
     folder = derived_files_dir(store) if directory is None else directory

@@ -1,4 +1,7 @@
-"""Figures with matplotlib: sheets, the common style, charts drawn on sheets, and picture files."""
+"""Figures with matplotlib: sheets, the common style, charts drawn on sheets, and picture files.
+
+A sheet is a matplotlib figure, which may have several panels.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,8 @@ from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import labels
 from sweep.analysis.charts import (
-    CATEGORY,
-    LOG,
+    CATEGORY_SCALE,
+    LOG_SCALE,
     Chart,
     ChartAxis,
     ChartLine,
@@ -29,11 +32,12 @@ from sweep.analysis.charts import (
     Panel,
 )
 
-DPI = 150
+PNG_DPI = 150
 """Resolution of PNG files [dots per inch]."""
 
 COLOUR_MAP_NAME = "viridis"
-MISSING_COLOUR = "0.75"
+"""Name of matplotlib's colour map for all continuous quantities."""
+MISSING_VALUE_COLOUR = "0.75"
 """Grey of missing values: nan, or a point that is not computed yet."""
 
 LINE_COLOURS = (
@@ -46,7 +50,7 @@ LINE_COLOURS = (
     "#000000",
     "#785A2D",
 )
-"""Line colours: those of Okabe and Ito (2008), and a brown that red-blind readers distinguish."""
+"""Colours of lines by Okabe and Ito (2008), and a brown that red-blind readers distinguish."""
 
 DASH_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 """Dash styles of lines, in matplotlib's notation."""
@@ -58,7 +62,7 @@ PICTURE_FORMATS = ("png", "pdf", "svg")
 VECTOR_FORMAT_DPI = 300
 """Resolution [dpi] of the rasterised parts of PDF and SVG: surfaces and large point clouds."""
 
-RC_PARAMS: dict[Any, Any] = {
+MATPLOTLIB_RC_PARAMS: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # part of matplotlib, so the same on every machine
     "grid.color": "0.9",
     "grid.linewidth": 0.6,
@@ -71,30 +75,31 @@ RC_PARAMS: dict[Any, Any] = {
 """Settings of matplotlib for all pictures."""
 
 PNG_SOURCE_FIELD = "Source"
-"""PNG metadata field that names the source of the picture."""
+"""Name of the PNG metadata field with the source of the picture."""
 
 _SOURCE_FIELD_BY_FORMAT = {"png": PNG_SOURCE_FIELD, "pdf": "Subject", "svg": "Description"}
+"""Names of the metadata fields with the source of the picture, by file format."""
 
-_OMITTED_METADATA: dict[str, dict[str, str | None]] = {
+_OMITTED_METADATA_BY_FORMAT: dict[str, dict[str, str | None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
 }
-"""Metadata fields left out because they differ between runs or machines."""
+"""Metadata fields that pictures lack, because they differ between runs or machines, by format."""
 
 
 @contextmanager
 def uniform_style() -> Iterator[None]:
-    """Apply the common style of all pictures, whatever the user's matplotlib settings are."""
+    """Context manager: apply the common style of all pictures in place of the user's settings."""
     with rc_context():
         rcdefaults()
-        rcParams.update(RC_PARAMS)
+        rcParams.update(MATPLOTLIB_RC_PARAMS)
         yield
 
 
 def blank_sheet(width: float, height: float) -> Sheet:
     """Return an empty sheet of the given width and height [inches]."""
-    new_sheet = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
+    new_sheet = Sheet(figsize=(width, height), dpi=PNG_DPI, layout="constrained")
     FigureCanvasAgg(new_sheet)
     return new_sheet
 
@@ -137,23 +142,23 @@ def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> P
     """
     file_path.parent.mkdir(parents=True, exist_ok=True)
     picture_format = file_path.suffix.removeprefix(".")
-    dpi = DPI if picture_format == "png" else VECTOR_FORMAT_DPI
+    dpi = PNG_DPI if picture_format == "png" else VECTOR_FORMAT_DPI
     with uniform_style():
-        metadata = _OMITTED_METADATA[picture_format] | (
+        metadata = _OMITTED_METADATA_BY_FORMAT[picture_format] | (
             {_SOURCE_FIELD_BY_FORMAT[picture_format]: source} if source else {}
         )
         finished_sheet.savefig(file_path, format=picture_format, dpi=dpi, metadata=metadata)
     return file_path
 
 
-LINES_TOGETHER_MAX = 4
-"""Largest number of lines in one panel; above it each line has a panel."""
+LINES_PER_SHARED_PANEL_MAX = 4
+"""Largest number of lines that share a panel; if there are more, each line has a panel."""
 
 MARKED_POINTS_MAX = 40
 """Largest number of points of a line at which every point has a marker."""
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-"""Markers of points on lines, by style index."""
+LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+"""Markers of the points of lines, by style index."""
 
 MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INCHES = (
     (9.5, 4.4),
@@ -161,24 +166,23 @@ MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INC
     (10.0, 1.75),
     (4.3, 3.0),
 )
-"""Width of a row of panels and height of a panel [inches].
-
-For SMALL_PANEL_INCHES, used with several panels in a row, the width is that of one panel.
-"""
+"""Widths and heights of panels [inches]: of heat maps, of lines, of a single line, and in rows."""
 
 
 def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
-    """Return a sheet with a chart, a heading above it, and its caption with a footnote below."""
+    """Draw a chart on a new sheet, with a heading, and a footnote at the end of its caption."""
     drawn_sheet = (
-        _draw_maps(chart, chart.colour_scale) if chart.colour_scale else _draw_lines(chart)
+        _draw_map_panels(chart, chart.colour_scale)
+        if chart.colour_scale
+        else _draw_line_panels(chart)
     )
     set_title(drawn_sheet, heading)
     set_caption(drawn_sheet, labels.join_sentences([*chart.caption, footnote]))
     return drawn_sheet
 
 
-def _draw_maps(chart: Chart, colour_scale: ColourScale) -> Sheet:
-    """Draw the maps of a chart in one column, or in two columns if it has several parts."""
+def _draw_map_panels(chart: Chart, colour_scale: ColourScale) -> Sheet:
+    """Draw the heat maps of a chart on a new sheet, in two columns if it has several parts."""
     n_columns = min(2, len({panel.facet_choices["part"] for panel in chart.panels}))
     n_rows = -(-len(chart.panels) // n_columns)
     maps_sheet, axes_list = sheet_with_axes(
@@ -211,17 +215,17 @@ def _draw_maps(chart: Chart, colour_scale: ColourScale) -> Sheet:
 
 
 def colour_norm(colour_scale: ColourScale) -> Normalize:
-    """Return matplotlib's normalisation for a colour scale."""
+    """Return matplotlib's normalisation of values for a colour scale."""
     return (LogNorm if colour_scale.is_log else Normalize)(colour_scale.low, colour_scale.high)
 
 
 def colour_map() -> Colormap:
-    """Return the colour map, with grey for missing values."""
-    return colormaps[COLOUR_MAP_NAME].with_extremes(bad=MISSING_COLOUR)
+    """Return the colour map of continuous quantities, with grey for missing values."""
+    return colormaps[COLOUR_MAP_NAME].with_extremes(bad=MISSING_VALUE_COLOUR)
 
 
 def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
-    """Return the edges of adjacent cells around their centres.
+    """Return the edges of adjacent cells with given centres.
 
     Parameters
     ----------
@@ -250,23 +254,23 @@ def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
     heat_map, mesh_edges = panel.heat_map, []
     assert heat_map is not None
     for axis_name, values, axis in (("x", heat_map.x, panel.x), ("y", heat_map.y, panel.y)):
-        if axis.kind == CATEGORY:
+        if axis.kind == CATEGORY_SCALE:
             axes.set(
                 **{f"{axis_name}ticks": np.arange(values.size), f"{axis_name}ticklabels": values}
             )
             values = np.arange(values.size)
-        mesh_edges.append(cell_edges(values, axis.kind == LOG))
+        mesh_edges.append(cell_edges(values, axis.kind == LOG_SCALE))
     values = np.ma.masked_invalid(heat_map.values)
     axes.pcolormesh(*mesh_edges, values, norm=norm, cmap=colour_map(), rasterized=True)
     if len(heat_map.contour_levels) and min(values.shape) > 1 and values.count():
         _draw_contours(axes, heat_map, values)
     _set_axis(axes, "x", panel.x)
     _set_axis(axes, "y", panel.y)
-    axes.set_facecolor(MISSING_COLOUR)
+    axes.set_facecolor(MISSING_VALUE_COLOUR)
 
 
 def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> None:
-    """Draw labelled contours, black with a pale outline, visible on every colour."""
+    """Draw labelled contours in black with a pale outline, which is visible on every colour."""
     levels_in_range = [
         level for level in heat_map.contour_levels if values.min() < level < values.max()
     ]
@@ -302,16 +306,16 @@ def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> 
 
 def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
     """Set the scale and the limits of an axis."""
-    if axis.kind != CATEGORY:
+    if axis.kind != CATEGORY_SCALE:
         axes.set(**{f"{axis_name}scale": axis.kind})
     if axis.limits is not None:
         axes.set(**{f"{axis_name}lim": axis.limits})
 
 
-def _draw_lines(chart: Chart) -> Sheet:
-    """Draw the panels of lines below each other, or in the rows that the chart defines."""
+def _draw_line_panels(chart: Chart) -> Sheet:
+    """Draw the line panels of a chart on a new sheet, one per row or in the rows of the chart."""
     drawn_panels, is_split = (
-        (chart.panels, False) if chart.panels_per_row else _one_line_per_panel(chart.panels)
+        (chart.panels, False) if chart.panels_per_row else _split_crowded_panels(chart.panels)
     )
     panels_per_row = chart.panels_per_row or [1] * len(drawn_panels)
     width, height = (
@@ -338,7 +342,7 @@ def _draw_lines(chart: Chart) -> Sheet:
         axes.set_visible(divmod(i, n_columns) in occupied_cells)
     for (row, column), panel in zip(occupied_cells, drawn_panels, strict=True):
         axes = axes_list[row * n_columns + column]
-        _draw_panel(axes, panel)
+        _draw_line_panel(axes, panel)
         has_panel_below = (row + 1, column) in occupied_cells
         axes.tick_params(
             labelbottom=not has_panel_below, labelsize=8 if chart.panels_per_row else None
@@ -354,10 +358,15 @@ def _draw_lines(chart: Chart) -> Sheet:
     return lines_sheet
 
 
-def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
-    """Split panels into one panel per line if their lines would overlap too much.
+def _split_crowded_panels(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
+    """Split panels with too many lines into one panel per line.
 
-    Return the panels, and whether they were split.
+    Returns
+    -------
+    panels : sequence of Panel
+        The given panels, or one for each line.
+    is_split : bool
+        True if the panels were split.
     """
     is_reduced = any(line.points_per_value > 1 for panel in panels for line in panel.lines)
     split_panels = [
@@ -365,7 +374,9 @@ def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]
          [line for line in panel.lines if line.style == "level"])
         for panel in panels
     ]  # fmt: skip
-    if max(len(lines) for _, lines, _ in split_panels) <= (1 if is_reduced else LINES_TOGETHER_MAX):
+    if max(len(lines) for _, lines, _ in split_panels) <= (
+        1 if is_reduced else LINES_PER_SHARED_PANEL_MAX
+    ):
         return panels, False
     return [
         replace(
@@ -376,16 +387,16 @@ def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]
     ], True
 
 
-def _draw_panel(axes: Axes, panel: Panel) -> None:
-    """Draw the lines of a panel, with its axes and title."""
+def _draw_line_panel(axes: Axes, panel: Panel) -> None:
+    """Draw the lines, axes and title of a panel."""
     has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
         _draw_line(axes, line, solid=has_stated or line.points_per_value > 1)
     _set_axis(axes, "x", panel.x)
     _set_axis(axes, "y", panel.y)
-    if panel.x.kind != CATEGORY:
+    if panel.x.kind != CATEGORY_SCALE:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
-    if panel.y.kind != LOG:
+    if panel.y.kind != LOG_SCALE:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 5))
     axes.grid(True)
     axes.set_axisbelow(True)
@@ -393,7 +404,10 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
-    """Draw one line, with its band or error bars."""
+    """Draw one line with its band or error bars.
+
+    With `solid` the line is not dashed, whatever its style index is.
+    """
     if line.style == "level":
         axes.axhline(line.y[0], color="0.6", linewidth=0.8, zorder=1)
         if not line.name:
@@ -411,7 +425,7 @@ def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
         )
         return
     plot_options |= {"label": line.name, "markersize": 4}
-    plot_options |= {"marker": MARKERS[line.style_index % 8]} if has_markers else {}
+    plot_options |= {"marker": LINE_MARKERS[line.style_index % 8]} if has_markers else {}
     if line.low is not None and line.high is not None:
         if line.style == "bars":
             error_bars = [line.y - line.low, line.high - line.y]
@@ -430,7 +444,7 @@ def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
 
 
 def _draw_legend(lines_sheet: Sheet, axes_list: Sequence[Axes]) -> None:
-    """Draw a legend in which each line name appears once."""
+    """Draw one legend for all axes of a sheet, in which each line name appears once."""
     handle_by_name: dict[str, Any] = {}
     for axes in axes_list:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -1,8 +1,8 @@
 """Charts as data: the general classes, and the charts of grids over two coordinates or along one.
 
 :mod:`sweep.analysis.canvas` draws charts to files, and :mod:`sweep.report.html_page` to pages. A
-sheet shows all panels side by side. A page shows one panel at a time, and the reader selects it by
-its facets.
+sheet shows all panels side by side. A page shows one panel at a time. Facets are the properties by
+which panels differ, such as the part of the study: the reader selects a panel by them.
 """
 
 from __future__ import annotations
@@ -24,77 +24,88 @@ from sweep.analysis.answers.probability import (
     pd_half_width,
 )
 from sweep.analysis.selection import (
-    HIGHEST,
-    LOWEST,
-    MEAN,
+    CELL_HIGHEST,
+    CELL_LOWEST,
+    CELL_MEAN,
     PointSelection,
     SortedCoordinate,
     split_by_coordinates,
-    thin_evenly,
+    thin_parts_evenly,
 )
 
-LINEAR, LOG, CATEGORY = "linear", "log", "category"
-"""Kinds of axes."""
+LINEAR_SCALE, LOG_SCALE, CATEGORY_SCALE = "linear", "log", "category"
+"""Scales of axes: linear, logarithmic, or categories."""
 
-PROBABILITY_LIMITS = (-0.03, 1.03)
+PROBABILITY_AXIS_LIMITS = (-0.03, 1.03)
 """Limits of an axis that shows probabilities."""
 
 
 @dataclass(frozen=True)
 class ChartAxis:
-    """Axis of a panel: label with units, kind of scale, and limits; None for the data's extent."""
+    """Axis of a panel."""
 
     label: str = ""
-    kind: str = LINEAR
+    """Label with units."""
+    kind: str = LINEAR_SCALE
+    """Scale: ``linear``, ``log`` or ``category``."""
     limits: tuple[float | None, float | None] | None = None
+    """Lowest and highest value; None for the extent of the data."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChartLine:
-    """Line of a panel: values ``y`` over ``x``, nan where missing.
-
-    ``name`` appears in the legend. ``style_index`` selects colour, dash and marker. ``low`` and
-    ``high`` are the ends of a band about the line. ``style`` is ``line``, ``stated`` (dashed),
-    ``dots``, ``bars`` (error bars), ``level`` (horizontal line) or ``area`` (stacked on the areas
-    before it). ``points_per_value`` is the number of points that each value summarises.
-    ``hover_texts`` are texts for the values.
-    """
+    """Line of a panel."""
 
     x: np.ndarray
+    """Positions of the values along the horizontal axis (n,)."""
     y: np.ndarray
+    """Values (n,); nan where missing."""
     name: str = ""
+    """Name in the legend."""
     style_index: int = 0
+    """Number that selects colour, dash and marker."""
     low: np.ndarray | None = None
+    """Lower ends of a band about the line (n,)."""
     high: np.ndarray | None = None
+    """Upper ends of a band about the line (n,)."""
     style: str = "line"
+    """Style of the line.
+
+    It is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (error bars), ``level`` (horizontal
+    line) or ``area`` (stacked on the areas before it).
+    """
     points_per_value: int = 1
+    """Number of points of the study whose mean each value is."""
     hover_texts: Sequence[str] = ()
+    """Texts that a page shows when the reader points at a value."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """Map of values (rows, columns) over ``y`` and ``x``; nan where missing.
-
-    Contours are drawn at ``contour_levels``.
-    """
+    """Map of values over two coordinates, shown by colours."""
 
     x: np.ndarray
+    """Positions of the columns along the horizontal axis."""
     y: np.ndarray
+    """Positions of the rows along the vertical axis."""
     values: np.ndarray
+    """Values (rows, columns); nan where missing."""
     contour_levels: Sequence[float] = ()
+    """Values at which contours are drawn."""
 
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Range of the colours of a variable, and whether the scale is logarithmic.
-
-    Probabilities of detection are shown from 0 to 1, wide spans on a logarithmic scale.
-    """
+    """Colour scale of a heat map."""
 
     low: float
+    """Lowest value of the scale."""
     high: float
+    """Highest value of the scale."""
     is_log: bool
+    """True if the scale is logarithmic."""
     label: str
+    """Label of the scale, with units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,89 +113,107 @@ class Panel:
     """Panel of a chart: lines or a heat map over two axes, for one choice of each facet."""
 
     facet_choices: Mapping[str, str]
+    """Choice of each facet at which a page shows the panel, by the facet's name."""
     x: ChartAxis
+    """Horizontal axis."""
     y: ChartAxis
+    """Vertical axis."""
     lines: Sequence[ChartLine] = ()
+    """Lines of the panel."""
     heat_map: HeatMap | None = None
+    """Heat map of the panel."""
 
     @property
     def title(self) -> str:
-        """Title of the panel: its facet choices in words."""
+        """Title of the panel: its choices of facets, separated by commas."""
         return ", ".join(filter(None, self.facet_choices.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Contents of a figure: heading, alternative text, caption and panels.
-
-    ``facet_labels`` name the choice of each facet. ``panels_per_row`` are the numbers of panels in
-    the rows of a sheet.
-    """
+    """Contents of a figure."""
 
     heading: str
+    """Heading above the figure."""
     alt: str
+    """Text for readers who can't see the figure."""
     caption: Sequence[str]
+    """Phrases of the caption."""
     panels: Sequence[Panel]
+    """Panels in order."""
     facet_labels: Mapping[str, str] = field(default_factory=dict)
+    """Labels of the controls by which the reader of a page selects a panel, by facet."""
     colour_scale: ColourScale | None = None
+    """Colour scale of all heat maps; None for charts of lines."""
     panels_per_row: Sequence[int] = ()
+    """Numbers of panels in the rows of a sheet; empty for one per row."""
 
 
 @dataclass(frozen=True)
 class ChartSizeLimits:
-    """Limits of a chart: numbers of parts, map columns, map rows, all cells, and maps in a row."""
+    """Limits of the size of a chart."""
 
     parts_max: int
+    """Largest number of parts of the study, each of which has a panel."""
     columns_max: int
+    """Largest number of columns of a row of heat maps."""
     rows_max: int
+    """Largest number of rows of a heat map."""
     cells_max: float
-    maps_abreast: int
+    """Largest number of cells of all heat maps together."""
+    maps_per_row: int
+    """Number of heat maps side by side, if there are several parts."""
 
 
-SHEET_LIMITS = ChartSizeLimits(
-    parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_abreast=2
+SHEET_SIZE_LIMITS = ChartSizeLimits(
+    parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_per_row=2
 )
-"""Limits for a sheet: a map has no more cells than pixels, so that no cell is lost."""
+"""Limits of charts on sheets. A heat map has no more cells than pixels, so that no cell is lost."""
 
 LINES_PER_PANEL_MAX = 8
-"""Largest number of lines in a panel; more are omitted."""
+"""Largest number of lines in a panel; further lines are omitted."""
 
-LINE_INTERVALS = 500
-"""Number of intervals to which a line of more than twice as many points is reduced."""
+REDUCED_LINE_INTERVALS = 500
+"""Number of values to which a line is reduced, if it has more than twice as many points."""
 
 _LOG_SCALE_DECADES_MIN = 3
-"""Least number of decades between median and largest value for a logarithmic colour scale."""
+"""Decades between the median and the largest value above which a colour scale is logarithmic."""
 
-_HARMFUL_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
-"""Prefixes of variables whose largest value is the worst."""
+_LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
+"""Prefixes of the names of variables whose largest value is the worst one."""
 
 
 @dataclass(frozen=True)
 class CoordinateAxis:
-    """Axis of a coordinate in display units; categorical values stay as they are."""
+    """Axis along which a coordinate of a study is shown, in display units."""
 
     axis: ChartAxis
+    """Label, scale and limits."""
     factor: float
+    """Factor from the units of the coordinate to those of the axis."""
     units: str
+    """Units of the axis; empty for categories."""
 
     @classmethod
     def from_points(cls, points: PointSelection, name: str) -> CoordinateAxis:
-        """Return the axis of a coordinate of the points."""
+        """Return the axis for a coordinate of a selection of points."""
         values, units = np.unique(points.coordinate_values(name)), points.coordinate_units(name)
         if labels.is_categorical(values):
-            return cls(ChartAxis(labels.coordinate_label(name), CATEGORY), 1.0, "")
+            return cls(ChartAxis(labels.coordinate_label(name), CATEGORY_SCALE), 1.0, "")
         factor, units = labels.display_factor_and_units(values, units)
         label = labels.axis_label(labels.coordinate_label(name), units)
-        return cls(ChartAxis(label, LOG if is_log_spaced(values) else LINEAR), factor, units)
+        return cls(
+            ChartAxis(label, LOG_SCALE if is_log_spaced(values) else LINEAR_SCALE), factor, units
+        )
 
     def to_axis_units(self, values: np.ndarray) -> np.ndarray:
-        """Return values in the units of the axis; categorical values as text."""
-        if self.axis.kind == CATEGORY:
+        """Convert values of the coordinate to the units of the axis; categories become text."""
+        if self.axis.kind == CATEGORY_SCALE:
             return np.array([str(value) for value in values])
         return values * self.factor
 
     def describe_span(self, values: np.ndarray) -> str:
-        """Return the first and last value as text."""
+        """Return a text with the label of the axis, and the first and last value."""
         axis_values = self.to_axis_units(values)
         end_texts = [
             labels.format_quantity(v, self.units) for v in (axis_values[0], axis_values[-1])
@@ -193,7 +222,7 @@ class CoordinateAxis:
 
 
 def is_log_spaced(values: np.ndarray) -> bool:
-    """Tell whether values are spaced evenly in their logarithm over at least a decade."""
+    """Return True if values have about equal ratios and span at least a decade."""
     if values.size < 3 or values.min() <= 0 or values.max() < 10 * values.min():
         return False
     steps = np.diff(np.log(values))
@@ -201,7 +230,7 @@ def is_log_spaced(values: np.ndarray) -> bool:
 
 
 def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) -> ColourScale:
-    """Return the colour scale of a variable.
+    """Return the colour scale for the values of a variable.
 
     Parameters
     ----------
@@ -237,18 +266,29 @@ def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) ->
 
 
 def worst_statistic(variable: str) -> str:
-    """Return which extreme of a variable is the worst value of a cell; '' if neither is bad."""
+    """Return which statistic of a cell is the worst value of a variable.
+
+    It is the lowest one for detection, the highest one for false alarms, and '' for other
+    variables.
+    """
     if variable.startswith(("pd_", "snr_")):
-        return LOWEST
-    return HIGHEST if variable.startswith(_HARMFUL_PREFIXES) else ""
+        return CELL_LOWEST
+    return CELL_HIGHEST if variable.startswith(_LARGEST_IS_WORST_PREFIXES) else ""
 
 
 def split_into_parts(
     points: PointSelection, shown_names: Sequence[str], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Split points by all coordinates that are not shown; a panel shows one part.
+    """Split a selection of points into the parts that panels show.
 
-    Return the named parts, and the number of omitted parts.
+    In a part only the coordinates with ``shown_names`` vary.
+
+    Returns
+    -------
+    parts : list of (str, PointSelection)
+        Name and points of at most ``parts_max`` parts.
+    n_omitted : int
+        Number of omitted parts.
     """
     if not points.size:
         return [], 0
@@ -260,11 +300,11 @@ def split_into_parts(
         for part_label, part in all_parts
         if all(len(part.unique_values(n)) > 1 for n in shown_names)
     ]
-    return thin_evenly(varied_parts or all_parts, parts_max)
+    return thin_parts_evenly(varied_parts or all_parts, parts_max)
 
 
 def omission_remark(n_omitted: int) -> str:
-    """Return a remark on the number of omitted values; '' if none is omitted."""
+    """Return a caption phrase with the number of omitted values; '' if none is omitted."""
     return f"{labels.counted(n_omitted, 'further value')} not shown" if n_omitted else ""
 
 
@@ -275,10 +315,12 @@ def surface_chart(
     y: str,
     variable: str,
     label: str,
-    size_limits: ChartSizeLimits = SHEET_LIMITS,
+    size_limits: ChartSizeLimits = SHEET_SIZE_LIMITS,
     levels: Sequence[float] = (),
 ) -> Chart:
-    """Return maps of a variable over two coordinates, a panel for each value of other coordinates.
+    """Return a chart of heat maps of a variable over two coordinates.
+
+    Each combination of values of the other coordinates has a panel.
 
     Parameters
     ----------
@@ -291,21 +333,23 @@ def surface_chart(
     label
         Label of the variable, with units.
     size_limits
-        Largest numbers of panels, and of columns, rows and cells of the maps. Larger maps are
-        reduced to cells of adjacent points: their mean, and for probabilities and SNRs a second map
-        with the worst value.
+        Largest numbers of panels, and of columns, rows and cells of the maps. Adjacent points of
+        larger maps are combined to cells. A map shows the mean of each cell, and for probabilities
+        and SNRs a second map shows the worst value.
     levels
         Values of the variable at which contours are drawn, if both coordinates are numeric.
     """
     parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
-    planes = [_to_plane(part, variable, x, y) for _, part in parts]
-    cell_statistics = [MEAN, worst_statistic(variable)] if worst_statistic(variable) else [MEAN]
-    cells_max = _cells_max(planes, size_limits, len(cell_statistics) * len(parts))
+    planes = [_arrange_on_plane(part, variable, x, y) for _, part in parts]
+    cell_statistics = (
+        [CELL_MEAN, worst_statistic(variable)] if worst_statistic(variable) else [CELL_MEAN]
+    )
+    cells_max = _map_cells_max(planes, size_limits, len(cell_statistics) * len(parts))
     points_per_cell = [
         max(x_coordinate.points_per_cell(cells_max[0]) for _, x_coordinate, _ in planes),
         max(y_coordinate.points_per_cell(cells_max[1]) for _, _, y_coordinate in planes),
     ]
-    cell_statistics = cell_statistics if max(points_per_cell) > 1 else [MEAN]
+    cell_statistics = cell_statistics if max(points_per_cell) > 1 else [CELL_MEAN]
     lazy_cells = [
         plane.coarsen(
             variable, [(y_coordinate, cells_max[1]), (x_coordinate, cells_max[0])], cell_statistic
@@ -327,7 +371,7 @@ def surface_chart(
             x_coordinate.cell_means(cells_max[0]),
             y_coordinate.cell_means(cells_max[1]),
         )
-        contour_levels = () if CATEGORY in (x_axis.axis.kind, y_axis.axis.kind) else levels
+        contour_levels = () if CATEGORY_SCALE in (x_axis.axis.kind, y_axis.axis.kind) else levels
         layer = HeatMap(
             x_axis.to_axis_units(x_values),
             y_axis.to_axis_units(y_values),
@@ -350,7 +394,7 @@ def surface_chart(
     return Chart(
         label,
         f"Heat map of {label} over {' and '.join(span_texts)}: "
-        f"{labels.describe_extent(layers[0])}.",
+        f"{labels.describe_value_extent(layers[0])}.",
         remarks,
         panels,
         {"part": "Shown for", "cell": "Each cell shows the"},
@@ -358,13 +402,16 @@ def surface_chart(
     )
 
 
-def _cells_max(
+def _map_cells_max(
     planes: Sequence[tuple[PointSelection, SortedCoordinate, SortedCoordinate]],
     size_limits: ChartSizeLimits,
     n_layers: int,
 ) -> tuple[int, int]:
-    """Return the largest numbers of columns and rows that all maps may have."""
-    columns_max = size_limits.columns_max // (size_limits.maps_abreast if len(planes) > 1 else 1)
+    """Return the largest numbers of columns and of rows that a heat map may have.
+
+    `planes` are the maps before reduction, `n_layers` is the number of all maps.
+    """
+    columns_max = size_limits.columns_max // (size_limits.maps_per_row if len(planes) > 1 else 1)
     n_columns = min(columns_max, max(x_coordinate.values.size for _, x_coordinate, _ in planes))
     n_rows = min(
         size_limits.rows_max, max(y_coordinate.values.size for _, _, y_coordinate in planes)
@@ -373,23 +420,28 @@ def _cells_max(
     return max(2, int(n_columns * shrink)), max(2, int(n_rows * shrink))
 
 
-def _to_plane(
+def _arrange_on_plane(
     points: PointSelection, variable: str, x: str, y: str
 ) -> tuple[PointSelection, SortedCoordinate, SortedCoordinate]:
-    """Return the points over two dimensions, and their sorted coordinates along x and y.
+    """Arrange the points of a heat map on a plane of two dimensions.
 
     If x and y lie along one zipped axis, the points are rearranged on a grid of both.
+
+    Returns
+    -------
+    tuple of PointSelection, SortedCoordinate, SortedCoordinate
+        The points, and their coordinates along x and y.
     """
-    if points.dim_of(x) != points.dim_of(y):
+    if points.dim_of_coordinate(x) != points.dim_of_coordinate(y):
         return points, points.sorted_coordinate(x), points.sorted_coordinate(y)
     x_values, column_index = np.unique(points.coordinate_values(x), return_inverse=True)
     y_values, row_index = np.unique(points.coordinate_values(y), return_inverse=True)
-    shared_dim = points.dim_of(x)
+    shared_dim = points.dim_of_coordinate(x)
     point_indices = np.asarray(points.dim_tables[shared_dim].index)
     flat_coordinate = SortedCoordinate(shared_dim, point_indices, point_indices)
     values = np.full((y_values.size, x_values.size), np.nan)
     values[row_index.ravel(), column_index.ravel()] = points.coarsen(
-        variable, [(flat_coordinate, flat_coordinate.values.size)], MEAN
+        variable, [(flat_coordinate, flat_coordinate.values.size)], CELL_MEAN
     )
     plane = PointSelection.from_dataset(xr.Dataset({variable: (("y", "x"), values)}))
     x_coordinate, y_coordinate = (
@@ -402,7 +454,7 @@ def _to_plane(
 def _reduction_remark(
     points_per_cell: int, coordinates: Sequence[SortedCoordinate], cell_statistics: Sequence[str]
 ) -> str:
-    """Return a remark on the number of points that share a cell; '' if none do."""
+    """Return a caption phrase on the number of points in a cell; '' for a single point."""
     if points_per_cell == 1:
         return ""
     n_points = math.prod(coordinate.values.size for coordinate in coordinates)
@@ -425,7 +477,7 @@ def slice_chart(
     parts_max: int = 6,
     levels: Sequence[float] = (),
 ) -> Chart:
-    """Return lines of a variable along a coordinate.
+    """Return a chart of a variable as lines over a coordinate.
 
     Parameters
     ----------
@@ -447,19 +499,20 @@ def slice_chart(
     line_coordinates = [by] if by else []
     parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
     named_points, n_omitted_lines = split_into_lines(parts, line_coordinates)
-    drawn_lines, remarks = lines_along(
+    drawn_lines, remarks = read_lines_along(
         [(line_points, variable) for _, _, line_points in named_points], x
     )
     x_axis = CoordinateAxis.from_points(points, x)
     value_scale = fit_colour_scale(variable, label, [line.y for line in drawn_lines])
-    limits = PROBABILITY_LIMITS if variable.startswith("pd_") else None
-    y_axis = ChartAxis(label, LOG if value_scale.is_log else LINEAR, limits)
-    panels = make_panels(named_points, drawn_lines, x_axis, y_axis)
+    limits = PROBABILITY_AXIS_LIMITS if variable.startswith("pd_") else None
+    y_axis = ChartAxis(label, LOG_SCALE if value_scale.is_log else LINEAR_SCALE, limits)
+    panels = make_line_panels(named_points, drawn_lines, x_axis, y_axis)
     alt_text = lines_alt_text(
         label, x_axis.describe_span(np.unique(points.coordinate_values(x))), panels[0]
     )
     panels = [
-        replace(panel, lines=[*panel.lines, *_level_lines(panel, levels)]) for panel in panels
+        replace(panel, lines=[*panel.lines, *_horizontal_level_lines(panel, levels)])
+        for panel in panels
     ]
     return Chart(
         label,
@@ -470,21 +523,29 @@ def slice_chart(
     )
 
 
-def _level_lines(panel: Panel, levels: Sequence[float]) -> list[ChartLine]:
-    """Return horizontal lines at levels, over the x values of the panel's first line."""
+def _horizontal_level_lines(panel: Panel, levels: Sequence[float]) -> list[ChartLine]:
+    """Return horizontal lines at the given levels, as long as the first line of a panel."""
     x = panel.lines[0].x
     return [ChartLine(x, np.full(x.size, level), f"{level:g}", style="level") for level in levels]
 
 
-NamedPoints = tuple[str, str, PointSelection]
-"""Part that a line belongs to, name of the line, and its points."""
+LabelledLinePoints = tuple[str, str, PointSelection]
+"""Name of the part (panel) to which a line belongs, name of the line, and points of the line."""
 
 
 def split_into_lines(
     parts: Sequence[tuple[str, PointSelection]], line_coordinates: Sequence[str]
-) -> tuple[list[NamedPoints], int]:
-    """Split every part into lines by coordinates; also return the number of omitted lines."""
-    named_points: list[NamedPoints] = []
+) -> tuple[list[LabelledLinePoints], int]:
+    """Split every part of a chart into lines by the values of coordinates.
+
+    Returns
+    -------
+    named_points : list of LabelledLinePoints
+        Part, name and points of each line.
+    n_omitted : int
+        Number of omitted lines.
+    """
+    named_points: list[LabelledLinePoints] = []
     n_omitted = 0
     for part_label, part_points in parts:
         part_lines, n_omitted_lines = split_by_coordinates(
@@ -497,14 +558,27 @@ def split_into_lines(
     return named_points, n_omitted
 
 
-def make_panels(
-    named_points: Sequence[NamedPoints],
+def make_line_panels(
+    named_points: Sequence[LabelledLinePoints],
     drawn_lines: Sequence[ChartLine],
     x_axis: CoordinateAxis,
     y_axis: ChartAxis,
     **further_choices: str,
 ) -> list[Panel]:
-    """Return a panel for each part; a line name has the same style in all panels."""
+    """Return a panel of lines for each part of a chart.
+
+    Parameters
+    ----------
+    named_points
+        Part, name and points of each line.
+    drawn_lines
+        The lines in the same order, with x in the units of the dataset. Lines of the same name get
+        the same style.
+    x_axis, y_axis
+        Axes of all panels.
+    further_choices
+        Choices of further facets, equal for all panels.
+    """
     style_by_name = {
         name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named_points))
     }
@@ -521,17 +595,17 @@ def make_panels(
 
 
 def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
-    """Return the alternative text of lines: the extent of each line of a panel."""
+    """Return the alternative text of a chart of lines: the extent of each line of a panel."""
     line_texts = [
-        f"{line.name or 'the line'}: {labels.describe_extent(line.y)}" for line in panel.lines
+        f"{line.name or 'the line'}: {labels.describe_value_extent(line.y)}" for line in panel.lines
     ]
     return f"Lines of {label} over {span_text}. {'; '.join(line_texts)}."
 
 
-def lines_along(
+def read_lines_along(
     points_and_variables: Sequence[tuple[PointSelection, str]], x: str
 ) -> tuple[list[ChartLine], list[str]]:
-    """Read variables along a coordinate in one pass.
+    """Read variables along a coordinate as lines of a chart, in one pass.
 
     Parameters
     ----------
@@ -543,28 +617,32 @@ def lines_along(
     Returns
     -------
     list of ChartLine
-        Lines in the order of the argument. A line of many points is reduced to intervals: the line
-        shows their means, and a band their lowest to highest points. Otherwise the band is the
-        interval of each point, if pd is drawn or the dataset has ``.._low`` and ``.._high``.
+        Lines in the order of the argument. If a line has many points, it shows the means of
+        adjacent points, with a band from the lowest to the highest of them. Otherwise the band is
+        the confidence interval of each point, if there is one.
     list of str
-        Remarks on reduction and bands.
+        Caption phrases on reduction and bands.
     """
     lazy_arrays: list[list[Any]] = []
     reductions: list[tuple[SortedCoordinate, int, float, bool]] = []
     for points, variable in points_and_variables:
         coordinate = points.sorted_coordinate(x)
-        dataset_with_ends, confidence = _mean_and_ends(points.dataset, variable)
-        cells_max = LINE_INTERVALS * (1 if coordinate.values.size > 2 * LINE_INTERVALS else 2)
+        dataset_with_ends, confidence = _value_and_interval_ends(points.dataset, variable)
+        cells_max = REDUCED_LINE_INTERVALS * (
+            1 if coordinate.values.size > 2 * REDUCED_LINE_INTERVALS else 2
+        )
         has_ends = len(dataset_with_ends) > 1
         cell_statistics = (
-            (MEAN, LOWEST, HIGHEST)
+            (CELL_MEAN, CELL_LOWEST, CELL_HIGHEST)
             if has_ends or coordinate.points_per_cell(cells_max) > 1
-            else (MEAN,)
+            else (CELL_MEAN,)
         )
         points_with_ends = replace(points, dataset=dataset_with_ends)
         lazy_arrays.append(
             [
-                points_with_ends.coarsen(k if has_ends else MEAN, [(coordinate, cells_max)], k).data
+                points_with_ends.coarsen(
+                    k if has_ends else CELL_MEAN, [(coordinate, cells_max)], k
+                ).data
                 for k in cell_statistics
             ]
         )
@@ -585,28 +663,34 @@ def lines_along(
     return chart_lines, list(dict.fromkeys(remarks))
 
 
-def _mean_and_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
-    """Return a variable with the ends of its interval, if it has any, and their confidence."""
+def _value_and_interval_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
+    """Return a variable with the ends of its confidence interval, and the confidence level.
+
+    The dataset has the variables `mean`, and `lowest` and `highest` if there is an interval.
+    Otherwise the level is 0.
+    """
     segment = variable.removeprefix("pd_")
     if f"{variable}_low" in dataset:
         variable_by_statistic = {
-            MEAN: variable,
-            LOWEST: f"{variable}_low",
-            HIGHEST: f"{variable}_high",
+            CELL_MEAN: variable,
+            CELL_LOWEST: f"{variable}_low",
+            CELL_HIGHEST: f"{variable}_high",
         }
         dataset_with_ends = xr.Dataset(
             {kind: dataset[name] for kind, name in variable_by_statistic.items()}
         )
     elif segment in SEGMENTS_AND_SHOT and pd_half_width(dataset, segment) is not None:
         dataset_with_ends = detection_probability(dataset, segment)
-        dataset_with_ends = dataset_with_ends.rename({"pd": MEAN, "low": LOWEST, "high": HIGHEST})
+        dataset_with_ends = dataset_with_ends.rename(
+            {"pd": CELL_MEAN, "low": CELL_LOWEST, "high": CELL_HIGHEST}
+        )
     else:
-        return xr.Dataset({MEAN: dataset[variable]}), 0.0
-    return dataset_with_ends, float(dataset_with_ends[LOWEST].attrs.get("confidence", 0.0))
+        return xr.Dataset({CELL_MEAN: dataset[variable]}), 0.0
+    return dataset_with_ends, float(dataset_with_ends[CELL_LOWEST].attrs.get("confidence", 0.0))
 
 
 def _band_remark(points_per_value: int, confidence: float, has_ends: bool) -> str:
-    """Return a remark on the reduction and the band of a line; '' for a plain line."""
+    """Return a caption phrase on the reduction and band of a line; '' for a line without them."""
     interval_text = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
     if points_per_value > 1:
         ends_note = f", their {interval_text}s included" if confidence else ""

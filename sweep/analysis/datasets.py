@@ -20,7 +20,7 @@ from sweep.analysis.answers import (
     probability,
     provenance,
 )
-from sweep.analysis.answers.dataset_lookup import STUDY_ID, marker_name
+from sweep.analysis.answers.dataset_lookup import STUDY_ID_NAME, study_marker_name
 from sweep.messages import suggested_call
 from sweep.model.outputs import RUNNING_SUMS
 from sweep.spec import GridSpec, SceneSpec
@@ -36,21 +36,21 @@ from sweep.storage.store_format import (
 )
 from sweep.storage.verified_store import open_verified_store
 
-BATCH_DIM = "batch"
-"""Dimension of the batches of draws, over which counts are summed."""
+DRAW_BATCH_DIM = "batch"
+"""Name of the dimension of batches of draws in a store."""
 
-VALUES_PER_READ = 2**20
-"""Number of array values in a Dask chunk for reading.
+READ_CHUNK_VALUES_MAX = 2**20
+"""Largest number of array values in a Dask chunk.
 
-It is small enough for any memory: a chunk of floats has 8 MB. It is large enough to keep Dask's
-task graph short, which takes about 7 kB per chunk.
+A chunk of floats has at most 8 MB. Much smaller chunks would make a large task graph, which takes
+about 7 kB per chunk.
 """
 
-SHOTS_PER_READ = 8192
-"""Number of shots, times draws, that are read at once."""
+READ_SHOTS_MAX = 8192
+"""Largest number of shots that are read at once, unless a stored chunk has more."""
 
-COUNT_MISSING = -1
-"""Value of a count in a block that is not computed yet."""
+MISSING_COUNT = -1
+"""Stored value of a count that is not computed yet."""
 
 GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
 """Kinds of stores."""
@@ -61,7 +61,7 @@ _DESCRIPTION_BY_KIND = {
     ACCURACY_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
     "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
 }
-"""Description of each kind of store, with the function that opens it."""
+"""Descriptions of the kinds of stores, with the function that opens each."""
 
 
 def open(
@@ -82,20 +82,17 @@ def open(
     path
         Store, complete or not. A list of stores, or a mapping from names of designs to stores, is
         joined along a new dimension. The designs of a list are named by the titles of their
-        studies.
-        Answers of `ds.sweep` from a join are given per design, from the spec of each design.
+        studies. From a join, `ds.sweep` answers for each design, by the design's own spec.
     dim
         Name of the new dimension of a join.
 
     Returns
     -------
     xarray.Dataset
-        Dataset with the scalar coordinate `study_id`, the id of the study. A marker coordinate,
-        which
-        has the id in its name, proves to `ds.sweep` that a part of the dataset comes from one
-        study.
-        Its attributes are those of the store, and `started` and `finished` (UTC; empty if not
-        known), `points`, `points_committed`, `blocks` and `blocks_committed`.
+        Dataset with the scalar coordinate `study_id`, the id of the study. A further coordinate,
+        with the id in its name, proves to `ds.sweep` that the dataset comes from one study. The
+        attributes are those of the store, and `started` and `finished` (UTC; empty if not known),
+        `points`, `points_committed`, `blocks` and `blocks_committed`.
 
     Raises
     ------
@@ -117,27 +114,27 @@ def open(
             {str(name): open(store) for name, store in path.items()}, dim
         )
     if isinstance(path, Sequence | Mapping) and not isinstance(path, str):
-        return provenance.join_designs(_name_by_title([open(store) for store in path]), dim)
+        return provenance.join_designs(_datasets_by_title([open(store) for store in path]), dim)
     path = parse_location(path)
     attributes = read_attributes_of_kind(path, GRID_KIND)
-    refuse_lost_coordinates(path)
+    require_intact_coordinates(path)
     dataset = xr.open_zarr(
         open_verified_store(path, attributes["study_id"]), chunks=None, **OPEN_ZARR_KWARGS
     )
     effect_flags = dataset["effects"]
     n_blocks = _count_chunks(effect_flags)
     dataset = rechunk_for_reading(dataset.drop_vars(RUNNING_SUMS, errors="ignore"))
-    if BATCH_DIM in dataset.dims:
-        dataset = sum_batches(dataset)
+    if DRAW_BATCH_DIM in dataset.dims:
+        dataset = sum_draw_batches(dataset)
     dataset = _add_study_id(_load_coordinates(dataset), attributes["study_id"])
     return dataset.assign_attrs(progress_attributes(path, effect_flags.size, n_blocks))
 
 
-def _name_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
-    """Return datasets by the titles of their studies; equal titles are followed by the study id."""
+def _datasets_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
+    """Return datasets by the titles of their studies. Titles that are equal get the study id."""
     titles = [str(dataset.attrs["title"]) for dataset in datasets]
     dataset_by_name = {
-        comparison.title_with_id(dataset) if titles.count(title) > 1 else title: dataset
+        comparison.study_title_with_id(dataset) if titles.count(title) > 1 else title: dataset
         for title, dataset in zip(titles, datasets, strict=True)
     }
     if not dataset_by_name:
@@ -148,7 +145,7 @@ def _name_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
 
 
 def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
-    """Load coordinates into memory; text becomes NumPy strings, which xarray plots and writes."""
+    """Return a dataset with its coordinates in memory, and their texts as NumPy strings."""
     loaded = {name: array.compute() for name, array in dataset.coords.items()}
     return dataset.assign_coords({
         name: array.copy(data=np.array(array.values.tolist(), str))
@@ -158,14 +155,17 @@ def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
-    """Return a dataset with the study's id and marker as coordinates, and flat attributes."""
+    """Return a dataset with two more coordinates: the id of its study, and the study's marker.
+
+    Attributes that are mappings of versions become text.
+    """
     id_attributes = {"long_name": "id of the study"}
     marker_attributes = {
         "long_name": "marker of the study, which shows where another's points join"
     }
     dataset = dataset.assign_coords({
-        STUDY_ID: xr.DataArray(study_id, attrs=id_attributes),
-        marker_name([study_id]): xr.DataArray(True, attrs=marker_attributes),
+        STUDY_ID_NAME: xr.DataArray(study_id, attrs=id_attributes),
+        study_marker_name([study_id]): xr.DataArray(True, attrs=marker_attributes),
     })  # fmt: skip
     return dataset.assign_attrs(
         {name: format_software_versions(v) for name, v in dataset.attrs.items()}
@@ -187,8 +187,7 @@ def open_scene(path: str | Location) -> xr.DataTree:
     -------
     xarray.DataTree
         Tree whose attributes are those of the store, and `started` and `finished` (UTC; empty if
-        not
-        known), `points` and `points_committed` (shots times draws), `blocks` and
+        not known), `points` and `points_committed` (shots times draws), `blocks` and
         `blocks_committed`.
 
     Raises
@@ -196,23 +195,25 @@ def open_scene(path: str | Location) -> xr.DataTree:
     NotAStoreError
         The path has no store of a scene.
     """
-    return open_tree(parse_location(path), chunks={})
+    return open_scene_tree(parse_location(path), chunks={})
 
 
-def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
-    """Open a scene's store as :func:`open_scene` does, with the given Dask chunks.
+def open_scene_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
+    """Open a scene's store as :func:`open_scene` does, with given sizes of Dask chunks.
 
-    With ``chunks=None`` arrays are NumPy-backed, and read when they are sliced.
+    With ``chunks=None`` no Dask array is made: values are read when an array is sliced.
     """
     attributes = read_attributes_of_kind(store_path, SCENE_KIND)
-    refuse_lost_coordinates(store_path)
+    require_intact_coordinates(store_path)
     store = open_verified_store(store_path, attributes["study_id"])
     whole_tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **OPEN_ZARR_KWARGS)
     groups = {name: group.to_dataset(inherit=False) for name, group in whole_tree.children.items()}
     root = whole_tree.to_dataset()
-    if _OLD_MAP_NAMES.keys() <= root.variables.keys():  # a store of an earlier version
-        groups[TERRAIN_MAP_GROUP] = root[list(_OLD_MAP_NAMES)].rename(_OLD_MAP_NAMES)
-        root = root.drop_vars(list(_OLD_MAP_NAMES))
+    if _NAME_BY_OLD_MAP_VARIABLE.keys() <= root.variables.keys():  # a store of an earlier version
+        groups[TERRAIN_MAP_GROUP] = root[list(_NAME_BY_OLD_MAP_VARIABLE)].rename(
+            _NAME_BY_OLD_MAP_VARIABLE
+        )
+        root = root.drop_vars(list(_NAME_BY_OLD_MAP_VARIABLE))
     for name in attributes["scanners"]:
         groups[name] = _add_study_id(_load_coordinates(groups[name]), attributes["study_id"])
     tree = xr.DataTree.from_dict({"/": _add_study_id(root, attributes["study_id"]), **groups})
@@ -226,8 +227,8 @@ def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.
     return tree
 
 
-_OLD_MAP_NAMES = {"map_x": "x", "map_y": "y", "map_height": "height"}
-"""Map variables in the root of stores of earlier versions, with their names in the map's group."""
+_NAME_BY_OLD_MAP_VARIABLE = {"map_x": "x", "map_y": "y", "map_height": "height"}
+"""Present names of map variables, by their names in the root of stores of earlier versions."""
 
 
 def _count_chunks(array: xr.DataArray) -> int:
@@ -235,21 +236,25 @@ def _count_chunks(array: xr.DataArray) -> int:
     return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
 
 
-def chunk_length(array: xr.DataArray, dim: str) -> int:
+def stored_chunk_length(array: xr.DataArray, dim: str) -> int:
     """Return the length of an array's stored chunks along a dimension."""
     return int(array.encoding.get("preferred_chunks", {}).get(dim, array.sizes[dim]))
 
 
-def read_slices(
-    array: xr.DataArray, dim: str, slice_length_max: int = SHOTS_PER_READ
+def chunk_aligned_slices(
+    array: xr.DataArray, dim: str, slice_length_max: int = READ_SHOTS_MAX
 ) -> list[slice]:
-    """Return slices along a dimension, each of whole stored chunks and up to a largest length."""
-    length, stored_chunk = array.sizes[dim], chunk_length(array, dim)
+    """Return consecutive slices that cover a dimension of an array.
+
+    Each slice has whole stored chunks, and at most `slice_length_max` elements if a chunk is not
+    longer.
+    """
+    length, stored_chunk = array.sizes[dim], stored_chunk_length(array, dim)
     step = stored_chunk * max(1, slice_length_max // stored_chunk)
     return [slice(start, min(start + step, length)) for start in range(0, length, step)]
 
 
-def refuse_lost_coordinates(store_path: Location) -> None:
+def require_intact_coordinates(store_path: Location) -> None:
     """Raise NotAStoreError if coordinates of a store are lost or changed.
 
     Zarr would read the values of a lost coordinate as zeros.
@@ -277,9 +282,9 @@ def refuse_lost_coordinates(store_path: Location) -> None:
 
 
 def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, Any]:
-    """Return the attributes of a store; raise NotAStoreError unless it is of the given kind.
+    """Return the attributes of a store; raise NotAStoreError if the store is of another kind.
 
-    ``kind``: ``grid``, ``scene`` or ``accuracy``; empty for any kind.
+    ``kind`` is ``grid``, ``scene``, ``accuracy`` or ``eyepoints``, or empty for any kind.
     """
     attributes = store_format.read_attributes(store_path)
     if kind and attributes["kind"] != kind:
@@ -288,7 +293,7 @@ def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, A
 
 
 def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset of Dask arrays in chunks of at most `VALUES_PER_READ` values.
+    """Return a dataset of Dask arrays in chunks of at most `READ_CHUNK_VALUES_MAX` values.
 
     A chunk consists of whole stored chunks. It grows first along the last dimension, along which
     values are adjacent in the files.
@@ -296,27 +301,30 @@ def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
     largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
     chunk_sizes = dict(zip(largest_array.dims, largest_array.encoding["chunks"], strict=True))
     for dim in reversed(largest_array.dims):
-        growth = VALUES_PER_READ // math.prod(chunk_sizes.values())
+        growth = READ_CHUNK_VALUES_MAX // math.prod(chunk_sizes.values())
         chunk_sizes[dim] = min(largest_array.sizes[dim], chunk_sizes[dim] * max(1, growth))
     return dataset.chunk(chunk_sizes)
 
 
-def sum_batches(dataset: xr.Dataset) -> xr.Dataset:
-    """Sum counts of draws over their batches; the sum is -1 if any batch is not computed."""
+def sum_draw_batches(dataset: xr.Dataset) -> xr.Dataset:
+    """Sum the counts of a dataset over batches of draws; a sum is -1 if a batch is not computed."""
     batched_counts = {
-        name: array for name, array in dataset.data_vars.items() if BATCH_DIM in array.dims
+        name: array for name, array in dataset.data_vars.items() if DRAW_BATCH_DIM in array.dims
     }
     sums = {
-        name: array.sum(BATCH_DIM, keep_attrs=True).where(
-            (array != COUNT_MISSING).all(BATCH_DIM), COUNT_MISSING
+        name: array.sum(DRAW_BATCH_DIM, keep_attrs=True).where(
+            (array != MISSING_COUNT).all(DRAW_BATCH_DIM), MISSING_COUNT
         )
         for name, array in batched_counts.items()
     }
-    return dataset.drop_dims(BATCH_DIM).assign(sums)
+    return dataset.drop_dims(DRAW_BATCH_DIM).assign(sums)
 
 
 def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> dict[str, Any]:
-    """Return start and end time, and the committed numbers of points and blocks, as attributes."""
+    """Return the times and the progress of a study, as attributes of a dataset.
+
+    ``n_points`` and ``n_blocks`` are the numbers of points and blocks of the complete study.
+    """
     receipts = read_receipt_totals(store_path, n_blocks)
     sessions = iter_records(store_path / JOURNAL_DIR / "sessions.jsonl")
     start_times = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
@@ -336,16 +344,17 @@ def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> d
 
 
 def _format_utc(time: float) -> str:
+    """Return a time [s since 1970] as ISO 8601 text in UTC."""
     return datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
 
 
 def _as_accessor_method(
     answer: Callable[..., Any], *, require_axes: bool = False
 ) -> Callable[..., Any]:
-    """Return a function of a dataset as an accessor method with the same docstring and signature.
+    """Turn a function of a dataset into a method of `ds.sweep` with the same docstring.
 
-    The method checks that the dataset comes from one study. For a join of studies it answers per
-    design. ``require_axes``: the answer needs the coordinates of all axes.
+    The method checks that the dataset comes from one study. For a join of studies it answers for
+    each design. With ``require_axes`` it checks that the coordinates of all axes exist.
     """
 
     @wraps(answer)
@@ -404,7 +413,7 @@ class SweepAccessor:
 
 @xr.register_datatree_accessor("sweep")
 class FlightAccessor:
-    """Answers from a tree of `sweep.open_scene`; all but the matching of shots are lazy."""
+    """Answers from a tree of `sweep.open_scene`. They are lazy, except that shots are matched."""
 
     def __init__(self, tree: xr.DataTree) -> None:
         self._tree = tree

@@ -10,16 +10,26 @@ import numpy as np
 
 from sweep.messages import counted as counted
 
-KILOMETRES_FROM = 1000.0
-"""Median distance [m] above which distances are shown in km."""
+KILOMETRE_DISPLAY_MIN = 1000.0
+"""Median of distances [m] above which they are shown in km."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
-"""Symbols of units in labels, for units that are written otherwise in stores."""
+"""Symbols of units in labels, by the units' names in stores, if they differ."""
 
-_UNITLESS = ("", "1")
-"""Units of pure numbers and of words."""
+_DIMENSIONLESS_UNITS = ("", "1")
+"""Values of the attribute `units` for pure numbers and for words."""
 
-_SI_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+_SI_PREFIX_BY_EXPONENT = {
+    -12: "p",
+    -9: "n",
+    -6: "µ",
+    -3: "m",
+    0: "",
+    3: "k",
+    6: "M",
+    9: "G",
+    12: "T",
+}
 """SI prefixes by exponent of ten."""
 
 _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
@@ -27,11 +37,11 @@ _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:
-    """Return the display units of values, and the factor to convert to them.
+    """Return the factor that converts values to display units, and the display units.
 
-    Long distances are shown in km, angles in radians as degrees.
+    Long distances are shown in km, and angles in degrees.
     """
-    if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRES_FROM:
+    if units == "m" and values.size and np.median(np.abs(values)) > KILOMETRE_DISPLAY_MIN:
         return 1e-3, "km"
     if units == "rad":
         return math.degrees(1.0), "deg"
@@ -40,19 +50,21 @@ def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str
 
 def axis_label(name: str, units: str) -> str:
     """Return the label of an axis: its name with units, ``range (km)``."""
-    return name if units in _UNITLESS else f"{name} ({_SYMBOL_BY_UNIT.get(units, units)})"
+    return (
+        name if units in _DIMENSIONLESS_UNITS else f"{name} ({_SYMBOL_BY_UNIT.get(units, units)})"
+    )
 
 
 def column_label(name: str, units: str) -> str:
     """Return the label of a table column: its name with units as in stores, ``range [m]``."""
-    return name if units in _UNITLESS else f"{name} [{units}]"
+    return name if units in _DIMENSIONLESS_UNITS else f"{name} [{units}]"
 
 
 def format_quantity(value: object, units: str = "") -> str:
     """Return a value with its unit: ``3.5 km``, ``15°``, ``2^17``."""
     text = str(value) if isinstance(value, str | np.str_) else format_number(float(value))  # type: ignore[arg-type]
     symbol = _SYMBOL_BY_UNIT.get(units, units)
-    if units in _UNITLESS:
+    if units in _DIMENSIONLESS_UNITS:
         return text
     return text + symbol if symbol == "°" else f"{text} {symbol}"
 
@@ -62,38 +74,38 @@ def format_coordinate_value(name: str, value: object, units: str = "") -> str:
     return f"{coordinate_label(name)} {format_quantity(value, units)}"
 
 
-def format_with_prefix(value: float, units: str) -> str:
-    """Format a value in SI units with a prefix: ``25 mm``, ``50 µrad``, ``2 km``."""
-    if units in _UNITLESS or units not in _PREFIXABLE_UNITS or value == 0:
+def format_with_si_prefix(value: float, units: str) -> str:
+    """Return a value in SI units as text with an SI prefix: ``25 mm``, ``50 µrad``, ``2 km``."""
+    if units in _DIMENSIONLESS_UNITS or units not in _PREFIXABLE_UNITS or value == 0:
         return format_quantity(value, units)
     prefix_exponent = min(max(3 * math.floor(math.log10(abs(value)) / 3 + 1e-12), -12), 12)
-    return f"{value / 10.0**prefix_exponent:.6g} {_SI_PREFIXES[prefix_exponent]}{units}"
+    return f"{value / 10.0**prefix_exponent:.6g} {_SI_PREFIX_BY_EXPONENT[prefix_exponent]}{units}"
 
 
 def format_number(value: float) -> str:
-    """Return a number with up to six digits; powers of two from 1024 as ``2^n``."""
+    """Return a number as text with up to six digits; powers of two from 1024 become ``2^n``."""
     if value >= 1024 and value == int(value) and int(value).bit_count() == 1:
         return f"2^{int(math.log2(value))}"
     return f"{value:.6g}"
 
 
 def coordinate_label(name: str) -> str:
-    """Return the name of a coordinate as words: ``grazing angle``."""
+    """Return the name of a coordinate in words: ``grazing angle`` for ``grazing_angle``."""
     return {"tnr": "TNR", "fft_size": "FFT size"}.get(name, name.replace("_", " "))
 
 
 def join_sentences(phrases: list[str]) -> str:
-    """Join phrases as sentences; skip empty phrases."""
+    """Turn each phrase into a sentence, and join the sentences; empty phrases are skipped."""
     return " ".join(part[0].upper() + part[1:].rstrip(".") + "." for part in phrases if part)
 
 
 def is_categorical(values: np.ndarray) -> bool:
-    """Tell whether the values of a coordinate are words, not numbers."""
+    """Return True if the values of a coordinate are words, not numbers."""
     return values.dtype.kind not in "fiu"
 
 
-def describe_extent(values: np.ndarray) -> str:
-    """Return the lowest, median and highest finite value as text."""
+def describe_value_extent(values: np.ndarray) -> str:
+    """Return a text with the lowest, the median and the highest finite value of an array."""
     finite_values = values[np.isfinite(values)]
     if not finite_values.size:
         return "no value is known"
@@ -102,7 +114,11 @@ def describe_extent(values: np.ndarray) -> str:
 
 
 def source_note(attributes: Mapping[Any, Any], counted_unit: str) -> str:
-    """Return the source note of a picture: study, model version, and progress if incomplete."""
+    """Return a text that names the study of a picture, the model version and missing progress.
+
+    `attributes` are those of the store. `counted_unit` is the unit of progress: ``points`` or
+    ``blocks``.
+    """
     note = (
         f"study '{attributes['title']}', {attributes['study_id'][:8]}, "
         f"model {attributes['model_version']}"

@@ -1,4 +1,4 @@
-"""Selections of a study's points by index along each axis, their statistics, and published cuts.
+"""Selections of a study's points, statistics of them, and cuts through range and grazing angle.
 
 A selection stores indices along axes. Arrays are read only when values are requested. Large arrays
 are reduced, chunk by chunk, to the number of cells that a figure or a page can show.
@@ -23,27 +23,30 @@ if TYPE_CHECKING:
     from sweep.spec import Axis, AxisParameter, GridSpec, SceneSpec
 
 
-MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
-"""Statistics of the points in a cell."""
+CELL_MEAN, CELL_LOWEST, CELL_HIGHEST = "mean", "lowest", "highest"
+"""Names of the statistics of the points in a cell of a figure."""
 
-VALUES_PER_SUM = 2**20
-"""Number of values that are summed at once."""
+SUMMED_VALUES_MAX = 2**20
+"""Largest number of values in a partial sum."""
 
 
 @dataclass(frozen=True)
 class SortedCoordinate:
-    """Dimension of a figure: indices and values of a coordinate, in the order of its values."""
+    """Coordinate along an axis of a figure, in the order of its values."""
 
     dim: str
+    """Dimension of the dataset along which the coordinate lies."""
     indices: np.ndarray
+    """Index along the dimension of each value."""
     values: np.ndarray
+    """Values of the coordinate, without duplicates."""
 
     def points_per_cell(self, cells_max: int) -> int:
-        """Return the number of adjacent points per cell that gives at most ``cells_max`` cells."""
+        """Return the number of adjacent points per cell for at most ``cells_max`` cells."""
         return 1 if labels.is_categorical(self.values) else -(-self.values.size // cells_max)
 
     def cell_means(self, cells_max: int) -> np.ndarray:
-        """Return the mean value of the coordinate in each cell."""
+        """Return the mean of the coordinate in each cell, for at most ``cells_max`` cells."""
         cell_size = self.points_per_cell(cells_max)
         if cell_size == 1:
             return self.values
@@ -53,20 +56,18 @@ class SortedCoordinate:
 
 
 def to_float_with_nan(array: xr.DataArray) -> xr.DataArray:
-    """Return an array as floats; missing counts, which are negative, become nan."""
+    """Return an array as floats; negative integers, which stand for missing counts, become nan."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
 @dataclass(frozen=True)
 class PointSelection:
-    """Selection of points of a dataset: all combinations of selected indices along its dimensions.
-
-    ``dim_tables`` has a table for each dimension. Its rows are the selected indices, its columns
-    the coordinates along the dimension.
-    """
+    """Selection of points: all combinations of selected indices along a dataset's dimensions."""
 
     dataset: xr.Dataset
+    """Dataset of which points are selected."""
     dim_tables: Mapping[str, pandas.DataFrame]
+    """Table for each dimension: rows are the selected indices, columns the coordinates along it."""
 
     @classmethod
     def from_dataset(cls, dataset: xr.Dataset) -> PointSelection:
@@ -89,13 +90,13 @@ class PointSelection:
         """Number of selected points."""
         return math.prod(map(len, self.dim_tables.values()))
 
-    def dim_of(self, name: str) -> str:
-        """Return the dimension of a coordinate, or the name itself if it is a zipped axis."""
+    def dim_of_coordinate(self, name: str) -> str:
+        """Return the dimension of the named coordinate, or the name if it is a dimension."""
         return next((dim for dim, table in self.dim_tables.items() if name in table), name)
 
     def coordinate_values(self, name: str) -> np.ndarray:
-        """Return the values of a coordinate along its dimension, or the indices if it has none."""
-        table = self.dim_tables[self.dim_of(name)]
+        """Return a coordinate's values at the selected indices; the indices if it has no values."""
+        table = self.dim_tables[self.dim_of_coordinate(name)]
         return np.asarray(table.get(name, table.index))
 
     def coordinate_units(self, name: str) -> str:
@@ -104,17 +105,19 @@ class PointSelection:
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
     def isel(self, dim: str, indices: np.ndarray) -> PointSelection:
-        """Return the selection restricted to positions, or a mask, along a dimension."""
+        """Return the selection restricted to row numbers, or a mask, of a dimension's table."""
         return replace(
             self, dim_tables={**self.dim_tables, dim: self.dim_tables[dim].iloc[indices]}
         )
 
     def sel(self, name: str, values: list[object]) -> PointSelection:
-        """Return the points at which a coordinate has one of the values."""
-        return self.isel(self.dim_of(name), matches_any(self.coordinate_values(name), values))
+        """Return the selection of the points at which a coordinate has one of the values."""
+        return self.isel(
+            self.dim_of_coordinate(name), matches_any_value(self.coordinate_values(name), values)
+        )
 
     def drop_duplicates(self) -> PointSelection:
-        """Return the selection without rows that repeat all coordinates of their dimension."""
+        """Return the selection without points that repeat all coordinates along a dimension."""
         tables = {dim: table.drop_duplicates() if len(table.columns) else table
                   for dim, table in self.dim_tables.items()}  # fmt: skip
         return replace(self, dim_tables=tables)
@@ -133,11 +136,18 @@ class PointSelection:
         ]
 
     def distinguishing_coordinates(self, names: Sequence[str]) -> list[str]:
-        """Return the fewest other coordinates needed to distinguish points of equal ``names``."""
-        return [name for dim in self.dim_tables for name in self.distinguishing_along(dim, names)]
+        """Return coordinates that distinguish points with equal values of the named coordinates.
 
-    def distinguishing_along(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Return :meth:`distinguishing_coordinates` restricted to one dimension."""
+        As few coordinates as possible are returned.
+        """
+        return [
+            name
+            for dim in self.dim_tables
+            for name in self.distinguishing_coordinates_along(dim, names)
+        ]
+
+    def distinguishing_coordinates_along(self, dim: str, names: Sequence[str]) -> list[str]:
+        """Return the `distinguishing_coordinates` that lie along one dimension."""
         table = self.dim_tables[dim]
         given_names = [name for name in names if name in table]
         distinguishing: list[str] = []
@@ -150,8 +160,11 @@ class PointSelection:
         return distinguishing
 
     def group_by(self, name: str) -> list[tuple[object, PointSelection]]:
-        """Return the points of each value of a coordinate, in the order of first appearance."""
-        dim = self.dim_of(name)
+        """Return each value of a coordinate with the selection of its points.
+
+        Values are in the order of their first appearance.
+        """
+        dim = self.dim_of_coordinate(name)
         groups = self.dim_tables[dim].groupby(
             self.coordinate_values(name), sort=False, dropna=False
         )
@@ -161,19 +174,19 @@ class PointSelection:
         ]
 
     def sorted_coordinate(self, name: str) -> SortedCoordinate:
-        """Return a coordinate's unique values, with an index of each.
+        """Return a coordinate's distinct values, each with an index along the dimension.
 
-        Numbers are sorted in rising order, words in the order of first appearance.
+        Numbers are in rising order, words in the order of their first appearance.
         """
         values, first_rows = np.unique(self.coordinate_values(name), return_index=True)
         if labels.is_categorical(values):
             order = np.argsort(first_rows)
             values, first_rows = values[order], first_rows[order]
-        dim = self.dim_of(name)
+        dim = self.dim_of_coordinate(name)
         return SortedCoordinate(dim, np.asarray(self.dim_tables[dim].index)[first_rows], values)
 
     def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
-        """Return the first selected index along every dimension except those of the coordinates."""
+        """Return the first selected index along each dimension without one of the coordinates."""
         shown_dims = {coordinate.dim for coordinate in coordinates}
         return {
             dim: int(table.index[0])
@@ -184,7 +197,7 @@ class PointSelection:
     def coarsen(
         self, variable: str, coordinates: Sequence[tuple[SortedCoordinate, int]], statistic: str
     ) -> xr.DataArray:
-        """Return a variable reduced to cells along some coordinates, lazily.
+        """Return a variable over some coordinates as a lazy array of cells of adjacent points.
 
         Parameters
         ----------
@@ -214,14 +227,16 @@ class PointSelection:
         }
         if max(points_per_cell.values()) > 1:
             coarsened = array.coarsen(points_per_cell, boundary="pad")
-            array = {MEAN: coarsened.mean, LOWEST: coarsened.min, HIGHEST: coarsened.max}[
-                statistic
-            ]()
+            array = {
+                CELL_MEAN: coarsened.mean,
+                CELL_LOWEST: coarsened.min,
+                CELL_HIGHEST: coarsened.max,
+            }[statistic]()
         return array.transpose(*points_per_cell)
 
 
-def matches_any(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
-    """Return a mask of the values that match a wanted value; floats to a relative 1e-9."""
+def matches_any_value(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
+    """Return a mask of the values that equal a wanted value, numbers to a relative 1e-9."""
     if values.dtype.kind not in "fiu":
         return np.isin([str(v) for v in values], [str(w) for w in wanted_values])
     matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted_values]  # type: ignore[arg-type]
@@ -231,7 +246,10 @@ def matches_any(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
 def select_where(
     points: PointSelection, spec: GridSpec, where: Mapping[str, object]
 ) -> PointSelection:
-    """Return the points at which coordinates have given values, written as in the spec."""
+    """Return the selection of the points at which coordinates have given values.
+
+    `where` are one or several values by coordinate, written as in a spec.
+    """
     for name, raw_value in where.items():
         wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
         if name in points.dataset.coords:
@@ -243,9 +261,14 @@ def select_where(
 def split_by_coordinates(
     points: PointSelection, names: Sequence[str], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Split points by the values of coordinates, and name each part.
+    """Split a selection by the values of coordinates.
 
-    Return at most ``parts_max`` parts, evenly spread, and the number of omitted parts.
+    Returns
+    -------
+    parts : list of (str, PointSelection)
+        Name and points of at most ``parts_max`` parts, evenly spread over all parts.
+    n_omitted : int
+        Number of omitted parts.
     """
     parts = [("", points)]
     for name in names:
@@ -260,13 +283,13 @@ def split_by_coordinates(
             for label, part in parts
             for value, subpart in part.group_by(name)
         ]
-    return thin_evenly(parts, parts_max)
+    return thin_parts_evenly(parts, parts_max)
 
 
-def thin_evenly(
+def thin_parts_evenly(
     parts: list[tuple[str, PointSelection]], parts_max: int
 ) -> tuple[list[tuple[str, PointSelection]], int]:
-    """Return at most ``parts_max`` of the parts, evenly spread, and the number of omitted parts."""
+    """Return at most ``parts_max`` evenly spread parts, and the number of omitted parts."""
     if len(parts) <= parts_max:
         return parts, 0
     return [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)], len(
@@ -275,12 +298,12 @@ def thin_evenly(
 
 
 def find_axis_parameter(spec: GridSpec, path: str) -> AxisParameter | None:
-    """Return the axis parameter of a path, or None if it is not on an axis."""
+    """Return the parameter with a path, if it is on an axis of the study, or None."""
     return next((m for axis in spec.axes for m in axis.parameters if m.path == path), None)
 
 
 def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -> dict[str, Any]:
-    """Return the SI values of all parameters at a position along the axes, by dotted path."""
+    """Return the SI values of all parameters by dotted path, at given indices along the axes."""
     return dict(spec.parameters()) | {
         axis_parameter.path: np.asarray(axis_parameter.values)[axis_indices[axis.name]].item()
         for axis in spec.axes
@@ -289,34 +312,36 @@ def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -
 
 
 RANGE_PATH, GRAZING_ANGLE_PATH = "target.range", "target.grazing_angle"
+"""Dotted paths of range and grazing angle."""
 PUBLISHED_CUTS = (
     (GRAZING_ANGLE_PATH, "15 deg"),
     (GRAZING_ANGLE_PATH, "85 deg"),
     (RANGE_PATH, "3500 m"),
 )
-"""Fixed parameter and value of each published cut."""
+"""Cuts of the published figures: path and value of the fixed parameter."""
 
-MEAN_RANGE_MIN = "5 m"
-"""Range below which points are excluded from means.
+AVERAGED_RANGE_MIN = "5 m"
+"""Smallest range of the points that means of false alarms include.
 
-At shorter ranges the echo's own shot noise matters [T 4.2].
+At shorter ranges the shot noise of the echo matters ([T] 4.2).
 """
 
 
 @dataclass(frozen=True)
-class Cut:
-    """Cut through a study: one coordinate fixed at a value, the other varying.
-
-    All names are empty for the cut that is the complete study.
-    """
+class StudyCut:
+    """Cut through a study, along which one coordinate is fixed and the other varies."""
 
     name: str
+    """Name of the cut: the fixed value, or 'all' for the complete study."""
     fixed_name: str
+    """Name of the fixed coordinate; empty for the complete study."""
     fixed_value: object
+    """Value of the fixed coordinate; None for the complete study."""
     varying_name: str
+    """Name of the varying coordinate."""
 
     def select_from(self, points: PointSelection) -> PointSelection:
-        """Return the points of the cut without duplicates."""
+        """Return the points of a selection that are on the cut, without duplicates."""
         return (
             points.sel(self.fixed_name, [self.fixed_value]).drop_duplicates()
             if self.fixed_name
@@ -324,18 +349,18 @@ class Cut:
         )
 
 
-def study_cuts(spec: GridSpec) -> list[Cut]:
-    """Return the cuts through range and grazing angle of a study.
+def study_cuts(spec: GridSpec) -> list[StudyCut]:
+    """Return the cuts of a study along which either range or grazing angle is fixed.
 
-    A zipped axis of both defines its cuts. Otherwise they are the three published cuts, or one cut
-    that is the complete study.
+    If both are on one zipped axis, that axis defines the cuts. Otherwise they are the published
+    cuts whose fixed value the study has, or the complete study.
     """
     range_parameter, angle_parameter = (
         find_axis_parameter(spec, RANGE_PATH),
         find_axis_parameter(spec, GRAZING_ANGLE_PATH),
     )
     uncut = [
-        Cut(
+        StudyCut(
             "all",
             "",
             None,
@@ -364,7 +389,7 @@ def study_cuts(spec: GridSpec) -> list[Cut]:
             (m, v) for m, v in published_values if np.isclose(m.display_values, float(v)).any()
         ]
     cut_list = [
-        Cut(
+        StudyCut(
             labels.format_quantity(value, axis_parameter.units).replace("°", " deg"),
             axis_parameter.coordinate,
             value,
@@ -378,9 +403,9 @@ def study_cuts(spec: GridSpec) -> list[Cut]:
 
 
 def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
-    """Return the constant parameter and its value for each run of a zipped axis, in order.
+    """Divide a zipped axis into runs along which range or grazing angle is constant.
 
-    In a run one of range and grazing angle is constant, while the other varies.
+    The result is the constant parameter and its value for each run, in order.
     """
     axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
     runs: list[tuple[AxisParameter, object]] = []
@@ -402,17 +427,21 @@ def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
     return runs
 
 
-def select_beyond(
+def select_beyond_range(
     points: PointSelection, spec: GridSpec, distance: str, *, inclusive: bool = False
 ) -> PointSelection:
-    """Return the points beyond a range, or at it with ``inclusive``, if range is on an axis."""
+    """Return the selection of the points beyond a range, such as "5 m".
+
+    With ``inclusive`` the points at that range count too. All points are returned if range is on no
+    axis.
+    """
     range_parameter = find_axis_parameter(spec, RANGE_PATH)
     if range_parameter is None:
         return points
     range_min = float(spec.read_coordinate_value(RANGE_PATH, distance))
     ranges = points.coordinate_values(range_parameter.coordinate)
     return points.isel(
-        points.dim_of(range_parameter.coordinate),
+        points.dim_of_coordinate(range_parameter.coordinate),
         ranges >= range_min if inclusive else ranges > range_min,
     )
 
@@ -422,16 +451,21 @@ class Statistics:
     """Statistics of the finite values of points; nan if there are none."""
 
     n_finite: int
+    """Number of finite values."""
     mean: float
+    """Mean of the finite values."""
     median: float
+    """Median of the finite values."""
     minimum: float
+    """Smallest finite value."""
     maximum: float
+    """Largest finite value."""
 
     @classmethod
     def from_values(cls, values: np.ndarray) -> Statistics:
-        """Return the statistics of values, nan or finite; the values are sorted in place."""
+        """Return the statistics of finite values; nan is ignored, and the array sorted in place."""
         total = sum(
-            np.nansum(part) for part in np.array_split(values, values.size // VALUES_PER_SUM + 1)
+            np.nansum(part) for part in np.array_split(values, values.size // SUMMED_VALUES_MAX + 1)
         )
         values.sort()  # nan is sorted to the end
         n_finite = int(np.searchsorted(values, np.nan))
@@ -444,7 +478,7 @@ class Statistics:
 
 
 def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[Statistics]:
-    """Return the statistics of a variable over the points of each group, in one reading pass."""
+    """Return the statistics of a variable over each group of points. The data are read once."""
     indices_by_group = [
         {dim: np.asarray(table.index) for dim, table in g.dim_tables.items()} for g in groups
     ]

@@ -1,4 +1,4 @@
-"""Spectra of a single shot, of a grid or of a scene, with its detections, as figure and report."""
+"""Spectra of a single shot of a grid or a scene, with its detections, as a figure and a report."""
 
 from __future__ import annotations
 
@@ -31,42 +31,51 @@ from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.units import percent
 
-Parameters = Mapping[str, float | int | str]
+ParameterValues = Mapping[str, float | int | str]
 """SI values of parameters by dotted path."""
 
-SEGMENT_NAMES = ("up-chirp", "Doppler", "down-chirp")
-"""Display names of the segments, in the order of their indices."""
+SEGMENT_DISPLAY_NAMES = ("up-chirp", "Doppler", "down-chirp")
+"""Display names of the segments of a shot, in the order of their indices."""
 
 
 @dataclass(frozen=True)
 class BinGroup:
-    """Indices of adjacent bins above the threshold: first, last, and strongest bin."""
+    """Group of adjacent bins above the threshold, by their indices in a spectrum."""
 
     first_index: int
+    """Index of the first bin."""
     last_index: int
+    """Index of the last bin."""
     peak_index: int
+    """Index of the strongest bin."""
 
 
 @dataclass(frozen=True)
 class SegmentSpectrum:
-    """Spectrum of a segment, with its detections.
-
-    Bins are sorted by frequency; a complex record has negative ones too. Frequencies and carrier
-    are in Hz. ``signal_magnitude`` is |X| of the signal alone and ``magnitude`` is |X| with noise,
-    if it is drawn, both in V. ``snr`` and ``pd`` are those of the strongest bin.
-    """
+    """Spectrum of a segment of n bins, with its detections."""
 
     name: str
+    """Display name of the segment."""
     slope: float
+    """Slope of the frequency over the chirp rate: 1 for the up-chirp, 0 for constant frequency."""
     bins: np.ndarray
+    """Numbers of the bins (n,), rising; a complex record has negative ones too."""
     frequency: np.ndarray
+    """Frequencies of the bins (n,) [Hz]."""
     signal_magnitude: np.ndarray
+    """Magnitudes |X| of the signal without noise (n,) [V]."""
     magnitude: np.ndarray
+    """Magnitudes |X| with noise, if noise was drawn (n,) [V]."""
     beat_frequency: float
+    """Beat frequency, before it is folded at the Nyquist frequency [Hz]."""
     carrier_frequency: float
+    """Carrier frequency of the segment [Hz]."""
     bin_groups: tuple[BinGroup, ...]
+    """Groups of bins above the threshold: the detections."""
     snr: float
+    """Signal-to-noise ratio of the signal's strongest bin."""
     pd: float
+    """Probability of detection in the segment."""
 
     @property
     def peak_index(self) -> int:
@@ -79,16 +88,23 @@ class SimulatedShot:
     """Simulated shot: parameters, prepared shot, spectra, and reported range and velocity."""
 
     label: str
-    parameters: Parameters
+    """Label of the shot in figures and tables."""
+    parameters: ParameterValues
+    """Parameters of the shot."""
     prepared_shot: shot_model.Shots
+    """Prepared shot, as an array of one shot."""
     outputs: dict[str, float]
+    """Outputs of the model, by variable name."""
     segments: tuple[SegmentSpectrum, ...]
+    """Spectra of the segments that the shot has."""
     reported_range: float
+    """Range that the strongest bins give [m]."""
     reported_radial_velocity: float
+    """Radial velocity that the strongest bins give [m/s]."""
 
     @property
-    def bin_deviation(self) -> float:
-        """Standard deviation of a bin's noise, per quadrature [V]."""
+    def noise_sigma(self) -> float:
+        """Standard deviation of the noise in a bin, per quadrature [V]."""
         return float(self.prepared_shot.bin_noise_sigma[0])
 
     @property
@@ -99,25 +115,27 @@ class SimulatedShot:
     @property
     def noise_rms(self) -> float:
         """Root mean square of |X| in a bin of noise [V]."""
-        return float(np.sqrt(2)) * self.bin_deviation
+        return float(np.sqrt(2)) * self.noise_sigma
 
-    def to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
-        """Return the amplitude of a tone with magnitude |X|, in dB relative to 1 V."""
+    def magnitude_to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
+        """Convert a magnitude |X| [V] to the amplitude of a tone with this magnitude [dBV]."""
         with np.errstate(divide="ignore"):
             return 20 * np.log10(2 * np.asarray(magnitude) / self.prepared_shot.window.sum)
 
     @property
     def is_detected(self) -> bool:
-        """True if the segments that decide about a shot have groups of bins above the threshold."""
+        """True if the shot is detected: both chirps, or any two segments, exceed the threshold."""
         if self.prepared_shot.any_two:
             return sum(bool(segment.bin_groups) for segment in self.segments) >= 2
         return all(
-            segment.bin_groups for segment in self.segments if segment.name != SEGMENT_NAMES[1]
+            segment.bin_groups
+            for segment in self.segments
+            if segment.name != SEGMENT_DISPLAY_NAMES[1]
         )
 
 
 def simulate_shot(
-    parameters: Parameters,
+    parameters: ParameterValues,
     effects: Collection[str] = DEFAULT_EFFECTS,
     *,
     label: str = "",
@@ -134,7 +152,7 @@ def simulate_shot(
     label
         Label of the shot in figures and tables.
     seed
-        Seed of the noise in the spectra; None for spectra without noise.
+        Seed of the noise in the spectra. Without a seed the spectra have no noise.
     """
     ((_, prepared_shot),) = prepare_shots(parameters, effects)
     return simulate_prepared_shot(prepared_shot, parameters, label=label, seed=seed)
@@ -142,12 +160,15 @@ def simulate_shot(
 
 def simulate_prepared_shot(
     prepared_shot: shot_model.Shots,
-    parameters: Parameters,
+    parameters: ParameterValues,
     *,
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one prepared shot, of a grid or a scene; with a seed, noise is drawn."""
+    """Simulate one prepared shot of a grid or a scene.
+
+    Parameters and result are those of :func:`simulate_shot`.
+    """
     segment_results = shot_model.evaluate_segments(prepared_shot)
     segments = tuple(
         _segment_spectrum(prepared_shot, segment_results[k, :, 0], k, seed)
@@ -156,7 +177,7 @@ def simulate_prepared_shot(
     )
     peak_results = segment_results.copy()
     for segment in segments:
-        peak_results[SEGMENT_NAMES.index(segment.name), 3, 0] = segment.frequency[
+        peak_results[SEGMENT_DISPLAY_NAMES.index(segment.name), 3, 0] = segment.frequency[
             segment.peak_index
         ]
     measurement = shot_model.measure_range_velocity(prepared_shot, peak_results)
@@ -180,7 +201,11 @@ def _segment_spectrum(
     segment_index: int,
     seed: int | None,
 ) -> SegmentSpectrum:
-    """Return the spectrum of a segment with its detections; with a seed, noise is drawn."""
+    """Return the spectrum of a segment with its detections.
+
+    `segment_result` are the results of the model for the segment. Noise is drawn if `seed` is
+    given.
+    """
     signed_bins, signal_magnitude = (
         prepared_shot.all_signed_bins,
         full_segment_spectrum(prepared_shot, 0, segment_index),
@@ -212,7 +237,7 @@ def _segment_spectrum(
         radial_velocity=np.ravel(segment.doppler_ratio)[0] * SPEED_OF_LIGHT / 2,
     )
     return SegmentSpectrum(
-        name=SEGMENT_NAMES[segment_index],
+        name=SEGMENT_DISPLAY_NAMES[segment_index],
         slope=segment.chirp_slope,
         bins=signed_bins,
         frequency=signed_bins * float(prepared_shot.sample_rate[0]) / prepared_shot.fft_size,
@@ -245,8 +270,8 @@ def draw_noise_spectrum(
     Returns
     -------
     numpy.ndarray
-        Complex spectrum [V], (N/2 + 1,) for a real record and (N,) for a complex one. It is added
-        to |X| of the signal, which does not keep the phase between bins.
+        Complex spectrum [V] of a record with FFT size N: (N/2 + 1,) for a real record, (N,) for a
+        complex one.
     """
     window_shape = prepared_shot.window
     spawn_key = (segment, look) if look else (segment,)
@@ -261,7 +286,7 @@ def draw_noise_spectrum(
 
 
 def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, ...]:
-    """Find runs of adjacent bins at or above the threshold."""
+    """Return the groups of adjacent bins whose magnitudes reach the threshold."""
     bins_above = np.flatnonzero(magnitude >= threshold)
     runs = (
         np.split(bins_above, np.flatnonzero(np.diff(bins_above) > 1) + 1) if bins_above.size else []
@@ -274,7 +299,7 @@ def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, 
 def range_or_velocity_at(
     shot: SimulatedShot, segment: SegmentSpectrum, frequency: np.ndarray
 ) -> np.ndarray:
-    """Return the range or radial velocity that frequencies in a segment correspond to.
+    """Convert frequencies in a segment's spectrum to range or radial velocity.
 
     Parameters
     ----------
@@ -283,7 +308,8 @@ def range_or_velocity_at(
     segment
         Segment of this shot.
     frequency
-        Frequencies in the spectrum [Hz]. They are unfolded as the segment's beat frequency is.
+        Frequencies in the spectrum [Hz]. They are taken to be folded at the Nyquist frequency like
+        the segment's beat frequency.
 
     Returns
     -------
@@ -318,36 +344,42 @@ SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
     canvas.LINE_COLOURS[1],
     "black",
 )
-MARGIN_BELOW_DB, MARGIN_ABOVE_DB = 25.0, 12.0
-"""Margins of the plot below the noise level and above the strongest bin [dB]."""
+LEVEL_AXIS_MARGIN_BELOW_DB, LEVEL_AXIS_MARGIN_ABOVE_DB = 25.0, 12.0
+"""Margins of the level axis below the noise and above the strongest bin or the threshold [dB]."""
 
-VIEW_HALF_WIDTH_MIN_BINS = 12
-"""Least half-width of the view around the peak [bins]."""
+PEAK_VIEW_HALF_WIDTH_MIN_BINS = 12
+"""Least half-width of the close-up of a peak [bins]."""
 
-VIEW_MARGIN_MIN_BINS = 8
-"""Least margin of the view around the outermost detections [bins]."""
+DETECTION_VIEW_MARGIN_MIN_BINS = 8
+"""Least margin of a close-up around its outermost detections [bins]."""
 
-NEAR_DETECTION_BAND_FRACTION = 0.05
-"""Largest distance of a detection from the strongest peak in a view, as a fraction of the band."""
+NEARBY_DETECTION_BAND_FRACTION_MAX = 0.05
+"""Largest distance of a detection from the peak in a close-up, as a fraction of the band.
+"""
 
 
 def draw_spectra_sheet(
     shots: Sequence[SimulatedShot], *, title: str, footnote: str, shows_detections: bool = False
 ) -> Sheet:
-    """Return a sheet of spectra: a row per segment; for each shot the full band and the peak."""
+    """Return a sheet with a row for each segment, and for each shot its full band and a close-up.
+
+    With ``shows_detections`` the close-up includes all detections near the peak.
+    """
     n_rows, n_columns = len(shots[0].segments), 2 * len(shots)
     width = 5.4 if len(shots) == 1 else 4.2
     sheet, axes = canvas.sheet_with_axes(width * n_columns, 3.1 * n_rows + 1.2, n_rows, n_columns)
-    decibel_limits = _decibel_limits(shots)
+    decibel_limits = _level_axis_limits_db(shots)
     for j, shot in enumerate(shots):
         for i, segment in enumerate(shot.segments):
             whole_axes, close_axes = axes[i * n_columns + 2 * j], axes[i * n_columns + 2 * j + 1]
             _draw_spectrum(whole_axes, shot, segment, slice(None), 0.5)
             view = (
-                detection_view(segment) if shows_detections else peak_view(segment.signal_magnitude)
+                detection_bin_slice(segment)
+                if shows_detections
+                else peak_bin_slice(segment.signal_magnitude)
             )
             _draw_spectrum(close_axes, shot, segment, view, 1.0)
-            _annotate(close_axes, shot, segment)
+            _annotate_snr_and_pd(close_axes, shot, segment)
             for panel in (whole_axes, close_axes):
                 panel.set_ylim(*decibel_limits)
                 panel.grid(True)
@@ -372,23 +404,26 @@ def draw_spectra_sheet(
     return sheet
 
 
-def _decibel_limits(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
-    """Return the limits of a level axis that shows noise and peaks of all shots [dB]."""
-    low = min(float(shot.to_dbv(shot.noise_rms)) for shot in shots) - MARGIN_BELOW_DB
+def _level_axis_limits_db(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
+    """Return the limits of a level axis that shows the noise and the peaks of all shots [dBV]."""
+    low = (
+        min(float(shot.magnitude_to_dbv(shot.noise_rms)) for shot in shots)
+        - LEVEL_AXIS_MARGIN_BELOW_DB
+    )
     high = max(
-        float(shot.to_dbv(max(segment.magnitude.max(), shot.threshold)))
+        float(shot.magnitude_to_dbv(max(segment.magnitude.max(), shot.threshold)))
         for shot in shots
         for segment in shot.segments
     )
-    return low, high + MARGIN_ABOVE_DB
+    return low, high + LEVEL_AXIS_MARGIN_ABOVE_DB
 
 
 def _draw_spectrum(
     axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum, view: slice, line_width: float
 ) -> None:
-    """Draw spectrum, threshold, noise level and detections of a view."""
+    """Draw a slice of a segment's spectrum, with threshold, noise level and detections."""
     frequency_mhz = segment.frequency[view] / 1e6
-    level_db = np.maximum(shot.to_dbv(segment.magnitude[view]), -500.0)
+    level_db = np.maximum(shot.magnitude_to_dbv(segment.magnitude[view]), -500.0)
     marker = "." if frequency_mhz.size <= 200 else ""
     axes.plot(
         frequency_mhz,
@@ -402,12 +437,12 @@ def _draw_spectrum(
         (shot.threshold, THRESHOLD_COLOUR, "--", "threshold"),
         (shot.noise_rms, NOISE_COLOUR, "-.", "noise (rms)"),
     ):
-        height_db = float(shot.to_dbv(value))
+        height_db = float(shot.magnitude_to_dbv(value))
         axes.axhline(height_db, color=colour, linestyle=dash, linewidth=1.2, label=label)
     peak_indices = np.array([group.peak_index for group in segment.bin_groups], dtype=int)
     axes.plot(
         segment.frequency[peak_indices] / 1e6,
-        shot.to_dbv(segment.magnitude[peak_indices]),
+        shot.magnitude_to_dbv(segment.magnitude[peak_indices]),
         linestyle="",
         marker="v",
         markersize=7,
@@ -418,8 +453,8 @@ def _draw_spectrum(
     axes.set_xlim(float(frequency_mhz[0]), float(frequency_mhz[-1]))
 
 
-def _annotate(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None:
-    """Annotate SNR and pd in a corner, and range or velocity on the top axis."""
+def _annotate_snr_and_pd(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None:
+    """Write SNR and pd into a corner of the axes, and add a top axis of range or velocity."""
     annotation_lines = (
         [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
     )
@@ -452,25 +487,25 @@ def _annotate(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None
     axes.ticklabel_format(axis="x", useOffset=False)
 
 
-def peak_view(magnitude: np.ndarray) -> slice:
-    """Return the slice of bins around the peak, down to a tenth of its height."""
+def peak_bin_slice(magnitude: np.ndarray) -> slice:
+    """Return the slice of bins around the largest magnitude, down to a tenth of it."""
     peak = int(np.argmax(magnitude))
     strong_bins = np.flatnonzero(magnitude >= 0.1 * magnitude[peak])
     nearby_bins = strong_bins[np.abs(strong_bins - peak) < magnitude.size // 8]
     half_width = max(
-        VIEW_HALF_WIDTH_MIN_BINS, int(1.5 * max(peak - nearby_bins[0], nearby_bins[-1] - peak))
+        PEAK_VIEW_HALF_WIDTH_MIN_BINS, int(1.5 * max(peak - nearby_bins[0], nearby_bins[-1] - peak))
     )
     return slice(max(peak - half_width, 0), min(peak + half_width + 1, magnitude.size))
 
 
-def detection_view(segment: SegmentSpectrum) -> slice:
-    """Return the slice of bins around the peak that also contains all nearby detections."""
-    view, n_bins = peak_view(segment.signal_magnitude), segment.signal_magnitude.size
+def detection_bin_slice(segment: SegmentSpectrum) -> slice:
+    """Return the slice of bins around a segment's peak that contains all detections near it."""
+    view, n_bins = peak_bin_slice(segment.signal_magnitude), segment.signal_magnitude.size
     peak = int(np.argmax(segment.signal_magnitude))
     near_groups = [
         group
         for group in segment.bin_groups
-        if abs(group.peak_index - peak) <= NEAR_DETECTION_BAND_FRACTION * n_bins
+        if abs(group.peak_index - peak) <= NEARBY_DETECTION_BAND_FRACTION_MAX * n_bins
     ]
     if not near_groups:
         return view
@@ -478,7 +513,7 @@ def detection_view(segment: SegmentSpectrum) -> slice:
         min(g.first_index for g in near_groups),
         max(g.last_index for g in near_groups),
     )
-    margin = max(VIEW_MARGIN_MIN_BINS, (last_index - first_index) // 6)
+    margin = max(DETECTION_VIEW_MARGIN_MIN_BINS, (last_index - first_index) // 6)
     return slice(
         max(min(view.start, first_index - margin), 0),
         min(max(view.stop, last_index + margin + 1), n_bins),
@@ -493,7 +528,7 @@ def draw_scene_shot_sheet(
     title: str,
     remarks: Sequence[str],
 ) -> Sheet:
-    """Return the spectra of a scene's shot, with marks at the lines of its beamlets."""
+    """Return a sheet of the spectra of a scene's shot, with marks at the lines of its beamlets."""
     notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
     sheet = draw_spectra_sheet(
         [shot], title=title, footnote=labels.join_sentences(notes), shows_detections=True
@@ -501,7 +536,9 @@ def draw_scene_shot_sheet(
     is_hit, line_bins = eyepoints.surface[0] >= 0, beamlet_line_positions(shot.prepared_shot)[0]
     bin_width = float(shot.prepared_shot.sample_rate[0]) / shot.prepared_shot.fft_size
     for i, segment in enumerate(shot.segments):
-        line_frequencies = line_bins[SEGMENT_NAMES.index(segment.name), is_hit] * bin_width / 1e6
+        line_frequencies = (
+            line_bins[SEGMENT_DISPLAY_NAMES.index(segment.name), is_hit] * bin_width / 1e6
+        )
         close_axes = sheet.axes[2 * i + 1]
         line_marks = [
             close_axes.plot(
@@ -524,7 +561,7 @@ def draw_scene_shot_sheet(
 
 
 def _noise_table(shot: SimulatedShot) -> PageTable:
-    """Return a table of the noise at the ADC by source, in volts and shares of the variance."""
+    """Return a table of the noise at the ADC by source: volts, and shares of the noise variance."""
     variance_by_source = {
         n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_variances.items()
     }
@@ -543,14 +580,14 @@ def _noise_table(shot: SimulatedShot) -> PageTable:
 
 
 def _segment_table(shot: SimulatedShot) -> PageTable:
-    """Return a table of the segments: beat, peak, level, SNR, pd and number of groups."""
+    """Return a table of the segments: beat frequency, peak, level, SNR, pd, number of groups."""
     columns = (
         "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
         "groups",
     )  # fmt: skip
     heading = (
-        f"Segments (noise of a bin {shot.to_dbv(shot.noise_rms):.1f} dBV rms, threshold "
-        f"{shot.to_dbv(shot.threshold):.1f} dBV)"
+        f"Segments (noise of a bin {shot.magnitude_to_dbv(shot.noise_rms):.1f} dBV rms, threshold "
+        f"{shot.magnitude_to_dbv(shot.threshold):.1f} dBV)"
     )
     rows = [
         (
@@ -558,7 +595,7 @@ def _segment_table(shot: SimulatedShot) -> PageTable:
             f"{segment.beat_frequency / 1e6:+.6f}",
             f"{segment.frequency[segment.peak_index] / 1e6:.6f}",
             int(segment.bins[segment.peak_index]),
-            f"{shot.to_dbv(segment.magnitude[segment.peak_index]):.1f}",
+            f"{shot.magnitude_to_dbv(segment.magnitude[segment.peak_index]):.1f}",
             f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
             f"{segment.pd:.6g}",
             len(segment.bin_groups),
@@ -604,10 +641,10 @@ def _false_alarm_table(shot: SimulatedShot) -> PageTable:
     return PageTable("False alarms", ("", "probability"), rows)
 
 
-DRAWN_VALUES_MAX = 3
-"""Largest number of values of a study's only axis at which every value is drawn."""
+DRAWN_AXIS_VALUES_MAX = 3
+"""Largest number of values of a study's only axis at which a report shows a shot each."""
 
-_DESCRIBED_PATHS = (
+_REPORTED_PARAMETER_PATHS = (
     "target.range",
     "target.grazing_angle",
     "target.radial_velocity",
@@ -621,7 +658,7 @@ _DESCRIBED_PATHS = (
     "instrument.processing.window",
     *THRESHOLD_PATHS,
 )
-"""Paths of the parameters that a report lists."""
+"""Dotted paths of the parameters that the report of a shot lists."""
 
 
 def write_shot_report(
@@ -633,11 +670,29 @@ def write_shot_report(
     seed: int = 0,
     picture_format: str = "png",
 ) -> tuple[str, list[Path]]:
-    """Write spectra, threshold, noise level and detections of one shot; return text and files.
+    """Write the spectra and tables of one shot of a grid; return the text and the written files.
 
-    Parameters on an axis take the values in ``coordinate_values``, written with units, or else
-    their first value. If a study has a single axis of few values and none is given, all of them are
-    drawn. Raise SpecError for values that can't be read.
+    Parameters
+    ----------
+    spec
+        Spec of the grid.
+    coordinate_values
+        Values of coordinates, written with units, by name or path. Coordinates without a value take
+        their first one. If nothing is given and the only axis has few values, each of them makes a
+        shot.
+    directory
+        Output directory.
+    draws_noise
+        If true, noise is drawn into the spectra.
+    seed
+        Seed of the noise.
+    picture_format
+        ``png``, ``pdf`` or ``svg``.
+
+    Raises
+    ------
+    SpecError
+        A value can't be read, or is given twice.
     """
     effect_modes = spec.effect_modes()
     effects = [e.name for e in EFFECTS if not e.is_random and effect_modes[e.name] != "off"]
@@ -668,8 +723,8 @@ def write_shot_report(
 
 def select_shot_parameters(
     spec: GridSpec, coordinate_values: Mapping[str, str]
-) -> list[tuple[str, Parameters]]:
-    """Return the parameters of the shots to draw, each with its label."""
+) -> list[tuple[str, ParameterValues]]:
+    """Return the label and the parameters of each shot that :func:`write_shot_report` draws."""
     axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
     path_by_name, rule_by_path = {m.coordinate: m.path for m in axis_parameters}, parameter_rules()
     names_by_path: dict[str, str] = {}
@@ -680,9 +735,9 @@ def select_shot_parameters(
             raise SpecError([Mistake(path, problem, suggestion="keep one of them")])
         names_by_path[path] = name
     draws_all_values = (
-        not coordinate_values and len(spec.axes) == 1 and spec.axes[0].size <= DRAWN_VALUES_MAX
+        not coordinate_values and len(spec.axes) == 1 and spec.axes[0].size <= DRAWN_AXIS_VALUES_MAX
     )
-    labelled_parameters: list[tuple[str, Parameters]] = []
+    labelled_parameters: list[tuple[str, ParameterValues]] = []
     for i in range(spec.axes[0].size if draws_all_values else 1):
         raw_values: dict[str, object] = {
             m.path: rule_by_path[m.path].format(m.values[i]) for m in axis_parameters
@@ -701,8 +756,8 @@ def select_shot_parameters(
     return labelled_parameters
 
 
-def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Return parameters by name, with values as a user would write them."""
+def _format_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Return the name and the formatted value of each parameter of a shot at the given paths."""
     rule_by_path = parameter_rules()
     descriptions = []
     for path in paths:
@@ -718,14 +773,14 @@ def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tu
         elif path == GRAZING_ANGLE_PATH:
             value_text = labels.format_quantity(math.degrees(value), "deg")
         else:
-            value_text = labels.format_with_prefix(value, rule_by_path[path].value_unit)
+            value_text = labels.format_with_si_prefix(value, rule_by_path[path].value_unit)
         descriptions.append((labels.coordinate_label(path.rsplit(".", 1)[-1]), value_text))
     return descriptions
 
 
 def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
-    """Return the parameters that all shots share, as one line of text."""
-    descriptions = [_describe_parameters(shot, _DESCRIBED_PATHS) for shot in shots]
+    """Return a line of text with the parameters that are equal in all shots."""
+    descriptions = [_format_parameters(shot, _REPORTED_PARAMETER_PATHS) for shot in shots]
     return ", ".join(
         f"{name} {value_text}"
         for name, value_text in descriptions[0]
@@ -734,12 +789,14 @@ def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
 
 
 def _shot_tables(shots: list[SimulatedShot]) -> list[PageTable]:
-    """Return the tables of all shots, headed by their labels."""
+    """Return the tables of all shots; their headings begin with the label of the shot."""
     tables = []
     for shot in shots:
         prefix = f"{shot.label}: " if shot.label else ""
         parameter_table = PageTable(
-            f"{prefix}Shot", ("parameter", "value"), _describe_parameters(shot, _DESCRIBED_PATHS)
+            f"{prefix}Shot",
+            ("parameter", "value"),
+            _format_parameters(shot, _REPORTED_PARAMETER_PATHS),
         )
         further_tables = [
             _noise_table(shot),

@@ -1,4 +1,4 @@
-"""Figures and tables of a study, of a grid or of a scene, as defined in its spec."""
+"""Figures and tables that the spec of a study defines, for grids and scenes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import accuracy_results, canvas, charts, labels, tables
-from sweep.analysis.datasets import ACCURACY_KIND, SCENE_KIND, open_tree, read_attributes_of_kind
+from sweep.analysis.datasets import (
+    ACCURACY_KIND,
+    SCENE_KIND,
+    open_scene_tree,
+    read_attributes_of_kind,
+)
 from sweep.analysis.datasets import open as open_store
 from sweep.analysis.scene_results import cloud_figures
 from sweep.analysis.scene_results.cloud_figures import HeightMap
 from sweep.analysis.scene_results.navigation_errors import (
-    navigation_chart,
-    navigation_curves,
-    navigation_page,
+    navigation_error_chart,
+    navigation_error_curves,
+    navigation_error_page,
 )
 from sweep.analysis.scene_results.recordings import (
     QUANTITY_BY_NAME,
@@ -29,7 +34,7 @@ from sweep.analysis.scene_results.recordings import (
     Recording,
     find_axis_position,
     find_multi_surface_shot,
-    gather_cloud,
+    gather_point_cloud,
     read_eyepoints,
 )
 from sweep.analysis.selection import (
@@ -63,10 +68,10 @@ from sweep.spec.figure_sections import (
 )
 from sweep.storage.locations import Location, derived_files_dir, parse_location
 
-LONG_AXIS_VALUES_MIN = 8
-"""Least number of values of an axis that can be a side of a surface."""
+SURFACE_AXIS_VALUES_MIN = 8
+"""Least number of values of an axis that a default figure shows as a side of a surface."""
 
-DEFAULT_VARIABLES = ("pd_shot", "pd_doppler")
+DEFAULT_FIGURE_VARIABLES = ("pd_shot", "pd_doppler")
 """Variables of the default figures of a grid."""
 
 
@@ -75,7 +80,9 @@ class GridResults:
     """Opened store of a grid, with its spec."""
 
     dataset: xr.Dataset
+    """Dataset of the store, as `sweep.open` returns it."""
     spec: GridSpec
+    """Spec of the study."""
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> GridResults:
@@ -90,13 +97,13 @@ class GridResults:
 
     @property
     def figure_specs(self) -> list[GridFigure]:
-        """Figures that the spec defines, or a default set."""
+        """Specs of the figures: those in the study's spec, or a default set."""
         return list(self.spec.figures) or default_grid_figures(self.spec)
 
     def make_chart(
         self, figure_spec: SurfaceFigure | SlicesFigure, size_limits: charts.ChartSizeLimits
     ) -> charts.Chart | None:
-        """Return the chart of a figure, or None if no point matches its selection."""
+        """Return the chart of a surface or of slices; None if the figure selects no points."""
         points = select_where(self.points, self.spec, figure_spec.where)
         if not points.size:
             return None
@@ -122,10 +129,10 @@ class GridResults:
             points, by=figure_spec.by, levels=figure_spec.levels, **chart_options
         )
 
-    def make_page(
+    def make_table_page(
         self, figure_spec: TableFigure | FalseAlarmTable | ThresholdTable
     ) -> tables.TablePage:
-        """Return the page of a table."""
+        """Return the page of a table that the spec defines."""
         title = figure_spec.title or self.spec.title
         if isinstance(figure_spec, TableFigure):
             units = str(self.dataset[figure_spec.variable].attrs.get("units", ""))
@@ -137,10 +144,10 @@ class GridResults:
         )
 
     def render_figure(self, figure_spec: GridFigure) -> canvas.Sheet | tables.TablePage | str:
-        """Return the sheet or the page of a figure, or a message why there is none."""
+        """Return the sheet of a figure or the page of a table; a message if it would be empty."""
         if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
-            return self.make_page(figure_spec)
-        chart = self.make_chart(figure_spec, charts.SHEET_LIMITS)
+            return self.make_table_page(figure_spec)
+        chart = self.make_chart(figure_spec, charts.SHEET_SIZE_LIMITS)
         if chart is None:
             return f"no point of the study has {describe_selection(figure_spec)}"
         title = "\n".join(filter(None, [self.spec.title, figure_spec.title]))
@@ -151,7 +158,7 @@ class GridResults:
 
 
 def describe_selection(figure_spec: SurfaceFigure | SlicesFigure) -> str:
-    """Return the selection of a figure in words."""
+    """Return a text with the coordinate values that a figure selects."""
     return ", ".join(
         f"{labels.coordinate_label(name)} {value}"
         for name, value in figure_spec.where.items()
@@ -202,7 +209,7 @@ def draw_figures(
     else:
         results = GridResults.from_store(store)
         if not results.figure_specs:
-            return tables.outputs_page(results.dataset).save_files(directory, "outputs")
+            return tables.single_point_page(results.dataset).save_files(directory, "outputs")
     paths = []
     for figure_spec in results.figure_specs:
         output = results.render_figure(figure_spec)
@@ -214,7 +221,7 @@ def draw_figures(
                 if isinstance(output, str)
                 else output
             )
-            source_text = picture_source(str(attributes["study_id"]), figure_spec)
+            source_text = picture_source_text(str(attributes["study_id"]), figure_spec)
             paths.append(
                 canvas.save_sheet(
                     sheet,
@@ -225,8 +232,8 @@ def draw_figures(
     return paths
 
 
-def picture_source(study_id: str, figure_spec: GridFigure | SceneFigure) -> str:
-    """Return a text that identifies the study and the figure of a picture.
+def picture_source_text(study_id: str, figure_spec: GridFigure | SceneFigure) -> str:
+    """Return the text in a picture's metadata that identifies its study and its figure.
 
     The study id depends on everything that determines the results, including the model version.
     """
@@ -235,10 +242,10 @@ def picture_source(study_id: str, figure_spec: GridFigure | SceneFigure) -> str:
 
 
 def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
-    """Return default figures: surfaces over two long axes, else slices along one axis.
+    """Return the specs of a grid's default figures.
 
-    Slices run along a zipped or the longest axis. Axes of words alone make slices by category, and
-    tables.
+    They are surfaces over two long axes, or otherwise slices along a zipped axis or the longest
+    one. A study whose axes have no numbers gets slices over categories, and tables.
     """
     zipped_axes = [axis for axis in spec.axes if axis.is_zipped][:1]
     axes = zipped_axes or sorted(spec.axes, key=lambda axis: -axis.size)
@@ -248,14 +255,16 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
         for axis_parameter in axis.parameters
         if not labels.is_categorical(np.asarray(axis_parameter.display_values))
     ]
-    long_axes = [axis for axis, _ in numeric_parameters if axis.size >= LONG_AXIS_VALUES_MIN]
+    long_axes = [axis for axis, _ in numeric_parameters if axis.size >= SURFACE_AXIS_VALUES_MIN]
     if not zipped_axes and len(long_axes) >= 2:
         # Prefer range and angle to other axes, with the angle as vertical axis.
         path_by_axis = {axis.name: axis.parameters[0].path for axis in long_axes}
         rank = {RANGE_PATH: 0, GRAZING_ANGLE_PATH: 1}
         axis_names = sorted(path_by_axis, key=lambda name: rank.get(path_by_axis[name], 2))[:2]
         x, y = sorted(axis_names, key=lambda name: path_by_axis[name] == GRAZING_ANGLE_PATH)
-        return [SurfaceFigure(kind="surface", variable=v, x=x, y=y) for v in DEFAULT_VARIABLES]
+        return [
+            SurfaceFigure(kind="surface", variable=v, x=x, y=y) for v in DEFAULT_FIGURE_VARIABLES
+        ]
     if numeric_parameters:
         axis, x = numeric_parameters[0]
         other_axes = [a for a in spec.axes if a is not axis and not a.is_zipped]
@@ -263,36 +272,38 @@ def default_grid_figures(spec: GridSpec) -> list[GridFigure]:
             ({"by": a.name} for a in other_axes if a.size <= charts.LINES_PER_PANEL_MAX), {}
         )
         return [
-            SlicesFigure(kind="slices", variable=v, x=x, **by_option) for v in DEFAULT_VARIABLES
+            SlicesFigure(kind="slices", variable=v, x=x, **by_option)
+            for v in DEFAULT_FIGURE_VARIABLES
         ]
     by_option = {"by": axes[1].parameters[0].coordinate} if len(axes) > 1 else {}
     columns_option = {"columns": by_option["by"]} if by_option else {}
     figure_specs: list[GridFigure] = [
         SlicesFigure(kind="slices", variable=v, x=a.parameters[0].coordinate, **by_option)
         for a in axes[:1]
-        for v in DEFAULT_VARIABLES
+        for v in DEFAULT_FIGURE_VARIABLES
     ]
     return figure_specs + [
         TableFigure(kind="table", variable=v, rows=a.parameters[0].coordinate, **columns_option)
         for a in axes[:1]
-        for v in DEFAULT_VARIABLES
+        for v in DEFAULT_FIGURE_VARIABLES
     ]
 
 
-DEFAULT_CLOUD_COLOURS = ("range", "radial_velocity")
+DEFAULT_CLOUD_QUANTITIES = ("range", "radial_velocity")
 """Quantities by which the default figures colour a point cloud."""
 
 
 def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
-    """Return default figures: each scanner's cloud by range and by velocity, and navigation.
+    """Return the specs of a flight's default figures.
 
-    The cloud by range also shows the flight path.
+    They show the point cloud of each scanner by range, with the flight path, and by radial
+    velocity, and the navigation errors.
     """
     scanners = [str(name) for name in tree.attrs["scanners"]]
     figure_specs: list[SceneFigure] = [
         CloudFigure(kind="cloud", scanner=scanner, colour=colour, path=colour == "range")
         for scanner in scanners
-        for colour in DEFAULT_CLOUD_COLOURS
+        for colour in DEFAULT_CLOUD_QUANTITIES
     ]
     if any("velocity_status" in tree[scanner] for scanner in scanners):
         figure_specs += [
@@ -304,16 +315,19 @@ def default_scene_figures(tree: xr.DataTree) -> list[SceneFigure]:
 
 @dataclass(frozen=True)
 class SceneResults:
-    """Opened store of point clouds, with its spec."""
+    """Opened store of a flight's point clouds, with its spec."""
 
     store_path: Location
+    """Path of the store."""
     tree: xr.DataTree
+    """Tree of the store, with NumPy arrays that are read when they are sliced."""
     spec: SceneSpec
+    """Spec of the study."""
 
     @classmethod
     def from_store(cls, store_path: str | Location) -> SceneResults:
         """Open the store of a scene."""
-        tree = open_tree(parse_location(store_path))
+        tree = open_scene_tree(parse_location(store_path))
         return cls(parse_location(store_path), tree, SceneSpec.from_stored(str(tree.attrs["spec"])))
 
     @property
@@ -323,57 +337,62 @@ class SceneResults:
 
     @property
     def surface_labels(self) -> list[str]:
-        """Display names of the surfaces, by number."""
+        """Display names of the scene's surfaces, in the order of their numbers."""
         return [labels.coordinate_label(str(name)) for name in self.tree.attrs["surfaces"]]
 
     @property
     def source_note(self) -> str:
-        """Source note for the caption of a picture."""
+        """Sentence for captions that names the study, the model version and the progress."""
         return labels.source_note(self.tree.attrs, "blocks")
 
     @property
     def figure_specs(self) -> list[SceneFigure]:
-        """Figures that the spec defines, or a default set."""
+        """Specs of the figures: those in the study's spec, or a default set."""
         return list(self.spec.figures) or default_scene_figures(self.tree)
 
     def render_figure(self, figure_spec: SceneFigure) -> canvas.Sheet | TablePage | str:
-        """Return the sheet or the page of a figure, or a message why there is none."""
+        """Return the sheet of a figure or the page of a table; a message if it would be empty."""
         draw_by_type: dict[
             type, Callable[[SceneResults, Any, AxisPosition], canvas.Sheet | TablePage | str]
         ] = {
-            CloudFigure: _draw_cloud,
-            ScatterFigure: _draw_scatter,
-            ShotSpectraFigure: _draw_shot,
-            NavigationFigure: _draw_navigation,
-            NavigationTable: _draw_navigation,
+            CloudFigure: _render_cloud_figure,
+            ScatterFigure: _render_scatter_figure,
+            ShotSpectraFigure: _render_shot_spectra_figure,
+            NavigationFigure: _render_navigation_figure,
+            NavigationTable: _render_navigation_figure,
         }
         return draw_by_type[type(figure_spec)](
             self, figure_spec, find_axis_position(self.spec, figure_spec.where)
         )
 
     def figure_title(self, figure_spec: SceneFigure, default_title: str) -> str:
-        """Return the title of a figure, headed by that of the study."""
+        """Return the title of a figure, with the title of the study in a line above."""
         return "\n".join([self.spec.title, figure_spec.title or default_title])
 
 
 SCATTER_POINTS_MAX = 200_000
-"""Largest number of points in a scatter plot; more are thinned."""
+"""Largest number of points in a scatter plot; a larger number is thinned."""
 
 NO_POINT_MESSAGE = "there is no point within the figure's limits"
+"""Message of a figure without points."""
 
 
-def _figure_recording(
+def _recording_of_figure(
     results: SceneResults,
     figure_spec: CloudFigure | ScatterFigure | ShotSpectraFigure,
     axis_position: AxisPosition,
 ) -> Recording:
-    return axis_position.recording(results.tree, figure_spec.scanner or results.scanners[0])
+    """Return the recording of the scanner that a figure names, or of the first scanner."""
+    return axis_position.open_recording(results.tree, figure_spec.scanner or results.scanners[0])
 
 
 def _picture_remarks(
     results: SceneResults, recording: Recording, axis_position: AxisPosition, figure_spec: Any
 ) -> list[str]:
-    """Return scanner, ranges, draw and axis position of a picture, as far as there is a choice."""
+    """Return caption sentences with the picture's scanner, ranges, draw, axis values and source.
+
+    What has only one possible value is not stated.
+    """
     choice_texts = []
     if len(results.scanners) > 1:
         choice_texts.append(f"scanner {labels.coordinate_label(recording.scanner)}")
@@ -384,13 +403,13 @@ def _picture_remarks(
     return [", ".join([*choice_texts, *filter(None, [axis_position.label])]), results.source_note]
 
 
-def _draw_cloud(
+def _render_cloud_figure(
     results: SceneResults, figure_spec: CloudFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a point cloud, or a message why there is none."""
-    recording = _figure_recording(results, figure_spec, axis_position)
+    """Return the sheet of a point cloud; a message if there are no points."""
+    recording = _recording_of_figure(results, figure_spec, axis_position)
     crop_by_name = {name: getattr(figure_spec, name) for name in (*WORLD_AXES, "time")}
-    cloud = gather_cloud(
+    cloud = gather_point_cloud(
         recording,
         [figure_spec.colour],
         ranges=figure_spec.ranges,
@@ -419,12 +438,12 @@ def _draw_cloud(
     )
 
 
-def _draw_scatter(
+def _render_scatter_figure(
     results: SceneResults, figure_spec: ScatterFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a scatter plot, or a message why there is none."""
-    recording = _figure_recording(results, figure_spec, axis_position)
-    thinned_rows = recording.thinned_rows(
+    """Return the sheet of a scatter plot; a message if there are no points."""
+    recording = _recording_of_figure(results, figure_spec, axis_position)
+    thinned_rows = recording.read_thinned_rows(
         [figure_spec.x, figure_spec.y, figure_spec.colour],
         SCATTER_POINTS_MAX,
         draw=figure_spec.draw,
@@ -448,11 +467,11 @@ def _draw_scatter(
     )
 
 
-def _draw_shot(
+def _render_shot_spectra_figure(
     results: SceneResults, figure_spec: ShotSpectraFigure, axis_position: AxisPosition
 ) -> canvas.Sheet | str:
-    """Return the sheet of a shot's spectra, or a message why there is none."""
-    recording = _figure_recording(results, figure_spec, axis_position)
+    """Return the sheet of a shot's spectra; a message if there is no such shot, or no target."""
+    recording = _recording_of_figure(results, figure_spec, axis_position)
     shot_choice = figure_spec.shot
     shot_number = (
         shot_choice
@@ -468,7 +487,7 @@ def _draw_shot(
         return f"shot {shot_number} sees nothing"
     parameters = parameters_at(results.spec, axis_position.axis_indices)
     effects = unpack_effect_flags(
-        int(recording.read("effects", slice(shot_number, shot_number + 1))[0])
+        int(recording.read_array("effects", slice(shot_number, shot_number + 1))[0])
     )
     prepared = prepare_eyepoint_shots(eyepoints, parameters, results.spec.surfaces(), effects)
     shot_remark = (
@@ -484,24 +503,29 @@ def _draw_shot(
     )
 
 
-def _draw_navigation(
+def _render_navigation_figure(
     results: SceneResults,
     figure_spec: NavigationFigure | NavigationTable,
     axis_position: AxisPosition,
 ) -> canvas.Sheet | TablePage | str:
-    """Return the sheet or the table of navigation errors, or a message why there is none."""
+    """Return a chart of navigation errors as a sheet, or their table as a page.
+
+    The result is a message if nothing was navigated.
+    """
     scanners = figure_spec.scanners or results.scanners
     named_recordings = [
-        (scanner, axis_position.recording(results.tree, scanner)) for scanner in scanners
+        (scanner, axis_position.open_recording(results.tree, scanner)) for scanner in scanners
     ]
-    error_curves = navigation_curves(
+    error_curves = navigation_error_curves(
         named_recordings, quantity=figure_spec.quantity, n_bins=figure_spec.bins
     )
     note = labels.join_sentences([axis_position.label, results.source_note])
     if isinstance(figure_spec, NavigationTable):
         title = figure_spec.title or results.spec.title
-        return navigation_page(error_curves, show=figure_spec.show, title=title, remarks=[note])
+        return navigation_error_page(
+            error_curves, show=figure_spec.show, title=title, remarks=[note]
+        )
     if not error_curves:
         return "no measurement cycle of three shots or more"
     title = results.figure_title(figure_spec, f"Navigation: {figure_spec.quantity}")
-    return canvas.draw_chart(navigation_chart(error_curves, figure_spec.show), title, note)
+    return canvas.draw_chart(navigation_error_chart(error_curves, figure_spec.show), title, note)

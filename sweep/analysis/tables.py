@@ -18,11 +18,11 @@ import xarray as xr
 from sweep.analysis import labels
 from sweep.analysis.answers.probability import false_alarms_per_shot
 from sweep.analysis.selection import (
-    MEAN_RANGE_MIN,
+    AVERAGED_RANGE_MIN,
     PointSelection,
     compute_statistics,
     parameters_at,
-    select_beyond,
+    select_beyond_range,
     select_where,
     split_by_coordinates,
     study_cuts,
@@ -37,27 +37,34 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec
     from sweep.spec import TableFigure as TableSpec
 
-Cell = str | float | int
+TableCell = str | float | int
 """Value of a table cell."""
 
 
 @dataclass(frozen=True)
 class PageTable:
-    """Table of a page: heading, column names, and rows of cells."""
+    """Table of a page."""
 
     heading: str
+    """Heading above the table."""
     columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    """Names of the columns."""
+    rows: Sequence[Sequence[TableCell]]
+    """Cells of each row, in the order of the columns."""
 
 
 @dataclass(frozen=True)
 class TablePage:
-    """Page of tables with a title and notes; its records hold the same numbers for a CSV file."""
+    """Page of tables as text, and the same numbers as records for a CSV file."""
 
     title: str
+    """Title of the page."""
     page_tables: Sequence[PageTable]
+    """Tables in order."""
     notes: Sequence[str]
-    records: Sequence[dict[str, Cell]]
+    """Lines of text below the tables."""
+    records: Sequence[dict[str, TableCell]]
+    """Rows of the CSV file, by column name."""
 
     def to_text(self) -> str:
         """Return the page as plain text."""
@@ -67,7 +74,7 @@ class TablePage:
         return "\n\n".join(parts) + "\n"
 
     def save_files(self, directory: Path, stem: str) -> list[Path]:
-        """Write the page as `stem`.txt and `stem`.csv."""
+        """Write the page to the files STEM.txt and STEM.csv of a directory; return their paths."""
         directory.mkdir(parents=True, exist_ok=True)
         text_path, csv_path = directory / f"{stem}.txt", directory / f"{stem}.csv"
         text_path.write_text(self.to_text(), encoding="utf-8")
@@ -76,15 +83,15 @@ class TablePage:
         return [text_path, csv_path]
 
 
-def format_cell(cell: Cell) -> str:
-    """Return the text of a cell; '-' for nan."""
+def format_cell(cell: TableCell) -> str:
+    """Return the text of a table cell: numbers with five digits, '-' for nan."""
     if isinstance(cell, float):
         return "-" if math.isnan(cell) else f"{cell:.5g}"
     return str(cell)
 
 
-def align_columns(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """Return rows as text with aligned columns: words to the left, numbers to the right."""
+def align_columns(columns: Sequence[str], rows: Sequence[Sequence[TableCell]]) -> str:
+    """Return a table as text with aligned columns: words to the left, numbers to the right."""
     cells = [list(columns), *([format_cell(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
     is_left_aligned = [not any(_is_numeric(row[i]) for row in rows) for i in range(len(columns))]
@@ -98,8 +105,8 @@ def align_columns(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str
     return "\n".join([lines[0], "-" * sum((*widths, 2 * len(widths) - 2)), *lines[1:]])
 
 
-def _is_numeric(cell: Cell) -> bool:
-    """Tell whether a cell holds a number, or the text of one."""
+def _is_numeric(cell: TableCell) -> bool:
+    """Return True if a cell holds a number, or the text of a number."""
     try:
         float(str(cell).removesuffix(" %").replace(",", ""))
     except ValueError:
@@ -110,14 +117,27 @@ def _is_numeric(cell: Cell) -> bool:
 def mean_table_page(
     points: PointSelection, spec: GridSpec, table_spec: TableSpec, units: str, title: str
 ) -> TablePage:
-    """Return a page with mean and median of a variable, by the values of two coordinates.
+    """Return a page with tables of the mean and the median of a variable over two coordinates.
 
-    ``table_spec`` names the coordinates of rows and columns, a selection, and published values to
-    compare with.
+    Parameters
+    ----------
+    points
+        Points of the study.
+    spec
+        Spec of the study.
+    table_spec
+        Spec of the table: variable, coordinates of its rows and columns, selected points, and
+        published values for comparison.
+    units
+        Units of the variable.
+    title
+        Title of the page.
     """
     points = select_where(points, spec, table_spec.where)
     if table_spec.minimum_range:
-        points = select_beyond(points, spec, f"{table_spec.minimum_range!r} m", inclusive=True)
+        points = select_beyond_range(
+            points, spec, f"{table_spec.minimum_range!r} m", inclusive=True
+        )
     column_values = points.unique_values(table_spec.columns) if table_spec.columns else [None]
     cells = [
         (
@@ -131,9 +151,9 @@ def mean_table_page(
     cell_statistics = compute_statistics(
         [cell_points for *_, cell_points in cells], table_spec.variable
     )
-    records: list[dict[str, Cell]] = []
+    records: list[dict[str, TableCell]] = []
     for k, ((row, column, _), statistic) in enumerate(zip(cells, cell_statistics, strict=True)):
-        printed_value = _printed_value(table_spec.printed, *divmod(k, len(column_values)))
+        printed_value = _published_value(table_spec.printed, *divmod(k, len(column_values)))
         records.append(
             {
                 "row": labels.format_quantity(row, points.coordinate_units(table_spec.rows)),
@@ -154,7 +174,7 @@ def mean_table_page(
     column_names = list(dict.fromkeys(str(r["column"]) for r in records))
     variable_phrase = f"of {labels.column_label(table_spec.variable, units)}"
     page_tables = [
-        _cross_table(
+        _pivot_table(
             f"{heading} {variable_phrase}",
             labels.coordinate_label(table_spec.rows),
             key,
@@ -172,10 +192,11 @@ def mean_table_page(
     return TablePage(title, page_tables, [], records)
 
 
-def _printed_value(printed_rows: Any, row: int, column: int) -> float:
-    """Return the published value of a row and column; nan if none is given.
+def _published_value(printed_rows: Any, row: int, column: int) -> float:
+    """Return the published value at a row and column of a table; nan if none is given.
 
-    A row that is a single number has only its first column.
+    `printed_rows` are the published values in the spec: for each row a list, or a number if the row
+    has a single column.
     """
     if row >= len(printed_rows):
         return math.nan
@@ -185,15 +206,18 @@ def _printed_value(printed_rows: Any, row: int, column: int) -> float:
     return float(row_values[column]) if column < len(row_values) else math.nan
 
 
-def _cross_table(
+def _pivot_table(
     heading: str,
     corner: str,
     record_key: str,
-    records: list[dict[str, Cell]],
+    records: list[dict[str, TableCell]],
     column_names: list[str],
 ) -> PageTable:
-    """Return a table of one quantity of each record, over row and column names."""
-    rows: dict[str, list[Cell]] = {}
+    """Return a table of one value of each record, by the record's entries `row` and `column`.
+
+    `corner` is the heading of the row names, `record_key` the key of the value.
+    """
+    rows: dict[str, list[TableCell]] = {}
     for record in records:
         rows.setdefault(str(record["row"]), []).append(record[record_key])
     return PageTable(
@@ -201,9 +225,9 @@ def _cross_table(
     )
 
 
-def outputs_page(dataset: xr.Dataset) -> TablePage:
-    """Return a page with all variables of a study of a single point."""
-    records: list[dict[str, Cell]] = [
+def single_point_page(dataset: xr.Dataset) -> TablePage:
+    """Return a page with all variables of a study that has a single point."""
+    records: list[dict[str, TableCell]] = [
         {
             "variable": str(name),
             "value": float(array.values),
@@ -217,22 +241,22 @@ def outputs_page(dataset: xr.Dataset) -> TablePage:
     return TablePage(str(dataset.attrs.get("title", "")), [outputs_table], [], records)
 
 
-#: Largest number of rows of a table.
 TABLE_ROWS_MAX = 100
+"""Largest number of rows of a table."""
 
 
-def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
-    """Return the leakage of each group of points, as part of a record.
+def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, TableCell]]:
+    """Return statistics of the leakage probabilities of each group of points, as part of a record.
 
-    The record has mean and median of the leakage probabilities of the up- and down-chirp, and of
-    the probability that noise or leakage raises an extra group in both.
+    They are mean and median of the probability of a false alarm by leakage in the up-chirp, by
+    leakage in the down-chirp, and by noise or leakage in both chirps.
     """
     dataset = groups[0].dataset
     dataset_with_shot = dataset.assign(
         shot_with_leakage=false_alarms_per_shot(dataset, leakage=True)
     )
     groups = [replace(group, dataset=dataset_with_shot) for group in groups]
-    records: list[dict[str, Cell]] = [{} for _ in groups]
+    records: list[dict[str, TableCell]] = [{} for _ in groups]
     for name in ("p_leakage_up", "p_leakage_down", "shot_with_leakage"):
         for record, group_statistics in zip(records, compute_statistics(groups, name), strict=True):
             record |= {
@@ -244,8 +268,8 @@ def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
 
 def noise_only_reference(
     spec: GridSpec, setting_parameters: dict[str, Any]
-) -> tuple[dict[str, Cell], float]:
-    """Return false alarms of noise alone, in closed form and by the model without an echo.
+) -> tuple[dict[str, TableCell], float]:
+    """Return the probabilities of false alarms by noise alone, in closed form and by the model.
 
     Parameters
     ----------
@@ -260,12 +284,12 @@ def noise_only_reference(
         Part of a record: `tnr`, `bins` (independent bins of a chirp), and the probability of a
         false alarm in both chirps, as `closed_form` and as `noise_only`, by the model.
     float
-        Model's probability of a false alarm in a bin.
+        Probability of a false alarm in a bin, by the model.
 
     Notes
     -----
     The closed form is the product of 1 - (1 - p)^N over both chirps, with the probability p in a
-    bin and the number N of independent bins. The model has a target of reflectance 0.
+    bin and the number N of independent bins. In the model, the target has a reflectance of 0.
     """
     first_parameters = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first_parameters | setting_parameters | {"target.reflectance": 0.0}
@@ -287,9 +311,14 @@ def noise_only_reference(
 def split_by_setting(
     points: PointSelection, spec: GridSpec, by: str
 ) -> list[tuple[str, dict[str, Any], PointSelection]]:
-    """Group points by `by` and every other varying coordinate except range and angle.
+    """Group points by the setting of the instrument: all coordinates except range and angle.
 
-    Return name, SI values of the setting's parameters, and points of each group.
+    The coordinate `by` comes first in the names of the groups.
+
+    Returns
+    -------
+    list of (str, dict, PointSelection)
+        Name of each setting, SI values of its parameters by path, and its points.
     """
     cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
     names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
@@ -304,12 +333,29 @@ def split_by_setting(
 
 def false_alarm_records(
     grid_points: PointSelection, spec: GridSpec, *, by: str, printed: Sequence[Sequence[float]] = ()
-) -> list[dict[str, Cell]]:
-    """Return a record of false alarms for each setting of the instrument and each cut."""
+) -> list[dict[str, TableCell]]:
+    """Return statistics of false alarms for each setting of the instrument and each cut.
+
+    Parameters
+    ----------
+    grid_points
+        Points of the study.
+    spec
+        Spec of the study.
+    by
+        Name of the coordinate by which settings are named first.
+    printed
+        Published values: for each setting a list with a value for each cut.
+    """
     setting_parts = split_by_setting(grid_points, spec, by)
     noise_references = [noise_only_reference(spec, setting)[0] for _, setting, _ in setting_parts]
     cut_groups = [
-        (i, j, cut.name, select_beyond(cut.select_from(setting_points), spec, MEAN_RANGE_MIN))
+        (
+            i,
+            j,
+            cut.name,
+            select_beyond_range(cut.select_from(setting_points), spec, AVERAGED_RANGE_MIN),
+        )
         for i, (_, _, setting_points) in enumerate(setting_parts)
         for j, cut in enumerate(study_cuts(spec))
     ]
@@ -317,11 +363,11 @@ def false_alarm_records(
         [cut_points for *_, cut_points in cut_groups], "pfa_both_chirps"
     )
     leakage_rows = leakage_records([cut_points for *_, cut_points in cut_groups])
-    records: list[dict[str, Cell]] = []
+    records: list[dict[str, TableCell]] = []
     for (i, j, cut, cut_points), pfa_statistic, leakage_row in zip(
         cut_groups, pfa_statistics, leakage_rows, strict=True
     ):
-        noise_reference, printed_value = noise_references[i], _printed_value(printed, i, j)
+        noise_reference, printed_value = noise_references[i], _published_value(printed, i, j)
         mean_excess, printed_excess = (
             noise_false_alarms.variance_excess_from_shot_pfa(
                 p, float(noise_reference["tnr"]), float(noise_reference["bins"])
@@ -350,10 +396,12 @@ _FALSE_ALARM_COLUMNS = {
     "closed form": ("closed_form", ".6e"), "noise only": ("noise_only", ".6e"),
     "study's mean": ("study_mean", ".6e"), "excess of mean": ("study_variance_excess", ".1e%"),
 }  # fmt: skip
+"""Columns of the table of false alarms: the record key of each, and its number format."""
 _PRINTED_COLUMNS = {
     "printed": ("printed", ".3e"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".4f%"),
 }  # fmt: skip
+"""Further columns of the table of false alarms, if there are published values."""
 _LEAKAGE_COLUMNS = {
     "setting": ("setting", ""), "cut": ("cut", ""),
     "up: mean": ("p_leakage_up_mean", ".3e"), "up: median": ("p_leakage_up_median", ".3e"),
@@ -361,22 +409,23 @@ _LEAKAGE_COLUMNS = {
     "shot: mean": ("shot_with_leakage_mean", ".3e"),
     "shot: median": ("shot_with_leakage_median", ".3e"),
 }  # fmt: skip
+"""Columns of the table of leakage: the record key of each, and its number format."""
 _THRESHOLD_COLUMNS = {
     "setting": ("setting", ""), "closed form": ("closed_form", ".6e"),
     "noise only": ("noise_only", ".6e"), "study's mean": ("study_mean", ".6e"),
     "printed": ("printed", ".3g"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".3f%"),
 }  # fmt: skip
-"""Columns of the tables: the record key of each, and its number format."""
+"""Columns of the table of thresholds: the record key of each, and its number format."""
 
 
 def false_alarm_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Return a page with the false alarms of a shot for each value of a coordinate.
+    """Return a page with the false-alarm probabilities of a shot for each value of a coordinate.
 
-    It has the form of tables 4.3 to 4.5 of [T]. ``printed`` are the published values, which are
-    compared with the study's.
+    It has the form of tables 4.3 to 4.5 of [T]. ``by`` is the name of the coordinate, ``printed``
+    are published values for comparison.
     """
     records = false_alarm_records(points, spec, by=by, printed=printed)
     has_printed = any(record["printed"] == record["printed"] for record in records)
@@ -394,7 +443,7 @@ def false_alarm_page(
     )
     notes = [
         f"closed form: (1 - (1 - p)^N)^2, p = exp(-(4 - pi)/4 TNR^2), N = {bins_text}.",
-        *_COMMON_NOTES,
+        *_FALSE_ALARM_NOTES,
         "With bins_counted 'half' the model leaves out the bins of the detection, the closed form",
         "  none. Shot (leakage): noise or leakage raises an extra group in both chirp segments.",
     ]
@@ -404,21 +453,22 @@ def false_alarm_page(
 def threshold_page(
     points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
 ) -> TablePage:
-    """Return a page with the false alarms of a bin for each threshold.
+    """Return a page with the probability of a false alarm in a bin, for each threshold.
 
-    It has the form of table 4.2 of [T]. ``printed`` are the published values, which are compared
-    with the study's.
+    It has the form of table 4.2 of [T]. ``by`` is the name of the threshold's coordinate,
+    ``printed`` are published values for comparison.
     """
-    records: list[dict[str, Cell]] = []
+    records: list[dict[str, TableCell]] = []
     setting_parts = split_by_setting(points, spec, by)
     pfa_statistics = compute_statistics(
-        [select_beyond(part, spec, MEAN_RANGE_MIN) for _, _, part in setting_parts], "pfa_bin"
+        [select_beyond_range(part, spec, AVERAGED_RANGE_MIN) for _, _, part in setting_parts],
+        "pfa_bin",
     )
     for i, (name, setting, _) in enumerate(setting_parts):
         noise_reference, pfa_bin = noise_only_reference(spec, setting)
         tnr = float(noise_reference["tnr"])
         closed_form = noise_false_alarms.bin_pfa(tnr)
-        printed_value = _printed_value(printed, i, 0)
+        printed_value = _published_value(printed, i, 0)
         records.append(
             {
                 "setting": name,
@@ -434,32 +484,39 @@ def threshold_page(
             }
         )
     heading = "Probability that a bin of noise crosses the threshold"
-    notes = ["closed form: exp(-(4 - pi)/4 TNR^2)", *_COMMON_NOTES]
+    notes = ["closed form: exp(-(4 - pi)/4 TNR^2)", *_FALSE_ALARM_NOTES]
     return TablePage(title, [_record_table(heading, _THRESHOLD_COLUMNS, records)], notes, records)
 
 
-_COMMON_NOTES = (
+_FALSE_ALARM_NOTES = (
     "noise only: the model with a reflectance of 0.",
-    f"study's mean: over points beyond {MEAN_RANGE_MIN} of range, the echo's own shot noise "
+    f"study's mean: over points beyond {AVERAGED_RANGE_MIN} of range, the echo's own shot noise "
     "included.",
     "excess: noise variance above the one that sets the threshold, as a figure implies.",
     "  Nothing is tuned to the printed figures.",
 )
-"""Notes below all tables of false alarms."""
+"""Notes below the tables of false alarms and of thresholds."""
 
 
 def _record_table(
-    heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, Cell]]
+    heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, TableCell]]
 ) -> PageTable:
-    """Return a table with the columns' values of each record."""
+    """Return a table with a row for each record.
+
+    `columns` are the record key and the number format of each column, by column name.
+    """
     rows = [
-        [_format_value(record[key], number_format) for key, number_format in columns.values()]
+        [
+            _format_record_value(record[key], number_format)
+            for key, number_format in columns.values()
+        ]
         for record in records
     ]
     return PageTable(heading, tuple(columns), rows)
 
 
-def _format_value(value: Cell, number_format: str) -> Cell:
+def _format_record_value(value: TableCell, number_format: str) -> TableCell:
+    """Format a value of a record; an empty format leaves it as it is, and nan becomes '-'."""
     if not number_format:
         return value
     if number_format.endswith("%"):

@@ -293,7 +293,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
 
         left, right = _open_store(a), _open_store(b)
         try:
-            comparisons = comparison.tabulated_differences(left, right)
+            comparisons = comparison.compute_tabulated_differences(left, right)
         except ValueError as error:
             raise click.UsageError(str(error)) from None
     for line in describe_differences(left.sweep.spec, right.sweep.spec) or ["the same study"]:
@@ -303,8 +303,8 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
             echo_wrapped(f"{scanner}: {comparison.describe_common_shots(scanner_comparison)}")
         print_table(
             f"{b.name} less {a.name}{scanner and ', '}{scanner}",
-            list(comparison.DIFFERENCE_COLUMNS),
-            comparison.difference_rows(scanner_comparison),
+            list(comparison.DIFFERENCE_TABLE_COLUMNS),
+            comparison.difference_table_rows(scanner_comparison),
             "largest at",
         )
     if figure is not None:

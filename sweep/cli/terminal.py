@@ -818,14 +818,14 @@ def print_accuracy_measurement(
     dataset, settings = accuracy_results.open_accuracy_store(store)
     print_table(
         "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
-        list(accuracy_results.SHORT_SETTING_COLUMNS),
-        accuracy_results.short_setting_rows(settings),
+        list(accuracy_results.SHORT_SETTING_TABLE_COLUMNS),
+        accuracy_results.short_setting_table_rows(settings),
         "setting",
     )
     print_table(
         "Cheapest setting for each error",
-        list(accuracy_results.CHEAPEST_COLUMNS),
-        accuracy_results.cheapest_rows(settings),
+        list(accuracy_results.CHEAPEST_SETTING_COLUMNS),
+        accuracy_results.cheapest_setting_rows(settings),
         "cheapest setting",
     )
     for sentence in accuracy_results.conclusion_sentences(dataset, settings):

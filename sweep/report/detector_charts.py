@@ -1,4 +1,4 @@
-"""Charts of the detector: ROC curves, noise by source, false alarms, maximum range."""
+"""Charts of a grid's detector: ROC curves, noise by source, false alarms, maximum range."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import xarray as xr
 from sweep.analysis import charts, labels
 from sweep.analysis.answers import probability
 from sweep.analysis.charts import (
-    LINEAR,
-    LOG,
-    PROBABILITY_LIMITS,
+    LINEAR_SCALE,
+    LOG_SCALE,
+    PROBABILITY_AXIS_LIMITS,
     Chart,
     ChartAxis,
     ChartLine,
@@ -30,7 +30,7 @@ from sweep.analysis.selection import (
     find_axis_parameter,
     parameters_at,
     split_by_coordinates,
-    thin_evenly,
+    thin_parts_evenly,
 )
 from sweep.analysis.study_figures import GridResults
 from sweep.model.detection import noise_false_alarms
@@ -47,22 +47,25 @@ from sweep.report.html_page import HtmlTable
 from sweep.units import percent
 
 CHART_PARTS_MAX = 6
-"""Largest number of parts of a study that a chart offers for selection."""
+"""Largest number of parts of a study among which the reader of a chart can choose."""
 
 NOISE_BUDGET_POINTS = 24
-"""Number of points along a coordinate at which the noise is split by source."""
+"""Number of points along a coordinate, or of shots along a flight, in a chart of noise sources."""
 
-ROC_PD_VALUES = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection; points closest to each of them get a ROC curve."""
+ROC_POINT_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
+"""Probabilities of detection by which points are chosen for ROC curves.
+
+The point with the closest pd to each value is chosen.
+"""
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
-"""False-alarm probabilities of a bin at which ROC curves are computed."""
+"""Probabilities of a false alarm in a bin at which ROC curves are computed."""
 
 ROC_DRAWS = 400
 """Number of draws for the ROC curve of a point with random effects."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
-"""Name of the probability that noise or leakage raises an extra group in both chirps."""
+"""Name of the variable for false alarms in both chirps by noise or leakage."""
 
 _LABEL_BY_ALARM = {
     "pfa_bin": "noise, one bin",
@@ -75,7 +78,8 @@ _LABEL_BY_ALARM = {
 }
 """Short legend labels of the false-alarm variables."""
 
-_RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
+_RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
+"""Names of the effects that are drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -83,24 +87,28 @@ class GridProfile:
     """Points of one part of a study along its main coordinate, or its only point."""
 
     label: str
+    """Name of the part."""
     points: PointSelection
+    """Points of the part."""
     coordinate_name: str
+    """Name of the main coordinate; empty for a single point."""
     coordinate: SortedCoordinate | None
+    """Main coordinate; None for a single point."""
 
     @property
     def coordinate_axis(self) -> CoordinateAxis:
-        """Axis of the main coordinate."""
+        """Axis along which a chart shows the main coordinate."""
         return CoordinateAxis.from_points(self.points, self.coordinate_name)
 
-    def spread_indices(self, n_max: int) -> np.ndarray:
-        """Return at most ``n_max`` indices along the profile, evenly spread."""
+    def evenly_spread_indices(self, n_max: int) -> np.ndarray:
+        """Return at most ``n_max`` evenly spread indices along the profile."""
         if self.coordinate is None:
             return np.zeros(1, int)
         size = self.coordinate.values.size
         return np.unique(np.linspace(0, size - 1, min(n_max, size)).round().astype(int))
 
     def axis_indices(self, index: Any) -> dict[str, Any]:
-        """Return the index along every axis for one or several indices along the profile."""
+        """Return the index along each axis of the study, by name, for indices along the profile."""
         if self.coordinate is None:
             return self.points.first_indices()
         return self.points.first_indices(self.coordinate) | {
@@ -108,14 +116,14 @@ class GridProfile:
         }
 
     def variable_values(self, variable: str, indices: np.ndarray) -> np.ndarray:
-        """Return a variable at indices along the profile."""
+        """Return the values of a variable at indices along the profile, (n,)."""
         return np.ravel(self.points.dataset[variable].isel(self.axis_indices(indices)).values)
 
 
 def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
-    """Return profiles along the main coordinate, and the number of omitted profiles.
+    """Return the profiles of a grid along its main coordinate, and the number of omitted profiles.
 
-    The main coordinate is range if it varies, else the numeric coordinate with most values.
+    The main coordinate is range if it varies, or else the numeric coordinate with most values.
     """
     axis_parameters = [
         axis_parameter for axis in results.spec.axes for axis_parameter in axis.parameters
@@ -140,7 +148,10 @@ def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
 
 
 def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: int) -> Chart:
-    """Return the chart of ROC curves: pd over the false-alarm probability for all thresholds."""
+    """Return the chart of ROC curves: pd over the probability of a false alarm.
+
+    Curves are those of a few points of each profile. `n_omitted` is the number of omitted profiles.
+    """
     panels = [panel for profile in profiles for panel in _roc_panels(results, profile)]
     line_names = [line.name for line in panels[0].lines if line.name]
     return Chart(
@@ -157,7 +168,7 @@ def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: 
             "False alarms of noise alone, in all bins that are counted",
             "Dots: the study's own threshold",
             "Points: those whose probability of detection comes nearest to "
-            + ", ".join(f"{pd_value:g}" for pd_value in ROC_PD_VALUES),
+            + ", ".join(f"{pd_value:g}" for pd_value in ROC_POINT_PDS),
             charts.omission_remark(n_omitted),
         ],
         panels=panels,
@@ -165,17 +176,23 @@ def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: 
     )
 
 
-_PFA_FROM_BIN = {
+_PFA_FUNCTION_BY_ALARM = {
     "in a segment": noise_false_alarms.segment_pfa,
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
-"""Functions that give a false-alarm probability from that of a bin and the number of bins."""
+"""Functions that convert the false-alarm probability of a bin, by the kind of false alarm.
+
+Their arguments are this probability and the number of independent bins.
+"""
 
 
 def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
-    """Return a panel for each kind of false alarm, with curves and dots of selected points."""
-    lines_by_alarm: dict[str, list[ChartLine]] = {alarm: [] for alarm in _PFA_FROM_BIN}
+    """Return a panel for each kind of false alarm with the ROC curves of a profile's points.
+
+    Dots mark the threshold of the study.
+    """
+    lines_by_alarm: dict[str, list[ChartLine]] = {alarm: [] for alarm in _PFA_FUNCTION_BY_ALARM}
     for style_index, index in enumerate(_roc_indices(profile)):
         point = results.dataset.isel(profile.axis_indices(index)).compute()
         curve = point.sweep.roc(ROC_PFA_BIN_VALUES, draws=ROC_DRAWS)
@@ -186,7 +203,7 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
             for p in (ROC_PFA_BIN_VALUES, study_pfa)
         )
         tnr_texts = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
-        for alarm, pfa_from_bin in _PFA_FROM_BIN.items():
+        for alarm, pfa_from_bin in _PFA_FUNCTION_BY_ALARM.items():
             x = np.asarray(pfa_from_bin(ROC_PFA_BIN_VALUES, n_bins))
             line = ChartLine(
                 x,
@@ -202,14 +219,14 @@ def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
                 style="dots",
             )
             lines_by_alarm[alarm] += [line, study_point]
-    x_axis = ChartAxis("probability of a false alarm", LOG)
-    y_axis = ChartAxis("probability of detection, shot", limits=PROBABILITY_LIMITS)
+    x_axis = ChartAxis("probability of a false alarm", LOG_SCALE)
+    y_axis = ChartAxis("probability of detection, shot", limits=PROBABILITY_AXIS_LIMITS)
     return [Panel({"part": profile.label, "alarm": alarm}, x_axis, y_axis, lines)
             for alarm, lines in lines_by_alarm.items()]  # fmt: skip
 
 
 def _point_label(profile: GridProfile, index: int) -> str:
-    """Return the main coordinate of a point in words."""
+    """Return a text with the main coordinate of the point at an index along a profile."""
     if profile.coordinate is None:
         return ""
     value = profile.coordinate_axis.to_axis_units(profile.coordinate.values[index : index + 1])[0]
@@ -219,13 +236,13 @@ def _point_label(profile: GridProfile, index: int) -> str:
 
 
 def _roc_indices(profile: GridProfile) -> np.ndarray:
-    """Return the indices along a profile at which pd is closest to `ROC_PD_VALUES`."""
-    indices = profile.spread_indices(4 * charts.LINE_INTERVALS)
+    """Return the indices along a profile whose pd is closest to the `ROC_POINT_PDS`."""
+    indices = profile.evenly_spread_indices(4 * charts.REDUCED_LINE_INTERVALS)
     pd = profile.variable_values("pd_shot", indices)
     if not np.isfinite(pd).any():
         return np.zeros(0, int)
     nearest_indices = [
-        int(indices[np.nanargmin(np.abs(pd - pd_value))]) for pd_value in ROC_PD_VALUES
+        int(indices[np.nanargmin(np.abs(pd - pd_value))]) for pd_value in ROC_POINT_PDS
     ]
     return np.unique(nearest_indices)
 
@@ -233,15 +250,18 @@ def _roc_indices(profile: GridProfile) -> np.ndarray:
 def noise_budget_of_grid(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
-    """Return the chart of each source's share of the noise at the ADC along the main coordinate."""
+    """Return the chart of the shares of noise sources at the ADC, along each profile of a grid.
+
+    `n_omitted` is the number of omitted profiles.
+    """
     panels = []
     for profile in profiles:
-        indices = profile.spread_indices(NOISE_BUDGET_POINTS)
+        indices = profile.evenly_spread_indices(NOISE_BUDGET_POINTS)
         budgets = []
         for index, flags in zip(indices, profile.variable_values("effects", indices), strict=True):
             parameters = parameters_at(results.spec, profile.axis_indices(index))
             effects = [
-                name for name in unpack_effect_flags(int(flags)) if name not in _RANDOM_EFFECTS
+                name for name in unpack_effect_flags(int(flags)) if name not in _RANDOM_EFFECT_NAMES
             ]
             ((_, shots),) = prepare_shots(parameters, effects)
             budgets.append(shots.noise_variances)
@@ -267,9 +287,17 @@ def noise_budget_panel(
     x: np.ndarray,
     budgets: Sequence[Mapping[str, Any]],
 ) -> Panel:
-    """Return the shares of noise sources from their variances [V^2] at each point, in a panel.
+    """Return the panel with the shares of noise sources in the noise variance.
 
-    The source that is largest at the first point comes first.
+    Parameters
+    ----------
+    facet_choices
+        Choices of facets at which the panel is shown.
+    x_axis, x
+        Horizontal axis, and positions of n points along it.
+    budgets
+        Variances of the noise sources by name [V^2], at each of n points. The largest source at
+        the first point is drawn first.
     """
     variances_by_point = [
         {n: float(np.ravel(v)[0]) for n, v in budget.items()} for budget in budgets
@@ -298,7 +326,7 @@ def noise_budget_panel(
 
 
 def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
-    """Return the chart of noise shares, with one panel shown at a time."""
+    """Return the chart with panels of the shares of noise sources."""
     share_texts = ", ".join(
         f"{line.name} {percent(line.y[0] / 100)} at first" for line in panels[0].lines
     )
@@ -309,7 +337,10 @@ def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart
 def false_alarm_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart | None:
-    """Return the chart of false alarms by noise and leakage along the main coordinate, or None."""
+    """Return the chart of false alarms by noise and leakage, along each profile of a grid.
+
+    It is None for a grid with a single point. `n_omitted` is the number of omitted profiles.
+    """
     if profiles[0].coordinate is None:
         return None
     coordinate_name = profiles[0].coordinate_name
@@ -317,7 +348,7 @@ def false_alarm_chart(
     alarm_dataset = results.dataset[
         [v for v in _LABEL_BY_ALARM if v != PFA_WITH_LEAKAGE_NAME]
     ].assign({PFA_WITH_LEAKAGE_NAME: pfa_with_leakage})
-    named_points: list[charts.NamedPoints] = []
+    named_points: list[charts.LabelledLinePoints] = []
     drawn_lines: list[ChartLine] = []
     remarks: list[str] = []
     for variable, alarm_label in _LABEL_BY_ALARM.items():
@@ -326,13 +357,15 @@ def false_alarm_chart(
             for profile in profiles
         ]
         # One reading pass per variable: in a joint pass chunks would accumulate in memory.
-        lines, remarks = charts.lines_along(
+        lines, remarks = charts.read_lines_along(
             [(points, variable) for _, _, points in variable_points], coordinate_name
         )
         drawn_lines += lines
         named_points += variable_points
     x_axis = CoordinateAxis.from_points(results.points, coordinate_name)
-    panels = charts.make_panels(named_points, drawn_lines, x_axis, ChartAxis("probability", LOG))
+    panels = charts.make_line_panels(
+        named_points, drawn_lines, x_axis, ChartAxis("probability", LOG_SCALE)
+    )
     # All points share one threshold if no axis changes it or the looks.
     off_axes = results.spec.parameters_off_axes()
     has_one_threshold = (
@@ -359,43 +392,45 @@ def false_alarm_chart(
     )  # fmt: skip
 
 
-PD_LEVEL = 0.9
-"""Level of pd for the maximum range and the summary."""
+REPORTED_PD_LEVEL = 0.9
+"""Level of pd by which a report states the maximum range and counts points."""
 
 UNBROKEN_LABEL = "kept all the way"
-"""Label of the range up to which pd never falls below the level."""
+"""Label of the maximum range up to which pd never falls below the level."""
 
-ANSWER_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
-"""Variables of :func:`.detection_limits.limit`, by the label of their choice."""
+LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
+"""Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
 
-LABEL_BY_END = {"low": "lower end", "high": "upper end"}
-"""Column names of the ends of a limit's interval."""
+INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
+"""Column names for the ends of the interval of the maximum range."""
 
-MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {PD_LEVEL:g}"
+MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {REPORTED_PD_LEVEL:g}"
+"""Heading of the chart or table of the maximum range."""
 
 MAXIMUM_RANGE_CAPTION = [
-    f"Kept all the way: up to here the probability of detection of a shot is {PD_LEVEL:g} or more "
-    "at "
+    "Kept all the way: up to here the probability of detection of a shot is "
+    f"{REPORTED_PD_LEVEL:g} or more at "
     "every range of the study; reached at all: the farthest range at which it is.",
     "Between ranges it is interpolated in its normal deviate.",
-    f"There is none where it is below {PD_LEVEL:g} from the first range on, not below it at the "
-    "last, or "
+    f"There is none where it is below {REPORTED_PD_LEVEL:g} from the first range on, "
+    "not below it at the last, or "
     "not computed.",
 ]
+"""Caption of the chart or table of the maximum range."""
 
 
 def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
-    """Return the maximum range along another coordinate, as a table if no other one varies.
+    """Return the maximum range of a grid as a chart over another coordinate.
 
-    Return None if range does not vary.
+    If nothing but range varies, the result is a table; if range does not vary, it is None.
     """
     range_parameter = find_axis_parameter(results.spec, RANGE_PATH)
     if range_parameter is None:
         return None
     points = results.points
     range_axis = CoordinateAxis.from_points(points, range_parameter.coordinate)
-    other_names = points.distinguishing_along(
-        points.dim_of(range_parameter.coordinate), [range_parameter.coordinate]
+    other_names = points.distinguishing_coordinates_along(
+        points.dim_of_coordinate(range_parameter.coordinate), [range_parameter.coordinate]
     )
     parts, _ = split_by_coordinates(points, other_names, points.size)
     varied_parts = [
@@ -403,15 +438,18 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
         for words, part_points in parts
         if len(part_points.unique_values(range_parameter.coordinate)) > 1
     ]
-    shown_parts, n_omitted = thin_evenly(varied_parts, CHART_PARTS_MAX)
+    shown_parts, n_omitted = thin_parts_evenly(varied_parts, CHART_PARTS_MAX)
     max_ranges = [
-        (words, _maximum_range_points(shown_points, range_parameter.coordinate, range_axis.factor))
+        (
+            words,
+            _maximum_range_selection(shown_points, range_parameter.coordinate, range_axis.factor),
+        )
         for words, shown_points in shown_parts
     ]
     if not max_ranges:
         return None
     words = labels.axis_label("maximum range", range_axis.units)
-    x = _choose_x(results, max_ranges[0][1])
+    x = _choose_x_coordinate(results, max_ranges[0][1])
     return (
         _maximum_range_chart(max_ranges, x, words, n_omitted)
         if x
@@ -419,16 +457,16 @@ def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
     )
 
 
-def is_empty(item: Chart | HtmlTable | None) -> bool:
-    """Tell whether a chart has no finite value, for example if pd never falls below the level."""
+def is_chart_without_values(item: Chart | HtmlTable | None) -> bool:
+    """Return True for a chart of lines without any finite value."""
     if not isinstance(item, Chart):
         return False
     return not any(np.isfinite(line.y).any() for panel in item.panels for line in panel.lines)
 
 
 def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
-    """Return sentences on the maximum range in a result of :func:`maximum_range_item`."""
-    unbroken_label = next(iter(ANSWER_BY_LABEL))
+    """Return sentences on the maximum range, from the result of :func:`maximum_range_item`."""
+    unbroken_label = next(iter(LIMIT_VARIABLE_BY_LABEL))
     if isinstance(item, Chart):
         range_label, unbroken_panels = (
             item.panels[0].y.label,
@@ -438,7 +476,7 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
     elif item is not None:
         range_label = next(name for name in item.frame if name.startswith("maximum range"))
         values = item.frame[range_label][
-            item.frame[f"a pd of {PD_LEVEL:g}"] == unbroken_label
+            item.frame[f"a pd of {REPORTED_PD_LEVEL:g}"] == unbroken_label
         ].to_numpy(float)
     else:
         return []
@@ -455,27 +493,32 @@ def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
         )
         quantity, _, units = range_label.rstrip(")").partition(" (")
         sentences = [
-            f"{quantity.capitalize()} with a probability of {PD_LEVEL:g} or more all the "
+            f"{quantity.capitalize()} with a probability of {REPORTED_PD_LEVEL:g} or more all the "
             f"way{parts_note}: "
             f"{range_texts} {units}."
         ]
     if n_missing := values.size - finite_values.size:
         sentences.append(
             f"No maximum range at {n_missing:,} of {values.size:,} places: there the probability "
-            "is "
-            f"below {PD_LEVEL:g} from the first range on, or {PD_LEVEL:g} or more up to the last."
+            f"is below {REPORTED_PD_LEVEL:g} from the first range on, "
+            f"or {REPORTED_PD_LEVEL:g} or more up to the last."
         )
     return sentences
 
 
-def _maximum_range_points(points: PointSelection, name: str, unit_factor: float) -> PointSelection:
-    """Return the maximum range of points, in display units; lazy."""
-    dim = points.dim_of(name)
+def _maximum_range_selection(
+    points: PointSelection, name: str, unit_factor: float
+) -> PointSelection:
+    """Return the maximum range over the other coordinates of points, as a lazy selection.
+
+    `name` is the coordinate of range, `unit_factor` converts it to display units.
+    """
+    dim = points.dim_of_coordinate(name)
     indices = np.sort(points.sorted_coordinate(name).indices)
     dataset = points.dataset
     if indices.size < dataset.sizes[dim]:
         dataset = dataset.isel({dim: indices})
-    max_range = dataset.sweep.maximum_range(PD_LEVEL)
+    max_range = dataset.sweep.maximum_range(REPORTED_PD_LEVEL)
     converted = {
         str(variable): (array * unit_factor).assign_attrs(array.attrs)
         for variable, array in max_range.data_vars.items()
@@ -484,8 +527,11 @@ def _maximum_range_points(points: PointSelection, name: str, unit_factor: float)
     return PointSelection.from_dataset(max_range.assign(converted))
 
 
-def _choose_x(results: GridResults, points: PointSelection) -> str:
-    """Return the name of the grazing angle if it varies, else of the longest numeric coordinate."""
+def _choose_x_coordinate(results: GridResults, points: PointSelection) -> str:
+    """Return the name of the coordinate over which the maximum range is drawn; '' if none varies.
+
+    It is the grazing angle if it varies, or else the numeric coordinate with most values.
+    """
     varying_names = points.varying_coordinates()
     angle_parameter = find_axis_parameter(results.spec, GRAZING_ANGLE_PATH)
     if angle_parameter is not None and angle_parameter.coordinate in varying_names:
@@ -501,7 +547,19 @@ def _choose_x(results: GridResults, points: PointSelection) -> str:
 def _maximum_range_chart(
     max_ranges: Sequence[tuple[str, PointSelection]], x: str, range_label: str, n_omitted: int
 ) -> Chart:
-    """Return a chart of both answers for each part, with lines by a coordinate of few values."""
+    """Return the chart of the maximum range: panels for each part and kind of maximum range.
+
+    Parameters
+    ----------
+    max_ranges
+        Name and maximum range of each part.
+    x
+        Name of the coordinate along the horizontal axis.
+    range_label
+        Label of the vertical axis.
+    n_omitted
+        Number of omitted parts.
+    """
     first_points = max_ranges[0][1]
     line_coordinates = [
         n
@@ -522,20 +580,20 @@ def _maximum_range_chart(
     named_points, _ = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates)
     pairs = [
         (line_points, answer)
-        for answer in ANSWER_BY_LABEL.values()
+        for answer in LIMIT_VARIABLE_BY_LABEL.values()
         for _, _, line_points in named_points
     ]
-    drawn_lines, remarks = charts.lines_along(pairs, x)
+    drawn_lines, remarks = charts.read_lines_along(pairs, x)
     x_axis = CoordinateAxis.from_points(first_points, x)
-    y_axis = ChartAxis(range_label, LINEAR, (0.0, None))
+    y_axis = ChartAxis(range_label, LINEAR_SCALE, (0.0, None))
     panels = [
         panel
         for answer_label, answer_lines in zip(
-            ANSWER_BY_LABEL,
+            LIMIT_VARIABLE_BY_LABEL,
             (drawn_lines[: len(named_points)], drawn_lines[len(named_points) :]),
             strict=True,
         )
-        for panel in charts.make_panels(
+        for panel in charts.make_line_panels(
             named_points, answer_lines, x_axis, y_axis, answer=answer_label
         )
     ]
@@ -543,30 +601,36 @@ def _maximum_range_chart(
     return Chart(
         MAXIMUM_RANGE_TITLE,
         charts.lines_alt_text(
-            f"{range_label} at a probability of detection of {PD_LEVEL:g}", span_text, panels[0]
+            f"{range_label} at a probability of detection of {REPORTED_PD_LEVEL:g}",
+            span_text,
+            panels[0],
         ),
         [*MAXIMUM_RANGE_CAPTION, *remarks, charts.omission_remark(n_omitted)],
         panels,
-        {"part": "Shown for", "answer": f"A pd of {PD_LEVEL:g}"},
+        {"part": "Shown for", "answer": f"A pd of {REPORTED_PD_LEVEL:g}"},
     )
 
 
 def _maximum_range_table(
     max_ranges: Sequence[tuple[str, PointSelection]], range_label: str
 ) -> HtmlTable:
-    """Return a table of both answers for each part, with intervals and the reason of a nan."""
+    """Return the table of the maximum range, with a row for each part and kind of maximum range.
+
+    Further columns are the interval, if pd is drawn, and the reason why there is no value.
+    """
     rows = []
     for part, range_points in max_ranges:
         max_range: xr.Dataset = range_points.dataset.isel(range_points.first_indices()).compute()
         reason_texts = str(max_range["unbroken_reason"].attrs["flag_meanings"]).split()
-        for answer_label, answer in ANSWER_BY_LABEL.items():
+        for answer_label, answer in LIMIT_VARIABLE_BY_LABEL.items():
             label_by_end = {
-                f"{answer}_{end_name}": end_label for end_name, end_label in LABEL_BY_END.items()
+                f"{answer}_{end_name}": end_label
+                for end_name, end_label in INTERVAL_END_LABELS.items()
             }
             rows.append(
                 {
                     "for": part,
-                    f"a pd of {PD_LEVEL:g}": answer_label,
+                    f"a pd of {REPORTED_PD_LEVEL:g}": answer_label,
                     range_label: max_range[answer].item(),
                 }
                 | {

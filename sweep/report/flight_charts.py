@@ -15,7 +15,7 @@ import xarray as xr
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.charts import (
-    PROBABILITY_LIMITS,
+    PROBABILITY_AXIS_LIMITS,
     Chart,
     ChartAxis,
     ChartLine,
@@ -24,20 +24,23 @@ from sweep.analysis.charts import (
 )
 from sweep.analysis.datasets import NotAStoreError
 from sweep.analysis.scene_results.cloud_figures import HeightMap
-from sweep.analysis.scene_results.navigation_errors import navigation_chart, navigation_curves
+from sweep.analysis.scene_results.navigation_errors import (
+    navigation_error_chart,
+    navigation_error_curves,
+)
 from sweep.analysis.scene_results.recordings import (
-    INTERPOLATED,
-    POINT_KINDS,
+    INTERPOLATED_RANGES,
+    POINT_KIND_BITS,
     WORLD_AXES,
     AxisPosition,
     PointCloud,
     Recording,
     axis_position_at,
-    gather_cloud,
-    point_kinds,
+    gather_point_cloud,
+    point_kind_indices,
     quantity_label,
     read_eyepoints,
-    to_shown_units,
+    to_displayed_values,
 )
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.study_figures import SceneResults
@@ -47,19 +50,19 @@ from sweep.model.pointcloud.navigation import STATUS_EXCLUDED
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.report.detector_charts import NOISE_BUDGET_POINTS, noise_budget_chart, noise_budget_panel
 from sweep.report.html_page import (
-    COLOUR_BAR,
-    Control,
+    COLOUR_BAR_LAYOUT,
     HtmlTable,
-    Plot,
+    InteractivePlot,
+    PlotControl,
+    colour_bar_title_layout,
     plot_layout,
-    title_layout,
     to_sentences,
     trace_meta,
 )
 from sweep.spec import SceneSpec
 
-CLOUD_COLOURS = ("range", "radial_velocity", "snr")
-"""Quantities by which points can be coloured."""
+CLOUD_COLOUR_QUANTITIES = ("range", "radial_velocity", "snr")
+"""Quantities by which the reader can colour the points of a cloud."""
 
 PAGE_POINTS_MAX = 36_000
 """Largest number of points of all clouds on a page."""
@@ -67,22 +70,25 @@ PAGE_POINTS_MAX = 36_000
 PAGE_CLOUDS_MAX = 8
 """Largest number of clouds on a page: scanners times positions along the study's axes."""
 
-TERRAIN_NODES_MAX = 90
-"""Largest number of terrain nodes along a side."""
+TERRAIN_SIDE_NODES_MAX = 90
+"""Largest number of terrain nodes along a side of the drawn terrain."""
 
-TERRAIN_DEPTH_FRACTION = 0.012
-"""Depth by which terrain is lowered, as a fraction of the map, so that points on it are visible."""
+TERRAIN_LOWERING_FRACTION = 0.012
+"""Depth by which the drawn terrain is lowered, as a fraction of its horizontal size.
 
-FIELD_OF_VIEW = math.radians(45)
+Points on the terrain are then visible.
+"""
+
+CAMERA_FIELD_OF_VIEW = math.radians(45)
 """Vertical field of view of plotly's camera [rad]."""
 
 VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
-"""Fraction of the field of view that the box fills, and least width-to-height ratio of a page.
+"""Fraction of the field of view that the points' box fills, and least width-to-height ratio.
 
-The rest of the field of view is for labels. The least ratio is that of a phone.
+The rest of the field of view is for labels. The ratio is that of a plot on a phone.
 """
 
-EYE_BY_VIEW = {
+CAMERA_POSITION_BY_VIEW = {
     "at an angle": {"x": 1.1, "y": -1.3, "z": 0.6},
     "from above": {"x": 0.0, "y": -0.01, "z": 1.8},
     "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
@@ -90,7 +96,7 @@ EYE_BY_VIEW = {
 }
 """Camera positions by view, in plotly's units of length."""
 
-LOOK_AT_POINT = {"x": 0.0, "y": 0.0, "z": -0.1}
+CAMERA_TARGET = {"x": 0.0, "y": 0.0, "z": -0.1}
 """Point at which the camera looks, in plotly's units of length."""
 
 
@@ -99,12 +105,18 @@ class LabelledRecording:
     """Recording of a scanner at one position along the study's axes, with a label."""
 
     label: str
+    """Label on the page: scanner and coordinates of the position, if there are several."""
     recording: Recording
+    """Shots and points."""
     axis_position: AxisPosition
+    """Position along the study's axes."""
 
 
 def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], int]:
-    """Return recordings at axis positions for a page, and the number of omitted ones."""
+    """Return the recordings that a report shows, and the number of omitted ones.
+
+    There is a recording for each scanner and position along the study's axes.
+    """
     axis_index_tuples = product(*(range(axis.size) for axis in results.spec.axes))
     candidates = list(product(results.scanners, axis_index_tuples))
     chosen_numbers = np.unique(
@@ -117,7 +129,7 @@ def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], i
         recording_label = ", ".join(filter(None, [scanner_label, axis_position.label]))
         labelled_recordings.append(
             LabelledRecording(
-                recording_label, axis_position.recording(results.tree, scanner), axis_position
+                recording_label, axis_position.open_recording(results.tree, scanner), axis_position
             )
         )
     return labelled_recordings, len(candidates) - len(labelled_recordings)
@@ -125,14 +137,17 @@ def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], i
 
 def cloud_plot(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording], n_omitted: int
-) -> Plot | None:
-    """Return a plot of all clouds, shown one at a time, or None if there are no points."""
+) -> InteractivePlot | None:
+    """Return the plot of the point clouds of all recordings, or None if there are no points.
+
+    It shows one cloud at a time. `n_omitted` is the number of omitted recordings.
+    """
     points_max = PAGE_POINTS_MAX // len(labelled_recordings)
     cloud_by_label = {
-        labelled.label: gather_cloud(
+        labelled.label: gather_point_cloud(
             labelled.recording,
-            [*CLOUD_COLOURS, "pd"],
-            ranges=INTERPOLATED,
+            [*CLOUD_COLOUR_QUANTITIES, "pd"],
+            ranges=INTERPOLATED_RANGES,
             with_path=True,
             points_max=points_max,
         )
@@ -155,13 +170,13 @@ def cloud_plot(
         f"{cloud_label}: {', '.join(cloud.remarks)}" if cloud_label else ", ".join(cloud.remarks)
         for cloud_label, cloud in shown_clouds.items()
     ]
-    return Plot(
+    return InteractivePlot(
         heading="Points, flight path and terrain",
         alt=(
             f"Point cloud in three dimensions of {first_cloud.thinned_points.n_total:,} points, "
             "heights in metres: "
-            f"{labels.describe_extent(first_cloud.points['z'])}; ranges: "
-            f"{labels.describe_extent(first_cloud.points['range'])}; "
+            f"{labels.describe_value_extent(first_cloud.points['z'])}; ranges: "
+            f"{labels.describe_value_extent(first_cloud.points['range'])}; "
             f"with the flight path{' over the terrain' if height_map else ''}."
         ),
         caption=to_sentences(
@@ -175,26 +190,28 @@ def cloud_plot(
         ),
         figure=go.Figure(traces, _scene_layout()),
         controls=[
-            Control("cloud", "Shown for", list(shown_clouds)),
-            Control(
+            PlotControl("cloud", "Shown for", list(shown_clouds)),
+            PlotControl(
                 "colour",
                 "Colour",
-                [_colour_option(name) for name in CLOUD_COLOURS],
+                [_colour_option_label(name) for name in CLOUD_COLOUR_QUANTITIES],
                 {
-                    _colour_option(name): {"title": title_layout(quantity_label(name))}
-                    for name in CLOUD_COLOURS
+                    _colour_option_label(name): {
+                        "title": colour_bar_title_layout(quantity_label(name))
+                    }
+                    for name in CLOUD_COLOUR_QUANTITIES
                 },
             ),
-            Control(
+            PlotControl(
                 "view",
                 "View",
-                list(EYE_BY_VIEW),
+                list(CAMERA_POSITION_BY_VIEW),
                 {
-                    name: {"scene.camera": _camera(name)} | _hidden_axis(name)
-                    for name in EYE_BY_VIEW
+                    name: {"scene.camera": _camera_layout(name)} | _hidden_axis_layout(name)
+                    for name in CAMERA_POSITION_BY_VIEW
                 },
             ),
-            Control(
+            PlotControl(
                 "frame",
                 "Frame",
                 ["whole flight", "ground"],
@@ -203,26 +220,28 @@ def cloud_plot(
                     "ground": _frame_layout(list(shown_clouds.values())),
                 },
             ),
-            Control("ground", "Terrain", ["shown", "hidden"] if height_map else ["none"]),
+            PlotControl("ground", "Terrain", ["shown", "hidden"] if height_map else ["none"]),
         ],
         is_tall=True,
     )
 
 
-def _colour_option(quantity: str) -> str:
+def _colour_option_label(quantity: str) -> str:
+    """Return the text of the option that colours points by a quantity."""
     return {"snr": "signal-to-noise ratio"}.get(quantity, labels.coordinate_label(quantity))
 
 
 def _xyz_columns(
     column_arrays: dict[str, np.ndarray], row_selection: np.ndarray | slice
 ) -> dict[str, np.ndarray]:
+    """Return the columns x, y and z of selected rows of a table, in single precision."""
     return {axis: column_arrays[axis][row_selection].astype(np.float32) for axis in WORLD_AXES}
 
 
 def _cloud_traces(
     cloud_label: str, cloud: PointCloud, height_map: HeightMap | None
 ) -> Iterator[go.Scatter3d | go.Surface]:
-    """Yield the traces of terrain, flight path, and points in each colouring."""
+    """Yield plotly's traces of a cloud: terrain, flight path, and points in each colouring."""
     if height_map is not None:
         yield from _terrain_traces(cloud_label, cloud, height_map)
     yield go.Scatter3d(
@@ -234,8 +253,8 @@ def _cloud_traces(
         hoverinfo="name",
     )
     is_true = cloud.is_true
-    for quantity in CLOUD_COLOURS:
-        values = to_shown_units(quantity, cloud.points[quantity])
+    for quantity in CLOUD_COLOUR_QUANTITIES:
+        values = to_displayed_values(quantity, cloud.points[quantity])
         scale_values = values[is_true] if is_true.any() else values
         scale_values = scale_values[np.isfinite(scale_values)]
         low, high = (
@@ -252,7 +271,7 @@ def _cloud_traces(
                     mode="markers",
                     name=kind_label,
                     customdata=kind_values,
-                    meta=trace_meta(cloud=cloud_label, colour=_colour_option(quantity))
+                    meta=trace_meta(cloud=cloud_label, colour=_colour_option_label(quantity))
                     | {"scaled": True},
                     hovertemplate=f"{quantity_label(quantity)}: "
                     f"%{{customdata:.5g}}<extra>{kind_label}</extra>",
@@ -263,7 +282,7 @@ def _cloud_traces(
                         "cmin": low,
                         "cmax": high,
                         "showscale": is_true_kind or not is_true.any(),
-                        "colorbar": COLOUR_BAR,
+                        "colorbar": COLOUR_BAR_LAYOUT,
                     },
                 )
 
@@ -271,39 +290,52 @@ def _cloud_traces(
 def _terrain_traces(
     cloud_label: str, cloud: PointCloud, height_map: HeightMap
 ) -> Iterator[go.Surface]:
-    """Yield the shaded terrain around the points, slightly lowered."""
+    """Yield plotly's trace of the shaded terrain around the points; none outside the height map."""
     map_limits = {}
     for axis in ("x", "y"):
         values = np.concatenate([cloud.points[axis], cloud.path[axis]])
         margin = 0.1 * (np.ptp(values) + 1.0)
         map_limits[axis] = float(values.min() - margin), float(values.max() + margin)
-    cropped = height_map.crop(map_limits["x"], map_limits["y"], TERRAIN_NODES_MAX)
+    cropped = height_map.crop(map_limits["x"], map_limits["y"], TERRAIN_SIDE_NODES_MAX)
     if cropped is None:
         return
     map_size = max(high - low for low, high in map_limits.values())
     yield go.Surface(
         x=cropped.x.astype(np.float32), y=cropped.y.astype(np.float32),
-        z=(cropped.height - TERRAIN_DEPTH_FRACTION * map_size).astype(np.float32),
+        z=(cropped.height - TERRAIN_LOWERING_FRACTION * map_size).astype(np.float32),
         surfacecolor=cropped.hillshade().astype(np.float32), cmin=0, cmax=1, showscale=False,
         lighting={"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}, hoverinfo="skip",
         name="terrain", meta=trace_meta(cloud=cloud_label, ground="shown") | {"ground": True},
     )  # fmt: skip
 
 
-def _camera(view: str) -> dict[str, dict[str, float]]:
-    return {"eye": EYE_BY_VIEW[view], "up": {"x": 0.0, "y": 0.0, "z": 1.0}, "center": LOOK_AT_POINT}
+def _camera_layout(view: str) -> dict[str, dict[str, float]]:
+    """Return plotly's camera for a view."""
+    return {
+        "eye": CAMERA_POSITION_BY_VIEW[view],
+        "up": {"x": 0.0, "y": 0.0, "z": 1.0},
+        "center": CAMERA_TARGET,
+    }
 
 
-def _hidden_axis(view: str) -> dict[str, bool]:
-    """Hide the axis along the viewing direction, whose labels would overlap."""
-    low, _, high = sorted(WORLD_AXES, key=lambda axis: abs(EYE_BY_VIEW[view][axis]))
-    return {f"scene.{high}axis.visible": False} if EYE_BY_VIEW[view][low] == 0 else {}
+def _hidden_axis_layout(view: str) -> dict[str, bool]:
+    """Return the change of plotly's layout that hides the axis along the direction of a view.
+
+    The labels of that axis would overlap.
+    """
+    low, _, high = sorted(WORLD_AXES, key=lambda axis: abs(CAMERA_POSITION_BY_VIEW[view][axis]))
+    return {f"scene.{high}axis.visible": False} if CAMERA_POSITION_BY_VIEW[view][low] == 0 else {}
 
 
-def _longest_side(side_ratios: np.ndarray) -> float:
-    """Return the largest side at which a box fits into every view, in plotly's units of length."""
+def _largest_fitting_side(side_ratios: np.ndarray) -> float:
+    """Return the largest length of a box's longest side at which the box fits into every view.
+
+    `side_ratios` (3,) are the sides relative to the longest one. The length is in plotly's units.
+    """
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * side_ratios
-    eye_positions = [np.array([view[axis] for axis in WORLD_AXES]) for view in EYE_BY_VIEW.values()]
+    eye_positions = [
+        np.array([view[axis] for axis in WORLD_AXES]) for view in CAMERA_POSITION_BY_VIEW.values()
+    ]
     side_lengths = np.linspace(2.0, 0.1, 191).tolist()
     fitting_lengths = (
         side_length
@@ -314,8 +346,8 @@ def _longest_side(side_ratios: np.ndarray) -> float:
 
 
 def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
-    """Tell whether corners (n, 3) are within the field of view from an eye position."""
-    view_direction = np.array([LOOK_AT_POINT[axis] for axis in WORLD_AXES]) - eye
+    """Return True if points (n, 3) are within the field of view of a camera at `eye` (3,)."""
+    view_direction = np.array([CAMERA_TARGET[axis] for axis in WORLD_AXES]) - eye
     view_direction /= np.linalg.norm(view_direction)
     right_direction = np.cross(view_direction, [0.0, 0.0, 1.0])
     right_direction /= np.linalg.norm(right_direction)
@@ -325,13 +357,13 @@ def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
         np.abs(from_eye @ right_direction) / VIEW_ASPECT_MIN,
         np.abs(from_eye @ np.cross(right_direction, view_direction)),
     )
-    return bool((offset <= VIEW_FILL_FRACTION * math.tan(FIELD_OF_VIEW / 2) * depth).all())
+    return bool((offset <= VIEW_FILL_FRACTION * math.tan(CAMERA_FIELD_OF_VIEW / 2) * depth).all())
 
 
 def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
-    """Return axis limits around the true points of all clouds, and optionally their paths.
+    """Return the changes of plotly's layout that frame the true points of all clouds.
 
-    All axes have the same scale.
+    With ``with_path`` the flight paths are framed too. All axes have the same scale.
     """
     axis_ranges: dict[str, Any] = {}
     lengths = {}
@@ -346,7 +378,7 @@ def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> d
         axis_ranges[f"scene.{axis}axis.range"] = [values.min() - margin, values.max() + margin]
         lengths[axis] = np.ptp(values) + 2 * margin
     side_ratios = np.array([lengths[axis] for axis in WORLD_AXES]) / max(lengths.values())
-    aspect_ratio = _longest_side(side_ratios) * side_ratios
+    aspect_ratio = _largest_fitting_side(side_ratios) * side_ratios
     return axis_ranges | {
         "scene.aspectratio": dict(zip(WORLD_AXES, aspect_ratio.tolist(), strict=True))
     }
@@ -369,20 +401,20 @@ def _scene_layout() -> dict[str, Any]:
 
 
 SHOT_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
-"""Quantities of shots in the charts over time."""
+"""Quantities of shots that a report draws over time."""
 
 MEASURED_QUANTITIES = ("range", "radial_velocity")
-"""Quantities of a point that have a true value in the store."""
+"""Quantities of a point whose errors a report draws over time."""
 
 PAGE_SHOTS_MAX = 12_000
 """Largest number of shots of all charts over time on a page."""
 
-ALTITUDE_BINS = 20
-"""Number of altitude bins for navigation errors."""
+NAVIGATION_ALTITUDE_BINS = 20
+"""Number of altitude bins in the charts of navigation errors."""
 
 
 def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Return the chart of shot quantities over time, or None if nothing is computed."""
+    """Return the chart of the `SHOT_QUANTITIES` over time, or None if no shot is computed."""
     quantities = [
         name for name in SHOT_QUANTITIES if name in labelled_recordings[0].recording.dataset
     ]
@@ -390,7 +422,7 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
         for name in quantities:
             y_axis = ChartAxis(
-                quantity_label(name), limits=PROBABILITY_LIMITS if name == "pd_shot" else None
+                quantity_label(name), limits=PROBABILITY_AXIS_LIMITS if name == "pd_shot" else None
             )
             yield quantity_label(name), y_axis, _lines_by_beam(column_arrays, name)
 
@@ -399,15 +431,15 @@ def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> C
     )
     extent_texts = [
         f"{panel.y.label}: "
-        f"{labels.describe_extent(np.concatenate([line.y for line in panel.lines]))}"
+        f"{labels.describe_value_extent(np.concatenate([line.y for line in panel.lines]))}"
         for panel in panels[: len(quantities)]
     ]
     alt = f"Marks of a quantity of each shot over time. {'; '.join(extent_texts)}."
     return _time_chart("Shots over time", alt, [reduction_remark], panels)
 
 
-def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
-    """Return the chart of range and velocity errors of true points, or None without any."""
+def measurement_error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
+    """Return the chart of errors of range and velocity over time, or None without true points."""
 
     def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
         is_true = (column_arrays["flags"].astype(int) & TRUE_FLAG) > 0
@@ -443,22 +475,32 @@ def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | Non
 
 
 QuantityLines = tuple[str, ChartAxis, list[ChartLine]]
-"""Label of a quantity, its axis, and its lines over time."""
+"""Label of a quantity, its vertical axis, and its lines over time."""
 
 
 def _time_panels(
     labelled_recordings: Sequence[LabelledRecording], noun: str, names: Sequence[str],
     quantity_lines: Callable[[dict[str, np.ndarray]], Iterator[QuantityLines]],
 ) -> tuple[list[Panel], str]:  # fmt: skip
-    """Return the panels of quantities over time, and a remark if rows were thinned.
+    """Return panels of quantities over time, and a caption phrase if shots or points were thinned.
 
-    ``quantity_lines`` yields the quantities of columns of shots or points.
+    Parameters
+    ----------
+    labelled_recordings
+        Recordings, each of which has its own panels.
+    noun
+        Name of what is drawn: ``shot`` or ``point``.
+    names
+        Quantities that are read.
+    quantity_lines
+        Function that yields the label, axis and lines of each drawn quantity, from the columns that
+        were read.
     """
     panels: list[Panel] = []
     thinning_step = 1
     for labelled in labelled_recordings:
-        thinned = labelled.recording.thinned_rows(
-            names, PAGE_SHOTS_MAX // len(labelled_recordings), ranges=INTERPOLATED
+        thinned = labelled.recording.read_thinned_rows(
+            names, PAGE_SHOTS_MAX // len(labelled_recordings), ranges=INTERPOLATED_RANGES
         )
         thinning_step = max(thinning_step, thinned.step)
         column_arrays = thinned.to_columns()
@@ -473,14 +515,17 @@ def _time_panels(
 
 
 def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
-    """Return a chart of quantities over time, or None without panels."""
+    """Return a chart with panels of quantities over time, or None if there are no panels."""
     facets = {"cloud": "Shown for", "quantity": "Quantity"}
     return Chart(heading, alt, caption, panels, facets) if panels else None
 
 
 def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[ChartLine]:
-    """Return the marks of each beam; those of all beams together if they outnumber the colours."""
-    values = to_shown_units(name, column_arrays[name])
+    """Return dots of a quantity over time for each beam.
+
+    If there are more beams than colours, all beams make one line of dots.
+    """
+    values = to_displayed_values(name, column_arrays[name])
     beams = np.unique(column_arrays["beam"])
     if beams.size > len(canvas.LINE_COLOURS):
         return [ChartLine(column_arrays["time"], values, "all beams", style="dots")]
@@ -498,18 +543,21 @@ def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[Char
 
 
 def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
-    """Return a table of shots, and points by kind, of each scanner over all draws."""
+    """Return a table with the numbers of shots and of points by kind, for each recording.
+
+    Shots and points are counted over all draws.
+    """
     rows = []
     for labelled in labelled_recordings:
-        kind_counts, n_shots = np.zeros(len(POINT_KINDS), int), 0
-        for shot_slice in labelled.recording.shot_slices():
+        kind_counts, n_shots = np.zeros(len(POINT_KIND_BITS), int), 0
+        for shot_slice in labelled.recording.iter_shot_slices():
             flags = np.asarray(labelled.recording.dataset["flags"].isel(shot=shot_slice).values)
             n_shots += flags.shape[0] * flags.shape[1]
             kind_counts += np.bincount(
-                point_kinds(flags).ravel() + 1, minlength=len(POINT_KINDS) + 1
+                point_kind_indices(flags).ravel() + 1, minlength=len(POINT_KIND_BITS) + 1
             )[1:]
         count_by_kind = dict(
-            zip(map(labels.coordinate_label, POINT_KINDS), kind_counts.tolist(), strict=True)
+            zip(map(labels.coordinate_label, POINT_KIND_BITS), kind_counts.tolist(), strict=True)
         )
         rows.append({"what": labelled.label or "all", "shots": n_shots} | count_by_kind)
     caption = ["Shots times draws, and points by kind."]
@@ -519,10 +567,16 @@ def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable
 def returns_sentences(
     returns_frame: pandas.DataFrame, groups: Sequence[xr.Dataset], n_omitted: int = 0
 ) -> list[str]:
-    """Return sentences on points and on solved velocities.
+    """Return sentences on the numbers of points and of velocities that navigation solved.
 
-    ``returns_frame`` is the frame of :func:`returns_table`. ``n_omitted`` is the number of parts of
-    the study that the page and the frame leave out.
+    Parameters
+    ----------
+    returns_frame
+        Frame of :func:`returns_table`.
+    groups
+        Datasets of the scanners.
+    n_omitted
+        Number of recordings that the page leaves out.
     """
     n_shots, n_true = (int(returns_frame[name].sum()) for name in ("shots", "true"))
     n_false = int(returns_frame.iloc[:, 2:].sum(axis=None)) - n_true
@@ -547,24 +601,29 @@ def returns_sentences(
     return messages
 
 
-def navigation_error_chart(
+def flight_navigation_error_chart(
     spec: SceneSpec, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
-    """Return velocity and altitude errors over altitude, or None if no scanner navigates."""
+    """Return the chart of navigation errors over altitude, or None if no scanner navigates.
+
+    The errors are those of velocity and altitude.
+    """
     named_recordings = [(labelled.label, labelled.recording) for labelled in labelled_recordings]
     error_curves = [
         curve
         for quantity in ("velocity", "altitude")
-        for curve in navigation_curves(named_recordings, quantity=quantity, n_bins=ALTITUDE_BINS)
+        for curve in navigation_error_curves(
+            named_recordings, quantity=quantity, n_bins=NAVIGATION_ALTITUDE_BINS
+        )
     ]
     if not error_curves:
         return None
-    chart = navigation_chart(error_curves, "all")
+    chart = navigation_error_chart(error_curves, "all")
     return replace(chart, caption=[*chart.caption, *_error_floor_remarks(spec)])
 
 
 def _error_floor_remarks(spec: SceneSpec) -> list[str]:
-    """Return remarks on the error floor of the spec, and on errors that it does not state."""
+    """Return caption phrases on the spec's error floor, and on errors that it leaves out."""
     floor_mapping = spec.to_yaml_mapping()["error_floor"]
     floor_texts = [
         f"{labels.coordinate_label(name)} {floor_mapping[name]}"
@@ -578,12 +637,15 @@ def _error_floor_remarks(spec: SceneSpec) -> list[str]:
 def noise_budget_of_flight(
     results: SceneResults, labelled_recordings: Sequence[LabelledRecording]
 ) -> Chart | None:
-    """Return the chart of noise shares along the flight, or None if eyepoints are missing."""
+    """Return the chart of the shares of noise sources along a flight.
+
+    It is None if the eyepoints are missing, or no shot hits a target.
+    """
     try:
         panels = [
             panel
             for labelled in labelled_recordings
-            if (panel := _noise_panel(results, labelled)).lines
+            if (panel := _flight_noise_panel(results, labelled)).lines
         ]
     except NotAStoreError:
         return None
@@ -597,8 +659,11 @@ def noise_budget_of_flight(
     )  # fmt: skip
 
 
-def _noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
-    """Return the noise shares of shots spread over the flight, as far as they hit a target."""
+def _flight_noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
+    """Return the panel with the shares of noise sources in shots spread over a flight.
+
+    Shots without a target are left out.
+    """
     recording = labelled.recording
     n_shots = recording.n_shots
     shot_indices = np.unique(

@@ -1,4 +1,4 @@
-"""HTML pages: interactive plotly plots with controls, tables, texts, and their single file."""
+"""HTML pages in a single file: interactive plots by plotly, with controls, tables and texts."""
 
 from __future__ import annotations
 
@@ -23,87 +23,101 @@ from plotly.offline import get_plotlyjs
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.canvas import MARKED_POINTS_MAX
-from sweep.analysis.charts import LOG, Chart, ChartAxis, ChartLine, ColourScale, Panel
+from sweep.analysis.charts import LOG_SCALE, Chart, ChartAxis, ChartLine, ColourScale, Panel
 from sweep.report.isolated_itables import get_itable_arguments, options
 
-LINE_COLOURS = {
+PAGE_LINE_COLOURS = {
     "light": ("#0072B2", "#C44E00", "#005A4B", "#A51E78", "#78784B", "#003CD2", "#000000",
               "#784B2D"),
     "dark": ("#56B4E9", "#FF9A4D", "#3CF0C3", "#FF4BB4", "#F0E442", "#6987FF", "#FFFFFF",
              "#B4875A"),
 }  # fmt: skip
-"""Line colours for a light and a dark page, derived from those of Okabe and Ito (2008).
+"""Colours of lines on a light and on a dark page, derived from those of Okabe and Ito (2008).
 
-Their contrast to the page is 4.5 or more. Their CIEDE2000 distance from each other is 10 or more
-(12 for the first four) for normal and colour-blind vision.
+The contrast of each colour to the page is 4.5 or more. The CIEDE2000 distance between two colours
+is 10 or more (12 among the first four), for normal and colour-blind vision.
 """
 
-DASH_STYLES = (
+PLOTLY_DASH_STYLES = (
     "solid", "dash", "dashdot", "dot", "longdash", "longdashdot", "5px 2px 1px 2px", "2px 6px",
 )  # fmt: skip
-"""Dash styles of lines, so that lines differ not only by colour."""
+"""Dash styles of lines in plotly's notation. Lines then differ not only by colour."""
 
-_COLOUR_MAP_PARTS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
-"""Parts of the colour map that contrast with the page."""
+_COLOUR_MAP_SPANS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
+"""Part of the colour map, 0..1, that contrasts with a light and with a dark page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
+"""Colours of the darkest and the brightest terrain, on a light and on a dark page."""
 
-COLOUR_BAR: dict[str, Any] = {
+COLOUR_BAR_LAYOUT: dict[str, Any] = {
     "orientation": "h", "x": 0.5, "yref": "container", "y": 0.91, "yanchor": "top", "len": 1.0,
     "thickness": 12,
 }  # fmt: skip
-"""Horizontal colour bar above the chart, which also fits narrow screens."""
+"""Layout of the colour bar: horizontal above the plot, which also fits narrow screens."""
 
 
 @dataclass(frozen=True)
-class Control:
-    """Control of a plot that selects one of several options.
-
-    `name` is the key of the choice in a trace's `meta`, and `label` its text on the page.
-    `relayout` has the layout changes of each option.
-    """
+class PlotControl:
+    """Control of a plot by which the reader selects one of several options."""
 
     name: str
+    """Name of the choice in the `meta` of traces (see :func:`trace_meta`)."""
     label: str
+    """Label on the page."""
     options: Sequence[str]
+    """Options in order."""
     relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Changes of plotly's layout that an option makes, by option."""
 
     @property
-    def initial_option(self) -> int:
-        """Index of the initial option: the middle one for parts of a study, else the first."""
+    def initial_option_index(self) -> int:
+        """Index of the option that a page shows first.
+
+        It is the middle one for parts of a study, and otherwise the first one.
+        """
         return (len(self.options) - 1) // 2 if self.name == "part" else 0
 
 
 @dataclass(frozen=True)
-class Plot:
-    """Interactive chart of a page, with its controls; a control with one option is not shown.
-
-    `meta` of a trace defines when it is shown and which colour it takes (see :func:`trace_meta`).
-    With `has_cut` the page offers cuts through the first heat map. `is_tall` is for views in three
-    dimensions.
-    """
+class InteractivePlot:
+    """Interactive plot of a page, with its controls."""
 
     heading: str
+    """Heading above the plot."""
     alt: str
+    """Text for readers who can't see the plot."""
     caption: Sequence[str]
+    """Sentences of the caption."""
     figure: go.Figure
-    controls: Sequence[Control] = ()
+    """Plotly's figure. The `meta` of its traces say when they are shown (:func:`trace_meta`)."""
+    controls: Sequence[PlotControl] = ()
+    """Controls of the plot; those with one option are hidden."""
     has_cut: bool = False
+    """True if the page offers cuts through the first heat map."""
     is_tall: bool = False
+    """True if the plot needs more height, for views in three dimensions."""
 
 
 def trace_meta(palette_index: int | None = None, **choices: str) -> dict[str, Any]:
-    """Return `meta` of a trace: the choices at which it is shown, and its index in the palette."""
+    """Return the `meta` of a trace of plotly, by which the page's script shows and colours it.
+
+    Parameters
+    ----------
+    palette_index
+        Index of the colour; None for a trace with colours of its own.
+    choices
+        Options at which the trace is shown, by the name of the control.
+    """
     return {"when": choices} | ({} if palette_index is None else {"series": palette_index})
 
 
 def to_sentences(parts: Sequence[str]) -> list[str]:
-    """Return parts as sentences; skip empty parts."""
+    """Turn each phrase into a sentence; empty phrases are skipped."""
     return [labels.join_sentences([part]) for part in parts if part]
 
 
-def make_plot(chart: Chart) -> Plot:
-    """Return a chart as an interactive plot."""
+def make_interactive_plot(chart: Chart) -> InteractivePlot:
+    """Convert a chart to an interactive plot."""
     first_panel = chart.panels[0]
     layout_options: dict[str, Any] = {}
     area_lines = [line for line in first_panel.lines if line.style == "area"]
@@ -113,11 +127,11 @@ def make_plot(chart: Chart) -> Plot:
     if chart.colour_scale is not None:
         layout_options |= {"margin": {"l": 10, "r": 16, "t": 88, "b": 55}}
         layout_options |= {
-            "title": title_layout(
+            "title": colour_bar_title_layout(
                 "log10 of " * chart.colour_scale.is_log + chart.colour_scale.label
             )
         }
-    return Plot(
+    return InteractivePlot(
         chart.heading,
         chart.alt,
         to_sentences(chart.caption),
@@ -134,8 +148,11 @@ def make_plot(chart: Chart) -> Plot:
     )
 
 
-def _make_control(panels: Sequence[Panel], name: str, label: str) -> Control:
-    """Return the control of a facet; an option changes the y axis if panels differ in it."""
+def _make_control(panels: Sequence[Panel], name: str, label: str) -> PlotControl:
+    """Return the control by which the reader chooses among the panels of a facet.
+
+    If the panels differ in their vertical axes, the options change that axis.
+    """
     axes_by_option: dict[str, set[ChartAxis]] = {}
     for panel in panels:
         axes_by_option.setdefault(panel.facet_choices[name], set()).add(panel.y)
@@ -149,12 +166,12 @@ def _make_control(panels: Sequence[Panel], name: str, label: str) -> Control:
                 k: v for k, v in _axis_layout(axis).items() if k in ("type", "range", "rangemode")
             }
             relayout[option] = {f"yaxis.{key}": value for key, value in axis_options.items()}
-            relayout[option]["yaxis.title.text"] = wrap_html(axis.label, 36)
-    return Control(name, label, list(axes_by_option), relayout)
+            relayout[option]["yaxis.title.text"] = wrap_with_html_breaks(axis.label, 36)
+    return PlotControl(name, label, list(axes_by_option), relayout)
 
 
 def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[Any]:
-    """Yield the traces of a panel's lines, or of its map."""
+    """Yield plotly's traces of the lines or of the heat map of a panel."""
     for line in panel.lines:
         yield from _line_traces(panel, line)
     if (heat_map := panel.heat_map) is None or colour_scale is None:
@@ -172,7 +189,7 @@ def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[An
         zmin=colour_limits[0],
         zmax=colour_limits[1],
         colorscale="Viridis",
-        colorbar=COLOUR_BAR,
+        colorbar=COLOUR_BAR_LAYOUT,
         name=panel.facet_choices["part"],
         meta=trace_meta(None, **panel.facet_choices),
     )
@@ -199,14 +216,14 @@ def _panel_traces(panel: Panel, colour_scale: ColourScale | None) -> Iterator[An
 
 
 def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Return floats in single precision, which is enough for a screen."""
+    """Return an array in single precision, which is enough for a screen; other types unchanged."""
     return values.astype(np.float32) if values.dtype.kind == "f" else values
 
 
 def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]:
-    """Yield the traces of a line, preceded by its band if it has one."""
+    """Yield plotly's traces of a line: its band, if it has one, and then the line."""
     meta = trace_meta(line.style_index, **panel.facet_choices)
-    if panel.y.kind == LOG:
+    if panel.y.kind == LOG_SCALE:
         line = _mask_nonpositive(line)
     x, y, low, high = line.x, line.y, line.low, line.high
     trace_options: dict[str, Any] = {
@@ -215,7 +232,7 @@ def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]
     }  # fmt: skip
     if line.hover_texts:
         trace_options |= {"text": list(line.hover_texts)}
-    dash = DASH_STYLES[line.style_index % len(DASH_STYLES)]
+    dash = PLOTLY_DASH_STYLES[line.style_index % len(PLOTLY_DASH_STYLES)]
     mode = "lines+markers" if x.size <= MARKED_POINTS_MAX else "lines"
     if line.style == "area":
         hover_template = "%{y:.3g} %" + ", %{text}" * bool(line.hover_texts)
@@ -251,7 +268,7 @@ def _line_traces(panel: Panel, line: ChartLine) -> Iterator[go.Scatter | go.Bar]
 
 
 def _mask_nonpositive(line: ChartLine) -> ChartLine:
-    """Return a line with nan for values that a logarithmic axis can't show."""
+    """Return a line with nan in place of values that are not positive."""
     masked_values: dict[str, Any] = {
         name: np.where(values > 0, values, np.nan)
         for name, values in (("y", line.y), ("low", line.low), ("high", line.high))
@@ -263,7 +280,7 @@ def _mask_nonpositive(line: ChartLine) -> ChartLine:
 def _band_trace(
     line: ChartLine, x: np.ndarray, low: np.ndarray, high: np.ndarray, meta: dict[str, Any]
 ) -> go.Scatter:
-    """Return the trace of the area between the ends of a line's band."""
+    """Return plotly's trace of the area between the lower and upper ends of a line's band."""
     finite_indices = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     reversed_indices = finite_indices[::-1]
     return go.Scatter(
@@ -279,22 +296,22 @@ def _band_trace(
 
 
 def colour_themes() -> dict[str, Any]:
-    """Return palette, colour scales and template of each colour scheme, for the page's script."""
+    """Return the colours and the plotly template of the light and the dark scheme of a page."""
     fractions, colours = np.linspace(0, 1, 11), colormaps[canvas.COLOUR_MAP_NAME]
     return {
         scheme: {
-            "lines": LINE_COLOURS[scheme],
+            "lines": PAGE_LINE_COLOURS[scheme],
             "scale": [[float(s), to_hex(colours(low + (high - low) * s))] for s in fractions],
             "ground": [[0, _GROUND_COLOURS[scheme][0]], [1, _GROUND_COLOURS[scheme][1]]],
             "template": plotly.io.templates[template].to_plotly_json(),
         }
         for scheme, template in (("light", "plotly_white"), ("dark", "plotly_dark"))
-        for low, high in [_COLOUR_MAP_PARTS[scheme]]
+        for low, high in [_COLOUR_MAP_SPANS[scheme]]
     }
 
 
 def plot_layout(**options_set: Any) -> dict[str, Any]:
-    """Return the layout of a plot: legend above, margins for labels, no title."""
+    """Return plotly's layout of a plot, with the legend above it; options replace the defaults."""
     default_options: dict[str, Any] = {
         "margin": {"l": 10, "r": 16, "t": 30, "b": 55},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -308,14 +325,14 @@ def plot_layout(**options_set: Any) -> dict[str, Any]:
     return default_options | options_set
 
 
-def wrap_html(text: str, width: int = 44) -> str:
-    """Return text with line breaks in HTML, so that it fits next to a plot."""
+def wrap_with_html_breaks(text: str, width: int = 44) -> str:
+    """Break a text into lines of at most `width` characters, by HTML line breaks."""
     return "<br>".join(textwrap.wrap(text, width, break_on_hyphens=False))
 
 
 def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
-    """Return the layout of an axis: title, scale and limits."""
-    label = wrap_html(axis.label) if options_set else axis.label
+    """Return plotly's layout of an axis: title, scale and limits; options replace the defaults."""
+    label = wrap_with_html_breaks(axis.label) if options_set else axis.label
     axis_options = {"title": {"text": label, "standoff": 12}, "zeroline": False, "type": axis.kind}
     if axis.limits is not None:
         axis_options |= (
@@ -330,69 +347,86 @@ def _axis_layout(axis: ChartAxis, **options_set: Any) -> dict[str, Any]:
     return axis_options | {"exponentformat": "power"} | options_set
 
 
-def title_layout(text: str) -> dict[str, Any]:
-    """Return the layout of the title above the colour bar."""
+def colour_bar_title_layout(text: str) -> dict[str, Any]:
+    """Return plotly's layout of a plot title that stands above the colour bar."""
     return {
-        "text": wrap_html(text, 48), "x": 0.5, "xanchor": "center", "yref": "container", "y": 1,
-        "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
+        "text": wrap_with_html_breaks(text, 48), "x": 0.5, "xanchor": "center",
+        "yref": "container", "y": 1, "yanchor": "top", "pad": {"t": 2}, "font": {"size": 15},
     }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class HtmlTable:
-    """Table that the reader can sort, search and download as `file`.csv, below a caption."""
+    """Table of a page, which the reader can sort, search and download."""
 
     heading: str
+    """Heading above the table."""
     caption: Sequence[str]
+    """Sentences of the caption."""
     frame: pandas.DataFrame
+    """Cells of the table, with its column names."""
     file: str
+    """Name of the CSV file to download, without suffix."""
 
 
 @dataclass(frozen=True)
 class TextItem:
-    """Preformatted text to read, copy, or download as `file`; '' for no download."""
+    """Preformatted text of a page, which the reader can copy or download."""
 
     heading: str
+    """Heading above the text."""
     caption: Sequence[str]
+    """Sentences of the caption."""
     text: str
+    """Text."""
     file: str = ""
+    """Name of the file to download; empty for no download."""
 
 
-PageItem = Plot | HtmlTable | TextItem
-"""Item of a page's section."""
+PageItem = InteractivePlot | HtmlTable | TextItem
+"""Item of a section of a page: plot, table or text."""
 
 
 @dataclass(frozen=True)
 class PageSection:
-    """Section of a page: paragraphs and items; `anchor` is its name in links."""
+    """Section of a page."""
 
     anchor: str
+    """Name of the section in links."""
     title: str
+    """Title of the section."""
     paragraphs: Sequence[str] = ()
+    """Paragraphs of text."""
     items: Sequence[PageItem] = ()
+    """Plots, tables and texts after the paragraphs."""
 
 
 @dataclass(frozen=True)
 class ReportPage:
-    """Complete report: key facts, important remarks, and sections in order."""
+    """Contents of the report of a study."""
 
     title: str
+    """Title of the study."""
     question: str
+    """Question of the study, from its spec."""
     facts: Sequence[tuple[str, str]]
+    """Name and value of each key fact."""
     remarks: Sequence[str]
+    """Sentences that the reader must not miss."""
     sections: Sequence[PageSection]
+    """Sections in order."""
 
 
 TABLE_ROWS_SHOWN = 10
-"""Number of table rows that are shown at once."""
+"""Number of rows of a table that a page shows at once."""
 
 
 LONG_CELL_CHARACTERS = 40
-"""Length above which the text of a cell counts as a sentence [characters]."""
+"""Length of a cell's text above which the text is wrapped like a sentence [characters]."""
 
 
 def render_html(page: ReportPage) -> str:
-    """Return the page as HTML."""
+    """Return a report as the HTML of a self-contained page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sweep.report"),
         autoescape=True,
@@ -417,19 +451,19 @@ def render_html(page: ReportPage) -> str:
 
 
 def _compress_base64(text: str) -> str:
-    """Return text compressed by gzip and encoded in base64, about a third of its size."""
+    """Compress a text by gzip, and return it in base64; that takes about a third of its size."""
     return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
-def _chart_json(plot: Plot) -> str:
-    """Return the JSON of a plot for the page's script."""
+def _chart_json(plot: InteractivePlot) -> str:
+    """Return a plot as JSON for the page's script."""
     relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
     content = {"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.has_cut}
     return str(to_json_plotly(content))
 
 
 def _table_json(table: HtmlTable) -> str:
-    """Return the JSON of a table for the page's script, including its sorting and download."""
+    """Return a table as JSON for the page's script, with the options of sorting and download."""
     csv_button = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
     widths = table.frame.map(lambda cell: len(str(cell))).max()
     with pandas.option_context("display.float_format", "{:.6g}".format):
@@ -454,5 +488,5 @@ def _table_json(table: HtmlTable) -> str:
 
 
 def _data_url(text_item: TextItem) -> str:
-    """Return a text as a data URL, which the browser can save."""
+    """Return the text of an item as a data URL, which a browser can save as a file."""
     return f"data:text/plain;charset=utf-8;base64,{b64encode(text_item.text.encode()).decode()}"

@@ -1,4 +1,4 @@
-"""Report of a store: the selection and order of its contents, and the HTML file."""
+"""Reports of grids and flights: the contents of each section, and the HTML file."""
 
 from __future__ import annotations
 
@@ -24,12 +24,16 @@ from sweep.analysis.datasets import (
     NotAStoreError,
     read_attributes_of_kind,
 )
-from sweep.analysis.scene_results.consistency import check_consistency
-from sweep.analysis.scene_results.recordings import INTERPOLATED, QUANTITY_BY_NAME, to_shown_units
+from sweep.analysis.scene_results.consistency import check_error_consistency
+from sweep.analysis.scene_results.recordings import (
+    INTERPOLATED_RANGES,
+    QUANTITY_BY_NAME,
+    to_displayed_values,
+)
 from sweep.analysis.selection import to_float_with_nan
 from sweep.analysis.study_figures import GridResults, SceneResults, describe_selection
 from sweep.analysis.tables import TablePage as TablePage
-from sweep.analysis.tables import outputs_page
+from sweep.analysis.tables import single_point_page
 from sweep.messages import shell_command
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.report import detector_charts, flight_charts
@@ -40,7 +44,7 @@ from sweep.report.html_page import (
     PageSection,
     ReportPage,
     TextItem,
-    make_plot,
+    make_interactive_plot,
     render_html,
 )
 from sweep.spec import GridSpec, SceneSpec, SlicesFigure, SurfaceFigure
@@ -49,20 +53,20 @@ from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, parse_location, write_path_atomically
 from sweep.storage.store_format import parse_software_versions
 
-PAGE_LIMITS = ChartSizeLimits(
+PAGE_SIZE_LIMITS = ChartSizeLimits(
     parts_max=detector_charts.CHART_PARTS_MAX,
     columns_max=500,
     rows_max=180,
     cells_max=400_000,
-    maps_abreast=1,
+    maps_per_row=1,
 )
 """Limits of charts on a page.
 
-The limit of cells applies to all heat maps together, which keeps a page to a few megabytes.
+The limit of cells applies to all heat maps of the page together, which keeps it to a few megabytes.
 """
 
 TABLE_POINTS_MAX = 1000
-"""Largest number of points in a table."""
+"""Largest number of points in a table of a report."""
 
 GRID_TABLE_VARIABLES = (
     "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
@@ -71,13 +75,13 @@ GRID_TABLE_VARIABLES = (
     "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
     "radial_velocity_bound", "beamlets", "n_draws", "effects_error",
 )  # fmt: skip
-"""Variables in the table of a grid's points."""
+"""Variables in the table of points of a grid's report."""
 
 CLOUD_TABLE_QUANTITIES = (
     "time", "beam", "x", "y", "z", "range", "radial_velocity", "snr", "pd", "true_range",
     "true_radial_velocity", "flags",
 )  # fmt: skip
-"""Quantities in the table of a point cloud."""
+"""Quantities in the table of points of a flight's report."""
 
 
 def write_report(store: str | Location, file: str | Path) -> Path:
@@ -116,19 +120,22 @@ def write_report(store: str | Location, file: str | Path) -> Path:
 
 
 SectionItem = Chart | PageItem | None
-"""Item of a section before charts become plots; None is left out."""
+"""Item of a section of a report. Charts become interactive plots; None is left out."""
 
 AnySpec = GridSpec | SceneSpec
+"""Spec of a grid or of a scene."""
 
 
 def _grid_report(store: Location) -> ReportPage:
-    """Return the report of a grid."""
+    """Return the report of a grid's store."""
     results = GridResults.from_store(store)
     dataset, spec = results.dataset, results.spec
-    figure_items: list[SectionItem] = list(_figure_charts(results))
-    table_items = list(_study_tables(results))
+    figure_items: list[SectionItem] = list(_iter_figure_charts(results))
+    table_items = list(_iter_spec_tables(results))
     max_range_item = detector_charts.maximum_range_item(results)
-    figure_items.append(None if detector_charts.is_empty(max_range_item) else max_range_item)
+    figure_items.append(
+        None if detector_charts.is_chart_without_values(max_range_item) else max_range_item
+    )
     profiles_and_omitted = detector_charts.grid_profiles(results)
     detector_items: list[SectionItem] = [
         detector_charts.noise_budget_of_grid(results, *profiles_and_omitted)
@@ -139,12 +146,12 @@ def _grid_report(store: Location) -> ReportPage:
             detector_charts.false_alarm_chart(results, *profiles_and_omitted),
             *detector_items,
         ]
-    request_section = _request_section(spec, [dataset["effects"]], dataset)
+    request_section = _spec_and_effects_section(spec, [dataset["effects"]], dataset)
     axis_texts = [f"{axis.size:,} {labels.coordinate_label(axis.name)}" for axis in spec.axes]
     facts = [("points", f"{dataset.attrs['points']:,}"),
              ("grid", " x ".join(axis_texts) or "a single point")]  # fmt: skip
     sections = [
-        _answer_section(
+        _main_results_section(
             spec, [dataset], "points", detector_charts.maximum_range_sentences(max_range_item)
         ),
         _page_section("figures", "Figures", figure_items),
@@ -155,11 +162,23 @@ def _grid_report(store: Location) -> ReportPage:
     return _report_page(spec, dataset.attrs, "points", facts, sections, store)
 
 
-def _answer_section(
+def _main_results_section(
     spec: AnySpec, groups: Sequence[xr.Dataset], counted_unit: str, further_sentences: Sequence[str]
 ) -> PageSection:
-    """Return the first section: detection, false alarms, and compliance with the tolerance."""
-    tolerance, pd_level = spec.accuracy.tolerance, detector_charts.PD_LEVEL
+    """Return the section with the main results: detection, false alarms, and the tolerance.
+
+    Parameters
+    ----------
+    spec
+        Spec of the study.
+    groups
+        Datasets with the variables of all points, or of the shots of each scanner.
+    counted_unit
+        Name of what the datasets count: ``points`` or ``shots``.
+    further_sentences
+        Sentences that follow the first one.
+    """
+    tolerance, pd_level = spec.accuracy.tolerance, detector_charts.REPORTED_PD_LEVEL
     limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
     lazy_counts = []
     for group in groups:
@@ -200,10 +219,13 @@ def _answer_section(
     return PageSection("answer", "Answer", sentences)
 
 
-def _request_section(
+def _spec_and_effects_section(
     spec: AnySpec, effect_flags: Sequence[xr.DataArray], dataset: xr.Dataset
 ) -> PageSection:
-    """Return the section on the study's fields, simulated effects and accuracy."""
+    """Return the section on the axes and fields of the spec, the simulated effects, and accuracy.
+
+    `effect_flags` are the flags of simulated effects at all points, `dataset` has the error bounds.
+    """
     items = [
         _axis_table(spec),
         _effect_table(effect_flags, spec.effect_modes()),
@@ -218,7 +240,7 @@ def _report_page(
     spec: AnySpec, attributes: Mapping[Any, Any], counted_unit: str,
     first_facts: Sequence[tuple[str, str]], sections: Sequence[PageSection], store: Location,
 ) -> ReportPage:  # fmt: skip
-    """Return the report: summary, sections, and instructions to reproduce it."""
+    """Return a report with its key facts, its sections, and instructions to reproduce the study."""
     facts = [
         *first_facts,
         ("study", attributes["study_id"][:8]),
@@ -240,8 +262,8 @@ def _report_page(
     )
 
 
-def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
-    """Yield the charts of the surfaces and slices in the spec, or of a default set."""
+def _iter_figure_charts(results: GridResults) -> Iterator[SectionItem]:
+    """Yield the charts of a grid's surfaces and slices: those of the spec, or a default set."""
     figure_specs = [
         figure_spec
         for figure_spec in results.figure_specs
@@ -250,7 +272,8 @@ def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
     n_maps = sum(isinstance(figure_spec, SurfaceFigure) for figure_spec in figure_specs)
     for figure_spec in figure_specs:
         chart = results.make_chart(
-            figure_spec, replace(PAGE_LIMITS, cells_max=PAGE_LIMITS.cells_max / max(1, n_maps))
+            figure_spec,
+            replace(PAGE_SIZE_LIMITS, cells_max=PAGE_SIZE_LIMITS.cells_max / max(1, n_maps)),
         )
         if chart is None:
             yield TextItem(figure_spec.title, ["No point of the study is within its limits."], "")
@@ -262,17 +285,22 @@ def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
             )
 
 
-def _study_tables(results: GridResults) -> Iterator[HtmlTable]:
-    """Yield the tables in the spec; for a study of a single point all its outputs."""
+def _iter_spec_tables(results: GridResults) -> Iterator[HtmlTable]:
+    """Yield the tables that a grid's spec defines; for a single point also all its outputs."""
     if not results.spec.axes:
-        yield from _html_tables(outputs_page(results.dataset), "outputs")
+        yield from _iter_html_tables(single_point_page(results.dataset), "outputs")
     for figure_spec in results.figure_specs:
         if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
-            yield from _html_tables(results.make_page(figure_spec), figure_spec.file_stem)
+            yield from _iter_html_tables(
+                results.make_table_page(figure_spec), figure_spec.file_stem
+            )
 
 
-def _html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
-    """Yield the tables of a page of tables."""
+def _iter_html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
+    """Yield the tables of a text page as tables of an HTML page.
+
+    `stem` is the beginning of the names of their CSV files.
+    """
     for table_number, page_table in enumerate(table_page.page_tables):
         frame = pandas.DataFrame(
             [list(row) for row in page_table.rows], columns=list(page_table.columns)
@@ -290,26 +318,26 @@ def _html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
 
 
 def _scene_report(store: Location) -> ReportPage:
-    """Return the report of a flight."""
+    """Return the report of a flight's store."""
     results = SceneResults.from_store(store)
     spec, attributes = results.spec, results.tree.attrs
     labelled_recordings, n_omitted = flight_charts.select_recordings(results)
     cloud_plot = flight_charts.cloud_plot(results, labelled_recordings, n_omitted)
     flight_items: list[SectionItem] = [
         flight_charts.shots_over_time_chart(labelled_recordings),
-        flight_charts.error_chart(labelled_recordings),
-        flight_charts.navigation_error_chart(spec, labelled_recordings),
+        flight_charts.measurement_error_chart(labelled_recordings),
+        flight_charts.flight_navigation_error_chart(spec, labelled_recordings),
         flight_charts.noise_budget_of_flight(results, labelled_recordings),
     ]
     scanner_datasets = [results.tree[name].to_dataset() for name in results.scanners]
-    request_section = _request_section(
+    request_section = _spec_and_effects_section(
         spec, [g["effects"].chunk() for g in scanner_datasets], scanner_datasets[0]
     )
     facts = [("shots times draws", f"{attributes['points']:,}"),
              ("scanners", ", ".join(map(labels.coordinate_label, results.scanners)))]  # fmt: skip
     returns_table = flight_charts.returns_table(labelled_recordings)
     sections = [
-        _answer_section(
+        _main_results_section(
             spec,
             scanner_datasets,
             "shots",
@@ -332,8 +360,8 @@ def _scene_report(store: Location) -> ReportPage:
 
 
 def consistency_sentences(tree: xr.DataTree) -> list[str]:
-    """Return sentences that compare errors with their stated standard errors."""
-    results = check_consistency(tree)
+    """Return sentences on how a flight's errors compare with their stated standard errors."""
+    results = check_error_consistency(tree)
     if messages := [result.message for result in results if not result.is_consistent]:
         return messages
     if not any(result.n_errors for result in results):
@@ -344,12 +372,15 @@ def consistency_sentences(tree: xr.DataTree) -> list[str]:
 def _page_section(
     anchor: str, title: str, items: Sequence[SectionItem], paragraphs: Sequence[str] = ()
 ) -> PageSection:
-    page_items = [make_plot(item) if isinstance(item, Chart) else item for item in items]
+    """Return a section of a page; charts become interactive plots, and None is left out."""
+    page_items = [
+        make_interactive_plot(item) if isinstance(item, Chart) else item for item in items
+    ]
     return PageSection(anchor, title, paragraphs, [item for item in page_items if item is not None])
 
 
 def _grid_point_table(results: GridResults) -> HtmlTable | None:
-    """Return a table of a grid's points, thinned along its longest axes; None without axes."""
+    """Return a table of a grid's points, thinned to `TABLE_POINTS_MAX`; None for a single point."""
     dataset = results.dataset
     if not results.spec.axes:
         return None
@@ -374,11 +405,11 @@ def _grid_point_table(results: GridResults) -> HtmlTable | None:
         }
     )
     n_total = int(np.prod(list(size_by_dim.values())))
-    return HtmlTable("Points", _reduction_caption(len(frame), n_total), frame, "points")
+    return HtmlTable("Points", _table_share_caption(len(frame), n_total), frame, "points")
 
 
-def _reduction_caption(n_rows: int, n_total: int) -> list[str]:
-    """Return the caption on how many of all points a table contains."""
+def _table_share_caption(n_rows: int, n_total: int) -> list[str]:
+    """Return the caption of a table that says how many of all points it contains."""
     if n_rows == n_total:
         return [f"All {n_total:,} points."]
     return [
@@ -388,13 +419,13 @@ def _reduction_caption(n_rows: int, n_total: int) -> list[str]:
 
 
 def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTable:
-    """Return a table of the points of all clouds in the first draw, thinned."""
+    """Return a table of points of all recordings in the first draw, thinned for the page."""
     frames, n_total = [], 0
     for labelled in labelled_recordings:
-        thinned = labelled.recording.thinned_rows(
+        thinned = labelled.recording.read_thinned_rows(
             CLOUD_TABLE_QUANTITIES,
             TABLE_POINTS_MAX // len(labelled_recordings),
-            ranges=INTERPOLATED,
+            ranges=INTERPOLATED_RANGES,
         )
         n_total += thinned.n_total
         if thinned.n_total:
@@ -402,18 +433,18 @@ def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTabl
             columns = {
                 labels.column_label(
                     name, "dB" if name == "snr" else QUANTITY_BY_NAME[name].units
-                ): (to_shown_units(name, values) if name != "flags" else values)
+                ): (to_displayed_values(name, values) if name != "flags" else values)
                 for name, values in column_arrays.items()
             }
             frames.append(
                 pandas.DataFrame({"recorded by": labelled.label or "the scanner"} | columns)
             )
     frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
-    return HtmlTable("Points", _reduction_caption(len(frame), n_total), frame, "points")
+    return HtmlTable("Points", _table_share_caption(len(frame), n_total), frame, "points")
 
 
 def _field_table(spec: AnySpec) -> HtmlTable:
-    """Return a table of every field of the spec, with its description."""
+    """Return a table of the spec's fields, with their values and descriptions."""
     rule_by_path = parameter_rules()
     spec_mapping = spec.to_yaml_mapping()
     rows = [
@@ -426,7 +457,10 @@ def _field_table(spec: AnySpec) -> HtmlTable:
 
 
 def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted path and value of every field of a nested mapping."""
+    """Yield the dotted path and the value of every field of a nested mapping.
+
+    `prefix` is put in front of each path.
+    """
     for name, value in mapping.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping) and value:
@@ -436,6 +470,7 @@ def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple
 
 
 def _format_field(value: object) -> str:
+    """Return the value of a field as text of at most 120 characters."""
     value_text = (
         value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
     )
@@ -443,7 +478,7 @@ def _format_field(value: object) -> str:
 
 
 def _axis_table(spec: AnySpec) -> HtmlTable | None:
-    """Return a table of the axes with their values, or None without axes."""
+    """Return a table of the study's axes with their values; None for a study without axes."""
     rows = [
         (
             axis.name,
@@ -461,6 +496,7 @@ def _axis_table(spec: AnySpec) -> HtmlTable | None:
 
 
 def _format_values(values: np.ndarray, units: str) -> str:
+    """Return the values of an axis as text; of many values the first two and the last."""
     value_texts = [labels.format_quantity(v, units) for v in values[:4]]
     if len(values) > 5:
         return ", ".join([*value_texts[:2], "...", labels.format_quantity(values[-1], units)])
@@ -468,7 +504,10 @@ def _format_values(values: np.ndarray, units: str) -> str:
 
 
 def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> HtmlTable:
-    """Return a table of the effects: share of points with each, and extent of these points."""
+    """Return a table of the effects: the share of points that simulate each, and their extent.
+
+    `flag_arrays` are the flags of simulated effects, `modes` the modes that the spec states.
+    """
     lazy_counts = []
     for k in range(len(EFFECTS)):
         presence = [array // 2**k % 2 > 0 for array in flag_arrays]
@@ -490,7 +529,7 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
     for effect, group_counts in zip(EFFECTS, effect_counts, strict=True):
         n_with_effect = sum(int(n_in_group) for n_in_group, _ in group_counts)
         extent_texts = [
-            _describe_presence(along)
+            _describe_effect_extent(along)
             for _, presence_by_dim in group_counts
             for along in presence_by_dim
         ]
@@ -518,8 +557,11 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
     return HtmlTable("Effects", caption, pandas.DataFrame(rows, columns=columns), "effects")
 
 
-def _describe_presence(presence: xr.DataArray) -> str:
-    """Return the extent of coordinates along a dimension within which an effect is present."""
+def _describe_effect_extent(presence: xr.DataArray) -> str:
+    """Return a text with the extent of the points along a dimension that simulate an effect.
+
+    `presence` is a mask along the dimension. The text is empty if all points or none do.
+    """
     is_present, extent_texts = presence.values, []
     for name, coordinate in presence.coords.items():
         if coordinate.ndim != 1 or is_present.all() or not is_present.any():
@@ -538,7 +580,7 @@ def _describe_presence(presence: xr.DataArray) -> str:
 
 
 def accuracy_sentences(dataset: xr.Dataset, spec: AnySpec) -> list[str]:
-    """Return sentences on the accuracy of the results."""
+    """Return sentences on the accuracy that the spec asks for, and on the errors of the results."""
     tolerance = spec.accuracy.tolerance
     sentences = [
         f"Asked for: no probability of detection off by more than {tolerance:g}"

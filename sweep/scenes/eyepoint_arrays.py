@@ -12,7 +12,7 @@ import numpy as np
 from sweep.model.outputs import BEAMLET_VARIABLES, SHOT_VARIABLES
 from sweep.model.pointcloud.eyepoints import Eyepoints
 
-_FIELD_OF_ARRAY = {
+_EYEPOINT_FIELD_BY_ARRAY = {
     "time": "time",
     "beam": "beam",
     "shot_cycle": "cycle",
@@ -28,26 +28,27 @@ _FIELD_OF_ARRAY = {
     "platform_acceleration": "platform_acceleration",
     **dict(zip(BEAMLET_VARIABLES, BEAMLET_VARIABLES, strict=True)),
 }
-"""Field of :class:`Eyepoints` that each array holds."""
+"""Names of the fields of :class:`Eyepoints`, by the names of the store's arrays."""
 
 
 def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
-    """Return the arrays of a store for n shots of b beamlets.
+    """Return eyepoints as the arrays of a store.
 
     Parameters
     ----------
     eyepoints : Eyepoints
-        Eyepoints of n shots.
+        Eyepoints of n shots with b beamlets each.
 
     Returns
     -------
     dict of str to ndarray
-        Arrays (n, ...) of `SHOT_VARIABLES` and `BEAMLET_VARIABLES`, in the types of the store.
+        Arrays by name, in the types of the store: shape (n,) or (n, 3) for `SHOT_VARIABLES`, and
+        (n, b) for `BEAMLET_VARIABLES`.
     """
     outputs = {**SHOT_VARIABLES, **BEAMLET_VARIABLES}
     arrays = {
         name: np.asarray(getattr(eyepoints, field), outputs[name].dtype)
-        for name, field in _FIELD_OF_ARRAY.items()
+        for name, field in _EYEPOINT_FIELD_BY_ARRAY.items()
     }
     shots = np.arange(len(eyepoints.time))
     arrays["beam_surface"] = arrays["surface"][shots, eyepoints.reference_beamlet]
@@ -55,7 +56,7 @@ def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Return the eyepoints that a store's arrays hold.
+    """Return the eyepoints of the arrays of a store.
 
     Parameters
     ----------
@@ -69,13 +70,13 @@ def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) 
     ValueError
         If an array is missing or has an unexpected shape.
     """
-    if missing := sorted(_FIELD_OF_ARRAY.keys() - arrays.keys()):
+    if missing := sorted(_EYEPOINT_FIELD_BY_ARRAY.keys() - arrays.keys()):
         raise ValueError(f"eyepoints lack {', '.join(missing)}")
-    fields = {field: np.asarray(arrays[name]) for name, field in _FIELD_OF_ARRAY.items()}
+    fields = {field: np.asarray(arrays[name]) for name, field in _EYEPOINT_FIELD_BY_ARRAY.items()}
     fields["beam"] = fields["beam"].astype(np.int64)
     fields["cycle"] = fields["cycle"].astype(np.int64)
     weight = np.asarray(weight, float)
-    for name, field in _FIELD_OF_ARRAY.items():
+    for name, field in _EYEPOINT_FIELD_BY_ARRAY.items():
         trailing_shape = (
             {1: (), 2: (3,)}[len(SHOT_VARIABLES[name].dims)]
             if name in SHOT_VARIABLES

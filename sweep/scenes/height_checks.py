@@ -9,7 +9,7 @@ import numpy as np
 from sweep.messages import counted
 from sweep.scenes.scene_files import SceneError
 
-HEIGHT_MAX = 1e6
+PLAUSIBLE_HEIGHT_MAX = 1e6
 """Largest magnitude of a plausible height [unit of the file]."""
 
 _CUSTOMARY_NO_DATA_VALUES = (
@@ -25,32 +25,35 @@ _CUSTOMARY_NO_DATA_VALUES = (
 )
 """Values that files customarily use for missing heights."""
 
-_CUSTOMARY_VALUE_GAP_MIN = 0.1
-"""Smallest suspicious gap between a customary value and the next height, relative to the span of
-all other heights."""
+_CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN = 0.1
+"""Gap from a customary no-data value to the nearest height, above which it is suspicious.
 
-_SHARED_VALUE_GAP_MIN = 1.0
-"""Smallest suspicious gap for any other value that several cells share, relative to the same
-span."""
+The gap is relative to the span of all other heights.
+"""
 
-_SHARED_CELLS_MIN = 4
-"""Smallest number of cells with exactly equal extreme values that is suspicious."""
+_REPEATED_EXTREME_RELATIVE_GAP_MIN = 1.0
+"""Gap between an extreme value of several cells and the nearest height, above which the value is
+suspicious. The gap is relative to the span of all other heights.
+"""
 
-_DOUBTFUL_VALUES_MAX = 3
-"""Maximum number of suspicious values that are searched for, from the extremes inwards."""
+_REPEATED_EXTREME_CELLS_MIN = 4
+"""Number of cells with exactly the same extreme value from which on the value is suspicious."""
 
-_ROWS_PER_STRIP = 256
-"""Number of rows that are examined for cliffs at a time."""
+_SUSPICIOUS_VALUES_MAX = 3
+"""Maximum number of suspicious values that are reported for a file."""
+
+_CLIFF_SEARCH_STRIP_ROWS = 256
+"""Number of grid rows that the search for cliffs reads at a time."""
 
 CLIFF_SLOPE_MIN = 20.0
-"""Slope between neighbouring cells, as a tangent, above which a cliff is reported."""
+"""Slope between neighbouring cells above which a step counts as a cliff: height over distance."""
 
 CLIFF_HEIGHT_MIN = 100.0
-"""Height difference above which a cliff is reported [m]."""
+"""Height difference of neighbouring cells above which a step counts as a cliff [m]."""
 
 
 def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) -> tuple[str, ...]:
-    """Set missing heights to NaN in place, and return warnings about values that may be missing.
+    """Set missing heights to NaN in place, and return warnings about suspicious heights.
 
     Parameters
     ----------
@@ -69,7 +72,7 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
     Raises
     ------
     SceneError
-        If a height exceeds `HEIGHT_MAX` and is not declared as missing.
+        If a height exceeds `PLAUSIBLE_HEIGHT_MAX` and is not declared as missing.
     """
     is_missing = ~np.isfinite(values)
     if no_data is not None:
@@ -78,31 +81,39 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
         with np.errstate(over="ignore"):
             is_missing |= values == np.float64(np.float32(no_data))
     values[is_missing] = np.nan
-    is_too_far = (values > HEIGHT_MAX) | (values < -HEIGHT_MAX)
+    is_too_far = (values > PLAUSIBLE_HEIGHT_MAX) | (values < -PLAUSIBLE_HEIGHT_MAX)
     if is_too_far.any():
         wrong_height = float(values[is_too_far][0])
         problem = (
             f"holds the height {wrong_height:g} at {counted(int(is_too_far.sum()), 'cell')}, "
-            f"farther than {HEIGHT_MAX:g}"
+            f"farther than {PLAUSIBLE_HEIGHT_MAX:g}"
         )
         raise SceneError(
-            path, problem, f"if they have no data, state 'no_data: {_shortest_text(wrong_height)}'"
+            path,
+            problem,
+            f"if they have no data, state 'no_data: {_shortest_decimal_text(wrong_height)}'",
         )
-    return tuple(_no_data_warnings(path, values))
+    return tuple(_undeclared_no_data_warnings(path, values))
 
 
-def _shortest_text(value: float) -> str:
-    """Return the shortest decimal text of a number; single precision is used if it is exact."""
+def _shortest_decimal_text(value: float) -> str:
+    """Return the shortest decimal text that reads back as the number.
+
+    The text is that of the single-precision number if both are equal.
+    """
     with np.errstate(over="ignore"):
         single_precision = np.float32(value)
     return str(single_precision) if float(single_precision) == value else repr(value)
 
 
-def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
-    """Return warnings about extreme values that are far from all others and may be missing."""
+def _undeclared_no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
+    """Return warnings about extreme heights that may stand for missing data.
+
+    Such a height is far from all others, or many cells share it.
+    """
     warnings: list[str] = []
     low, high = -np.inf, np.inf
-    for _ in range(_DOUBTFUL_VALUES_MAX):
+    for _ in range(_SUSPICIOUS_VALUES_MAX):
         is_inside = (values > low) & (values < high)
         if not is_inside.any():
             break
@@ -122,14 +133,17 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
         for value, gap, span in candidates:
             count = int(np.count_nonzero(values == value))
             if value in _CUSTOMARY_NO_DATA_VALUES:
-                is_doubtful = gap > _CUSTOMARY_VALUE_GAP_MIN * span
+                is_doubtful = gap > _CUSTOMARY_NO_DATA_RELATIVE_GAP_MIN * span
             else:  # with only two distinct heights neither is more suspicious
-                is_doubtful = count >= _SHARED_CELLS_MIN and gap > _SHARED_VALUE_GAP_MIN * span > 0
+                is_doubtful = (
+                    count >= _REPEATED_EXTREME_CELLS_MIN
+                    and gap > _REPEATED_EXTREME_RELATIVE_GAP_MIN * span > 0
+                )
             if is_doubtful:
                 warnings.append(
                     f"{path}: the value {value:g} stands in {counted(count, 'cell')}, "
                     f"{gap:.4g} from the next: if it means that there is no data, "
-                    f"state 'no_data: {_shortest_text(value)}'"
+                    f"state 'no_data: {_shortest_decimal_text(value)}'"
                 )
                 low, high = (value, high) if value == lowest else (low, value)
                 break
@@ -139,10 +153,10 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
 
 
 def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]) -> list[str]:
-    """Return a warning if neighbouring cells differ by an implausible height, else nothing.
+    """Return a list with one warning about implausible cliffs, or an empty list.
 
-    Missing heights that are not declared appear as cliffs in a grid, even if they were blended with
-    heights by resampling.
+    A no-data value that is not declared makes cliffs in the grid, even after resampling has blended
+    it with heights.
 
     Parameters
     ----------
@@ -154,10 +168,10 @@ def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]
         Grid steps along x and y [m].
     """
     n_cliffs, largest_rise, step_at_largest = 0, 0.0, 0.0
-    for first_row in range(0, len(heights), _ROWS_PER_STRIP):
-        strip = heights[first_row : first_row + _ROWS_PER_STRIP + 1]
+    for first_row in range(0, len(heights), _CLIFF_SEARCH_STRIP_ROWS):
+        strip = heights[first_row : first_row + _CLIFF_SEARCH_STRIP_ROWS + 1]
         for axis, step in ((1, abs(spacing[0])), (0, abs(spacing[1]))):
-            rise = np.abs(np.diff(strip[:_ROWS_PER_STRIP] if axis else strip, axis=axis))
+            rise = np.abs(np.diff(strip[:_CLIFF_SEARCH_STRIP_ROWS] if axis else strip, axis=axis))
             is_cliff = rise > max(CLIFF_SLOPE_MIN * step, CLIFF_HEIGHT_MIN)
             n_cliffs += int(np.count_nonzero(is_cliff))
             strip_largest_rise = float(np.max(rise, where=is_cliff, initial=0.0))

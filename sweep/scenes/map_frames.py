@@ -19,19 +19,23 @@ import numpy as np
 from sweep.scenes.scene_files import SceneError
 from sweep.units import QuantityError, read_unit
 
-SCALE_ERROR_MAX = 1e-3
-"""Relative error of a map's scale up to which its coordinates are used without a warning."""
+MAP_SCALE_ERROR_MAX = 1e-3
+"""Largest relative error of a map's scale that needs no warning."""
 
 STATED_SCALE_ERROR_MAX = 5e-2
-"""Relative error of a scale stated by the user above which it counts as a mistake."""
+"""Largest relative error of a scale that the user states; a larger one counts as a mistake."""
 
-CELL_TAKEN_FOR_DEGREES_MAX = 0.1
-"""Cell size below which coordinates in the range of longitudes and latitudes count as degrees."""
+DEGREE_CELL_SIZE_MAX = 0.1
+"""Largest cell size of a raster whose coordinates may be degrees [unit of the coordinates].
+
+It applies to rasters without a reference system, within 360 degrees of longitude and 90 of
+latitude.
+"""
 
 MapBounds = tuple[float, float, float, float]
-"""West, south, east and north, in a map's own coordinates."""
+"""West, south, east and north end of an area, in the coordinates of a map."""
 
-_METRES_PER_HEIGHT_UNIT = (
+_METRES_BY_HEIGHT_UNIT = (
     dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0)
     | dict.fromkeys(
         ("us survey foot", "us_survey_foot", "us survey feet", "us-ft", "sft", "ftus", "foot_us"),
@@ -39,42 +43,42 @@ _METRES_PER_HEIGHT_UNIT = (
     )
     | dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048)
 )
-"""Metres per unit of height, by the names of the unit in rasters."""
+"""Metres per unit of height, by the names that rasters give to the unit."""
 
 
 class MetresPerUnit(NamedTuple):
-    """Metres on the ground per unit of a map's coordinates."""
+    """Length on the ground of one unit of a map's coordinates [m]."""
 
     east: float
-    """Metres per unit eastwards."""
+    """Metres on the ground per unit of the map's coordinates eastwards."""
     north: float
-    """Metres per unit northwards."""
+    """Metres on the ground per unit of the map's coordinates northwards."""
 
 
-class StatedUnits(NamedTuple):
-    """Units of a raster's coordinates and heights as stated by the user; None if not stated."""
+class UserStatedUnits(NamedTuple):
+    """Units of a raster's coordinates and heights that the user states; None if not stated."""
 
     metres_per_degree: tuple[float, float] | None = None
-    """Metres per degree eastwards and northwards."""
+    """Metres on the ground per degree eastwards and northwards."""
     metres_per_unit: tuple[float, float] | None = None
-    """Metres per unit of the coordinates eastwards and northwards."""
+    """Metres on the ground per unit of the coordinates eastwards and northwards."""
     height_unit: str | None = None
     """Unit of the heights."""
 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Map that a raster's coordinates belong to."""
+    """Reference system and scale of a raster's map coordinates."""
 
     metres_per_unit: MetresPerUnit
-    """Metres per unit by which the raster's coordinates are multiplied."""
+    """Factors by which the raster's coordinates are multiplied to give metres."""
     wkt: str = ""
     """Coordinate reference system as WKT; empty if the raster states none."""
     warnings: tuple[str, ...] = ()
-    """Doubts about the map's scale, as sentences."""
+    """Warnings about the map's scale, as sentences."""
 
     def is_same_map(self, other: MapFrame) -> bool:
-        """Return True if the horizontal reference systems of two maps are equal or not stated."""
+        """Return True if two maps have the same horizontal reference system, or one states none."""
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
         horizontal_crs, other_horizontal_crs = (
@@ -83,30 +87,30 @@ class MapFrame:
         return bool(horizontal_crs.equals(other_horizontal_crs, ignore_axis_order=True))
 
     def has_same_height_reference(self, other: MapFrame) -> bool:
-        """Return True if heights on two maps refer to one surface, or a map states none."""
+        """Return True if the heights of two maps refer to the same surface, or one states none."""
         return not (self.wkt and other.wkt) or _is_same_height_reference(
             _crs_from_wkt(self.wkt), _crs_from_wkt(other.wkt)
         )
 
     @property
     def height_reference_name(self) -> str:
-        """Name of the reference surface of the heights; empty if it is not stated."""
+        """Name of the surface from which heights are measured; empty if it is not stated."""
         return _height_reference_name(_crs_from_wkt(self.wkt)) if self.wkt else ""
 
     @property
     def crs_name(self) -> str:
-        """Name of the coordinate reference system."""
+        """Name of the coordinate reference system; 'none' if it is not stated."""
         return str(_crs_from_wkt(self.wkt).name) if self.wkt else "none"
 
 
-def metric_projection_of_crs(wkt: str) -> str:
-    """Return the WKT of a reference system if it is a map projection in metres, else ''.
+def metric_projection_wkt_of_crs(wkt: str) -> str:
+    """Return a coordinate reference system as WKT if it is a map projection in metres, else ''.
 
-    A vertical part in another unit than metres is removed.
+    `wkt` is the reference system. Its vertical part is removed if heights are not in metres.
     """
     crs = _crs_from_wkt(wkt)
     horizontal = _horizontal_crs(crs)
-    if not horizontal.is_projected or _linear_unit(horizontal)[1] != 1.0:
+    if not horizontal.is_projected or _horizontal_axis_unit(horizontal)[1] != 1.0:
         return ""
     axis = _vertical_axis(crs)
     if axis is None or float(axis.unit_conversion_factor) == 1.0:
@@ -115,21 +119,20 @@ def metric_projection_of_crs(wkt: str) -> str:
 
 
 def metres_per_height_unit(unit: str) -> float:
-    """Return the metres per unit of height; raise `QuantityError` for an unknown unit."""
+    """Return how many metres a unit of height has; raise `QuantityError` for an unknown unit."""
     word = unit.strip().lower()
-    if word in _METRES_PER_HEIGHT_UNIT:
-        return _METRES_PER_HEIGHT_UNIT[word]
+    if word in _METRES_BY_HEIGHT_UNIT:
+        return _METRES_BY_HEIGHT_UNIT[word]
     return float(read_unit(unit, si_unit="m", example="ft").to_si(Fraction(1)))
 
 
-def height_factor(
+def resolve_metres_per_height(
     path: Path, wkt: str, band_unit: str, stated_unit: str | None, has_height_scale: bool
 ) -> float:
-    """Return the metres per unit of a raster's heights.
+    """Return the factor that converts the heights of a raster to metres.
 
-    The unit is stated by the user, by the band, or by the vertical axis of the reference system. If
-    none of them states it, the unit is the metre. A map in another unit than metres must have a
-    stated unit of height.
+    The unit of heights is stated by the user, by the raster's band, or by the vertical axis of the
+    reference system. Otherwise it is the metre, unless the map's horizontal unit is another one.
 
     Parameters
     ----------
@@ -147,9 +150,9 @@ def height_factor(
     Raises
     ------
     SceneError
-        If the unit is unknown, or statements contradict each other.
+        If the unit is unknown or has to be stated, or if statements contradict each other.
     """
-    declared_unit = _declared_unit(path, wkt, band_unit)
+    declared_unit = _declared_height_unit(path, wkt, band_unit)
     if stated_unit is not None:
         factor = metres_per_height_unit(stated_unit)
         if declared_unit is not None and not math.isclose(declared_unit[1], factor, rel_tol=1e-9):
@@ -157,7 +160,7 @@ def height_factor(
             raise SceneError(path, problem, "leave height_unit out, or correct the file")
         declared_unit = (stated_unit, factor)
     if declared_unit is None:
-        unit = _linear_unit(_horizontal_crs(_crs_from_wkt(wkt))) if wkt else ("metre", 1.0)
+        unit = _horizontal_axis_unit(_horizontal_crs(_crs_from_wkt(wkt))) if wkt else ("metre", 1.0)
         if unit[1] != 1.0 and not has_height_scale:
             problem = f"is in units of a {unit[0]}, and does not tell the unit of its heights"
             raise SceneError(
@@ -173,10 +176,10 @@ def height_factor(
     return declared_unit[1]
 
 
-def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
-    """Return the unit of heights that a raster states, and metres per unit.
+def _declared_height_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
+    """Return the name of the unit of heights that a raster file states, and its length [m].
 
-    The result is None if the raster states no unit.
+    The result is None if the file states no unit.
     """
     crs = _crs_from_wkt(wkt) if wkt else None
     axis = _vertical_axis(crs) if crs is not None else None
@@ -203,14 +206,14 @@ def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | 
 
 
 def _short_unit_name(unit: str) -> str:
-    """Return the short name of a unit of length in a reference system."""
+    """Return the short name of a unit of length, such as 'ft' for 'foot'."""
     return {"us survey foot": "sft", "foot": "ft"}.get(unit.lower(), unit)
 
 
 def make_map_frame(
-    path: Path, wkt: str, bounds: MapBounds, cell_size: float, stated: StatedUnits
+    path: Path, wkt: str, bounds: MapBounds, cell_size: float, stated: UserStatedUnits
 ) -> MapFrame:
-    """Return the map of a raster, with a check of its scale on the ground.
+    """Return the map frame of a raster, after a check of its scale on the ground.
 
     Parameters
     ----------
@@ -219,17 +222,17 @@ def make_map_frame(
     wkt : str
         Coordinate reference system as WKT; empty for none.
     bounds : MapBounds
-        Bounds of the part that is read.
+        Bounds of the part of the raster that is read.
     cell_size : float
         Smaller side of a cell, in the raster's coordinates.
-    stated : StatedUnits
+    stated : UserStatedUnits
         Units that the user states.
 
     Raises
     ------
     SceneError
         If the size of a unit on the ground is unknown, or varies over the bounds by more than
-        `SCALE_ERROR_MAX`.
+        `MAP_SCALE_ERROR_MAX`.
     """
     per_degree, per_unit = stated.metres_per_degree, stated.metres_per_unit
     for name, sizes in (("degree", per_degree), ("unit", per_unit)):
@@ -256,15 +259,16 @@ def make_map_frame(
 def _map_frame_without_crs(
     path: Path, bounds: MapBounds, cell_size: float, stated: tuple[float, float] | None
 ) -> MapFrame:
-    """Return the map of a raster without a reference system, in metres unless a unit is stated.
+    """Return the map frame of a raster without a reference system.
 
-    Coordinates that could be degrees raise a `SceneError`.
+    Its unit is the metre, unless the user states metres per unit. Raise `SceneError` if the
+    coordinates could be degrees.
     """
     if stated is not None:
         return MapFrame(MetresPerUnit(*stated))
     west, south, east, north = bounds
     may_be_degrees = -360 <= west < east <= 360 and -90 <= south < north <= 90
-    if may_be_degrees and cell_size < CELL_TAKEN_FOR_DEGREES_MAX:
+    if may_be_degrees and cell_size < DEGREE_CELL_SIZE_MAX:
         problem = (
             "names no coordinate reference system, and its coordinates could be degrees: they lie "
             f"within {west:.6g} to {east:.6g} and {south:.6g} to {north:.6g}, with cells of "
@@ -287,10 +291,14 @@ def _checked_map_frame(
     stated: tuple[float, float] | None,
     field_name: str,
 ) -> MapFrame:
-    """Return the map of a raster, after comparison of its scale with that on the ground."""
+    """Return the map frame of a raster with a reference system, after a check of its scale.
+
+    The factors to metres are compared with distances on the ground. `stated` are the factors that
+    the user states, and `field_name` is their field in the spec.
+    """
     unit = "degree" if crs.is_geographic else "unit of its coordinates"
     if stated is None and not crs.is_geographic:
-        factor = _linear_unit(crs)[1]
+        factor = _horizontal_axis_unit(crs)[1]
         factors = MetresPerUnit(factor, factor)
     elif stated is not None:
         factors = MetresPerUnit(*stated)
@@ -308,10 +316,10 @@ def _checked_map_frame(
         remedy = f"state metres_per_degree, here {sizes}, or reproject it with gdalwarp"
         raise SceneError(path, problem, remedy)
     scale_error = _largest_scale_error(factors, scales)
-    if skew > SCALE_ERROR_MAX:
+    if skew > MAP_SCALE_ERROR_MAX:
         problem = f"has axes that are {math.degrees(skew):.3g} deg off a right angle on the ground"
         raise SceneError(path, problem, _reprojection_remedy(crs, bounds))
-    if scale_error <= SCALE_ERROR_MAX:
+    if scale_error <= MAP_SCALE_ERROR_MAX:
         return MapFrame(factors, wkt)
     message = (
         f"takes a {unit} for {factors.east:.6g} m eastwards and {factors.north:.6g} m northwards, "
@@ -327,12 +335,15 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
-    """Return the largest relative difference between a map's scale and the scales on the ground."""
+    """Return the largest relative error of a map's scale against scales measured on the ground.
+
+    `scales` (n, 2) are metres per unit eastwards and northwards at n points.
+    """
     return float(np.abs(np.array(factors) / scales - 1).max())
 
 
 def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray | None, float]:
-    """Return the scales of a map on the ground, and the deviation of its axes from a right angle.
+    """Measure the scale of a map on the ground, and the angle between its axes.
 
     Parameters
     ----------
@@ -346,8 +357,8 @@ def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray 
     Returns
     -------
     scales : ndarray, shape (9, 2), or None
-        Metres per unit eastwards and northwards at nine points; None for a map without a position
-        on a planet.
+        Metres on the ground per unit of the map eastwards and northwards, at nine points; None for
+        a map without a position on a planet.
     skew : float
         Largest deviation of the axes from a right angle [rad].
     """
@@ -385,7 +396,7 @@ def _ground_scales(path: Path, crs: Any, bounds: MapBounds) -> tuple[np.ndarray 
 
 
 def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
-    """Return the remedy for a map whose scale is not that of the ground: a reprojection."""
+    """Return the advice to reproject a map, with a suitable projection for its centre."""
     from pyproj import Transformer
 
     geographic = crs if crs.is_geographic else crs.geodetic_crs
@@ -411,14 +422,14 @@ def _reprojection_remedy(crs: Any, bounds: MapBounds) -> str:
 
 
 def _crs_from_wkt(wkt: str) -> Any:
-    """Return the pyproj reference system of a WKT."""
+    """Return the pyproj reference system that a WKT describes."""
     from pyproj import CRS
 
     return CRS.from_wkt(wkt)
 
 
 def _crs_of_raster(path: Path, wkt: str) -> Any:
-    """Return the pyproj reference system of a raster; raise `SceneError` if it can't be read."""
+    """Return the pyproj reference system of a raster; raise `SceneError` if its WKT is invalid."""
     from pyproj.exceptions import CRSError
 
     try:
@@ -429,16 +440,16 @@ def _crs_of_raster(path: Path, wkt: str) -> Any:
 
 
 def _horizontal_crs(crs: Any) -> Any:
-    """Return the horizontal part of a reference system, without a change of datum."""
+    """Return the horizontal part of a pyproj reference system, without transformations of datum."""
     while crs.is_bound or crs.is_compound:
         crs = crs.source_crs if crs.is_bound else crs.sub_crs_list[0]
     return crs
 
 
 def _vertical_crs(crs: Any) -> Any:
-    """Return the part of a reference system that heights refer to; None if there is none.
+    """Return the part of a pyproj reference system that defines heights; None if there is none.
 
-    This is a vertical system, or a system of three axes.
+    The part is a vertical reference system, or one with three axes.
     """
     while crs.is_bound:
         crs = crs.source_crs
@@ -452,14 +463,17 @@ def _vertical_crs(crs: Any) -> Any:
 
 
 def _vertical_axis(crs: Any) -> Any:
-    """Return the height axis of a reference system; None if there is none."""
+    """Return the height axis of a pyproj reference system; None if there is none."""
     vertical = _vertical_crs(crs)
     axes = vertical.axis_info if vertical is not None else []
     return axes[-1] if axes else None
 
 
 def _height_reference_name(crs: Any) -> str:
-    """Return the name of the reference surface of a system's heights; empty if there is none."""
+    """Return the name of the surface from which a reference system measures heights.
+
+    The name is empty if the system has no heights.
+    """
     vertical = _vertical_crs(crs)
     if vertical is None:
         return ""
@@ -467,9 +481,9 @@ def _height_reference_name(crs: Any) -> str:
 
 
 def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
-    """Return True if heights of two systems refer to the same surface, or one states no surface.
+    """Return True if two reference systems measure heights from the same surface.
 
-    Units may differ, because all heights are converted to metres.
+    The result is also True if one of them has no heights. Their units may differ.
     """
     first, second = _vertical_crs(crs), _vertical_crs(other_crs)
     if first is None or second is None:
@@ -479,8 +493,11 @@ def _is_same_height_reference(crs: Any, other_crs: Any) -> bool:
     return _height_reference_name(crs) == _height_reference_name(other_crs)
 
 
-def _linear_unit(crs: Any) -> tuple[str, float]:
-    """Return the name of the unit of a map's axes, and metres per unit; 1 for degrees."""
+def _horizontal_axis_unit(crs: Any) -> tuple[str, float]:
+    """Return the name and length [m] of the unit of a map's horizontal axes.
+
+    A map in degrees gives 'metre' and 1.
+    """
     axes = crs.axis_info
     if crs.is_geographic or not axes:
         return "metre", 1.0

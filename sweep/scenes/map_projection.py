@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sweep.scenes.map_frames import metric_projection_of_crs
+from sweep.scenes.map_frames import metric_projection_wkt_of_crs
 from sweep.scenes.rasters import open_raster as open_raster
 from sweep.scenes.scene_files import require_file
 
 
 def metric_projection_wkt(path: str | Path, metres_per_unit: Sequence[float] | None = None) -> str:
-    """Return the map projection of a raster as WKT if the scene's coordinates are those of the map.
+    """Return the map projection of a raster as WKT, or '' if it is not that of the scene.
 
-    A scene is in metres. Coordinates in feet, degrees or units of a stated size are multiplied by
-    that size, so that they belong to no projection. If only the heights are in feet, the result is
-    the projection of the map without its vertical part.
+    A scene is in metres. Map coordinates in feet, degrees or units of a stated size are multiplied
+    by that size, and the products belong to no map projection. If only the heights are in feet, the
+    result is the projection of the map without its vertical part.
 
     Parameters
     ----------
     path : str or Path
         File of the raster.
     metres_per_unit : sequence of float, optional
-        Stated metres on the ground per unit of the raster's coordinates, east and north.
+        Metres on the ground per unit of the raster's coordinates, east and north, if the user
+        states them.
 
     Returns
     -------
@@ -33,4 +34,4 @@ def metric_projection_wkt(path: str | Path, metres_per_unit: Sequence[float] | N
         crs = raster.crs
         if crs is None or (metres_per_unit is not None and tuple(metres_per_unit) != (1.0, 1.0)):
             return ""
-        return metric_projection_of_crs(str(crs.to_wkt()))
+        return metric_projection_wkt_of_crs(str(crs.to_wkt()))

@@ -17,43 +17,49 @@ from numpy.typing import ArrayLike
 
 from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_shapes
 from sweep.model.geometry.quaternion import axis_angle, rotate
-from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
-from sweep.scenes.polygons import triangulate
-from sweep.scenes.scene_files import SceneError, read_companion, require_file, require_memory
+from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygon_file
+from sweep.scenes.polygons import triangulate_polygons
+from sweep.scenes.scene_files import SceneError, read_companion_file, require_file, require_memory
 from sweep.units import QuantityError, read_unit
 
 IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
 """Quaternion (w, x, y, z) of no rotation."""
 
-_AREA_ROUNDING = 1e-12
-"""Ratio of a face's normal to the product of two edges above which the area is no rounding
-error."""
+_RELATIVE_AREA_ROUNDING = 1e-12
+"""Largest length that rounding gives to the normal of a face without area.
+
+The normal is the cross product of two edges. The length is relative to the product of the edges'
+lengths.
+"""
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
-"""Formats whose specification makes y the vertical axis; z is assumed for all others."""
+"""Formats with a vertical y axis by their specification. All others are taken to have z up."""
 
-_TRIANGLE_FORMATS = {".stl", *_Y_UP_FORMATS}
+_TRIANGLES_ONLY_FORMATS = {".stl", *_Y_UP_FORMATS}
 """Formats that hold triangles only."""
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
-"""Formats that can be read. Archives are excluded, because their content can be of any size."""
+"""Suffixes of the mesh formats that can be read, without archives.
 
-COORDINATE_MAX = 1e9
-"""Largest magnitude of a vertex coordinate [m]; squares of larger ones overflow."""
+The content of an archive can be of any size.
+"""
 
-_MESH_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
-"""Packages of the extra `scenes` that reading a mesh requires."""
+VERTEX_COORDINATE_MAX = 1e9
+"""Largest magnitude of a vertex coordinate [m]."""
 
-FACES_MAX = 100_000_000
+_MESH_READER_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
+"""Packages that reading a mesh requires; pip installs them with the extra `scenes`."""
+
+MESH_FACES_MAX = 100_000_000
 """Maximum number of triangles of a mesh file."""
 
 _MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
-"""Memory for reading and preparing a mesh over the size of its file, upper bound by format."""
+"""Upper bound of the memory for reading and preparing a mesh, per byte of its file, by suffix."""
 
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """Triangles with the numbers of their surfaces, before cleaning."""
+    """Triangles and their surface numbers, before :func:`clean_mesh`."""
 
     vertices: np.ndarray
     """Vertices (n, 3) relative to the origin [m].
@@ -68,10 +74,12 @@ class Facets:
     origin: np.ndarray
     """Origin (3,) of the vertices in world coordinates [m]."""
     notes: tuple[str, ...] = ()
-    """Changes that were made on reading, as sentences."""
-    is_grid: bool = False
-    """True if the triangles need no cleaning: vertices and faces are distinct, all vertices are
-    used and all faces have an area."""
+    """Changes that the reader of the file made, as sentences."""
+    is_clean: bool = False
+    """True if the triangles need no cleaning.
+
+    All vertices and faces are then distinct, all vertices are used, and all faces have an area.
+    """
 
     @classmethod
     def on_one_surface(
@@ -106,37 +114,45 @@ class Facets:
     def transform(
         self, *, rotation: Sequence[float] | np.ndarray = IDENTITY_QUATERNION, scale: float = 1.0
     ) -> Facets:
-        """Return the facets scaled, then rotated about their origin by a quaternion w, x, y, z."""
+        """Return the facets scaled, and then rotated about their origin.
+
+        Parameters
+        ----------
+        rotation : sequence of float
+            Quaternion (w, x, y, z).
+        scale : float
+            Factor on all vertices.
+        """
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
-    def to_mesh(self) -> tuple[Mesh, MeshReport]:
-        """Return a mesh for ray casting in the world frame, and the report of its cleaning.
+    def to_mesh(self) -> tuple[Mesh, MeshCleaningReport]:
+        """Clean the triangles; return a mesh for ray casting, and the report of the cleaning.
 
         Raises
         ------
         ValueError
-            If a vertex lies beyond `COORDINATE_MAX`, or no face is left.
+            If a vertex lies beyond `VERTEX_COORDINATE_MAX`, or no face is left.
         """
         with np.errstate(invalid="ignore"):
-            is_too_far = np.abs(self.vertices) > COORDINATE_MAX
+            is_too_far = np.abs(self.vertices) > VERTEX_COORDINATE_MAX
         if is_too_far.any():
             far_vertex = self.vertices[is_too_far][0]
             raise ValueError(
-                f"a vertex lies at {far_vertex:.3g} m, farther than {COORDINATE_MAX:.0e} m from "
-                "zero"
+                f"a vertex lies at {far_vertex:.3g} m, farther than "
+                f"{VERTEX_COORDINATE_MAX:.0e} m from zero"
             )
-        if self.is_grid:
+        if self.is_clean:
             _require_faces(len(self.faces), len(self.faces))
             centre = exact_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
-            return mesh, MeshReport(len(self.vertices), len(self.faces), notes=self.notes)
+            return mesh, MeshCleaningReport(len(self.vertices), len(self.faces), notes=self.notes)
         mesh, report = clean_mesh(self.vertices, self.faces, self.surface)
         report = replace(report, notes=self.notes)
         return replace(mesh, origin=mesh.origin + self.origin), report
 
 
 def join_facets(facets_list: Sequence[Facets]) -> Facets:
-    """Join at least one set of facets into one, relative to the origin of the first."""
+    """Join one or more sets of facets. The result has the origin of the first set."""
     origin = facets_list[0].origin
     index_shifts = np.cumsum([0, *(len(facets.vertices) for facets in facets_list)])[:-1]
     return Facets(
@@ -153,40 +169,42 @@ def join_facets(facets_list: Sequence[Facets]) -> Facets:
     )
 
 
-_REPAIR_TEXTS = {
-    "non_finite": "{} faces without data dropped",
-    "degenerate": "{} faces without area dropped",
-    "duplicate": "{} duplicate faces dropped",
-    "merged": "{} coincident vertices merged",
-    "unreferenced": "{} unused vertices dropped",
+_REPAIR_TEXT_BY_COUNT = {
+    "n_non_finite_faces": "{} faces without data dropped",
+    "n_degenerate_faces": "{} faces without area dropped",
+    "n_duplicate_faces": "{} duplicate faces dropped",
+    "n_merged_vertices": "{} coincident vertices merged",
+    "n_unreferenced_vertices": "{} unused vertices dropped",
 }
-"""Text for each count of `MeshReport`."""
+"""Templates of the texts about repairs, by field of `MeshCleaningReport`."""
 
 
 @dataclass(frozen=True)
-class MeshReport:
-    """Counts of the vertices and faces of a mesh, and of the repairs by `clean_mesh`."""
+class MeshCleaningReport:
+    """Numbers of vertices and faces of a mesh, and of the repairs by `clean_mesh`."""
 
     n_vertices: int
     """Number of vertices before cleaning."""
     n_faces: int
     """Number of faces before cleaning."""
-    non_finite: int = 0
+    n_non_finite_faces: int = 0
     """Number of faces dropped because a vertex is not finite."""
-    degenerate: int = 0
+    n_degenerate_faces: int = 0
     """Number of faces dropped because corners coincide or are collinear."""
-    duplicate: int = 0
+    n_duplicate_faces: int = 0
     """Number of faces dropped because another face has the same corners, in any order."""
-    merged: int = 0
+    n_merged_vertices: int = 0
     """Number of vertices merged with a coincident vertex."""
-    unreferenced: int = 0
+    n_unreferenced_vertices: int = 0
     """Number of vertices dropped because no face uses them."""
     notes: tuple[str, ...] = ()
-    """Changes that were made on reading, as sentences."""
+    """Changes that the reader of the file made, as sentences."""
 
     def summary(self) -> str:
-        """Return one line with the counts before cleaning and all repairs that were needed."""
-        counts = [(template, getattr(self, name)) for name, template in _REPAIR_TEXTS.items()]
+        """Return one line of text: numbers of faces and vertices before cleaning, and repairs."""
+        counts = [
+            (template, getattr(self, name)) for name, template in _REPAIR_TEXT_BY_COUNT.items()
+        ]
         repairs = [template.format(count) for template, count in counts if count]
         input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"
         return "; ".join([input_text, *self.notes, *(repairs or ["nothing to mend"])])
@@ -194,7 +212,7 @@ class MeshReport:
 
 def clean_mesh(
     vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike
-) -> tuple[Mesh, MeshReport]:
+) -> tuple[Mesh, MeshCleaningReport]:
     """Clean triangles for ray casting.
 
     Faces that are not finite, have no area or occur twice are dropped. Coincident vertices are
@@ -214,7 +232,7 @@ def clean_mesh(
     -------
     mesh : Mesh
         Mesh with faces in the given order.
-    report : MeshReport
+    report : MeshCleaningReport
         Counts of repairs.
 
     Raises
@@ -232,16 +250,16 @@ def clean_mesh(
     _require_faces(len(face_corners), len(has_data))
     used = np.unique(face_corners)
     positions = positions[used] + 0.0  # -0.0 and 0.0 are equal positions
-    kept_vertices, index_in_kept = _distinct_rows(positions)
-    face_corners, merged = (
+    kept_vertices, index_in_kept = _first_unique_rows(positions)
+    face_corners, n_merged_vertices = (
         index_in_kept[np.searchsorted(used, face_corners)],
         len(used) - len(kept_vertices),
     )
     positions = positions[kept_vertices]
     origin = exact_centre(positions)
     positions -= origin
-    has_area = np.flatnonzero(_have_area(positions, face_corners))
-    kept_faces = has_area[_distinct_rows(np.sort(face_corners[has_area], axis=1))[0]]
+    has_area = np.flatnonzero(_mask_faces_with_area(positions, face_corners))
+    kept_faces = has_area[_first_unique_rows(np.sort(face_corners[has_area], axis=1))[0]]
     _require_faces(len(kept_faces), len(has_data))
     kept_vertices = np.unique(face_corners[kept_faces])
     mesh = Mesh(
@@ -250,14 +268,14 @@ def clean_mesh(
         surfaces[kept_faces],
         origin,
     )
-    return mesh, MeshReport(
+    return mesh, MeshCleaningReport(
         n_vertices=n_vertices,
         n_faces=n_faces,
-        non_finite=int((~has_data).sum()),
-        degenerate=len(face_corners) - len(has_area),
-        duplicate=len(has_area) - len(kept_faces),
-        merged=merged,
-        unreferenced=n_vertices - merged - len(kept_vertices),
+        n_non_finite_faces=int((~has_data).sum()),
+        n_degenerate_faces=len(face_corners) - len(has_area),
+        n_duplicate_faces=len(has_area) - len(kept_faces),
+        n_merged_vertices=n_merged_vertices,
+        n_unreferenced_vertices=n_vertices - n_merged_vertices - len(kept_vertices),
     )
 
 
@@ -267,8 +285,16 @@ def _require_faces(n_left: int, n_given: int) -> None:
         raise ValueError(f"of {n_given} faces none is left that a ray could hit")
 
 
-def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ascending indices of unique rows (first occurrences), and the inverse mapping."""
+def _first_unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the distinct rows of an array.
+
+    Returns
+    -------
+    kept : ndarray
+        Indices of the first occurrence of each distinct row, in rising order.
+    index_in_kept : ndarray
+        Position in `kept` of the row equal to each row.
+    """
     order = np.lexsort(rows.T)  # stable: the first of equal rows is kept
     is_new = np.ones(len(rows), dtype=bool)
     is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
@@ -278,12 +304,12 @@ def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return kept, index_in_kept
 
 
-def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return a mask (m,) of the faces with an area above 0, by exact arithmetic."""
+def _mask_faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return a mask (m,) of the faces with an area above 0; doubtful cases are computed exactly."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
-    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _AREA_ROUNDING * longest)
+    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _RELATIVE_AREA_ROUNDING * longest)
     doubtful_faces = np.flatnonzero(~has_area)
     exact_normals, _ = facet_normals(vertices[faces[doubtful_faces]].transpose(1, 2, 0))
     has_area[doubtful_faces] = exact_normals.any(axis=0)
@@ -293,7 +319,7 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def read_mesh(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Read all parts of a mesh file; the mesh is not cleaned.
+    """Read all parts of a mesh file as facets, which are not cleaned yet.
 
     Polygons are cut into triangles (:mod:`sweep.scenes.polygons`).
 
@@ -327,12 +353,12 @@ def read_mesh(
     bytes_needed = _MEMORY_PER_FILE_BYTE[suffix] * path.stat().st_size
     require_memory(path, bytes_needed, "reduce the mesh, or cut a part out of it")
     try:
-        reader = _read_polygon_file if suffix in POLYGON_FORMATS else _read_triangle_file
+        reader = _read_polygon_facets if suffix in POLYGON_FORMATS else _read_triangle_facets
         parts, file_unit = reader(path)
     except SceneError:
         raise
     except ImportError as error:
-        if (error.name or "").partition(".")[0] in _MESH_PACKAGES:
+        if (error.name or "").partition(".")[0] in _MESH_READER_PACKAGES:
             raise
         remedy = "install what it asks for, or export to OBJ, PLY, STL or plain glTF"
         raise SceneError(path, f"needs another package ({error})", remedy) from None
@@ -348,10 +374,18 @@ def read_mesh(
     )
 
 
-def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
-    """Return the facets of a file of polygons in its frame, and None because it states no unit."""
-    polygons = read_polygons(path)
-    triangulation = triangulate(polygons)
+def _read_polygon_facets(path: Path) -> tuple[list[Facets], str | None]:
+    """Read a file of polygons, and cut them into triangles.
+
+    Returns
+    -------
+    facets : list of Facets
+        The facets in the coordinates of the file; empty if there are none.
+    unit : None
+        Such files state no unit of length.
+    """
+    polygons = read_polygon_file(path)
+    triangulation = triangulate_polygons(polygons)
     if not len(triangulation.faces):
         return [], None
     return [
@@ -362,8 +396,16 @@ def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
     ], None
 
 
-def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
-    """Return the facets of each part of a file of triangles in its frame, and its length unit."""
+def _read_triangle_facets(path: Path) -> tuple[list[Facets], str | None]:
+    """Read the parts of a file of triangles.
+
+    Returns
+    -------
+    facets : list of Facets
+        Facets of each part, in the coordinates of the file.
+    unit : str or None
+        Unit of length that the file states.
+    """
     import trimesh
 
     if path.suffix.lower() in _Y_UP_FORMATS:
@@ -374,53 +416,56 @@ def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
         scene: Any = trimesh.load_scene(
             file,
             file_type=path.suffix.lower()[1:],
-            resolver=_companion_resolver(path),
+            resolver=_make_companion_resolver(path),
             process=False,
             skip_materials=True,  # textures have no effect and can be of any size
         )
     nodes = sorted(scene.graph.nodes_geometry)
     faces = [len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) for node in nodes]
-    if sum(faces) > FACES_MAX:
+    if sum(faces) > MESH_FACES_MAX:
         problem = f"places its meshes so often that they make {sum(faces):,} triangles"
-        raise SceneError(path, problem, f"keep it below {FACES_MAX:.0e}")
+        raise SceneError(path, problem, f"keep it below {MESH_FACES_MAX:.0e}")
     return [part for node in nodes for part in _iter_node_facets(scene, node)], scene.units
 
 
-def _companion_resolver(path: Path) -> Any:
-    """Return trimesh's resolver of file names, restricted to plain files in the mesh's folder."""
+def _make_companion_resolver(path: Path) -> Any:
+    """Return an object by which trimesh reads the further files that a mesh file names.
+
+    It reads nothing but plain files, by paths relative to the mesh file.
+    """
     from trimesh.resolvers import Resolver
 
     class CompanionResolver(Resolver):  # type: ignore[misc]
-        """Resolver of the plain files that a mesh file names."""
+        """Reader of the plain files that a mesh file names."""
 
         def __init__(self) -> None:
             pass
 
         def get(self, key: str) -> bytes:
-            """Return the content of a file."""
-            return read_companion(path, key)
+            """Return the content of the file with a name."""
+            return read_companion_file(path, key)
 
         def write(self, name: str, data: bytes) -> None:
-            """Refuse to write: files that a mesh names are only read."""
+            """Raise `PermissionError`, because the files that a mesh names are only read."""
             raise PermissionError(f"{name}: a mesh's files are not written")
 
         def namespaced(self, namespace: str) -> CompanionResolver:
-            """Return this resolver: a glTF has no names below a folder."""
+            """Return this object, because a glTF has no names below a folder."""
             return self
 
         def keys(self) -> list[str]:
-            """Return an empty list: names are not enumerated."""
+            """Return an empty list, because the files are not known in advance."""
             return []
 
     return CompanionResolver()
 
 
-_STL_HEADER = struct.Struct("<80sI")
+_STL_HEADER_STRUCT = struct.Struct("<80sI")
 """Header of a binary STL: 80 bytes of text and the number of triangles."""
 _STL_TRIANGLE_BYTES = 50
 """Bytes per triangle of a binary STL."""
 _STL_PROBE_BYTES = 1000
-"""Number of bytes at the beginning of an STL by which text and binary files are distinguished."""
+"""Number of first bytes of an STL file that show whether it is text or binary."""
 
 
 def _check_stl(path: Path) -> None:
@@ -432,11 +477,11 @@ def _check_stl(path: Path) -> None:
         first_bytes = file.read(_STL_PROBE_BYTES)
     if b"\0" not in first_bytes and re.search(rb"^\W*solid|\bfacet\b", first_bytes, re.I):
         return
-    header = first_bytes[: _STL_HEADER.size]
-    if len(header) < _STL_HEADER.size:
+    header = first_bytes[: _STL_HEADER_STRUCT.size]
+    if len(header) < _STL_HEADER_STRUCT.size:
         raise ValueError(f"it has {len(header)} bytes, and a binary STL has 84 or more")
-    count, size = _STL_HEADER.unpack(header)[1], path.stat().st_size
-    bytes_needed = _STL_HEADER.size + _STL_TRIANGLE_BYTES * count
+    count, size = _STL_HEADER_STRUCT.unpack(header)[1], path.stat().st_size
+    bytes_needed = _STL_HEADER_STRUCT.size + _STL_TRIANGLE_BYTES * count
     if size != bytes_needed:
         raise ValueError(
             f"its header counts {count:,} triangles, which take {bytes_needed:,} bytes, and it has "
@@ -444,22 +489,22 @@ def _check_stl(path: Path) -> None:
         )
 
 
-_GLB_HEADER = struct.Struct("<4sIIII")
-"""Header of a binary glTF and of its first chunk."""
-_ACCESSOR_ELEMENT_BYTES_MAX = 64
-"""Largest size of an accessor's element: a matrix of 16 floats [bytes]."""
+_GLB_HEADER_STRUCT = struct.Struct("<4sIIII")
+"""Header of a binary glTF, with the header of its first chunk."""
+_GLTF_ACCESSOR_ELEMENT_BYTES_MAX = 64
+"""Size of the largest element of a glTF array, a matrix of 16 floats [bytes]."""
 
 
 def _check_gltf(path: Path) -> None:
-    """Raise an error if a glTF is invalid, or its arrays exceed its buffers or the free memory."""
+    """Raise an error if a glTF is invalid, or its arrays exceed its data or the free memory."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
-        if len(content) < _GLB_HEADER.size:
+        if len(content) < _GLB_HEADER_STRUCT.size:
             raise ValueError("it is cut off")
-        magic, version, _, length, _ = _GLB_HEADER.unpack_from(content)
+        magic, version, _, length, _ = _GLB_HEADER_STRUCT.unpack_from(content)
         if magic != b"glTF" or version != 2:
             raise ValueError("it is no binary glTF of version 2")
-        content = content[_GLB_HEADER.size : _GLB_HEADER.size + length]
+        content = content[_GLB_HEADER_STRUCT.size : _GLB_HEADER_STRUCT.size + length]
     document = json.loads(content)
     accessors = document.get("accessors", []) if isinstance(document, dict) else None
     if accessors is None:
@@ -472,11 +517,14 @@ def _check_gltf(path: Path) -> None:
     if n_elements > max(buffer_bytes, 1):
         raise ValueError(f"its arrays have {n_elements:,} elements in {buffer_bytes:,} bytes")
     remedy = "reduce the mesh, or cut a part out of it"
-    require_memory(path, n_elements * _ACCESSOR_ELEMENT_BYTES_MAX + buffer_bytes, remedy)
+    require_memory(path, n_elements * _GLTF_ACCESSOR_ELEMENT_BYTES_MAX + buffer_bytes, remedy)
 
 
 def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
-    """Yield the facets of one mesh of a file in the file's frame; nothing for points and curves."""
+    """Yield the facets of a node of a file's scene graph, in the coordinates of the file.
+
+    Nodes of points and curves have none.
+    """
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
     if not len(getattr(mesh, "faces", ())):
@@ -489,7 +537,7 @@ def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
 
 
 def _metres_per_unit(path: Path, unit: str | None) -> float:
-    """Return the metres per unit of length; 1 if no unit is given."""
+    """Return how many metres a unit of length has; 1 if no unit is given."""
     if unit is None:
         return 1.0
     try:

@@ -11,19 +11,19 @@ import numpy as np
 
 from sweep.scenes.polygons import Polygons
 
-_INDEX_PROPERTIES = ("vertex_indices", "vertex_index")
-"""Names that PLY files use for the vertex indices of a face."""
+_PLY_INDEX_PROPERTIES = ("vertex_indices", "vertex_index")
+"""Names of the PLY property with the vertex indices of a face."""
 
 
-def read_polygons(path: Path) -> Polygons:
-    """Return the vertices and faces of an OBJ, PLY or OFF file as they are written.
+def read_polygon_file(path: Path) -> Polygons:
+    """Return the vertices and polygons of an OBJ, PLY or OFF file.
 
     Raises
     ------
     ValueError
         If the file is invalid.
     """
-    return _READERS[path.suffix.lower()](path)
+    return _READER_BY_SUFFIX[path.suffix.lower()](path)
 
 
 def _make_polygons(vertices: Any, faces: list[list[int]]) -> Polygons:
@@ -37,7 +37,7 @@ def _read_obj(path: Path) -> Polygons:
     """Return the polygons of a Wavefront OBJ file; materials and textures are ignored."""
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
-    for number, words in _iter_lines(path, continuation_mark="\\"):
+    for number, words in _iter_line_words(path, continuation_mark="\\"):
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
@@ -55,7 +55,7 @@ def _read_obj(path: Path) -> Polygons:
 
 def _read_off(path: Path) -> Polygons:
     """Return the polygons of an OFF file; colours, normals and texture coordinates are ignored."""
-    lines = _iter_lines(path)
+    lines = _iter_line_words(path)
     number, words = next(lines, (1, [""]))
     heading = words[0].upper()
     if not heading.endswith("OFF") or heading.startswith(("4", "N4")) or "BINARY" in words:
@@ -87,7 +87,10 @@ def _read_off(path: Path) -> Polygons:
 def _take_lines(
     lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield `number` lines; raise `ValueError` if the file ends before."""
+    """Yield the next `number` lines; raise `ValueError` if the file has fewer.
+
+    `element_name` is what the lines describe, for the error.
+    """
     for k in range(number):
         line = next(lines, None)
         if line is None:
@@ -95,8 +98,11 @@ def _take_lines(
         yield line
 
 
-def _iter_lines(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and words of the lines that are not empty; '#' begins a comment."""
+def _iter_line_words(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and words of each line that is not empty; '#' begins a comment.
+
+    A line that ends with the continuation mark is joined to the next one.
+    """
     continued_text = ""
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
@@ -116,7 +122,7 @@ def _read_ply(path: Path) -> Polygons:
     _check_ply_row_counts(path)
     data: Any
     try:  # files with triangles only are read many times faster this way
-        triangles = {"face": dict.fromkeys(_INDEX_PROPERTIES, 3)}
+        triangles = {"face": dict.fromkeys(_PLY_INDEX_PROPERTIES, 3)}
         data = PlyData.read(str(path), mmap="c", known_list_len=triangles)
     except PlyElementParseError:
         data = PlyData.read(str(path), mmap="c")
@@ -125,9 +131,11 @@ def _read_ply(path: Path) -> Polygons:
         raise ValueError("it has no element 'vertex'")
     if "face" not in names:
         return _make_polygons([], [])
-    index_properties = [p.name for p in data["face"].properties if p.name in _INDEX_PROPERTIES]
+    index_properties = [p.name for p in data["face"].properties if p.name in _PLY_INDEX_PROPERTIES]
     if not index_properties:
-        raise ValueError(f"its faces have none of the properties {', '.join(_INDEX_PROPERTIES)}")
+        raise ValueError(
+            f"its faces have none of the properties {', '.join(_PLY_INDEX_PROPERTIES)}"
+        )
     vertex, indices = data["vertex"], data["face"].data[index_properties[0]]
     vertices = np.stack([np.asarray(vertex[axis], float) for axis in "xyz"], axis=1)
     if indices.dtype != object:
@@ -138,20 +146,20 @@ def _read_ply(path: Path) -> Polygons:
     return Polygons(vertices, corners, counts)
 
 
-_HEADER_BYTES_MAX = 1 << 20
+_PLY_HEADER_BYTES_MAX = 1 << 20
 """Maximum size of a PLY header [bytes]."""
 _INTEGER_PATTERN = re.compile(rb"[-+]?\d{1,4000}")
 """Pattern of an integer in a PLY header."""
 
 
 def _check_ply_row_counts(path: Path) -> None:
-    """Raise `ValueError` if a header declares a negative or impossible number of rows.
+    """Raise `ValueError` if the header of a PLY file declares an impossible number of rows.
 
-    A file has at least one byte per row, so that more rows than bytes are impossible.
+    A number is impossible if it is negative, or larger than the file in bytes.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        header, end_mark, _ = file.read(_HEADER_BYTES_MAX).partition(b"end_header")
+        header, end_mark, _ = file.read(_PLY_HEADER_BYTES_MAX).partition(b"end_header")
     if not end_mark:
         raise ValueError("its header does not end")
     words = [line.split() for line in header.splitlines() if line.startswith(b"element")]
@@ -170,7 +178,7 @@ def _check_ply_row_counts(path: Path) -> None:
         raise ValueError(f"it declares {rows:,} vertices and faces in {size:,} bytes")
 
 
-_READERS = {".obj": _read_obj, ".ply": _read_ply, ".off": _read_off}
-"""Reader of each format, by suffix."""
-POLYGON_FORMATS = frozenset(_READERS)
-"""Suffixes of the formats that this module reads."""
+_READER_BY_SUFFIX = {".obj": _read_obj, ".ply": _read_ply, ".off": _read_off}
+"""Readers of the file formats, by suffix."""
+POLYGON_FORMATS = frozenset(_READER_BY_SUFFIX)
+"""Suffixes of the file formats that this module reads."""

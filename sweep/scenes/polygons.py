@@ -1,4 +1,4 @@
-"""Triangulation of the polygons of mesh files.
+"""Division of the polygons of mesh files into triangles.
 
 A polygon is projected to its mean plane (Newell's normal). A convex polygon becomes a fan about its
 first corner. Any other polygon is cut by Mapbox's earcut, and the result is checked: the areas of
@@ -14,23 +14,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-BEND_REPORTED_MIN = 1e-3
-"""Departure from the mean plane, relative to the square root of the area, that is reported."""
+NON_PLANARITY_REPORTED_MIN = 1e-3
+"""Departure of a polygon from its mean plane that is reported [square root of its area]."""
 
-BEND_MAX = 0.25
-"""Departure from the mean plane, relative to the square root of the area, above which a polygon is
-refused: its surface is undetermined.
+NON_PLANARITY_MAX = 0.25
+"""Departure of a polygon from its mean plane above which it is refused [square root of its area].
+
+The surface of such a polygon is not determined by its corners.
 """
 
-_AREA_ROUNDING = 1e-12
-"""Ratio of area to squared extent below which an area may be due to rounding."""
+_RELATIVE_AREA_ROUNDING = 1e-12
+"""Largest area that rounding gives to a polygon without area, over the square of its extent."""
 
-_AREA_TOLERANCE = 1e-9
-"""Relative difference between the areas of triangles and polygon that may be due to rounding."""
+_AREA_SUM_TOLERANCE = 1e-9
+"""Largest relative difference by rounding between a polygon's area and the sum of its triangles."""
 
 
 class PolygonError(ValueError):
-    """Error of a polygon that can't be triangulated, with its number in the file, from 1."""
+    """Error about a polygon that can't be cut into triangles, with its number from 1."""
 
     def __init__(self, number: int, problem: str) -> None:
         super().__init__(f"face {number} {problem}")
@@ -42,46 +43,54 @@ class Polygons(NamedTuple):
     vertices: np.ndarray
     """Vertices (n, 3), float64."""
     corners: np.ndarray
-    """Vertex indices (sum of counts,) int64 of all polygons, one polygon after the other."""
-    counts: np.ndarray
+    """Vertex indices of the corners of all polygons, one polygon after the other, int64."""
+    corner_counts: np.ndarray
     """Number of corners (m,) int64 of each polygon."""
 
 
 class Triangulation(NamedTuple):
-    """Triangles of polygons, in the polygons' order and winding."""
+    """Triangles into which polygons were cut, with the order and winding of the polygons."""
 
     faces: np.ndarray
     """Vertex indices (k, 3) int64 of the triangles."""
-    n_cut: int
+    n_cut_polygons: int
     """Number of polygons with more than three corners."""
-    n_concave: int
+    n_concave_polygons: int
     """Number of polygons with more than three corners that are not convex."""
-    n_bent: int
-    """Number of polygons that depart from their mean plane by more than `BEND_REPORTED_MIN`."""
-    largest_bend: float
-    """Largest departure of a bent polygon from its mean plane [unit of the vertices]."""
+    n_non_planar_polygons: int
+    """Number of polygons whose departure from a plane exceeds `NON_PLANARITY_REPORTED_MIN`."""
+    largest_plane_departure: float
+    """Largest departure of a corner from the mean plane of its polygon [unit of the vertices].
+
+    Only the polygons counted by `n_non_planar_polygons` are considered.
+    """
 
     def notes(self) -> tuple[str, ...]:
-        """Return sentences about the polygons that were cut, with lengths in the file's unit."""
-        if not self.n_cut:
+        """Return sentences about the polygons that were cut into triangles.
+
+        Lengths are in the unit of the file.
+        """
+        if not self.n_cut_polygons:
             return ()
-        concave_text = f", {self.n_concave:,} of them not convex" if self.n_concave else ""
-        notes = [f"{_polygon_count_text(self.n_cut)} cut into triangles{concave_text}"]
-        if self.n_bent:
-            verb = "departs" if self.n_bent == 1 else "depart"
+        concave_text = (
+            f", {self.n_concave_polygons:,} of them not convex" if self.n_concave_polygons else ""
+        )
+        notes = [f"{_polygon_count_text(self.n_cut_polygons)} cut into triangles{concave_text}"]
+        if self.n_non_planar_polygons:
+            verb = "departs" if self.n_non_planar_polygons == 1 else "depart"
             notes.append(
-                f"{_polygon_count_text(self.n_bent)} {verb} from a plane by up to "
-                f"{self.largest_bend:.3g} units"
+                f"{_polygon_count_text(self.n_non_planar_polygons)} {verb} from a plane by up to "
+                f"{self.largest_plane_departure:.3g} units"
             )
         return tuple(notes)
 
 
 def _polygon_count_text(polygons: int) -> str:
-    """Return a number of polygons as text."""
+    """Return a number of polygons as text, such as '1 polygon'."""
     return f"{polygons:,} polygon{'s' * (polygons != 1)}"
 
 
-def triangulate(polygons: Polygons) -> Triangulation:
+def triangulate_polygons(polygons: Polygons) -> Triangulation:
     """Cut polygons into triangles.
 
     A polygon without area, or with a vertex that is not finite, becomes triangles of the same kind,
@@ -100,11 +109,11 @@ def triangulate(polygons: Polygons) -> Triangulation:
     Raises
     ------
     PolygonError
-        If a polygon crosses itself, is bent by more than `BEND_MAX`, or has an invalid vertex
-        index.
+        If a polygon crosses itself, departs from a plane by more than `NON_PLANARITY_MAX`, or has
+        an invalid vertex index.
     """
-    vertices, corners, counts = polygons
-    first_corner = np.cumsum(counts) - counts
+    vertices, corners, corner_counts = polygons
+    first_corner = np.cumsum(corner_counts) - corner_counts
     wrong_corners = np.flatnonzero((corners < 0) | (corners >= len(vertices)))
     if wrong_corners.size:
         face = int(np.searchsorted(first_corner, wrong_corners[0], side="right")) - 1
@@ -112,10 +121,10 @@ def triangulate(polygons: Polygons) -> Triangulation:
         raise PolygonError(face + 1, problem)
     triangles: list[np.ndarray] = []
     polygon_of_triangle: list[np.ndarray] = []
-    n_cut = n_concave = n_bent = 0
-    largest_bend = 0.0
-    for n_corners in np.unique(counts):
-        polygon_numbers = np.flatnonzero(counts == n_corners)
+    n_cut_polygons = n_concave_polygons = n_non_planar_polygons = 0
+    largest_plane_departure = 0.0
+    for n_corners in np.unique(corner_counts):
+        polygon_numbers = np.flatnonzero(corner_counts == n_corners)
         corner_vertices = corners[first_corner[polygon_numbers, None] + np.arange(n_corners)]
         if n_corners <= 3:  # one or two corners have no area
             triangles.append(
@@ -123,14 +132,18 @@ def triangulate(polygons: Polygons) -> Triangulation:
             )
             polygon_of_triangle.append(polygon_numbers)
             continue
-        flat_polygons = _flatten(vertices[corner_vertices], polygon_numbers)
-        n_cut += len(polygon_numbers)
-        n_concave += int((~flat_polygons.is_convex & ~flat_polygons.is_empty).sum())
-        is_bent = flat_polygons.bend > BEND_REPORTED_MIN
-        n_bent += int(is_bent.sum())
-        largest_bend = max(
-            largest_bend,
-            float((flat_polygons.bend * np.sqrt(flat_polygons.area))[is_bent].max(initial=0.0)),
+        flat_polygons = _project_to_mean_planes(vertices[corner_vertices], polygon_numbers)
+        n_cut_polygons += len(polygon_numbers)
+        n_concave_polygons += int((~flat_polygons.is_convex & ~flat_polygons.is_empty).sum())
+        is_bent = flat_polygons.non_planarity > NON_PLANARITY_REPORTED_MIN
+        n_non_planar_polygons += int(is_bent.sum())
+        largest_plane_departure = max(
+            largest_plane_departure,
+            float(
+                (flat_polygons.non_planarity * np.sqrt(flat_polygons.area))[is_bent].max(
+                    initial=0.0
+                )
+            ),
         )
         # Empty polygons become fans too: clean_mesh drops and counts their triangles without area.
         fanned = np.flatnonzero(flat_polygons.is_convex | flat_polygons.is_empty)
@@ -141,7 +154,7 @@ def triangulate(polygons: Polygons) -> Triangulation:
         triangles.append(corner_vertices[fanned][:, fan].reshape(-1, 3))
         polygon_of_triangle.append(np.repeat(polygon_numbers[fanned], n_corners - 2))
         for k in np.flatnonzero(~(flat_polygons.is_convex | flat_polygons.is_empty)):
-            part_triangles = _triangulate_polygon(
+            part_triangles = _triangulate_by_earcut(
                 flat_polygons.corners[k], vertices[corner_vertices[k]], int(polygon_numbers[k]) + 1
             )
             triangles.append(corner_vertices[k][part_triangles])
@@ -149,28 +162,35 @@ def triangulate(polygons: Polygons) -> Triangulation:
     if not triangles:
         return Triangulation(np.empty((0, 3), np.int64), 0, 0, 0, 0.0)
     order = np.argsort(np.concatenate(polygon_of_triangle), kind="stable")
-    return Triangulation(np.concatenate(triangles)[order], n_cut, n_concave, n_bent, largest_bend)
+    return Triangulation(
+        np.concatenate(triangles)[order],
+        n_cut_polygons,
+        n_concave_polygons,
+        n_non_planar_polygons,
+        largest_plane_departure,
+    )
 
 
 class _FlatPolygons(NamedTuple):
-    """Polygons of n corners each, projected to their mean planes."""
+    """Polygons with n corners each, projected to their mean planes."""
 
     corners: np.ndarray
-    """Corners (m, n, 2) in the plane, counter-clockwise."""
+    """Corners (m, n, 2) in the mean planes, counter-clockwise."""
     area: np.ndarray
-    """Areas (m,)."""
-    bend: np.ndarray
-    """Largest departures (m,) from the plane, relative to the square root of the area."""
+    """Areas (m,) of the polygons."""
+    non_planarity: np.ndarray
+    """Largest departures (m,) of corners from the mean plane, over the square root of the area."""
     is_convex: np.ndarray
     """Mask (m,) of the strictly convex polygons."""
     is_empty: np.ndarray
     """Mask (m,) of the polygons without area or with vertices that are not finite."""
 
 
-def _flatten(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
-    """Project polygons (m, n, 3) to their mean planes.
+def _project_to_mean_planes(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
+    """Project polygons to their mean planes.
 
-    `polygon_numbers` (m,) are their indices in the file, for errors.
+    `points` (m, n, 3) are the corners of m polygons. `polygon_numbers` (m,) are the indices of
+    these polygons in the file, for errors.
     """
     has_data = np.isfinite(points).all(axis=(1, 2))
     points = np.where(has_data[:, None, None], points, 0.0)
@@ -179,8 +199,8 @@ def _flatten(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
     extent = np.sqrt((points * points).sum(axis=2)).max(axis=1)
     area_vector = 0.5 * np.cross(points, next_points).sum(axis=1)
     area = np.sqrt((area_vector * area_vector).sum(axis=1))
-    has_area = area > _AREA_ROUNDING * extent * extent
-    is_collinear = _are_collinear(points, extent)
+    has_area = area > _RELATIVE_AREA_ROUNDING * extent * extent
+    is_collinear = _collinear_polygon_mask(points, extent)
     if (is_folded := ~has_area & ~is_collinear).any():
         raise PolygonError(int(polygon_numbers[is_folded.argmax()]) + 1, "crosses itself")
     is_empty = ~has_data | is_collinear
@@ -192,36 +212,57 @@ def _flatten(points: np.ndarray, polygon_numbers: np.ndarray) -> _FlatPolygons:
     axes = np.stack([in_plane_axis, np.cross(normal, in_plane_axis), normal], axis=2)
     flat = points @ axes
     height = flat[..., 2] - flat[..., 2].mean(axis=1)[:, None]
-    bend = np.abs(height).max(axis=1) / np.sqrt(np.where(is_empty, 1.0, area))
-    bend[is_empty] = 0.0
-    if (bend > BEND_MAX).any():
-        k = int((bend > BEND_MAX).argmax())
-        problem = f"is bent by {100 * bend[k]:.0f} % of its size, so its surface is not determined"
+    non_planarity = np.abs(height).max(axis=1) / np.sqrt(np.where(is_empty, 1.0, area))
+    non_planarity[is_empty] = 0.0
+    if (non_planarity > NON_PLANARITY_MAX).any():
+        k = int((non_planarity > NON_PLANARITY_MAX).argmax())
+        problem = (
+            f"is bent by {100 * non_planarity[k]:.0f} % of its size, "
+            "so its surface is not determined"
+        )
         raise PolygonError(int(polygon_numbers[k]) + 1, problem)
     corners = flat[..., :2]
     edge = np.roll(corners, -1, axis=1) - corners
     previous_edge = np.roll(edge, 1, axis=1)
     edge_cross = previous_edge[..., 0] * edge[..., 1] - previous_edge[..., 1] * edge[..., 0]
     total_angle = np.arctan2(edge_cross, (previous_edge * edge).sum(axis=2)).sum(axis=1)
-    is_convex = (edge_cross > _AREA_ROUNDING * (extent * extent)[:, None]).all(axis=1) & (
+    is_convex = (edge_cross > _RELATIVE_AREA_ROUNDING * (extent * extent)[:, None]).all(axis=1) & (
         total_angle < 3 * np.pi
     )
-    return _FlatPolygons(corners, area, bend, is_convex & ~is_empty, is_empty)
+    return _FlatPolygons(corners, area, non_planarity, is_convex & ~is_empty, is_empty)
 
 
-def _are_collinear(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Return a mask (m,) of the polygons (m, n, 3), relative to a corner, that are collinear."""
+def _collinear_polygon_mask(points: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Return a mask (m,) of the polygons whose corners all lie on a line.
+
+    `points` (m, n, 3) are the corners relative to the first one. `extent` (m,) are their largest
+    distances from it.
+    """
     squared_distance = (points * points).sum(axis=2)
     farthest = points[np.arange(len(points)), squared_distance.argmax(axis=1)]
     cross_product = np.cross(points, farthest[:, None])
     distance = np.sqrt((cross_product * cross_product).sum(axis=2)).max(axis=1)
-    return np.asarray(distance <= _AREA_ROUNDING * extent * extent)
+    return np.asarray(distance <= _RELATIVE_AREA_ROUNDING * extent * extent)
 
 
-def _triangulate_polygon(plane_corners: np.ndarray, points: np.ndarray, number: int) -> np.ndarray:
-    """Return the triangles (k, 3) of a polygon, given by corners (n, 2) and points (n, 3).
+def _triangulate_by_earcut(
+    plane_corners: np.ndarray, points: np.ndarray, number: int
+) -> np.ndarray:
+    """Cut a polygon of n corners into triangles by Mapbox's earcut, and check the result.
 
-    `plane_corners` are the corners in the polygon's plane, `points` the corners in space.
+    Parameters
+    ----------
+    plane_corners : ndarray, shape (n, 2)
+        Corners in the polygon's mean plane.
+    points : ndarray, shape (n, 3)
+        The same corners in space.
+    number : int
+        Number of the polygon in the file, for errors.
+
+    Returns
+    -------
+    ndarray, shape (k, 3)
+        Indices of the corners of the triangles.
     """
     import mapbox_earcut
 
@@ -232,28 +273,34 @@ def _triangulate_polygon(plane_corners: np.ndarray, points: np.ndarray, number: 
     triangles = (
         mapbox_earcut.triangulate_float64(corners, ring_ends).reshape(-1, 3).astype(np.int64)
     )
-    area = _triangle_areas(corners, triangles)
+    area = _signed_triangle_areas(corners, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]
     x, y = corners.T
     polygon_area = 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     if not (
-        len(triangles) and abs(np.abs(area).sum() - polygon_area) <= _AREA_TOLERANCE * polygon_area
+        len(triangles)
+        and abs(np.abs(area).sum() - polygon_area) <= _AREA_SUM_TOLERANCE * polygon_area
     ):
         raise PolygonError(
             number, f"of {len(plane_corners)} corners crosses itself, seen along its normal"
         )
-    if not _winds_once(corners, triangles[np.abs(area) > _AREA_ROUNDING * polygon_area]):
+    if not _polygon_winds_once(
+        corners, triangles[np.abs(area) > _RELATIVE_AREA_ROUNDING * polygon_area]
+    ):
         rule = f"of {len(plane_corners)} corners covers a part of its plane twice"
         raise PolygonError(number, f"{rule}: a hole has to be gone round against its outline")
     return kept[_insert_collinear_corners(triangles, corners)]
 
 
 _EDGE_POINT_PAIRS_MAX = 1 << 22
-"""Number of pairs of edge and point whose winding numbers are computed at a time."""
+"""Maximum number of pairs of an edge and a point in one batch of winding numbers."""
 
 
-def _winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
-    """Return True if a polygon (n, 2) winds once and counter-clockwise about its triangles."""
+def _polygon_winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
+    """Return True if a polygon winds once and counter-clockwise about each of its triangles.
+
+    `corners` (n, 2) are the polygon's corners, `triangles` (k, 3) indices into them.
+    """
     edge_ends = np.roll(corners, -1, axis=0)
     centres = corners[triangles].mean(axis=1)
     rows = max(_EDGE_POINT_PAIRS_MAX // len(corners), 1)
@@ -271,17 +318,18 @@ def _winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
     return True
 
 
-def _triangle_areas(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the areas (k,) of triangles, positive if they are counter-clockwise."""
+def _signed_triangle_areas(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the areas (k,) of triangles in a plane; positive if they are counter-clockwise."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     b, c = b - a, c - a
     return np.asarray(0.5 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]))
 
 
 def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return triangles that include the corners on straight edges, which earcut leaves out.
+    """Split triangles at the polygon's corners that lie on straight edges.
 
-    Otherwise neighbouring polygons with such a corner would not share the edge.
+    Earcut leaves such corners out. The polygon would then not share its edges with a neighbour that
+    has the same corner. `triangles` (k, 3) are indices into `corners` (n, 2).
     """
     used = np.zeros(len(corners), bool)
     used[triangles] = True
@@ -314,6 +362,9 @@ def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.
 
 
 def _directed_edges(triangle: tuple[int, ...], number: int) -> dict[tuple[int, int], int]:
-    """Return the directed edges of a triangle, each with the triangle's number."""
+    """Return the three edges of a triangle as keys, with the triangle's number as value.
+
+    An edge is a pair of corner indices, in the order of the winding.
+    """
     a, b, c = triangle
     return {(a, b): number, (b, c): number, (c, a): number}

@@ -1,4 +1,4 @@
-"""Terrain from files: georeferenced rasters, NumPy arrays, grey images, and a sample survey."""
+"""Readers of terrain: georeferenced rasters, NumPy arrays, grey images, and a sample survey."""
 
 from __future__ import annotations
 
@@ -18,20 +18,28 @@ from xml.etree import ElementTree
 import numpy as np
 
 from sweep.scenes.height_checks import cliff_warnings, mask_missing_heights
-from sweep.scenes.map_frames import StatedUnits, degree_lengths, height_factor, make_map_frame
+from sweep.scenes.map_frames import (
+    UserStatedUnits,
+    degree_lengths,
+    make_map_frame,
+    resolve_metres_per_height,
+)
 from sweep.scenes.scene_files import SceneError, require_file, require_memory
 from sweep.scenes.terrain import AreaBounds, Terrain
 
 GRID_CELLS_MAX = 50_000_000
-"""Maximum number of heights read at once, which make 100 million triangles."""
+"""Maximum number of heights of a terrain, which make 100 million triangles."""
 
-FILE_CELLS_MAX = 1_000_000_000
-"""Maximum number of heights in a raster file: all of them are read for its digest."""
+RASTER_FILE_CELLS_MAX = 1_000_000_000
+"""Maximum number of heights in a raster file, all of which are read for the file's digest."""
 
-BYTES_PER_CELL = 220
-"""Measured upper bound of the memory per height while triangles and tree are built [bytes]."""
+TRIANGULATION_BYTES_PER_CELL = 220
+"""Upper bound of the memory per height for building triangles and their ray-casting tree [bytes].
 
-_STRIP_CELLS = 1 << 22
+It was measured.
+"""
+
+_READ_STRIP_CELLS = 1 << 22
 """Number of heights that are read from a file at a time."""
 
 _GDAL_OFFLINE_OPTIONS = {
@@ -42,26 +50,25 @@ _GDAL_OFFLINE_OPTIONS = {
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_VRT_ENABLE_RAWRASTERBAND": "NO",
 }
-"""Options of GDAL that prevent it from fetching or running anything that a raster names."""
+"""Options of GDAL that keep it from fetching or running anything that a raster file names."""
 
 _GDAL_DRIVERS = (
     "GTiff", "AAIGrid", "GRASSASCIIGrid", "EHdr", "ENVI", "HFA", "PNG", "JPEG", "BMP", "SRTMHGT",
     "USGSDEM", "DTED", "GSAG", "GSBG", "GS7BG", "XYZ", "SAGA", "RST", "PDS", "ISIS2", "ISIS3",
     "VICAR", "JP2OpenJPEG", "netCDF",
 )  # fmt: skip
-"""Raster formats that are local files and refer to no other files."""
+"""GDAL drivers of the raster formats that can be read: local files without references to others."""
 
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
-"""Formats of grey images; other formats may run programs or contain something else than an
-image."""
+"""Formats of grey images that can be read; readers of other formats may run programs."""
 
 _VRT_BYTES_MAX = 1 << 26
 """Maximum size of a virtual raster's file [bytes]."""
-_VRT_DEPTH_MAX = 8
-"""Maximum depth of virtual rasters within each other."""
+_VRT_NESTING_MAX = 8
+"""Maximum depth to which virtual rasters may be nested."""
 
 
-def read_raster(
+def read_raster_terrain(
     path: str | Path,
     *,
     band: int = 1,
@@ -119,7 +126,7 @@ def read_raster(
             raise SceneError(
                 path, f"has {raster.count} band(s), not a band {band}", "choose another"
             )
-        transform = _unrotated_transform(path, raster, pixel)
+        transform = _unrotated_geotransform(path, raster, pixel)
         pixel_window = _pixel_window(path, raster, transform, window)
         x, y = (
             sorted((first, first + step * number))
@@ -132,11 +139,11 @@ def read_raster(
                 ),
             )
         )
-        wkt = "" if raster.crs is None else _crs_wkt(path, raster)
+        wkt = "" if raster.crs is None else _raster_crs_wkt(path, raster)
         cell_size = math.inf if pixel is not None else min(abs(transform.a), abs(transform.e))
-        stated = StatedUnits(metres_per_degree, metres_per_unit, height_unit)
+        stated = UserStatedUnits(metres_per_degree, metres_per_unit, height_unit)
         map_frame = make_map_frame(path, wkt, (x[0], y[0], x[1], y[1]), cell_size, stated)
-        metres_per_height = height_factor(
+        metres_per_height = resolve_metres_per_height(
             path, wkt, raster.units[band - 1] or "", height_unit, has_height_scale
         )
         heights = _read_band(raster, band, pixel_window)
@@ -151,11 +158,11 @@ def read_raster(
     terrain = Terrain(
         heights, spacing, np.array([first_x * east, first_y * north, 0.0]), map_frame=map_frame
     )
-    return _add_warnings(path, terrain, no_data_warnings)
+    return _terrain_with_warnings(path, terrain, no_data_warnings)
 
 
-def _crs_wkt(path: Path, raster: Any) -> str:
-    """Return the coordinate reference system of a raster as WKT."""
+def _raster_crs_wkt(path: Path, raster: Any) -> str:
+    """Return the coordinate reference system of a raster as WKT (well-known text)."""
     from rasterio.errors import CRSError
 
     try:
@@ -165,18 +172,25 @@ def _crs_wkt(path: Path, raster: Any) -> str:
         raise SceneError(path, problem, "state it anew with gdal_edit -a_srs") from None
 
 
-def _add_warnings(path: Path, terrain: Terrain, no_data_warnings: tuple[str, ...]) -> Terrain:
-    """Return the terrain with warnings about its map, its missing heights and its cliffs."""
-    _require_heights(path, terrain.heights)
+def _terrain_with_warnings(
+    path: Path, terrain: Terrain, no_data_warnings: tuple[str, ...]
+) -> Terrain:
+    """Return a terrain with warnings about its map scale, suspicious heights and cliffs added."""
+    _require_enough_heights(path, terrain.heights)
     map_warnings = () if terrain.map_frame is None else terrain.map_frame.warnings
     cliff_texts = cliff_warnings(path, terrain.heights, terrain.spacing)
     return replace(terrain, warnings=(*map_warnings, *no_data_warnings, *cliff_texts))
 
 
 def raster_digest(path: str | Path) -> str:
-    """Return the digest of all heights, spacing and coordinate frame of a raster.
+    """Return the digest of a raster's heights, grid and coordinate reference system.
 
-    A virtual raster has the digest of the data of its sources.
+    The digest of a virtual raster is that of the heights in its source files.
+
+    Returns
+    -------
+    str
+        BLAKE2b digest, 32 hexadecimal digits.
 
     Raises
     ------
@@ -185,16 +199,16 @@ def raster_digest(path: str | Path) -> str:
     """
     path = require_file(path)
     with open_raster(path) as raster:
-        if raster.width * raster.height * raster.count > FILE_CELLS_MAX:
+        if raster.width * raster.height * raster.count > RASTER_FILE_CELLS_MAX:
             size_text = f"{raster.width:,} x {raster.height:,} heights in {raster.count} band(s)"
-            problem = f"declares {size_text}, more than {FILE_CELLS_MAX:.0e}"
+            problem = f"declares {size_text}, more than {RASTER_FILE_CELLS_MAX:.0e}"
             raise SceneError(path, problem, "cut a part out of it with gdal_translate -projwin")
         frame = (raster.shape, raster.transform, raster.crs and raster.crs.to_wkt())
         digest = hashlib.blake2b(repr(frame).encode(), digest_size=16)
         for band in raster.indexes:
             band_scaling = raster.scales[band - 1], raster.offsets[band - 1], raster.units[band - 1]
             digest.update(repr(band_scaling).encode())
-            for strip in _iter_strips(raster.width, raster.height):
+            for strip in _iter_pixel_windows(raster.width, raster.height):
                 digest.update(_read_window(raster, band, strip).tobytes())
     return digest.hexdigest()
 
@@ -211,9 +225,9 @@ def open_raster(path: Path) -> Iterator[Any]:
     import rasterio
 
     try:
-        with _gdal_offline():
+        with _gdal_without_network():
             _check_vrt_sources(path, ())
-            with _open_dataset(path) as raster:
+            with _open_raster_file(path) as raster:
                 _require_block_memory(path, raster)
                 yield raster
     except rasterio.errors.RasterioError as error:
@@ -223,14 +237,17 @@ def open_raster(path: Path) -> Iterator[Any]:
 
 
 def _require_block_memory(path: Path, raster: Any) -> None:
-    """Raise `SceneError` if a block of a raster, decompressed as one, exceeds the memory."""
+    """Raise `SceneError` if a block of a raster does not fit into the free memory.
+
+    A block is the part of a file that is decompressed at a time.
+    """
     for (rows, columns), dtype in zip(raster.block_shapes, raster.dtypes, strict=True):
         bytes_needed = 2 * rows * columns * np.dtype(dtype).itemsize
         require_memory(path, bytes_needed, "write it anew with gdal_translate -co TILED=YES")
 
 
-def _open_dataset(path: Path) -> Any:
-    """Open a raster of a supported format."""
+def _open_raster_file(path: Path) -> Any:
+    """Open a raster file with rasterio, if its format is supported."""
     from rasterio.io import DatasetReader
 
     for sidecar in path.parent.glob(f"{glob.escape(path.stem)}.*"):
@@ -239,13 +256,13 @@ def _open_dataset(path: Path) -> Any:
             raise SceneError(path, problem, "remove that: it would be read as a part of the raster")
     # DatasetReader takes several drivers, unlike rasterio.open; an absolute path is never taken for
     # a URL.
-    drivers = ["VRT"] if _is_vrt(path) else list(_GDAL_DRIVERS)
+    drivers = ["VRT"] if _is_virtual_raster(path) else list(_GDAL_DRIVERS)
     return DatasetReader(str(path.absolute()), driver=drivers)
 
 
 @contextmanager
-def _gdal_offline() -> Iterator[None]:
-    """Context manager: GDAL fetches nothing, whatever proxy exemptions the environment has."""
+def _gdal_without_network() -> Iterator[None]:
+    """Context manager: keep GDAL off the network, whatever the environment's proxy settings."""
     import rasterio
 
     proxy_exemptions = {
@@ -258,29 +275,32 @@ def _gdal_offline() -> Iterator[None]:
         os.environ.update(proxy_exemptions)
 
 
-def _is_vrt(path: Path) -> bool:
-    """Return True if the beginning of a file is that of a virtual raster for GDAL."""
+def _is_virtual_raster(path: Path) -> bool:
+    """Return True if a file begins like a virtual raster of GDAL."""
     with path.open("rb") as file:
         return b"<vrtdataset" in file.read(1 << 16).lower()
 
 
 def _check_vrt_sources(path: Path, enclosing_files: tuple[Path, ...]) -> None:
-    """Raise `SceneError` if a virtual raster has a source that is no raster on this machine.
+    """Raise `SceneError` if a source file of a virtual raster is no raster on this machine.
 
-    GDAL may read zeros for a missing source. It opens sources of any format, including remote
-    hosts. `enclosing_files` are the virtual rasters that lead to this one.
+    GDAL would read zeros for a missing source, and would fetch a remote one. `enclosing_files` are
+    the virtual rasters in which this one is nested.
     """
-    if not _is_vrt(path):
+    if not _is_virtual_raster(path):
         return
-    if len(enclosing_files) > _VRT_DEPTH_MAX or path in enclosing_files:
+    if len(enclosing_files) > _VRT_NESTING_MAX or path in enclosing_files:
         raise SceneError(path, "is a virtual raster over itself", "name the rasters below it")
-    for source in _vrt_sources(path):
+    for source in _read_vrt_sources(path):
         _check_vrt_sources(source, (*enclosing_files, path))
-        _require_raster(source)
+        _require_supported_format(source)
 
 
-def _vrt_sources(path: Path) -> list[Path]:
-    """Return the existing files that a virtual raster names, without duplicates."""
+def _read_vrt_sources(path: Path) -> list[Path]:
+    """Return the source files that a virtual raster names, without duplicates.
+
+    Raise `SceneError` if one does not exist.
+    """
     if path.stat().st_size > _VRT_BYTES_MAX:
         raise SceneError(path, "is no raster that can be read (too large)", "make it a GeoTIFF")
     content = path.read_bytes()
@@ -306,20 +326,24 @@ def _vrt_sources(path: Path) -> list[Path]:
     return list(sources)
 
 
-def _require_raster(path: Path) -> None:
-    """Raise `SceneError` if a source of a virtual raster has no supported format."""
+def _require_supported_format(path: Path) -> None:
+    """Raise `SceneError` if the format of a raster file is not supported."""
     import rasterio
 
     try:
-        with _open_dataset(path):
+        with _open_raster_file(path):
             pass
     except rasterio.errors.RasterioError as error:
         problem = f"is no raster that can be read ({error.__cause__ or error})"
         raise SceneError(path, problem, "convert it to a GeoTIFF") from None
 
 
-def _unrotated_transform(path: Path, raster: Any, pixel: float | None) -> Any:
-    """Return the geotransform of a raster; raise `SceneError` if it is rotated or has no scale."""
+def _unrotated_geotransform(path: Path, raster: Any, pixel: float | None) -> Any:
+    """Return the transform from pixels to map coordinates of a raster.
+
+    Raise `SceneError` if the raster is rotated against its map, or has no scale. `pixel` is the
+    stated size of a pixel [m] of a raster without a scale.
+    """
     from rasterio import Affine
 
     transform = raster.transform
@@ -337,7 +361,10 @@ def _unrotated_transform(path: Path, raster: Any, pixel: float | None) -> Any:
 
 
 def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | None) -> Any:
-    """Return the window of pixels to read; raise `SceneError` if it has no cell or is too large."""
+    """Convert a window in map coordinates to a window of pixels; None stands for the whole raster.
+
+    Raise `SceneError` if the window is empty or too large.
+    """
     from rasterio.windows import Window as PixelWindow
 
     pixel_window = PixelWindow(0, 0, raster.width, raster.height)
@@ -356,28 +383,34 @@ def _pixel_window(path: Path, raster: Any, transform: Any, window: AreaBounds | 
     return pixel_window
 
 
-def _iter_strips(width: int, height: int) -> Iterator[Any]:
-    """Yield windows of several rows, or parts of one row, that cover a raster."""
+def _iter_pixel_windows(width: int, height: int) -> Iterator[Any]:
+    """Yield pixel windows that together cover a raster of `width` x `height` pixels.
+
+    A window has several rows, or a part of one row.
+    """
     from rasterio.windows import Window as PixelWindow
 
-    rows, columns = max(_STRIP_CELLS // width, 1), min(width, _STRIP_CELLS)
+    rows, columns = max(_READ_STRIP_CELLS // width, 1), min(width, _READ_STRIP_CELLS)
     for top in range(0, height, rows):
         for left in range(0, width, columns):
             yield PixelWindow(left, top, min(columns, width - left), min(rows, height - top))
 
 
 def _read_window(raster: Any, band: int, window: Any) -> np.ndarray:
-    """Return the stored values of a band in a window (rows, columns); NaN for missing data."""
+    """Return the stored values (rows, columns) of a band in a pixel window; NaN if missing."""
     values = raster.read(band, window=window, masked=True)
     return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
 def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
-    """Return the stored values of a band in a window, read in strips to save memory."""
+    """Return the stored values (rows, columns) of a band in a pixel window.
+
+    The values are read in strips to save memory.
+    """
     from rasterio.windows import Window as PixelWindow
 
     values = np.empty((int(pixel_window.height), int(pixel_window.width)))
-    for strip in _iter_strips(int(pixel_window.width), int(pixel_window.height)):
+    for strip in _iter_pixel_windows(int(pixel_window.width), int(pixel_window.height)):
         window = PixelWindow(
             pixel_window.col_off + strip.col_off,
             pixel_window.row_off + strip.row_off,
@@ -390,7 +423,7 @@ def _read_band(raster: Any, band: int, pixel_window: Any) -> np.ndarray:
     return values
 
 
-def _require_heights(path: Path, heights: np.ndarray) -> None:
+def _require_enough_heights(path: Path, heights: np.ndarray) -> None:
     """Raise `SceneError` if a grid has too few heights for a triangle."""
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
@@ -401,17 +434,17 @@ def require_grid_size(path: Path, rows: int, columns: int, remedy: str) -> None:
     if rows * columns > GRID_CELLS_MAX:
         problem = f"has {columns:,} x {rows:,} heights, more than {GRID_CELLS_MAX:.0e}"
         raise SceneError(path, problem, remedy)
-    require_memory(path, BYTES_PER_CELL * rows * columns, f"{remedy}, or coarsen it")
+    require_memory(path, TRIANGULATION_BYTES_PER_CELL * rows * columns, f"{remedy}, or coarsen it")
 
 
-def read_array(
+def read_numpy_terrain(
     path: str | Path,
     *,
     spacing: tuple[float, float],
     name: str | None = None,
     no_data: float | None = None,
 ) -> Terrain:
-    """Read a NumPy file; the first height is at the world's origin.
+    """Read the heights of a NumPy file as a terrain with its first node at the world's origin.
 
     Parameters
     ----------
@@ -442,10 +475,14 @@ def read_array(
 
 
 def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.ndarray:
-    """Return the heights of an ``.npy`` file of `size` bytes, or of one array of an ``.npz``."""
+    """Return the heights of an ``.npy`` file, or of one array of an ``.npz`` file.
+
+    `size` is the size of the file [bytes]. `name` is the name of the array, or None for the only
+    two-dimensional one.
+    """
     if not zipfile.is_zipfile(file):
         file.seek(0)
-        return _read_array_data(path, file, size)
+        return _read_npy_data(path, file, size)
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         entries = {
@@ -458,7 +495,7 @@ def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.n
             grid_names = []
             for key, entry in entries.items():
                 with archive.open(entry) as stream:
-                    if len(_read_array_header(stream)[0]) == 2:
+                    if len(_read_npy_header(stream)[0]) == 2:
                         grid_names.append(key)
             if len(grid_names) != 1:
                 raise SceneError(path, f"holds {len(grid_names)} grids", remedy)
@@ -466,11 +503,11 @@ def _read_npy_or_npz(path: Path, file: Any, size: int, name: str | None) -> np.n
         if name not in entries:
             raise SceneError(path, f"holds no '{name}'", remedy)
         with archive.open(entries[name]) as stream:
-            return _read_array_data(path, stream, entries[name].file_size)
+            return _read_npy_data(path, stream, entries[name].file_size)
 
 
-def _read_array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type of an array in NumPy's format from its header."""
+def _read_npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read the header of a NumPy file; return the shape and data type of its array."""
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0
     if version != (1, 0):
@@ -479,12 +516,12 @@ def _read_array_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _read_array_data(path: Path, file: Any, size: int) -> np.ndarray:
-    """Return the array of a NumPy file of `size` bytes.
+def _read_npy_data(path: Path, file: Any, size: int) -> np.ndarray:
+    """Return the array of an open NumPy file of `size` bytes.
 
-    Check shape and size in its header first.
+    The shape and size in the file's header are checked first.
     """
-    shape, dtype = _read_array_header(file)
+    shape, dtype = _read_npy_header(file)
     if len(shape) != 2 or dtype.kind not in "iuf":
         problem = f"holds {dtype} of shape {shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
@@ -498,24 +535,26 @@ def _read_array_data(path: Path, file: Any, size: int) -> np.ndarray:
 def _terrain_of_heights(
     path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
 ) -> Terrain:
-    """Return the terrain of an array of heights, at the world's origin."""
+    """Return a terrain with an array of heights, and with its first node at the world's origin."""
     if min(values.shape) < 2:
         problem = f"holds {values.dtype} of shape {values.shape}"
         raise SceneError(path, problem, "heights are a two-dimensional array of numbers")
     heights = values.astype(float)
     no_data_warnings = mask_missing_heights(path, heights, no_data)
-    _require_heights(path, heights)
+    _require_enough_heights(path, heights)
     try:
         terrain = Terrain(heights, spacing, np.zeros(3))
     except ValueError as error:
         raise SceneError(path, str(error), "state steps in metres") from None
-    return _add_warnings(path, terrain, no_data_warnings)
+    return _terrain_with_warnings(path, terrain, no_data_warnings)
 
 
-def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: float) -> Terrain:
-    """Read a grey image of 8 or 16 bits.
+def read_image_terrain(
+    path: str | Path, *, pixel: float, black: float = 0.0, white: float
+) -> Terrain:
+    """Read a grey image of 8 or 16 bits as a terrain.
 
-    Row 0 is the northern one, the first pixel at the world's origin.
+    The first pixel lies at the world's origin. Row 0 is the northernmost row.
 
     Heights are linear in the grey level, and therefore quantised: smooth them before using slopes.
 
@@ -539,7 +578,7 @@ def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: flo
 
 
 def _read_grey_levels(path: Path) -> np.ndarray:
-    """Return the grey levels of an image as stored, uint8 or uint16."""
+    """Return the stored grey levels (rows, columns) of an image, as uint8 or uint16."""
     from PIL import Image
 
     try:
@@ -560,11 +599,11 @@ def _read_grey_levels(path: Path) -> np.ndarray:
     return np.asarray(levels, np.uint8 if mode == "L" else np.uint16)
 
 
-def read_jacksboro() -> Terrain:
-    """Return the terrain of the Jacksboro fault, Tennessee, 30 km x 32 km, from matplotlib.
+def read_jacksboro_terrain() -> Terrain:
+    """Return the terrain around the Jacksboro fault in Tennessee, 30 km x 32 km.
 
-    The survey has posts every 3 arc seconds (USGS). World coordinates are metres from its centre;
-    heights are above sea level.
+    Matplotlib's sample data contain this USGS survey with a grid step of 3 arc seconds. World x and
+    y are measured from the survey's centre [m], heights from sea level.
     """
     from matplotlib.cbook import get_sample_data
 

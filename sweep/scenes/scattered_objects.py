@@ -14,14 +14,17 @@ from sweep.scenes.terrain import AreaBounds, Terrain
 
 
 @dataclass(frozen=True)
-class LeastPowerLaw:
-    """Size-frequency law: the minimum of power laws ``N(>D) = coefficient * D**-exponent``."""
+class MinimumOfPowerLaws:
+    """Size-frequency law that is the minimum of power laws ``N(>D) = coefficient * D**-exponent``.
 
-    laws: tuple[tuple[float, float], ...]
-    """Pairs of coefficient and exponent, for N in 1/m^2 and D in m."""
+    N(>D) is the number of objects per area with a diameter above D.
+    """
 
-    def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of objects of at least a diameter.
+    coefficients_and_exponents: tuple[tuple[float, float], ...]
+    """Coefficient and exponent of each power law, for N in 1/m^2 and D in m."""
+
+    def cumulative_number_density(self, diameter: np.ndarray) -> np.ndarray:
+        """Return the number per area of objects that are at least as large as a diameter.
 
         Parameters
         ----------
@@ -34,32 +37,33 @@ class LeastPowerLaw:
             Numbers per area [1/m^2].
         """
         d = np.asarray(diameter, float)
-        return np.min([c * d**-b for c, b in self.laws], axis=0)
+        return np.min([c * d**-b for c, b in self.coefficients_and_exponents], axis=0)
 
-    def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
+    def diameter_at_number_density(self, density: np.ndarray) -> np.ndarray:
         """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
 
-        This is the inverse of `cumulative_density`.
+        This is the inverse of `cumulative_number_density`.
         """
         n = np.asarray(density, float)
-        return np.min([(c / n) ** (1 / b) for c, b in self.laws], axis=0)
+        return np.min([(c / n) ** (1 / b) for c, b in self.coefficients_and_exponents], axis=0)
 
 
-TRASK_POWER_LAW = (10**-1.1, 2.0)
-"""Coefficient and exponent of lunar craters in equilibrium.
+LUNAR_CRATER_EQUILIBRIUM_LAW = (10**-1.1, 2.0)
+"""Coefficient and exponent of the size-frequency law of old craters on the Moon, per m^2.
 
-The law is ``N = 10**10.9 D**-2`` per 10^6 km^2, with D in metres:
-Trask, in Ranger VIII and IX, part II, JPL Technical Report 32-800 (1966), restated per m^2.
+In equilibrium new craters destroy as many old ones. Trask gives ``N = 10**10.9 D**-2`` per 10^6
+km^2, with D in metres: Ranger VIII and IX, part II, JPL Technical Report 32-800 (1966).
 """
 
-PRODUCTION_EXPONENT = 2.8
-"""Exponent of young craters of 1 to 100 m, which have not yet worn each other down.
+CRATER_PRODUCTION_EXPONENT = 2.8
+"""Exponent of the size-frequency law of young craters of 1 to 100 m.
 
-Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
+Young craters have not yet worn each other down. Moore, Boyce and Hahn, The Moon and the
+Planets 23, 231 (1980): "near 2.8".
 """
 
 
-def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw:
+def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> MinimumOfPowerLaws:
     """Return the size-frequency law of lunar craters.
 
     Parameters
@@ -70,15 +74,18 @@ def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw
 
     Returns
     -------
-    LeastPowerLaw
-        The equilibrium law, and beyond the diameter the production law that meets it there.
+    MinimumOfPowerLaws
+        The equilibrium law below the diameter, and the production law above it. Both are equal at
+        the diameter.
     """
     if math.isinf(equilibrium_diameter):
-        return LeastPowerLaw((TRASK_POWER_LAW,))
-    coefficient = TRASK_POWER_LAW[0] * equilibrium_diameter ** (
-        PRODUCTION_EXPONENT - TRASK_POWER_LAW[1]
+        return MinimumOfPowerLaws((LUNAR_CRATER_EQUILIBRIUM_LAW,))
+    coefficient = LUNAR_CRATER_EQUILIBRIUM_LAW[0] * equilibrium_diameter ** (
+        CRATER_PRODUCTION_EXPONENT - LUNAR_CRATER_EQUILIBRIUM_LAW[1]
     )
-    return LeastPowerLaw((TRASK_POWER_LAW, (coefficient, PRODUCTION_EXPONENT)))
+    return MinimumOfPowerLaws(
+        (LUNAR_CRATER_EQUILIBRIUM_LAW, (coefficient, CRATER_PRODUCTION_EXPONENT))
+    )
 
 
 @dataclass(frozen=True)
@@ -105,8 +112,8 @@ class MartianRockLaw:
         """Decay rate q of the covered area with the diameter [1/m]."""
         return 1.79 + 0.152 / self.area_fraction
 
-    def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
-        """Return the number per area of rocks of at least a diameter.
+    def cumulative_number_density(self, diameter: np.ndarray) -> np.ndarray:
+        """Return the number per area of rocks that are at least as large as a diameter.
 
         Parameters
         ----------
@@ -124,10 +131,10 @@ class MartianRockLaw:
             4 * self.area_fraction * q / math.pi * (np.exp(-q * d) / d - q * exp1(q * d))
         )
 
-    def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
+    def diameter_at_number_density(self, density: np.ndarray) -> np.ndarray:
         """Return the diameters (n,) [m] at which the number per area is `density` (n,) [1/m^2].
 
-        This is the inverse of `cumulative_density`, by Newton's method on its logarithm.
+        This is the inverse of `cumulative_number_density`, by Newton's method on its logarithm.
         """
         n = np.asarray(density, float)
         scale = 4 * self.area_fraction * self.decay_rate / math.pi
@@ -136,7 +143,7 @@ class MartianRockLaw:
         # D, so that Newton's method approaches the root from below without overshoot.
         d = np.minimum(scale / (3 * math.e * n), 1 / self.decay_rate)
         for _ in range(100):
-            value = self.cumulative_density(d)
+            value = self.cumulative_number_density(d)
             step = (
                 (np.log(value) - log_density)
                 * value
@@ -149,11 +156,11 @@ class MartianRockLaw:
         return np.asarray(d)
 
 
-SizeFrequencyLaw = LeastPowerLaw | MartianRockLaw
-"""Size-frequency law: number per area from diameter, and its inverse."""
+SizeFrequencyLaw = MinimumOfPowerLaws | MartianRockLaw
+"""Size-frequency law: converts a diameter to the number of objects per area, and back."""
 
 
-def draw_scatter(
+def draw_positions_and_diameters(
     generator: np.random.Generator,
     law: SizeFrequencyLaw,
     *,
@@ -191,27 +198,31 @@ def draw_scatter(
     west, south, east, north = bounds
     if not (0 < smallest < largest and west < east and south < north):
         raise ValueError("a size-frequency law needs 0 < smallest < largest and an area")
-    density_of_smallest, density_of_largest = law.cumulative_density(np.array([smallest, largest]))
+    density_of_smallest, density_of_largest = law.cumulative_number_density(
+        np.array([smallest, largest])
+    )
     expected_number = (density_of_smallest - density_of_largest) * (east - west) * (north - south)
     if expected_number > 5e6:
         raise ValueError(f"{expected_number:.2g} objects are too many: raise the smallest diameter")
     number = generator.poisson(expected_number)
     x = generator.uniform(west, east, number)
     y = generator.uniform(south, north, number)
-    diameter = law.diameter_at_density(
+    diameter = law.diameter_at_number_density(
         generator.uniform(density_of_largest, density_of_smallest, number)
     )
     order = np.argsort(-diameter, kind="stable")
     return x[order], y[order], diameter[order]
 
 
-EJECTA_REACH_RADII = 4.0
-"""Radius at which ejecta are cut off, in crater radii: they have 1/64 of their height at the rim
-there."""
+EJECTA_CUTOFF_CRATER_RADII = 4.0
+"""Distance from the crater's centre at which its ejecta are cut off [crater radii].
+
+The ejecta are 1/64 as high there as at the rim.
+"""
 
 
 class CraterArrays(NamedTuple):
-    """Craters of a piece of ground, as arrays (n,)."""
+    """Positions, diameters and freshness of n craters."""
 
     x: np.ndarray
     """World x of the centres [m]."""
@@ -223,7 +234,7 @@ class CraterArrays(NamedTuple):
     """Depth and rim height as a fraction of those of a fresh crater, 0..1."""
 
 
-def fresh_depth(diameter: np.ndarray) -> np.ndarray:
+def fresh_crater_depth(diameter: np.ndarray) -> np.ndarray:
     """Return the depth of a fresh simple crater below its rim crest [m].
 
     Parameters
@@ -243,7 +254,7 @@ def fresh_depth(diameter: np.ndarray) -> np.ndarray:
     return np.asarray(1e3 * 0.196 * (np.asarray(diameter, float) / 1e3) ** 1.010)
 
 
-def fresh_rim_height(diameter: np.ndarray) -> np.ndarray:
+def fresh_crater_rim_height(diameter: np.ndarray) -> np.ndarray:
     """Return the height of a fresh simple crater's rim crest above the original ground [m].
 
     Parameters
@@ -285,19 +296,19 @@ def crater_profile(
     -----
     The bowl is a paraboloid from floor to rim crest. Outside, the thickness of ejecta falls with
     the third power of the distance [1]_; it is lowered so that it ends without a step at
-    `EJECTA_REACH_RADII`.
+    `EJECTA_CUTOFF_CRATER_RADII`.
 
     References
     ----------
     .. [1] McGetchin, Settle and Head, Earth Planet. Sci. Lett. 20, 226 (1973).
     """
-    depth, rim_height = fresh_depth(diameter), fresh_rim_height(diameter)
+    depth, rim_height = fresh_crater_depth(diameter), fresh_crater_rim_height(diameter)
     relative_radius = 2 * np.asarray(radius, float) / diameter
     bowl = rim_height - depth * (1 - relative_radius**2)
     ejecta = (
         rim_height
-        * (np.maximum(relative_radius, 1.0) ** -3 - EJECTA_REACH_RADII**-3)
-        / (1 - EJECTA_REACH_RADII**-3)
+        * (np.maximum(relative_radius, 1.0) ** -3 - EJECTA_CUTOFF_CRATER_RADII**-3)
+        / (1 - EJECTA_CUTOFF_CRATER_RADII**-3)
     )
     return np.asarray(freshness * np.where(relative_radius < 1, bowl, np.maximum(ejecta, 0.0)))
 
@@ -311,12 +322,12 @@ def draw_craters(
     largest: float,
     least_fresh: float = 0.1,
 ) -> CraterArrays:
-    """Draw the craters that reach into a rectangle, in descending order of diameter.
+    """Draw the craters that reach into a rectangle.
 
     Parameters
     ----------
     generator, law, smallest, largest
-        As in `draw_scatter`.
+        As in `draw_positions_and_diameters`.
     bounds : AreaBounds
         Bounds of the rectangle [m]; craters with their centre outside may reach into it.
     least_fresh : float
@@ -325,7 +336,7 @@ def draw_craters(
     Returns
     -------
     CraterArrays
-        Craters whose ejecta or bowl reach into the rectangle.
+        Craters whose ejecta or bowl reach into the rectangle, in descending order of diameter.
 
     Notes
     -----
@@ -333,13 +344,13 @@ def draw_craters(
     from `least_fresh` to 1: a simplification, because wear by diffusion leaves more shallow
     craters.
     """
-    margin = EJECTA_REACH_RADII * largest / 2
+    margin = EJECTA_CUTOFF_CRATER_RADII * largest / 2
     wider_bounds = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
-    x, y, diameter = draw_scatter(
+    x, y, diameter = draw_positions_and_diameters(
         generator, law, bounds=wider_bounds, smallest=smallest, largest=largest
     )
     freshness = generator.uniform(least_fresh, 1.0, len(x))
-    reach = EJECTA_REACH_RADII * diameter / 2
+    reach = EJECTA_CUTOFF_CRATER_RADII * diameter / 2
     west, south, east, north = bounds
     is_near = (x > west - reach) & (x < east + reach) & (y > south - reach) & (y < north + reach)
     return CraterArrays(x[is_near], y[is_near], diameter[is_near], freshness[is_near])
@@ -361,7 +372,7 @@ def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
         )
     heights = terrain.heights.copy()
     for x, y, diameter, freshness in zip(*craters, strict=True):
-        reach = EJECTA_REACH_RADII * diameter / 2
+        reach = EJECTA_CUTOFF_CRATER_RADII * diameter / 2
         rows, row_y = _nodes_within_reach(
             y - terrain.origin[1], reach, terrain.spacing[1], heights.shape[0]
         )
@@ -376,7 +387,26 @@ def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
 def _nodes_within_reach(
     centre: float, reach: float, step: float, number: int
 ) -> tuple[slice, np.ndarray]:
-    """Return the range of an axis's nodes within `reach` of a centre, and their distances [m]."""
+    """Return the nodes of a grid axis that lie within a distance of a centre.
+
+    Parameters
+    ----------
+    centre : float
+        Coordinate of the centre, from the first node [m].
+    reach : float
+        Largest distance [m].
+    step : float
+        Grid step [m].
+    number : int
+        Number of nodes of the axis.
+
+    Returns
+    -------
+    nodes : slice
+        Indices of the nodes.
+    distances : ndarray
+        Signed distances of the nodes from the centre [m].
+    """
     first, last = sorted(((centre - reach) / step, (centre + reach) / step))
     start = min(max(int(np.ceil(first)), 0), number)
     stop = max(min(int(np.floor(last)) + 1, number), start)
@@ -397,13 +427,13 @@ def draw_boulders(
 ) -> Facets:
     """Draw boulders on a terrain: half-ellipsoids with random diameter, elongation and heading.
 
-    The outline of a boulder has exactly the area of a circle of its diameter. Boulders at a hole of
-    the terrain are left out.
+    Seen from above, a boulder has exactly the area of a circle of its diameter. Boulders at a hole
+    of the terrain are left out.
 
     Parameters
     ----------
     generator, law, smallest, largest
-        As in `draw_scatter`.
+        As in `draw_positions_and_diameters`.
     terrain : Terrain
         Ground on which the boulders lie.
     bounds : AreaBounds, optional
@@ -420,7 +450,7 @@ def draw_boulders(
     Facets
         Triangles of all boulders.
     """
-    x, y, diameter = draw_scatter(
+    x, y, diameter = draw_positions_and_diameters(
         generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
     )
     axis_ratio = generator.uniform(1.0, elongation, len(x))
@@ -462,7 +492,7 @@ def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     vertices : ndarray, shape (n, 3)
-        Vertices. The area of the outline is exactly pi.
+        Vertices. Seen from above, the dome has exactly the area pi.
     faces : ndarray, shape (m, 3)
         Indices of the corners of each triangle.
     """
@@ -500,8 +530,8 @@ def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class MeanTree:
-    """Mean dimensions of the trees of a clump.
+class MeanTreeDimensions:
+    """Mean dimensions of the trees of a group.
 
     Notes
     -----
@@ -522,15 +552,18 @@ class MeanTree:
     crown_base: float = 3.0
     """Height of the crown's lower end [m]."""
     trunk_diameter: float = 0.4
-    """Diameter of the trunk at the ground [m]; a third of it at the top."""
+    """Diameter of the trunk at the ground [m]. At the top it is a third of that."""
     leaf_length: float = 0.30
-    """Long diagonal of a leaf, which is a rhombus [m]."""
+    """Long diagonal of a leaf [m]. A leaf is a rhombus."""
     leaf_width: float = 0.20
     """Short diagonal of a leaf [m]."""
     leaf_area_index: float = 2.0
-    """One-sided leaf area over the area of the crown's outline."""
+    """Area of one side of all leaves of a tree, over the crown's area seen from above."""
     variation: float = 0.25
-    """Largest relative deviation of a tree's size from the mean; sizes are uniform within it."""
+    """Largest relative deviation of a tree's size from the mean size.
+
+    Sizes are uniformly distributed up to this deviation.
+    """
 
     def __post_init__(self) -> None:
         if not 0 <= self.crown_base < self.height:
@@ -538,7 +571,7 @@ class MeanTree:
 
     @property
     def leaf_area(self) -> float:
-        """One-sided area of a leaf [m^2]."""
+        """Area of one side of a leaf [m^2]."""
         return self.leaf_length * self.leaf_width / 2
 
     @property
@@ -549,19 +582,19 @@ class MeanTree:
 
 
 LEAF_SURFACE, TRUNK_SURFACE = 0, 1
-"""Surface numbers of leaves and trunks."""
+"""Surface numbers of the leaves and trunks of trees."""
 
 
-def plant_clump(
+def draw_tree_clump(
     generator: np.random.Generator,
     terrain: Terrain,
     *,
     centre: tuple[float, float],
     radius: float,
     number: int,
-    tree: MeanTree,
+    tree: MeanTreeDimensions,
 ) -> Facets:
-    """Draw a clump of trees on a terrain, with trunks at least half a crown diameter apart.
+    """Draw a group of trees on a terrain, with trunks at least half a crown diameter apart.
 
     Parameters
     ----------
@@ -570,12 +603,12 @@ def plant_clump(
     terrain : Terrain
         Ground on which the trees stand.
     centre : (float, float)
-        World x and y of the clump's centre [m].
+        World x and y of the group's centre [m].
     radius : float
         Largest distance of a trunk from the centre [m].
     number : int
         Number of trees, >= 1.
-    tree : MeanTree
+    tree : MeanTreeDimensions
         Mean dimensions of the trees.
 
     Returns
@@ -611,7 +644,21 @@ def _draw_trunk_positions(
     number: int,
     distance_min: float,
 ) -> list[tuple[float, float]]:
-    """Draw positions in a disc, at least `distance_min` [m] apart, by rejection sampling."""
+    """Draw positions in a disc by rejection sampling.
+
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    centre : (float, float)
+        World x and y of the disc's centre [m].
+    radius : float
+        Radius of the disc [m].
+    number : int
+        Number of positions.
+    distance_min : float
+        Smallest distance between two positions [m].
+    """
     positions: list[tuple[float, float]] = []
     for _ in range(1000 * number):
         if len(positions) == number:
@@ -627,8 +674,11 @@ def _draw_trunk_positions(
     return positions
 
 
-def trunk_facets(tree: MeanTree, size_factor: float = 1.0) -> Facets:
-    """Return a tapered prism from half a metre below the foot to the middle of the crown."""
+def trunk_facets(tree: MeanTreeDimensions, size_factor: float = 1.0) -> Facets:
+    """Return the trunk of a tree whose foot is at the origin, as a tapered prism.
+
+    It reaches from half a metre below the foot to the middle of the crown.
+    """
     sides = 8
     top_height = (tree.crown_base + tree.height) / 2
     angle = 2 * math.pi * np.arange(sides) / sides
@@ -645,7 +695,7 @@ def trunk_facets(tree: MeanTree, size_factor: float = 1.0) -> Facets:
 
 
 def crown_facets(
-    generator: np.random.Generator, tree: MeanTree, size_factor: float = 1.0
+    generator: np.random.Generator, tree: MeanTreeDimensions, size_factor: float = 1.0
 ) -> Facets:
     """Draw the leaves of a tree whose foot is at the origin.
 
@@ -656,21 +706,21 @@ def crown_facets(
     ----------
     generator : numpy.random.Generator
         Source of random numbers.
-    tree : MeanTree
+    tree : MeanTreeDimensions
         Mean dimensions.
     size_factor : float
         Size of this tree over the mean size.
     """
     n_leaves = round(tree.number_of_leaves * size_factor**2)
-    directions = _draw_directions(generator, n_leaves)
+    directions = _draw_unit_vectors(generator, n_leaves)
     unit_ball_points = directions * np.cbrt(generator.random(n_leaves))[:, None]
     semi_axes = (
         np.array([tree.crown_diameter, tree.crown_diameter, tree.height - tree.crown_base]) / 2
     )
     middle = np.array([0.0, 0.0, (tree.height + tree.crown_base) / 2])
     centres = size_factor * (unit_ball_points * semi_axes + middle)
-    along = _draw_directions(generator, n_leaves)
-    across = np.cross(along, _draw_directions(generator, n_leaves))
+    along = _draw_unit_vectors(generator, n_leaves)
+    across = np.cross(along, _draw_unit_vectors(generator, n_leaves))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along, across = along * tree.leaf_length / 2, across * tree.leaf_width / 2
     corners = [centres + along, centres + across, centres - along, centres - across]
@@ -679,7 +729,7 @@ def crown_facets(
     return Facets.on_one_surface(np.stack(corners, axis=1), faces, surface=LEAF_SURFACE)
 
 
-def _draw_directions(generator: np.random.Generator, number: int) -> np.ndarray:
+def _draw_unit_vectors(generator: np.random.Generator, number: int) -> np.ndarray:
     """Draw unit vectors (number, 3), uniform over the sphere."""
     vectors = generator.standard_normal((number, 3))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

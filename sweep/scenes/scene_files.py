@@ -21,7 +21,7 @@ from sweep.units import QuantityError, read_unit
 
 
 class SceneError(EscapedTextError):
-    """Error of a file or object that is unsuitable for a scene, with problem and remedy."""
+    """Error about a file or object that can not be used in a scene, with problem and remedy."""
 
     def __init__(self, file: str | Path, problem: str, remedy: str) -> None:
         super().__init__(f"{file}: {problem}; {remedy}")
@@ -29,7 +29,7 @@ class SceneError(EscapedTextError):
 
 
 def require_file(path: str | Path) -> Path:
-    """Return the path of an existing plain file; raise `SceneError` if there is none."""
+    """Return the path of a plain file; raise `SceneError` if there is no such file."""
     path = Path(path)
     if str(path).startswith("/vsi"):
         raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
@@ -51,7 +51,7 @@ def require_file(path: str | Path) -> Path:
 
 
 def _is_link_loop(path: Path) -> bool:
-    """Return True if symbolic links on the path form a loop."""
+    """Return True if the symbolic links of a path lead back to themselves."""
     try:
         path.stat()
     except OSError as error:
@@ -60,12 +60,12 @@ def _is_link_loop(path: Path) -> bool:
 
 
 def file_digest(path: str | Path) -> str:
-    """Return the digest of a file, including the files that a glTF refers to.
+    """Return the digest of a file's content; for a glTF, also of the files to which it refers.
 
     Returns
     -------
     str
-        BLAKE2b of the content, 32 hexadecimal digits.
+        BLAKE2b digest, 32 hexadecimal digits.
 
     Raises
     ------
@@ -106,13 +106,13 @@ def require_memory(subject: str | Path, bytes_needed: float, remedy: str) -> Non
         raise SceneError(subject, f"{problem} are free", remedy)
 
 
-def read_companion(path: Path, name: str) -> bytes:
-    """Return the content of a plain file that another file names.
+def read_companion_file(path: Path, name: str) -> bytes:
+    """Return the content of the plain file `name` to which the file at `path` refers.
 
     Raises
     ------
     SceneError
-        If it is no plain file on this machine, or too large for the memory.
+        If `name` is no plain file on this machine, or too large for the memory.
     """
     companion = require_file(_companion_path(path, name))
     size = companion.stat().st_size
@@ -122,9 +122,9 @@ def read_companion(path: Path, name: str) -> bytes:
 
 
 def _companion_path(path: Path, name: str) -> Path:
-    """Return the path of a file that another file names.
+    """Return the path of the file `name` to which the file at `path` refers.
 
-    Raise `SceneError` for a network address.
+    Raise `SceneError` if `name` is a network address.
     """
     if "://" in name:
         problem = f"needs {name}, and nothing is fetched over the network"
@@ -133,7 +133,7 @@ def _companion_path(path: Path, name: str) -> Path:
 
 
 def _companion_paths(path: Path) -> list[Path]:
-    """Return the files that a glTF refers to; none for other formats."""
+    """Return the paths of the files to which a glTF refers; an empty list for other formats."""
     if path.suffix.lower() != ".gltf":
         return []
     try:
@@ -155,29 +155,29 @@ WAYPOINT_COLUMN_UNITS = {
     "qw": "", "qx": "", "qy": "", "qz": "",
     "heading": "rad", "pitch": "rad", "roll": "rad",
 }  # fmt: skip
-"""Columns of a table of waypoints with their SI units; quaternions have no unit."""
+"""SI units of the columns of a table of waypoints, by name; empty for pure numbers."""
 
-_POSITION_COLUMNS = ("time", "x", "y", "z")
+_REQUIRED_WAYPOINT_COLUMNS = ("time", "x", "y", "z")
 """Columns that every table of waypoints must have."""
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 """Columns of an attitude as a quaternion, body to world."""
-_ANGLE_COLUMNS = ("heading", "pitch", "roll")
-"""Columns of an attitude as angles."""
+_ATTITUDE_ANGLE_COLUMNS = ("heading", "pitch", "roll")
+"""Columns of an attitude as three angles."""
 _HEADER_CELL_PATTERN = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
-"""Pattern of a header cell: a name with a unit in brackets."""
-_EXAMPLE_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
-"""Header of a table of waypoints that errors show."""
+"""Pattern of a header cell: a name, followed by an optional unit in brackets."""
+_EXAMPLE_WAYPOINT_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
+"""Example of a header of a table of waypoints, shown in error messages."""
 
 
 NumberedRow = tuple[int, list[str]]
-"""Line number and cells of a row."""
+"""Line number and cells of a row of a CSV file."""
 
 
 class WaypointTable(NamedTuple):
     """Waypoints of a CSV table."""
 
     time: np.ndarray
-    """Rising times (n,) [s]."""
+    """Times (n,) [s], in rising order."""
     position: np.ndarray
     """World positions (n, 3) [m]."""
     attitude: np.ndarray | None
@@ -207,30 +207,36 @@ def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> Waypo
     Raises
     ------
     SceneError
-        If the file is missing or no such table.
+        If the file is missing, or is no table of waypoints.
     """
     table = read_csv_columns(
-        path, WAYPOINT_COLUMN_UNITS, _POSITION_COLUMNS, _EXAMPLE_HEADER, time_origin
+        path,
+        WAYPOINT_COLUMN_UNITS,
+        _REQUIRED_WAYPOINT_COLUMNS,
+        _EXAMPLE_WAYPOINT_HEADER,
+        time_origin,
     )
     position = np.column_stack([table[name] for name in "xyz"])
-    return WaypointTable(table["time"], position, _table_attitude(Path(path), table))
+    return WaypointTable(table["time"], position, _attitude_from_columns(Path(path), table))
 
 
-def read_first_time(path: str | Path) -> Decimal:
-    """Return the first time [s] of a CSV table of waypoints, with all its digits.
+def read_first_waypoint_time(path: str | Path) -> Decimal:
+    """Return the first time [s] in a CSV table of waypoints, with all its digits.
 
     Raises
     ------
     SceneError
-        If the file is missing or no such table.
+        If the file is missing, or is no table of waypoints.
     """
     path = require_file(path)
-    rows = _read_rows(path)
+    rows = _read_csv_rows(path)
     if len(rows) < 2:
-        raise _too_short_error(path, _EXAMPLE_HEADER)
-    factors = _column_factors(path, rows[0][1], WAYPOINT_COLUMN_UNITS, ("time",), _EXAMPLE_HEADER)
+        raise _too_few_rows_error(path, _EXAMPLE_WAYPOINT_HEADER)
+    factors = _header_si_factors(
+        path, rows[0][1], WAYPOINT_COLUMN_UNITS, ("time",), _EXAMPLE_WAYPOINT_HEADER
+    )
     _parse_row(path, rows[1], list(factors))
-    return _read_exact_times(rows[1:2], factors)[0]
+    return _exact_times(rows[1:2], factors)[0]
 
 
 def read_csv_columns(
@@ -240,7 +246,7 @@ def read_csv_columns(
     example: str,
     time_origin: Decimal = Decimal(0),
 ) -> dict[str, np.ndarray]:
-    """Read the columns of a CSV table in SI units; its times must rise.
+    """Read a CSV table with rising times, and convert its columns to SI units.
 
     The first row names the columns and their units, such as ``time [us]``. Lines that begin with #
     are skipped.
@@ -250,15 +256,15 @@ def read_csv_columns(
     path : str or Path
         CSV file.
     column_units : Mapping
-        SI unit of each permitted column, which include ``time``; empty for a pure number.
+        SI unit of each permitted column by its name; empty for a pure number. One column is
+        ``time``.
     required_columns : Collection of str
-        Columns that must exist.
+        Names of the columns that must exist.
     example : str
-        A valid header, for errors.
+        A valid header, for error messages.
     time_origin : Decimal
-        Time [s] that is subtracted from the times in decimal arithmetic, before conversion to
-        float64. In float64 GPS seconds (1.35e9) would lose 1e-7 s, and with that the accelerations
-        of a path.
+        Time [s] that is subtracted from all times before they become float64. GPS seconds (1.35e9)
+        as float64 would be rounded to 1e-7 s, which falsifies the accelerations of a path.
 
     Returns
     -------
@@ -268,13 +274,14 @@ def read_csv_columns(
     Raises
     ------
     SceneError
-        If the file is missing or no such table; names every line with a mistake and a remedy.
+        If the file is missing, or is no such table. The error lists all lines with mistakes, and
+        remedies.
     """
     path = require_file(path)
-    numbered_rows = _read_rows(path)
+    numbered_rows = _read_csv_rows(path)
     if len(numbered_rows) < 3:
-        raise _too_short_error(path, example)
-    factors = _column_factors(path, numbered_rows[0][1], column_units, required_columns, example)
+        raise _too_few_rows_error(path, example)
+    factors = _header_si_factors(path, numbered_rows[0][1], column_units, required_columns, example)
     rows, mistakes = [], []
     for line in numbered_rows[1:]:
         try:
@@ -282,9 +289,9 @@ def read_csv_columns(
         except SceneError as error:
             mistakes.append(error)
     if not mistakes:
-        times = _read_exact_times(numbered_rows[1:], factors)
+        times = _exact_times(numbered_rows[1:], factors)
         mistakes = [
-            _falling_time_error(
+            _time_order_error(
                 path, (numbered_rows[i][0], times[i - 1]), (numbered_rows[i + 1][0], times[i])
             )
             for i in range(1, len(times))
@@ -295,7 +302,7 @@ def read_csv_columns(
     values = np.array(rows)
     table = {name: values[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
     if time_origin:
-        with localcontext(prec=_TIME_DIGITS):
+        with localcontext(prec=_DECIMAL_TIME_DIGITS):
             table["time"] = np.array([float(time - time_origin) for time in times])
     equal_times = np.flatnonzero(np.diff(table["time"]) <= 0)
     if equal_times.size:  # equal in float64 although the decimals differ
@@ -306,11 +313,11 @@ def read_csv_columns(
 
 
 _MISTAKES_SHOWN_MAX = 10
-"""Maximum number of mistakes of one file that are listed; further ones are counted."""
+"""Maximum number of mistakes in a file that an error lists; it states the number of the others."""
 
 
 def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
-    """Return one error with all mistakes of a file; each problem is a predicate about the file."""
+    """Combine several errors about a file into one."""
     shown_mistakes = mistakes[:_MISTAKES_SHOWN_MAX]
     rule = ", and ".join(mistake.problem for mistake in shown_mistakes)
     if len(mistakes) > len(shown_mistakes):
@@ -320,29 +327,32 @@ def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
     )
 
 
-def _too_short_error(path: Path, example: str) -> SceneError:
+def _too_few_rows_error(path: Path, example: str) -> SceneError:
     """Return the error for a table with fewer than two lines of numbers."""
     remedy = f"write a header ({example}) and a line for each"
     return SceneError(path, "holds fewer than two lines of numbers", remedy)
 
 
-def _read_exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> list[Decimal]:
-    """Return the times [s] of rows of finite numbers, with all digits that are written."""
+def _exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> list[Decimal]:
+    """Return the times [s] of table rows in decimal arithmetic, without rounding.
+
+    `factors` are the factors from the columns to SI units, by column name.
+    """
     column, factor = list(factors).index("time"), Decimal(repr(factors["time"]))
-    with localcontext(prec=_TIME_DIGITS):
+    with localcontext(prec=_DECIMAL_TIME_DIGITS):
         return [Decimal(cells[column].strip()) * factor for _, cells in rows]
 
 
-_TIME_DIGITS = 60
-"""Significant digits of times in decimal arithmetic."""
+_DECIMAL_TIME_DIGITS = 60
+"""Number of significant digits of times in decimal arithmetic."""
 
 
-def _falling_time_error(
+def _time_order_error(
     path: Path, earlier: tuple[int, Decimal], later: tuple[int, Decimal]
 ) -> SceneError:
     """Return the error for a time that does not exceed the previous one.
 
-    Both times are given with their line.
+    `earlier` and `later` are the line number and the time [s] of both rows, in the file's order.
     """
     (line, time), (next_line, next_time) = earlier, later
     if next_time == time:
@@ -357,16 +367,16 @@ def _falling_time_error(
     return SceneError(path, problem, "sort the lines by time")
 
 
-def _column_factors(
+def _header_si_factors(
     path: Path,
     header: Sequence[str],
     column_units: Mapping[str, str],
     required_columns: Collection[str],
     example: str,
 ) -> dict[str, float]:
-    """Return the factor from each column to SI units, in the order of the header.
+    """Return the factor from each column's unit to SI by column name, in the order of the header.
 
-    All mistakes of the header raise one `SceneError`.
+    If the header has mistakes, one `SceneError` lists all of them.
     """
     for separator, separator_name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
@@ -385,7 +395,7 @@ def _column_factors(
         else:
             factors[name] = 1.0
             try:
-                factors[name] = _column_factor(
+                factors[name] = _column_si_factor(
                     path, name, column_units[name], (match[2] or "").strip()
                 )
             except SceneError as error:
@@ -400,8 +410,8 @@ def _column_factors(
     return factors
 
 
-def _read_rows(path: Path) -> list[NumberedRow]:
-    """Return line number and cells of all rows that are neither empty nor comments."""
+def _read_csv_rows(path: Path) -> list[NumberedRow]:
+    """Return line number and cells of each row of a CSV file, except empty lines and comments."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -414,8 +424,8 @@ def _read_rows(path: Path) -> list[NumberedRow]:
     ]
 
 
-def _column_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
-    """Return the factor from a column to its SI unit."""
+def _column_si_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
+    """Return the factor from the unit of a column to the column's SI unit."""
     if not si_unit:
         if unit not in ("", "1"):
             raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
@@ -431,7 +441,7 @@ def _column_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
 
 
 def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str]) -> list[float]:
-    """Return the numbers of a row, in the order of the columns."""
+    """Return the numbers in a row of a table; raise `SceneError` if a cell has no finite number."""
     line_number, cells = numbered_row
     if len(cells) != len(column_names):
         problem = (
@@ -450,7 +460,7 @@ def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str
 
 
 def _parse_finite_number(cell: str) -> float | None:
-    """Return the number in a cell; None if it is not a finite number."""
+    """Return the number in a cell; None if the cell has no finite number."""
     try:
         value = float(cell)
     except ValueError:
@@ -458,15 +468,20 @@ def _parse_finite_number(cell: str) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Return the quaternions (n, 4) of a table; None if it has no attitude."""
+def _attitude_from_columns(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the attitudes in a table of waypoints as quaternions (n, 4) from body to world.
+
+    The result is None if the table has no columns of attitude.
+    """
     quaternion_columns = [name for name in _QUATERNION_COLUMNS if name in table]
-    angle_columns = {name: table[name] for name in _ANGLE_COLUMNS if name in table}
+    angle_columns = {name: table[name] for name in _ATTITUDE_ANGLE_COLUMNS if name in table}
     if quaternion_columns and angle_columns:
         raise SceneError(path, "has both a quaternion and angles", "leave one of them out")
     if angle_columns:
         zeros = np.zeros(len(table["time"]))
-        return from_heading(**{name: angle_columns.get(name, zeros) for name in _ANGLE_COLUMNS})
+        return from_heading(
+            **{name: angle_columns.get(name, zeros) for name in _ATTITUDE_ANGLE_COLUMNS}
+        )
     if not quaternion_columns:
         return None
     if len(quaternion_columns) < len(_QUATERNION_COLUMNS):
@@ -474,15 +489,15 @@ def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray |
     quaternions = np.column_stack([table[name] for name in _QUATERNION_COLUMNS])
     norms = np.linalg.norm(quaternions, axis=1)
     if (wrong_rows := np.flatnonzero(~(np.abs(norms - 1) < 1e-3))).size:
-        line_numbers = [line_number for line_number, _ in _read_rows(path)[1:]]
+        line_numbers = [line_number for line_number, _ in _read_csv_rows(path)[1:]]
         raise _join_errors(
             path,
-            [_unfit_quaternion(path, line_numbers[row], norms[row]) for row in wrong_rows],
+            [_non_unit_quaternion_error(path, line_numbers[row], norms[row]) for row in wrong_rows],
         )
     return np.asarray(quaternions / norms[:, None])
 
 
-def _unfit_quaternion(path: Path, line_number: int, norm: float) -> SceneError:
+def _non_unit_quaternion_error(path: Path, line_number: int, norm: float) -> SceneError:
     """Return the error for a quaternion whose length is not 1."""
     problem = f"has a quaternion of the length {norm:.6g} on line {line_number}, which has to be 1"
     remedy = "divide it by its length" if norm > 0 else "write 1, 0, 0, 0 for no turn"

@@ -21,11 +21,11 @@ from scipy import fft
 from sweep.scenes.map_frames import MapFrame
 from sweep.scenes.meshes import Facets
 
-_NEGATIVE_VARIANCE_MAX = 1e-6
-"""Largest fraction of the variance that rounding may make negative in a power spectrum."""
+_NEGATIVE_VARIANCE_FRACTION_MAX = 1e-6
+"""Largest negative part of a power spectrum that rounding may cause, over the total variance."""
 
-_NODES_PER_BATCH = 1 << 20
-"""Number of nodes whose covariance is computed at a time."""
+_COVARIANCE_BATCH_NODES = 1 << 20
+"""Number of grid nodes whose covariance is computed at a time."""
 
 AreaBounds = tuple[float, float, float, float]
 """Smallest x, smallest y, largest x and largest y of an area in world coordinates [m]."""
@@ -44,7 +44,7 @@ class Terrain:
     map_frame: MapFrame | None = None
     """Map to which the coordinates belong; None if the terrain is not from a map."""
     warnings: tuple[str, ...] = ()
-    """Doubts about the heights, as sentences."""
+    """Warnings about heights that may be wrong, as sentences."""
 
     def __post_init__(self) -> None:
         z, spacing = self.heights, self.spacing
@@ -106,14 +106,15 @@ class Terrain:
             new_number = np.cumsum(used, dtype=np.int32) - 1
             faces, nodes = new_number[faces], nodes[used]
         surface = np.zeros(len(faces), np.int16)
-        return Facets(nodes, faces, surface, self.origin, is_grid=True)
+        return Facets(nodes, faces, surface, self.origin, is_clean=True)
 
 
 def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
-    """Return the triangles (m, 3) int32 of all cells, counter-clockwise for positive steps.
+    """Return the triangles of all cells of a grid, as node indices (m, 3) int32.
 
-    A complete cell is cut along the diagonal from node (i, j) to (i+1, j+1). The lower triangles of
-    all cells come first, then the upper triangles.
+    `has_height` (rows, columns) is true for nodes with a height. The triangles are
+    counter-clockwise for positive grid steps. A complete cell is cut along the diagonal from node
+    (i, j) to (i+1, j+1). The lower triangles of all cells come first, then the upper triangles.
     """
     node = np.arange(has_height.size, dtype=np.int32).reshape(has_height.shape)
     # Corners of each cell, counter-clockwise from (i, j).
@@ -145,7 +146,11 @@ def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
 def _interpolate_on_triangles(
     heights: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
-    """Return the height of the triangulated grid at fractional rows and columns; NaN outside."""
+    """Interpolate heights linearly on the triangles of a grid.
+
+    `row` and `column` are the positions, in grid steps from the first node. The result is NaN
+    outside the grid.
+    """
     rows, columns = heights.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
     j = np.clip(np.floor(column), 0, columns - 2).astype(np.int64)
@@ -161,8 +166,8 @@ def _interpolate_on_triangles(
     return np.where(inside, value, np.nan)
 
 
-def refine(terrain: Terrain, *, factor: int) -> Terrain:
-    """Refine a terrain by a cubic spline through all its heights.
+def refine_terrain(terrain: Terrain, *, factor: int) -> Terrain:
+    """Return a terrain on a finer grid, interpolated by a cubic spline through all heights.
 
     Slopes of the spline are continuous, so that a narrow beam does not see the facets of the
     original grid. A new node has a height if all original nodes around it have heights.
@@ -209,8 +214,8 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
     return replace(terrain, heights=fine_heights, spacing=spacing)
 
 
-def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
-    """Smooth a terrain by a Gaussian filter; holes stay holes and have no weight.
+def smooth_terrain(terrain: Terrain, *, standard_deviation: float) -> Terrain:
+    """Smooth a terrain by a Gaussian filter. Holes stay holes, and have no weight.
 
     Parameters
     ----------
@@ -222,7 +227,7 @@ def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
     Raises
     ------
     ValueError
-        If the standard deviation is out of range; memory grows with it.
+        If the standard deviation is out of range.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -243,7 +248,7 @@ def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
     return replace(terrain, heights=smoothed)
 
 
-def cut_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
+def crop_to_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
     """Cut a square out of a terrain.
 
     Parameters
@@ -275,7 +280,7 @@ def cut_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Ter
     return replace(terrain, heights=terrain.heights[node_ranges[0], node_ranges[1]], origin=corner)
 
 
-def square_bounds(terrain: Terrain, *, centre: Sequence[float], size: float) -> AreaBounds:
+def clipped_square_bounds(terrain: Terrain, *, centre: Sequence[float], size: float) -> AreaBounds:
     """Return the bounds of a square with centre (x, y) [m], clipped to the terrain.
 
     Raises
@@ -360,9 +365,18 @@ def draw_fractal_relief(
 
 
 def _stein_covariance(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
-    """Return the torus's period, the coefficient of the paraboloid and the covariance function.
+    """Return the covariance of Stein's method for fractal relief with the Hurst exponent alpha / 2.
 
-    `alpha` is twice the Hurst exponent. Distances are in units of the grid's diagonal.
+    Distances are in units of the grid's diagonal.
+
+    Returns
+    -------
+    period : float
+        Period of the torus on which the relief is drawn.
+    paraboloid : float
+        Coefficient of the paraboloid by which the covariance differs from that of the fractal.
+    covariance : callable
+        Function that returns the covariance at each distance.
     """
     if alpha <= 1.5:
         torus_half_period, tail_coefficient, paraboloid = 1.0, 0.0, alpha / 2
@@ -434,11 +448,22 @@ def draw_hills(
 
 
 def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
-    """Draw a stationary Gaussian field on a torus of at least `period`.
+    """Draw a stationary Gaussian field with a given covariance.
 
-    Return the corner of the torus of `shape` (rows, columns).
+    The field is drawn on a torus, of which a corner is returned.
 
-    `covariance` is a function of distance, in the unit of `steps` and `period`.
+    Parameters
+    ----------
+    generator : numpy.random.Generator
+        Source of random numbers.
+    shape : (int, int)
+        Number of rows and columns of the result.
+    steps : (float, float)
+        Distance from row to row and from column to column.
+    covariance : callable
+        Function that returns the covariance at each distance, in the unit of the steps.
+    period : float
+        Smallest period of the torus, in the unit of the steps.
     """
     torus_shape = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
     if math.prod(torus_shape) > 2e8:
@@ -450,7 +475,7 @@ def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: 
         for n, step in zip(torus_shape, steps, strict=True)
     ]
     covariances = np.empty(torus_shape)  # computed in batches, because a torus may be large
-    batch_rows = max(_NODES_PER_BATCH // torus_shape[1], 1)
+    batch_rows = max(_COVARIANCE_BATCH_NODES // torus_shape[1], 1)
     for row_range in (
         slice(first, first + batch_rows) for first in range(0, torus_shape[0], batch_rows)
     ):
@@ -462,7 +487,7 @@ def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: 
     negative_fraction = (
         -power_spectrum[power_spectrum < 0].sum() / power_spectrum[power_spectrum > 0].sum()
     )
-    if negative_fraction > _NEGATIVE_VARIANCE_MAX:
+    if negative_fraction > _NEGATIVE_VARIANCE_FRACTION_MAX:
         raise ArithmeticError(
             f"{negative_fraction:.1e} of the relief's variance is negative on this grid"
         )

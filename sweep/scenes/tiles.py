@@ -1,4 +1,4 @@
-"""Joining of adjacent rasters of one grid without seams.
+"""Extension of adjacent rasters of one grid, so that no gaps remain between them.
 
 The nodes of a raster lie at the centres of its pixels. Between the last nodes of one tile and the
 first nodes of the next there is therefore a gap of one pixel. Each tile is extended by one row and
@@ -23,14 +23,16 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Largest deviation from a whole number of cells at which two grids count as one [cells]."""
+"""Offset of two grids from a whole number of cells up to which they count as one grid [cells]."""
 
-_TOUCHING_GAP_MAX_CELLS = 2.0
-"""Largest gap at which two grids count as adjacent [cells of the coarser grid]."""
+_ADJACENT_GAP_MAX_CELLS = 2.0
+"""Gap up to which two grids count as adjacent [cells of the coarser grid]."""
 
 
-def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[str]]:
-    """Extend each tile by the first nodes of its neighbours.
+def extend_tiles_to_neighbours(
+    tiles: Mapping[str, Terrain],
+) -> tuple[dict[str, Terrain], list[str]]:
+    """Extend each tile by the first row and column of its neighbours' nodes, which closes gaps.
 
     Parameters
     ----------
@@ -62,9 +64,9 @@ def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[s
 
 
 def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
-    """Return row and column of another tile's first node on a tile's grid.
+    """Return the row and column of a tile's grid at which another tile has its first node.
 
-    The result is None if the grids differ.
+    The result is None if the two tiles are on different grids.
     """
     (dx, dy), (rows, columns) = tile.spacing, other.heights.shape
     for step, other_step, number in ((dx, other.spacing[0], columns), (dy, other.spacing[1], rows)):
@@ -78,7 +80,10 @@ def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
 
 
 def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
-    """Return a tile with one more row and column, if its neighbours have nodes there."""
+    """Return a tile with one more row and one more column, taken from adjacent tiles.
+
+    A row or column without any height is not added.
+    """
     rows, columns = tile.heights.shape
     heights = np.full((rows + 1, columns + 1), np.nan)
     heights[:rows, :columns] = tile.heights
@@ -101,9 +106,9 @@ def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
 
 
 def _gap_width(tile: Terrain, other: Terrain) -> float:
-    """Return the width of the gap between adjacent rasters of different grids [m].
+    """Return the width of the gap between two tiles on different grids [m].
 
-    The width is 0 if there is no gap.
+    The width is 0 if the tiles are on one grid, overlap, or are not adjacent.
     """
     if _grid_offset(tile, other) is not None:
         return 0.0
@@ -117,7 +122,7 @@ def _gap_width(tile: Terrain, other: Terrain) -> float:
     cell_size = np.maximum(np.abs(tile.spacing), np.abs(other.spacing))
     for axis in (0, 1):
         if (
-            0 < separation[axis] < _TOUCHING_GAP_MAX_CELLS * cell_size[axis]
+            0 < separation[axis] < _ADJACENT_GAP_MAX_CELLS * cell_size[axis]
             and separation[1 - axis] < 0
         ):
             return float(separation[axis])

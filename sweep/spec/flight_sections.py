@@ -288,11 +288,11 @@ class Platform(RigidMotion):
 
         This is the first time of the path's table, or 0 if the path is not given by a table.
         """
-        from sweep.scenes.scene_files import read_first_time
+        from sweep.scenes.scene_files import read_first_waypoint_time
 
         if not isinstance(self.path, WaypointPath):
             return Decimal(0)
-        return read_first_time(files.resolve(self.path.file))
+        return read_first_waypoint_time(files.resolve(self.path.file))
 
     def build_moving_body(
         self, files: SpecFiles, span: TimeSpan | None = None

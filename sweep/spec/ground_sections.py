@@ -11,7 +11,12 @@ import numpy as np
 
 import sweep.spec.fields as declare
 from sweep.model.ground import REFLECTANCE_LAWS
-from sweep.scenes.rasters import BYTES_PER_CELL, GRID_CELLS_MAX, raster_digest, read_raster
+from sweep.scenes.rasters import (
+    GRID_CELLS_MAX,
+    TRIANGULATION_BYTES_PER_CELL,
+    raster_digest,
+    read_raster_terrain,
+)
 from sweep.scenes.scene_files import require_memory
 from sweep.spec.fields import SpecFiles, SpecSection
 from sweep.spec.sections import REFLECTANCE_FIELD
@@ -129,7 +134,9 @@ class Craters(SpecSection):
 def _check_memory(n_nodes: int) -> None:
     """Raise `SceneError` if the triangles of a grid would need more memory than is free."""
     remedy = "take a coarser grid, or a smaller part of it"
-    require_memory(f"a ground of {n_nodes:,} heights", BYTES_PER_CELL * n_nodes, remedy)
+    require_memory(
+        f"a ground of {n_nodes:,} heights", TRIANGULATION_BYTES_PER_CELL * n_nodes, remedy
+    )
 
 
 class Ground(Material, ABC):
@@ -175,7 +182,7 @@ class Ground(Material, ABC):
         ValueError
             If the refined grid has too many nodes.
         """
-        from sweep.scenes.terrain import refine, smooth
+        from sweep.scenes.terrain import refine_terrain, smooth_terrain
 
         if terrain.heights.size * self.factor**2 > GRID_CELLS_MAX:
             raise ValueError(
@@ -183,9 +190,9 @@ class Ground(Material, ABC):
             )
         _check_memory(terrain.heights.size * self.factor**2)
         if self.smoothing:
-            terrain = smooth(terrain, standard_deviation=self.smoothing)
+            terrain = smooth_terrain(terrain, standard_deviation=self.smoothing)
         if self.factor > 1:
-            terrain = refine(terrain, factor=self.factor)
+            terrain = refine_terrain(terrain, factor=self.factor)
         if self.relief is not None:
             heights = terrain.heights + self.relief.draw_heights(
                 terrain.heights.shape, terrain.spacing
@@ -250,12 +257,14 @@ class JacksboroGround(PlacedGround):
 
     def unplaced_terrain(self, files: SpecFiles | None) -> Terrain:
         """Return the heights of the survey, or of the square cut from it [m above sea level]."""
-        from sweep.scenes.rasters import read_jacksboro
-        from sweep.scenes.terrain import cut_square
+        from sweep.scenes.rasters import read_jacksboro_terrain
+        from sweep.scenes.terrain import crop_to_square
 
-        survey = read_jacksboro()
+        survey = read_jacksboro_terrain()
         return (
-            survey if self.size is None else cut_square(survey, centre=self.middle, size=self.size)
+            survey
+            if self.size is None
+            else crop_to_square(survey, centre=self.middle, size=self.size)
         )  # type: ignore[arg-type]
 
     def check_grid(self) -> None:
@@ -309,7 +318,7 @@ class RasterGround(Ground):
     def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
         """Return the heights of the raster, times `scale`, in the raster's coordinates."""
         field_names = {"band", "window", "metres_per_degree", "metres_per_unit", "height_unit"}
-        terrain = read_raster(
+        terrain = read_raster_terrain(
             files.resolve(self.file, raster_digest),
             **self.model_dump(include={*field_names, "no_data", "pixel"}),
             has_height_scale=self.scale != 1.0,
@@ -333,11 +342,11 @@ class ArrayGround(PlacedGround):
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
         """Return the heights of the NumPy file, times `scale`."""
-        from sweep.scenes.rasters import read_array
+        from sweep.scenes.rasters import read_numpy_terrain
 
         spacing, no_data = (self.spacing[0], self.spacing[1]), self.no_data
         path = files.resolve(self.file)
-        terrain = read_array(path, spacing=spacing, name=self.name, no_data=no_data)
+        terrain = read_numpy_terrain(path, spacing=spacing, name=self.name, no_data=no_data)
         return replace(terrain, heights=terrain.heights * self.scale)
 
 
@@ -352,10 +361,10 @@ class ImageGround(PlacedGround):
 
     def unplaced_terrain(self, files: SpecFiles) -> Terrain:
         """Return the heights of the image, linear in the grey level between `black` and `white`."""
-        from sweep.scenes.rasters import read_image
+        from sweep.scenes.rasters import read_image_terrain
 
         path = files.resolve(self.file)
-        return read_image(path, pixel=self.pixel, black=self.black, white=self.white)
+        return read_image_terrain(path, pixel=self.pixel, black=self.black, white=self.white)
 
 
 # Ground without a file

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sweep.model.geometry.body_motion import MovingBody
     from sweep.model.geometry.mesh import Mesh, SurfaceMaterial
     from sweep.model.geometry.ray_casting import RayCaster
-    from sweep.scenes.meshes import Facets, MeshReport
+    from sweep.scenes.meshes import Facets, MeshCleaningReport
     from sweep.scenes.scattered_objects import SizeFrequencyLaw
     from sweep.scenes.terrain import Terrain
 
@@ -159,9 +159,9 @@ class PowerLaw(SpecSection):
 
     def size_frequency_law(self) -> SizeFrequencyLaw:
         """Return the power law of the number of boulders per area over their diameter."""
-        from sweep.scenes.scattered_objects import LeastPowerLaw
+        from sweep.scenes.scattered_objects import MinimumOfPowerLaws
 
-        return LeastPowerLaw(((self.density, self.exponent),))
+        return MinimumOfPowerLaws(((self.density, self.exponent),))
 
 
 class Boulders(Material):
@@ -207,11 +207,11 @@ class Boulders(Material):
             If there are too many boulders, or the square contains no ground.
         """
         from sweep.scenes.scattered_objects import draw_boulders
-        from sweep.scenes.terrain import square_bounds
+        from sweep.scenes.terrain import clipped_square_bounds
 
         bounds = None
         if self.within is not None:
-            bounds = square_bounds(ground, centre=self.centre, size=self.within)
+            bounds = clipped_square_bounds(ground, centre=self.centre, size=self.within)
         field_names = {"smallest", "largest", "height_ratio", "elongation", "subdivisions"}
         rng, law = random_generator("boulders", self.seed), self.law.size_frequency_law()
         return draw_boulders(
@@ -281,15 +281,15 @@ class Trees(SpecSection):
         ValueError
             If the trees do not fit into the clump, or a tree would stand off the ground.
         """
-        from sweep.scenes.scattered_objects import MeanTree, plant_clump
+        from sweep.scenes.scattered_objects import MeanTreeDimensions, draw_tree_clump
 
-        return plant_clump(
+        return draw_tree_clump(
             random_generator("trees", self.seed),
             ground,
             centre=(self.centre[0], self.centre[1]),
             radius=self.radius,
             number=self.number,
-            tree=MeanTree(**self.tree.model_dump()),
+            tree=MeanTreeDimensions(**self.tree.model_dump()),
         )
 
 
@@ -623,7 +623,7 @@ def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
     )
 
 
-def _build_mesh(facets: Facets, first_surface: int) -> tuple[Mesh, MeshReport]:
+def _build_mesh(facets: Facets, first_surface: int) -> tuple[Mesh, MeshCleaningReport]:
     """Return the mesh of facets and its report; surface numbers start at `first_surface`."""
     surface = (facets.surface + first_surface).astype(np.int16)
     return replace(facets, surface=surface).to_mesh()
@@ -639,7 +639,7 @@ def _build_grounds(
 ) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
     """Return the scene's origin (3,) [m], grounds in the scene's frame by name, and warnings."""
     from sweep.scenes.map_frames import require_one_map
-    from sweep.scenes.tiles import join_tiles
+    from sweep.scenes.tiles import extend_tiles_to_neighbours
 
     ground_sections = {
         name: ground_section
@@ -659,7 +659,9 @@ def _build_grounds(
     ]
     require_one_map(map_frames)
     names_without_crs = [name for name, map_frame in map_frames if not map_frame.wkt]
-    joined_terrains, warnings = join_tiles({name: terrains[name] for name, _ in map_frames})
+    joined_terrains, warnings = extend_tiles_to_neighbours(
+        {name: terrains[name] for name, _ in map_frames}
+    )
     if 0 < len(names_without_crs) < len(map_frames):
         warnings += [
             f"scene.objects.{name}: names no coordinate reference system, and is taken to lie on "

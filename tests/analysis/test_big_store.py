@@ -39,7 +39,7 @@ def peak_of(work, *given):
 
 def growth(work, sizes, monkeypatch):
     """Memory that work takes more where a store is larger, as a share of what it is larger by."""
-    monkeypatch.setattr(datasets, "VALUES_PER_READ", 2**13)
+    monkeypatch.setattr(datasets, "READ_CHUNK_VALUES_MAX", 2**13)
     work(next(iter(sizes)))  # so that imports and caches are there
     peaks = [peak_of(work, path) for path in sizes]
     less, more = sizes.values()
@@ -60,8 +60,10 @@ def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
-    monkeypatch.setattr(charts, "SHEET_LIMITS", replace(charts.SHEET_LIMITS, columns_max=20))
-    monkeypatch.setattr(charts, "LINE_INTERVALS", 5)
+    monkeypatch.setattr(
+        charts, "SHEET_SIZE_LIMITS", replace(charts.SHEET_SIZE_LIMITS, columns_max=20)
+    )
+    monkeypatch.setattr(charts, "REDUCED_LINE_INTERVALS", 5)
     monkeypatch.setattr(canvas, "save_sheet", lambda sheet, path, source: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37

@@ -12,15 +12,15 @@ from stored_studies import spec_over_axes
 
 from sweep.analysis import canvas, charts
 from sweep.analysis.selection import (
-    HIGHEST,
-    LOWEST,
-    MEAN,
+    CELL_HIGHEST,
+    CELL_LOWEST,
+    CELL_MEAN,
     PointSelection,
     SortedCoordinate,
     select_where,
 )
 
-BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
+BY_HAND = {CELL_MEAN: np.mean, CELL_LOWEST: np.min, CELL_HIGHEST: np.max}
 
 UNITS = {"range": "m", "grazing_angle": "deg", "power": "W"}
 

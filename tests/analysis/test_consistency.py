@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 
-from sweep.analysis.scene_results.consistency import check_consistency, inconsistency_messages
+from sweep.analysis.scene_results.consistency import check_error_consistency, inconsistency_messages
 from sweep.analysis.scene_results.point_export import export
 from sweep.cli import main
 from sweep.model.pointcloud.pairing import TRUE_FLAG
@@ -52,14 +52,14 @@ def cloud(understated=1.0, *, navigated=1.0, shots=SHOTS):
 
 
 def test_normal_errors_of_the_stated_size_are_consistent():
-    found = check_consistency(cloud())
+    found = check_error_consistency(cloud())
     assert [each.quantity for each in found] == ["range", "radial velocity", "velocity", "altitude"]
     for each in found:
         assert each.error_ratio == pytest.approx(1, abs=0.1) and each.is_consistent
 
 
 def test_errors_are_told_by_their_ratio_to_those_that_are_stated():
-    found = {each.quantity: each for each in check_consistency(cloud(100.0, navigated=7.0))}
+    found = {each.quantity: each for each in check_error_consistency(cloud(100.0, navigated=7.0))}
     for quantity, ratio in (("range", 100), ("radial velocity", 100), ("velocity", 7),
                             ("altitude", 7)):  # fmt: skip
         assert found[quantity].error_ratio == pytest.approx(ratio, rel=0.1)
@@ -71,9 +71,9 @@ def test_errors_are_told_by_their_ratio_to_those_that_are_stated():
 
 def test_few_errors_and_long_flights():
     few = cloud(100.0, shots=3).isel(draw=slice(2), power=slice(1))
-    assert [each.n_errors for each in check_consistency(few)] == [6, 6, 2, 2]
-    assert all(each.is_consistent for each in check_consistency(few))
-    long = check_consistency(cloud(3.0, shots=3 << 14))
+    assert [each.n_errors for each in check_error_consistency(few)] == [6, 6, 2, 2]
+    assert all(each.is_consistent for each in check_error_consistency(few))
+    long = check_error_consistency(cloud(3.0, shots=3 << 14))
     assert long[0].n_errors < 3 << 20 and long[0].error_ratio == pytest.approx(3, rel=0.05)
 
 

@@ -21,7 +21,7 @@ from sweep.analysis.answers import comparison
 from sweep.analysis.canvas import draw_chart
 from sweep.analysis.study_figures import draw_figures
 from sweep.report import study_report
-from sweep.report.html_page import Plot
+from sweep.report.html_page import InteractivePlot
 
 GOLDEN = Path(__file__).with_name("every_figure.json")
 WRITES = os.environ.get("SWEEP_GOLDEN") == "write"
@@ -97,11 +97,13 @@ def pictures(tmp_path_factory):
     with canvas.uniform_style():
         opened = sweep.open(stores["powers"])
         less = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
-        chart = comparison.difference_chart(comparison.tabulated_differences(opened, less))
+        chart = comparison.pd_difference_chart(
+            comparison.compute_tabulated_differences(opened, less)
+        )
         sheets["comparison"] = draw_chart(chart, "T", "")
     for name, page in (("grid", study_report._grid_report), ("scene", study_report._scene_report)):
         items = (i for s in page(stores[name]).sections for i in s.items)
-        plots = [item for item in items if isinstance(item, Plot)]
+        plots = [item for item in items if isinstance(item, InteractivePlot)]
         sheets |= {f"{name}: {plot.heading}": plot.figure for plot in reversed(plots)}
     return sheets
 

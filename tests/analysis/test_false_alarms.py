@@ -14,7 +14,7 @@ from stored_studies import (
 
 from sweep.analysis import tables
 from sweep.analysis.datasets import open as open_store
-from sweep.analysis.selection import PointSelection, select_beyond, study_cuts
+from sweep.analysis.selection import PointSelection, select_beyond_range, study_cuts
 
 PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4.62e-9, 4.45e-9))
 
@@ -193,6 +193,9 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
     dataset = open_store(run_into_store(tmp_path, SURFACE_AXES))
     found = PointSelection.from_dataset(dataset)
-    near = select_beyond(found, spec_over_axes(SURFACE_AXES), "10 m")
+    near = select_beyond_range(found, spec_over_axes(SURFACE_AXES), "10 m")
     assert near.size == 23 * 9
-    assert select_beyond(found, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size == 24 * 9
+    assert (
+        select_beyond_range(found, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size
+        == 24 * 9
+    )

@@ -6,14 +6,14 @@ from PIL import Image
 from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
 
 from sweep.analysis import canvas
-from sweep.analysis.charts import SHEET_LIMITS
+from sweep.analysis.charts import SHEET_SIZE_LIMITS
 from sweep.analysis.study_figures import (
     GridResults,
     default_grid_figures,
     draw_figures,
-    picture_source,
+    picture_source_text,
 )
-from sweep.report.html_page import make_plot
+from sweep.report.html_page import make_interactive_plot
 from sweep.report.study_report import write_report
 
 ASKED = [
@@ -155,20 +155,20 @@ def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path)
     assert all(map(has_content, draw_figures(path)))
     figures = GridResults.from_store(path)
     for figure in figures.figure_specs[:1]:
-        (panel,) = figures.make_chart(figure, SHEET_LIMITS).panels
+        (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
         assert panel.x.kind == "category"
         for line in panel.lines:  # in the order of the study, not of the alphabet
             assert line.x.tolist() == ["rectangular", "hann", "blackman"]
     values = figures.dataset.pd_shot
     for figure, words in zip(figures.figure_specs[2:], ("x", "y"), strict=True):
-        (panel,) = figures.make_chart(figure, SHEET_LIMITS).panels
+        (panel,) = figures.make_chart(figure, SHEET_SIZE_LIMITS).panels
         assert getattr(panel, words).kind == "category"
         own = (
             values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
         )
         np.testing.assert_allclose(panel.heat_map.values, own)
         assert getattr(panel.heat_map, words).tolist() == ["rectangular", "hann", "blackman"]
-        (trace,) = make_plot(figures.make_chart(figure, SHEET_LIMITS)).figure.data
+        (trace,) = make_interactive_plot(figures.make_chart(figure, SHEET_SIZE_LIMITS)).figure.data
         assert getattr(trace, words).tolist() == ["rectangular", "hann", "blackman"]
     assert write_report(path, tmp_path / "page.html").stat().st_size > 1e6
 
@@ -179,7 +179,7 @@ def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
     path = run_into_store(tmp_path, SURFACE_AXES, figures=figures)
     assert all(map(has_content, draw_figures(path)))
     surface, slices = (
-        GridResults.from_store(path).make_chart(f, SHEET_LIMITS)
+        GridResults.from_store(path).make_chart(f, SHEET_SIZE_LIMITS)
         for f in GridResults.from_store(path).figure_specs
     )
     assert surface.panels[0].heat_map.contour_levels == (0.5, 0.9) and "0.5 and 0.9" in " ".join(
@@ -191,7 +191,9 @@ def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
         sheet = canvas.draw_chart(surface, "", "")
     told = {text.get_text() for axes in sheet.axes for text in axes.texts}
     assert told == {"0.5", "0.9"}
-    contours = [trace for trace in make_plot(surface).figure.data if trace.type == "contour"]
+    contours = [
+        trace for trace in make_interactive_plot(surface).figure.data if trace.type == "contour"
+    ]
     assert [trace.contours.start for trace in contours] == [0.5, 0.9]
 
 
@@ -207,7 +209,7 @@ def test_levels_that_nothing_reaches_or_across_words_leave_the_map(levels, x, tm
 def test_a_picture_says_what_it_was_drawn_from(asked, tmp_path):
     png, pdf, svg = (draw_figures(asked, tmp_path, form)[0] for form in ("png", "pdf", "svg"))
     spec = GridResults.from_store(asked).spec
-    told = picture_source(spec.id, spec.figures[0])
+    told = picture_source_text(spec.id, spec.figures[0])
     with Image.open(png) as image:
         assert image.info[canvas.PNG_SOURCE_FIELD] == told
     assert told in svg.read_text() and told.encode() in pdf.read_bytes()

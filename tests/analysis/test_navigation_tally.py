@@ -11,7 +11,7 @@ from sweep.model.geometry.scanner import corner_directions
 from sweep.model.pointcloud.navigation import solve_velocity
 
 FIELDS = (
-    "attempts", "n_solutions", "mean_error", "squared_deviation", "mean_stated_variance",
+    "n_attempts", "n_solutions", "mean_error", "squared_deviation", "mean_stated_variance",
 )  # fmt: skip
 
 
@@ -45,7 +45,7 @@ def test_a_tally_says_what_numpy_says_of_all_draws():
     error, variance, available = _draws(5000)
     result = _of_all(error, variance, available)
     held = error[available]
-    assert result.n_solutions == available.sum() and result.attempts == 5000
+    assert result.n_solutions == available.sum() and result.n_attempts == 5000
     assert result.availability == available.mean()
     np.testing.assert_allclose(result.bias, held.mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(result.variance, held.var(axis=0, ddof=1), rtol=1e-12)
@@ -57,7 +57,7 @@ def test_a_tally_says_what_numpy_says_of_all_draws():
 def test_merged_tallies_equal_one_pass(sizes):
     parts, (error, variance, available) = _units(sizes)
     whole, merged = _of_all(error, variance, available), merge_tallies(parts)
-    assert merged.attempts == whole.attempts and merged.n_solutions == whole.n_solutions
+    assert merged.n_attempts == whole.n_attempts and merged.n_solutions == whole.n_solutions
     for name in FIELDS[2:]:
         np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
 
@@ -82,7 +82,7 @@ def test_cells_of_altitude_hold_their_own_draws():
     altitude = np.random.default_rng(2).uniform(0, 700, 3000)
     edges = np.array([100.0, 200.0, 400.0, 500.0])
     result = tally_errors(error, variance, available, np.digitize(altitude, edges) - 1, 3)
-    assert result.attempts.shape == (3,) and result.variance.shape == (3, 3)
+    assert result.n_attempts.shape == (3,) and result.variance.shape == (3, 3)
     for i in range(3):
         here = (altitude >= edges[i]) & (altitude < edges[i + 1])
         alone = _of_all(error[here], variance[here], available[here])
@@ -90,7 +90,7 @@ def test_cells_of_altitude_hold_their_own_draws():
             np.testing.assert_allclose(
                 getattr(result, name)[i], getattr(alone, name), rtol=1e-12, err_msg=name
             )
-    assert result.attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
+    assert result.n_attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
 
 
 def test_what_is_not_there_is_nan_and_never_a_warning():

@@ -7,7 +7,12 @@ import xarray as xr
 from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
 
 import sweep
-from sweep.analysis.datasets import NotAStoreError, open_scene, read_slices, sum_batches
+from sweep.analysis.datasets import (
+    NotAStoreError,
+    chunk_aligned_slices,
+    open_scene,
+    sum_draw_batches,
+)
 from sweep.analysis.datasets import open as open_store
 from sweep.analysis.scene_results.recordings import read_eyepoints
 from sweep.model.outputs import (
@@ -79,7 +84,7 @@ def test_counts_of_draws_are_summed_over_batches_and_a_batch_not_counted_voids_t
         {"n_detected_shot": (("range", "batch"), counts, {"units": "1"}), "pd": ("range", [1, 2])},
         coords={"batch_draws": ("batch", [10, 10, 7])},
     )
-    result = sum_batches(dataset)
+    result = sum_draw_batches(dataset)
     assert result.n_detected_shot.values.tolist() == [12, -1]
     assert result.n_detected_shot.attrs["units"] == "1"
     assert set(result.dims) == {"range"}
@@ -157,7 +162,7 @@ def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scen
 def test_stretches_are_whole_chunks_and_cover_all_once(size, most):
     array = xr.DataArray(np.zeros((2, 100)), dims=("power", "shot"))
     array.encoding["preferred_chunks"] = {"power": 1, "shot": 7}
-    parts = read_slices(array, "shot", size)
+    parts = chunk_aligned_slices(array, "shot", size)
     covered = np.concatenate([np.arange(100)[part] for part in parts])
     assert covered.tolist() == list(range(100))
     assert all(part.start % 7 == 0 for part in parts)

@@ -8,7 +8,11 @@ import xarray as xr
 from stored_scenes import copy_without_last_cycles, run_flight_into_store
 
 import sweep
-from sweep.analysis.scene_results.interface_reports import REPORT_COLUMNS, make_reports, quantise
+from sweep.analysis.scene_results.interface_reports import (
+    REPORT_COLUMNS,
+    make_reports,
+    quantise_and_clip,
+)
 from sweep.model.pointcloud.pairing import TRUE_FLAG, UNCONFIRMED_FLAG
 from sweep.spec import SpecError
 from sweep.spec.scene_sections import Interface
@@ -83,7 +87,7 @@ def test_limits_flag_those_beyond_and_no_others(quantum):
 
 
 def test_a_limit_that_is_no_multiple_moves_to_the_next():
-    values, beyond = quantise(np.array([1.0, 1.1, 9.9, 12.0]), 0.5, 1.1, 9.9)
+    values, beyond = quantise_and_clip(np.array([1.0, 1.1, 9.9, 12.0]), 0.5, 1.1, 9.9)
     assert values.tolist() == [1.0, 1.0, 10.0, 10.0] and beyond.tolist() == [1, 0, 0, 1]
 
 

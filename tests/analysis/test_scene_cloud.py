@@ -7,7 +7,7 @@ from mpl_toolkits.mplot3d import proj3d
 from stored_scenes import GROUND_SLOPE, copy_without_last_cycles
 
 from sweep.analysis import canvas
-from sweep.analysis.datasets import open_tree
+from sweep.analysis.datasets import open_scene_tree
 from sweep.analysis.scene_results import cloud_figures, point_styles, recordings
 from sweep.analysis.scene_results.cloud_figures import HeightMap
 from sweep.analysis.scene_results.recordings import (
@@ -15,19 +15,19 @@ from sweep.analysis.scene_results.recordings import (
     PointCloud,
     ThinnedRows,
     find_axis_position,
-    gather_cloud,
+    gather_point_cloud,
 )
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 
 @pytest.fixture(scope="module")
 def tree(scene_store):
-    return open_tree(scene_store)
+    return open_scene_tree(scene_store)
 
 
 @pytest.fixture(scope="module")
 def weak(tree, spec):
-    return find_axis_position(spec, {"power": "0.3 mW"}).recording(tree, "pair")
+    return find_axis_position(spec, {"power": "0.3 mW"}).open_recording(tree, "pair")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def small_cloud(points, **changes):
 
 
 def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, arrays):
-    found = gather_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
+    found = gather_point_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert 20 < none.sum() < none.size - 20
     assert found.thinned_dropouts.n_total == none.sum()
@@ -84,9 +84,9 @@ def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, array
 
 @pytest.mark.parametrize("geometry", [True, False])
 def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path, arrays, geometry):
-    short = open_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=geometry))
-    weak = find_axis_position(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    found = gather_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
+    short = open_scene_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=geometry))
+    weak = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(short, "pair")
+    found = gather_point_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert found.thinned_dropouts.n_total == none[:256].sum() > 0
 
@@ -96,9 +96,9 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
     scene_store, tree, spec, power, draw
 ):
     at = find_axis_position(spec, {"power": power})
-    found = gather_cloud(
-        at.recording(tree, "pair"), ["snr"], ranges="interpolated", draw=draw, with_dropouts=True,
-        with_path=True,
+    found = gather_point_cloud(
+        at.open_recording(tree, "pair"), ["snr"], ranges="interpolated", draw=draw,
+        with_dropouts=True, with_path=True,
     )  # fmt: skip
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.axis_indices, draw=draw)
     true = (arrays.flags.values & TRUE_FLAG) > 0
@@ -117,8 +117,8 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
     crops = {"x": (-30.0, 25.0), "time": (1.0, 5.0)}
-    found = gather_cloud(weak, ["range"], ranges="quantised", crops=crops, with_dropouts=True)
-    every = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True)
+    found = gather_point_cloud(weak, ["range"], ranges="quantised", crops=crops, with_dropouts=True)
+    every = gather_point_cloud(weak, ["range"], ranges="quantised", with_dropouts=True)
     assert (
         0 < found.thinned_points.n_total < every.thinned_points.n_total
         and 0 < found.thinned_dropouts.n_total < every.thinned_dropouts.n_total
@@ -127,12 +127,14 @@ def test_crops_cut_points_and_dropouts_and_the_picture(weak):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
     room = max(high - low for low, high in found.box.values()) * recordings.BOX_MARGIN_FRACTION
     assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
-    assert gather_cloud(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
+    assert (
+        gather_point_cloud(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
+    )
 
 
 def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
-    whole = gather_cloud(weak, ["shot"], ranges="quantised")
-    found = gather_cloud(weak, ["shot"], ranges="quantised", points_max=50)
+    whole = gather_point_cloud(weak, ["shot"], ranges="quantised")
+    found = gather_point_cloud(weak, ["shot"], ranges="quantised", points_max=50)
     assert found.thinned_points.step == 2 ** int(
         np.ceil(np.log2(whole.thinned_points.n_total / 50))
     )
@@ -147,7 +149,9 @@ def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
     ("view", "axes"), [("above", ("x", "y")), ("side", ("x", "z")), ("front", ("y", "z"))]
 )
 def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
-    found = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True)
+    found = gather_point_cloud(
+        weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True
+    )
     sheet = drawn(found, tree, view=view, height_map=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
     true = (found.points["flags"] & TRUE_FLAG) > 0
@@ -165,7 +169,7 @@ def test_the_nearest_points_lie_on_top():
         "range", found.points["range"], is_trusted=np.ones(3, bool), surfaces=[]
     )
     colour = drawn(found, None).axes[0].collections[0].get_facecolors()
-    assert np.allclose(colour, scale.map_values(np.array([2.0, 0.0, 1.0])))
+    assert np.allclose(colour, scale.to_rgba_colours(np.array([2.0, 0.0, 1.0])))
 
 
 @pytest.mark.parametrize("view", ["oblique", (20.0, 60.0), (-130.0, 5.0)])
@@ -203,8 +207,8 @@ def test_velocities_of_both_signs_have_a_scale_centred_on_zero_and_of_one_sign_d
     assert both.cmap is point_styles.DIVERGING_COLOUR_MAP
     assert (one.norm.vmin, one.norm.vmax) == (1, 4)
     assert both.label == "radial velocity (m/s)"
-    middle = both.map_values(np.array([0.0]))[0, :3]
-    assert all(middle.sum() < both.map_values(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
+    middle = both.to_rgba_colours(np.array([0.0]))[0, :3]
+    assert all(middle.sum() < both.to_rgba_colours(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
 
 
 def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_told():
@@ -227,7 +231,7 @@ def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
         "surface", values, is_trusted=np.ones(4, bool), surfaces=["ground", "block"]
     )
     assert names.label_by_number == {-1: "none", 0: "ground", 1: "block"}
-    paint = names.map_values(values)
+    paint = names.to_rgba_colours(values)
     assert len(np.unique(paint, axis=0)) == 3 and np.array_equal(paint[1], paint[3])
     assert len(set(canvas.LINE_COLOURS)) == len(canvas.LINE_COLOURS)
     kinds = point_styles.choose_colours(
@@ -274,5 +278,5 @@ def test_slopes_towards_the_light_are_brighter_and_walls_are_left_open():
     level = HeightMap(x, y, np.zeros((21, 21))).hillshade()
     assert (towards > level).all() and (level > away).all()
     step = np.where(x > 5, 10.0, 0.0) + 0 * y[:, None]
-    kept = np.isfinite(HeightMap(x, y, step).mask_walls().height)
+    kept = np.isfinite(HeightMap(x, y, step).mask_steep_ground().height)
     assert not kept[:, 10].any() and kept[:, :9].all() and kept[:, 13:].all()

@@ -10,7 +10,7 @@ import trimesh
 import xarray as xr
 from stored_scenes import GROUND_CENTRE, copy_without_last_cycles, run_flight_into_store
 
-from sweep.analysis.datasets import NotAStoreError, open_tree
+from sweep.analysis.datasets import NotAStoreError, open_scene_tree
 from sweep.analysis.scene_results.point_export import POINT_COLUMNS, PointTable, export, write_las
 from sweep.analysis.scene_results.recordings import Recording
 from sweep.model.pointcloud.pairing import TRUE_FLAG
@@ -192,7 +192,13 @@ def test_las_steps_grow_only_where_points_lie_farther_apart_than_its_integers_re
     scene_store, tmp_path, half, step
 ):
     """2^31 steps of 0.1 mm to either side of the offset are 214.7 km."""
-    group = open_tree(scene_store).children["square"].to_dataset(inherit=False).isel(power=1).load()
+    group = (
+        open_scene_tree(scene_store)
+        .children["square"]
+        .to_dataset(inherit=False)
+        .isel(power=1)
+        .load()
+    )
     there = group.flags.values[:, 0] > 0
     position = np.full(group.position.shape, np.nan)
     position[:, 0][there] = np.linspace(-half, half, there.sum())[:, None] * [1.0, 0.1, 0.0]
@@ -236,7 +242,7 @@ def test_times_and_projections_of_a_scenes_files(tmp_path):
         scene={"origin": "ground", "objects": {"ground": ground}},
         platform={"path": {"kind": "waypoints", "file": "path.csv"}},
     )  # fmt: skip
-    tree = open_tree(store)
+    tree = open_scene_tree(store)
     assert tree.attrs["time_origin"] == first and tree.attrs["projection"] == ""
     assert tree["one"].time.values[0] == 0
     export(store, tmp_path / "cloud.las")

@@ -8,7 +8,7 @@ import xarray as xr
 from stored_scenes import copy_without_last_cycles, run_flight_into_store
 
 from sweep.analysis import study_figures
-from sweep.analysis.datasets import NotAStoreError, open_tree
+from sweep.analysis.datasets import NotAStoreError, open_scene_tree
 from sweep.analysis.scene_results import cloud_figures
 from sweep.analysis.scene_results.recordings import find_axis_position
 from sweep.analysis.study_figures import SceneResults, default_scene_figures, draw_figures
@@ -16,7 +16,7 @@ from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
-    usual = default_scene_figures(open_tree(scene_store))
+    usual = default_scene_figures(open_scene_tree(scene_store))
     assert [figure.file_stem for figure in usual] == [
         "square_range_cloud", "square_radial_velocity_cloud", "pair_range_cloud",
         "pair_radial_velocity_cloud", "velocity_all_navigation", "altitude_all_navigation",
@@ -50,30 +50,34 @@ def test_spectra_need_the_eyepoints_beside_the_store(tmp_path):
 def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every_point(
     scene_store, spec, tmp_path
 ):
-    weak = find_axis_position(spec, {"power": "0.3 mW"}).recording(open_tree(scene_store), "pair")
+    weak = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(
+        open_scene_tree(scene_store), "pair"
+    )
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
     options = {"draw": 0, "ranges": "quantised", "time_limits": None}
-    shots = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
+    shots = weak.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values)
-    points = weak.thinned_rows(["time", "radial_velocity", "beam"], 10**6, **options)
+    points = weak.read_thinned_rows(["time", "radial_velocity", "beam"], 10**6, **options)
     there = arrays.flags.values > 0
     assert np.array_equal(
         points.to_columns()["radial_velocity"], arrays.radial_velocity.values[there]
     )
-    short = open_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
-    less = find_axis_position(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    shots = less.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
+    short = open_scene_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
+    less = find_axis_position(spec, {"power": "0.3 mW"}).open_recording(short, "pair")
+    shots = less.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values[:256])
     interval = 2.0, 3.0
     limited = options | {"time_limits": interval}
-    some = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **limited)
+    some = weak.read_thinned_rows(["time", "pd_shot", "beam"], 10**6, **limited)
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
     assert np.array_equal(some.to_columns()["pd_shot"], arrays.pd_shot.values[inside])
 
 
 def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
-    strong = find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "pair")
-    found = strong.thinned_rows(["time", "range", "snr"], 10**6, ranges="interpolated")
+    strong = find_axis_position(spec, {"power": "1 W"}).open_recording(
+        open_scene_tree(scene_store), "pair"
+    )
+    found = strong.read_thinned_rows(["time", "range", "snr"], 10**6, ranges="interpolated")
     sheet = cloud_figures.draw_scatter_sheet(
         found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )

@@ -8,20 +8,22 @@ import xarray as xr
 from stored_scenes import SCENE_MAPPING, copy_without_last_cycles, run_flight_into_store
 
 from sweep.analysis.canvas import draw_chart
-from sweep.analysis.datasets import open_tree
+from sweep.analysis.datasets import open_scene_tree
 from sweep.analysis.scene_results import navigation_errors
 from sweep.analysis.scene_results.navigation_errors import (
-    navigation_chart,
-    navigation_curves,
-    navigation_page,
+    navigation_error_chart,
+    navigation_error_curves,
+    navigation_error_page,
 )
 from sweep.analysis.scene_results.recordings import find_axis_position
 
 
 def recordings(store, spec, power):
-    at, tree = find_axis_position(spec, {"power": power}), open_tree(store)
+    at, tree = find_axis_position(spec, {"power": power}), open_scene_tree(store)
     return [
-        (name, at.recording(tree, name)) for name in ("pair", "square") if name in tree.children
+        (name, at.open_recording(tree, name))
+        for name in ("pair", "square")
+        if name in tree.children
     ]
 
 
@@ -30,7 +32,9 @@ def recordings(store, spec, power):
 def test_statistics_are_plain_averages_over_the_solutions_of_a_bin(
     scene_store, spec, quantity, power
 ):
-    (curve,) = navigation_curves(recordings(scene_store, spec, power), quantity=quantity, n_bins=4)
+    (curve,) = navigation_error_curves(
+        recordings(scene_store, spec, power), quantity=quantity, n_bins=4
+    )
     assert curve.scanner == "square" and curve.altitude_edges.size == 5
     index = 0 if power == "0.3 mW" else 1
     arrays = xr.open_zarr(scene_store, group="square", chunks=None).isel(power=index).load()
@@ -48,7 +52,7 @@ def test_statistics_are_plain_averages_over_the_solutions_of_a_bin(
         inside = (altitude >= low) & (altitude < high)
         own = error[inside].reshape(-1, size)
         solved = np.isfinite(own).all(axis=1)
-        assert curve.tally.attempts[i] == own.shape[0]
+        assert curve.tally.n_attempts[i] == own.shape[0]
         assert curve.tally.availability[i] == pytest.approx(solved.mean())
         seen += own.shape[0]
         if not solved.any():
@@ -73,14 +77,18 @@ def test_results_are_the_same_bits_every_time_and_the_same_numbers_in_other_chun
     scene_store, spec, tmp_path, monkeypatch
 ):
     own = recordings(scene_store, spec, "0.3 mW")
-    (first,), (again,) = (navigation_curves(own, quantity="velocity", n_bins=5) for _ in range(2))
+    (first,), (again,) = (
+        navigation_error_curves(own, quantity="velocity", n_bins=5) for _ in range(2)
+    )
     assert np.array_equal(first.rmse, again.rmse, equal_nan=True)
     monkeypatch.setattr(navigation_errors, "SOLUTIONS_PER_READ", 1)  # a tally for each chunk
     square = {"square": SCENE_MAPPING["scanners"]["square"]}
     other = run_flight_into_store(
         tmp_path, scanners=square, storage={"block_shots": 160, "block_draws": 1}
     )
-    (apart,) = navigation_curves(recordings(other, spec, "0.3 mW"), quantity="velocity", n_bins=5)
+    (apart,) = navigation_error_curves(
+        recordings(other, spec, "0.3 mW"), quantity="velocity", n_bins=5
+    )
     assert np.array_equal(first.tally.n_solutions, apart.tally.n_solutions)
     np.testing.assert_allclose(apart.rmse, first.rmse, rtol=1e-12)
 
@@ -88,8 +96,10 @@ def test_results_are_the_same_bits_every_time_and_the_same_numbers_in_other_chun
 @pytest.mark.parametrize("geometry", [True, False])
 def test_cycles_that_are_not_computed_are_no_attempts(scene_store, spec, tmp_path, geometry):
     short = copy_without_last_cycles(scene_store, tmp_path, with_geometry=geometry)
-    (curve,) = navigation_curves(recordings(short, spec, "1 W"), quantity="altitude", n_bins=3)
-    assert curve.tally.attempts.sum() == 64 * 3
+    (curve,) = navigation_error_curves(
+        recordings(short, spec, "1 W"), quantity="altitude", n_bins=3
+    )
+    assert curve.tally.n_attempts.sum() == 64 * 3
     assert curve.tally.n_solutions.sum() == 64 * 3
 
 
@@ -99,18 +109,20 @@ def test_a_level_flight_has_one_bin_and_a_scanner_of_two_beams_no_curve(
     ends = {"from": ["-90 m", "50 m", "300 m"], "to": ["-90 m", "90 m", "300 m"]}
     path = {"kind": "straight", "initial_speed": "20 m/s"} | ends
     store = run_flight_into_store(tmp_path, platform={"path": path, "attitude": {"kind": "nadir"}})
-    (curve,) = navigation_curves(recordings(store, spec, "1 W"), quantity="altitude", n_bins=9)
-    assert curve.tally.attempts.tolist() == [20 * 3]
+    (curve,) = navigation_error_curves(
+        recordings(store, spec, "1 W"), quantity="altitude", n_bins=9
+    )
+    assert curve.tally.n_attempts.tolist() == [20 * 3]
     assert curve.bin_centres == pytest.approx(300 + 90 * 0.05, abs=1e-3)
     pair = recordings(scene_store, spec, "1 W")[:1]
-    assert navigation_curves(pair, quantity="velocity", n_bins=3) == []
+    assert navigation_error_curves(pair, quantity="velocity", n_bins=3) == []
 
 
 def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_store, spec):
-    (curve,) = navigation_curves(
+    (curve,) = navigation_error_curves(
         recordings(scene_store, spec, "1 W"), quantity="velocity", n_bins=4
     )
-    sheet = draw_chart(navigation_chart([curve, curve], "all"), "T", "note")
+    sheet = draw_chart(navigation_error_chart([curve, curve], "all"), "T", "note")
     panels = {axes.get_title(loc="left"): axes for axes in sheet.axes if axes.get_visible()}
     error, stated = panels["RMS error of the velocity, z"].lines[:2]
     assert np.array_equal(error.get_ydata(), curve.rmse[:, 2])
@@ -120,21 +132,21 @@ def test_the_figure_draws_the_statistics_and_the_stated_deviation_dashed(scene_s
     available = panels["velocity available"].lines[0]
     assert np.array_equal(available.get_ydata(), 100 * curve.tally.availability)
     for show, number in (("availability", 1), ("bias", 3), ("rmse", 4)):
-        assert len(navigation_chart([curve], show).panels) == number
+        assert len(navigation_error_chart([curve], show).panels) == number
 
 
 def test_the_table_holds_the_same_numbers_in_text_and_csv(scene_store, spec, tmp_path):
-    (curve,) = navigation_curves(
+    (curve,) = navigation_error_curves(
         recordings(scene_store, spec, "1 W"), quantity="altitude", n_bins=3
     )
-    page = navigation_page([curve], show="all", title="T", remarks=["a note"])
+    page = navigation_error_page([curve], show="all", title="T", remarks=["a note"])
     text, table = page.save_files(tmp_path, "navigation")
     rows = list(csv.DictReader(table.open()))
     assert [float(row["rmse"]) for row in rows] == curve.rmse[:, 0].tolist()
     assert [float(row["bias"]) for row in rows] == curve.tally.bias[:, 0].tolist()
     assert [float(row["from"]) for row in rows] == curve.altitude_edges[:-1].tolist()
-    assert sum(int(row["cycles"]) for row in rows) == curve.tally.attempts.sum()
+    assert sum(int(row["cycles"]) for row in rows) == curve.tally.n_attempts.sum()
     said = text.read_text()
     assert "square: altitude" in said and "in m;" in said and "a note" in said
-    only = navigation_page([curve], show="bias", title="", remarks=[])
+    only = navigation_error_page([curve], show="bias", title="", remarks=[])
     assert "rmse" not in only.records[0] and "bias" in only.records[0]

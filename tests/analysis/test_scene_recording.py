@@ -7,16 +7,16 @@ import pytest
 import xarray as xr
 from stored_scenes import GROUND_SLOPE, copy_without_last_cycles
 
-from sweep.analysis.datasets import open_tree
+from sweep.analysis.datasets import open_scene_tree
 from sweep.analysis.scene_results.recordings import (
-    POINT_KINDS,
+    POINT_KIND_BITS,
     QUANTITY_BY_NAME,
-    UNLIMITED,
+    UNLIMITED_VALUES,
     ThinnedRows,
     find_axis_position,
-    point_kinds,
-    select_within,
-    to_shown_units,
+    point_kind_indices,
+    select_rows_within,
+    to_displayed_values,
 )
 from sweep.analysis.selection import parameters_at
 from sweep.model.pointcloud.pairing import FLAG_BITS, TRUE_FLAG
@@ -27,7 +27,9 @@ from sweep.spec.figure_sections import FIGURE_QUANTITIES as OF_SPECS
 @pytest.fixture
 def weak(scene_store, spec):
     """What the square saw at the lower power."""
-    return find_axis_position(spec, {"power": "0.3 mW"}).recording(open_tree(scene_store), "square")
+    return find_axis_position(spec, {"power": "0.3 mW"}).open_recording(
+        open_scene_tree(scene_store), "square"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,9 @@ def arrays(scene_store):
 
 
 def all_points(recording, names, **options):
-    parts = [recording.point_columns(names, part, **options) for part in recording.shot_slices()]
+    parts = [
+        recording.point_columns(names, part, **options) for part in recording.iter_shot_slices()
+    ]
     return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
@@ -89,8 +93,10 @@ def test_beams_aim_at_the_slope_or_at_the_block(weak):
 
 def test_what_is_not_computed_has_no_points_and_no_stretch(scene_store, spec, tmp_path):
     at = find_axis_position(spec, {"power": "1 W"})
-    whole = at.recording(open_tree(scene_store), "square")
-    short = at.recording(open_tree(copy_without_last_cycles(scene_store, tmp_path)), "square")
+    whole = at.open_recording(open_scene_tree(scene_store), "square")
+    short = at.open_recording(
+        open_scene_tree(copy_without_last_cycles(scene_store, tmp_path)), "square"
+    )
     found = all_points(whole, ["time", "x", "shot"])
     less = all_points(short, ["time", "x", "shot"])
     kept = found["shot"] < 256
@@ -101,19 +107,22 @@ def test_what_is_not_computed_has_no_points_and_no_stretch(scene_store, spec, tm
 def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch):
     from sweep.analysis.scene_results import recordings as module
 
-    every = module.read_slices
-    monkeypatch.setattr(module, "read_slices", lambda array, dim: every(array, dim, 64))
-    assert [part.start for part in weak.shot_slices()] == [0, 128, 256]
-    time = weak.read("time", slice(0, weak.n_shots))
+    every = module.chunk_aligned_slices
+    monkeypatch.setattr(module, "chunk_aligned_slices", lambda array, dim: every(array, dim, 64))
+    assert [part.start for part in weak.iter_shot_slices()] == [0, 128, 256]
+    time = weak.read_array("time", slice(0, weak.n_shots))
     asked = float(time[130]), float(time[200])
-    assert [part.start for part in weak.shot_slices(asked)] == [128]
+    assert [part.start for part in weak.iter_shot_slices(asked)] == [128]
 
 
 def test_rows_within_limits_are_kept_and_those_without_a_value_are_not():
     table = {"x": np.array([0.0, 1.0, np.nan, 3.0]), "y": np.arange(4.0)}
-    assert select_within(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
-    assert select_within(table, {"x": UNLIMITED, "y": (-np.inf, 2)})["y"].tolist() == [0, 1]
-    assert select_within(table, {}) is table
+    assert select_rows_within(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
+    assert select_rows_within(table, {"x": UNLIMITED_VALUES, "y": (-np.inf, 2)})["y"].tolist() == [
+        0,
+        1,
+    ]
+    assert select_rows_within(table, {}) is table
 
 
 @pytest.mark.parametrize("cuts", [[1000], [1, 2, 3, 994], [7] * 142 + [6], [500, 0, 500]])
@@ -137,12 +146,12 @@ def test_flags_say_one_kind_each_and_ratios_are_shown_in_decibels():
     flags = np.array(
         [0, TRUE_FLAG, FLAG_BITS["sidelobe"] | FLAG_BITS["unconfirmed"], FLAG_BITS["false_alarm"]]
     )
-    names = list(POINT_KINDS)
-    assert [names[i] if i >= 0 else "" for i in point_kinds(flags)] == [
+    names = list(POINT_KIND_BITS)
+    assert [names[i] if i >= 0 else "" for i in point_kind_indices(flags)] == [
         "", "true", "sidelobe", "false_alarm",
     ]  # fmt: skip
-    assert to_shown_units("snr", np.array([1.0, 100.0, 0.0]))[:2].tolist() == [0, 20]
-    assert np.isnan(to_shown_units("snr", np.array([0.0]))).all()
+    assert to_displayed_values("snr", np.array([1.0, 100.0, 0.0]))[:2].tolist() == [0, 20]
+    assert np.isnan(to_displayed_values("snr", np.array([0.0]))).all()
 
 
 def test_a_place_is_the_first_that_fits_and_says_what_it_left_open(spec):
@@ -173,11 +182,11 @@ def test_shots_are_computed_draw_by_draw_as_their_chunks_are_there(scene_store, 
     copy = shutil.copytree(scene_store, tmp_path / "holes.zarr")
     (copy / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
     (copy / "square" / "flags" / "c" / "0" / "1" / "1" / "0").unlink()  # shots 128 to 255, draw 2
-    whole, tree = slice(0, 316), open_tree(copy)
+    whole, tree = slice(0, 316), open_scene_tree(copy)
     weak, strong = (
-        find_axis_position(spec, {"power": power}).recording(tree, "square")
+        find_axis_position(spec, {"power": power}).open_recording(tree, "square")
         for power in ("0.3 mW", "1 W")
     )
-    assert np.flatnonzero(~weak.computed_shots(whole, 2)).tolist() == list(range(128, 256))
-    assert weak.computed_shots(whole, 1).all() and strong.computed_shots(whole, 2).all()
-    assert not weak.computed_shots(slice(150, 160), 2).any()
+    assert np.flatnonzero(~weak.computed_shot_mask(whole, 2)).tolist() == list(range(128, 256))
+    assert weak.computed_shot_mask(whole, 1).all() and strong.computed_shot_mask(whole, 2).all()
+    assert not weak.computed_shot_mask(slice(150, 160), 2).any()

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from sweep.analysis import shot_spectra
-from sweep.analysis.datasets import open_tree
+from sweep.analysis.datasets import open_scene_tree
 from sweep.analysis.scene_results.recordings import (
     find_axis_position,
     find_multi_surface_shot,
@@ -21,7 +21,9 @@ from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 @pytest.fixture(scope="module")
 def recording(scene_store, spec):
-    return find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "pair")
+    return find_axis_position(spec, {"power": "1 W"}).open_recording(
+        open_scene_tree(scene_store), "pair"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,9 @@ def arrays(scene_store):
 def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(scene_store, recording.dataset, np.array([number]))
     parameters = parameters_at(spec, find_axis_position(spec, {"power": "1 W"}).axis_indices)
-    effects = unpack_effect_flags(int(recording.read("effects", slice(number, number + 1))[0]))
+    effects = unpack_effect_flags(
+        int(recording.read_array("effects", slice(number, number + 1))[0])
+    )
     prepared = prepare_eyepoint_shots(eyepoints, parameters, spec.surfaces(), effects)
     return eyepoints, simulate_prepared_shot(prepared, parameters, seed=seed)
 
@@ -57,7 +61,9 @@ def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recor
 
 
 def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store, spec):
-    square = find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "square")
+    square = find_axis_position(spec, {"power": "1 W"}).open_recording(
+        open_scene_tree(scene_store), "square"
+    )
     values = square.dataset.load()
     alike = square.dataset.assign(surface=xr.zeros_like(values.surface))
     seen = type(square)("square", alike)
@@ -121,5 +127,5 @@ def test_views_reach_over_all_detections_but_not_to_those_far_away():
         1.0,
         1.0,
     )
-    view = shot_spectra.detection_view(segment)
+    view = shot_spectra.detection_bin_slice(segment)
     assert 900 < view.start < 950 and 1140 < view.stop < 1200

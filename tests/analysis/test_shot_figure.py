@@ -70,7 +70,7 @@ def test_peaks_stand_where_the_beats_are_and_as_high_as_the_statistics_say(one):
     for segment in one.segments:
         assert abs(segment.frequency[segment.peak_index] - abs(segment.beat_frequency)) < 3 * width
     up = one.segments[0]
-    snr = (up.magnitude.max() / one.bin_deviation) ** 2 / 2
+    snr = (up.magnitude.max() / one.noise_sigma) ** 2 / 2
     assert snr == pytest.approx(up.snr, rel=1e-9)
     assert up.snr == pytest.approx(one.outputs["snr_up"], rel=1e-12)
 
@@ -168,9 +168,9 @@ def test_what_the_shot_reports_is_what_the_model_reports_without_noise(one):
 def test_the_view_around_the_peak_holds_all_that_the_footprint_spreads():
     magnitude = np.full(4000, 1e-6)
     magnitude[2000:2100] = 1.0
-    view = shot_spectra.peak_view(magnitude)
+    view = shot_spectra.peak_bin_slice(magnitude)
     assert view.start < 2000 and view.stop > 2100
-    assert shot_spectra.peak_view(np.eye(1, 4000, 3)[0]).start == 0
+    assert shot_spectra.peak_bin_slice(np.eye(1, 4000, 3)[0]).start == 0
 
 
 def test_a_shot_too_weak_is_reported_as_not_detected(tmp_path):

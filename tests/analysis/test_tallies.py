@@ -21,7 +21,7 @@ some = st.lists(
 @given(values=some, cut=st.integers(1, 9))
 def test_a_mean_is_the_exact_one_but_for_rounding(values, cut):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selection, "VALUES_PER_SUM", cut)
+        patch.setattr(selection, "SUMMED_VALUES_MAX", cut)
         found = Statistics.from_values(np.array(values))
     exact, size = sum(map(Fraction, values)), sum(abs(Fraction(v)) for v in values)
     assert abs(Fraction(found.mean) * len(values) - exact) <= size * len(values) * Fraction(

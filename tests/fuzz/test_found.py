@@ -17,7 +17,7 @@ from sweep.model.effects.noise_sources import SUN_RADIUS, solar_irradiance
 from sweep.model.effects.saturation import FULL_SCALE_EXCESS_MAX
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
-from sweep.scenes.terrain import Terrain, smooth
+from sweep.scenes.terrain import Terrain, smooth_terrain
 from sweep.spec import GridSpec, SceneSpec, SpecError, load
 from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
@@ -199,23 +199,23 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
 
 
 def test_boulders_beside_the_ground_are_refused():
-    from sweep.scenes.terrain import square_bounds
+    from sweep.scenes.terrain import clipped_square_bounds
     from sweep.spec.fields import SpecFiles
     from sweep.spec.ground_sections import PlaneGround
 
     ground = PlaneGround(kind="plane", size="100 m", reflectance=0.1).build_terrain(SpecFiles("."))
-    assert square_bounds(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
+    assert clipped_square_bounds(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
     with pytest.raises(ValueError, match="there is no ground within 10 m"):
-        square_bounds(ground, centre=(90.0, 0.0), size=20.0)
+        clipped_square_bounds(ground, centre=(90.0, 0.0), size=20.0)
 
 
 def test_a_ground_is_not_blurred_by_more_than_its_own_size():
     """The filter's memory goes by its width: 1e9 m over steps of 6 m took all that there was."""
     ground = Terrain(np.arange(12.0).reshape(3, 4), (10.0, 10.0), np.zeros(3))
-    assert np.ptp(smooth(ground, standard_deviation=30.0).heights) < np.ptp(ground.heights)
+    assert np.ptp(smooth_terrain(ground, standard_deviation=30.0).heights) < np.ptp(ground.heights)
     for width in (31.0, 1e9):
         with pytest.raises(ValueError, match="the ground's 30 m"):
-            smooth(ground, standard_deviation=width)
+            smooth_terrain(ground, standard_deviation=width)
 
 
 def test_a_plan_measures_once_however_late_it_is(monkeypatch):

@@ -448,7 +448,7 @@ def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
         }
     )
     shot = simulate_shot(given, ("image",), seed=3)
-    power = (shot.segments[0].magnitude[8:-8] / shot.bin_deviation) ** 2 / 2
+    power = (shot.segments[0].magnitude[8:-8] / shot.noise_sigma) ** 2 / 2
     looks = shot.prepared_shot.looks
     if combine == "binary":  # the fourth largest of 16
         levels = np.array([0.8, 1.4, 2.0])

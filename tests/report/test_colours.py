@@ -20,8 +20,8 @@ PALETTES = {
         "#ffffff",
         2.2,
     ),  # Okabe's orange and sky blue; dashes differ as well
-    "light page": (html_page.LINE_COLOURS["light"], "#ffffff", 4.5),
-    "dark page": (html_page.LINE_COLOURS["dark"], "#111417", 4.5),
+    "light page": (html_page.PAGE_LINE_COLOURS["light"], "#ffffff", 4.5),
+    "dark page": (html_page.PAGE_LINE_COLOURS["dark"], "#111417", 4.5),
 }
 
 AT_A_GLANCE, FIRST_FOUR = 10.0, 12.0
@@ -75,9 +75,9 @@ def test_each_sight_keeps_greys_and_loses_what_it_lacks():
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_lines_differ_in_dashes_too_and_surfaces_stand_out(scheme):
     assert (
-        len(set(html_page.DASH_STYLES))
-        == len(html_page.DASH_STYLES)
-        == len(html_page.LINE_COLOURS[scheme])
+        len(set(html_page.PLOTLY_DASH_STYLES))
+        == len(html_page.PLOTLY_DASH_STYLES)
+        == len(html_page.PAGE_LINE_COLOURS[scheme])
     )
     _, paper, _ = PALETTES[f"{scheme} page"]
     ends = [stop[1] for stop in html_page.colour_themes()[scheme]["scale"]]

@@ -23,7 +23,7 @@ from sweep.model.evaluation import evaluate
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.model.threshold import TNR_PATH
 from sweep.report import detector_charts, flight_charts
-from sweep.report.html_page import Control
+from sweep.report.html_page import PlotControl
 from sweep.report.study_report import write_report
 from sweep.spec import GridSpec
 from sweep.tasks import driver
@@ -194,7 +194,7 @@ def test_an_answer_from_the_parts_that_a_page_shows_says_so():
 def test_errors_of_a_flight_are_measured_less_true(scene_store):
     study = SceneResults.from_store(scene_store)
     seen, _ = flight_charts.select_recordings(study)
-    chart = flight_charts.error_chart(seen)
+    chart = flight_charts.measurement_error_chart(seen)
     group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
     true = (group["flags"].values & TRUE_FLAG) > 0
     expected = (group["range_interpolated"] - group["true_range"]).values[true]
@@ -204,13 +204,15 @@ def test_errors_of_a_flight_are_measured_less_true(scene_store):
 
 
 def test_parts_of_a_study_open_in_their_middle():
-    assert [Control("part", "", list("abcdef")[:n]).initial_option for n in (1, 2, 3, 6)] == [
+    assert [
+        PlotControl("part", "", list("abcdef")[:n]).initial_option_index for n in (1, 2, 3, 6)
+    ] == [
         0,
         0,
         1,
         2,
     ]
-    assert Control("answer", "", list("abc")).initial_option == 0
+    assert PlotControl("answer", "", list("abc")).initial_option_index == 0
 
 
 def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
@@ -260,6 +262,9 @@ def test_a_place_of_a_flight_without_computed_shots_has_no_panel_over_time(scene
     shutil.rmtree(store / "four" / "flags" / "c" / "0")  # of the first of two places
     (store / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
     found, _ = flight_charts.select_recordings(SceneResults.from_store(store))
-    for chart in (flight_charts.shots_over_time_chart(found), flight_charts.error_chart(found)):
+    for chart in (
+        flight_charts.shots_over_time_chart(found),
+        flight_charts.measurement_error_chart(found),
+    ):
         assert {panel.facet_choices["cloud"] for panel in chart.panels} == {found[1].label}
         assert all(panel.lines for panel in chart.panels)

@@ -5,7 +5,7 @@ import pytest
 from report_specs import EXPERIMENTS, GRID_SPEC
 
 from sweep.analysis import labels
-from sweep.analysis.charts import SHEET_LIMITS
+from sweep.analysis.charts import SHEET_SIZE_LIMITS
 from sweep.analysis.study_figures import GridResults
 from sweep.report import detector_charts
 from sweep.report.html_page import HtmlTable
@@ -41,18 +41,21 @@ def drawn_lines(chart, **choices):
     return {line.name: line for line in panel.lines}
 
 
-@pytest.mark.parametrize("choice,answer", detector_charts.ANSWER_BY_LABEL.items())
+@pytest.mark.parametrize("choice,answer", detector_charts.LIMIT_VARIABLE_BY_LABEL.items())
 def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, choice, answer):
     study = GridResults.from_store(grid_store)
     chart = detector_charts.maximum_range_item(study)
-    expected = study.dataset.sweep.maximum_range(detector_charts.PD_LEVEL)[answer].compute() / 1000
+    expected = (
+        study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL)[answer].compute()
+        / 1000
+    )
     assert expected.notnull().any()
     for power in (1, 3):
         line = drawn_lines(chart, answer=choice)[f"power {power} W"]
         assert list(line.x) == [20, 50, 80]
         np.testing.assert_allclose(line.y, expected.sel(power=power), rtol=1e-6)
     assert {panel.y.label for panel in chart.panels} == {"maximum range (km)"}
-    assert f"pd of {detector_charts.PD_LEVEL:g}" in chart.heading
+    assert f"pd of {detector_charts.REPORTED_PD_LEVEL:g}" in chart.heading
 
 
 def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
@@ -61,9 +64,10 @@ def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     study = made(tmp_path, GRID_SPEC | {"axes": axes, "target": target, "figures": []})
     table = detector_charts.maximum_range_item(study)
     assert isinstance(table, HtmlTable)
-    answer = study.dataset.sweep.maximum_range(detector_charts.PD_LEVEL).compute()
+    answer = study.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute()
     assert list(table.frame["maximum range (km)"] * 1000) == [
-        pytest.approx(float(answer[name])) for name in detector_charts.ANSWER_BY_LABEL.values()
+        pytest.approx(float(answer[name]))
+        for name in detector_charts.LIMIT_VARIABLE_BY_LABEL.values()
     ]
     assert set(table.frame["which is"]) == {"found"}
 
@@ -81,7 +85,7 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     parts = list(dict.fromkeys(panel.facet_choices["part"] for panel in chart.panels))
     assert parts == ["grazing angle 30°", "grazing angle 85°"]
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
-    expected = steep.sweep.maximum_range(detector_charts.PD_LEVEL).unbroken / 1000
+    expected = steep.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).unbroken / 1000
     (line,) = drawn_lines(
         chart, part="grazing angle 85°", answer=detector_charts.UNBROKEN_LABEL
     ).values()
@@ -96,14 +100,16 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     sure = detector_charts.maximum_range_item(
         made(tmp_path / "near", GRID_SPEC | {"axes": near, "figures": []})
     )
-    assert detector_charts.is_empty(sure) and not detector_charts.is_empty(chart)
+    assert detector_charts.is_chart_without_values(
+        sure
+    ) and not detector_charts.is_chart_without_values(chart)
     (told,) = detector_charts.maximum_range_sentences(sure)
     assert told.startswith("No maximum range at 2 of 2 places") and "up to the last" in told
 
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
     figure = SlicesFigure(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
-    chart = drawn.make_chart(figure, SHEET_LIMITS)
+    chart = drawn.make_chart(figure, SHEET_SIZE_LIMITS)
     told = drawn.dataset.sweep.detection_probability("shot").compute()
     for angle in (30, 90):
         line = drawn_lines(chart)[f"grazing angle {labels.format_quantity(angle, 'deg')}"]
@@ -117,7 +123,7 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
     chart = detector_charts.maximum_range_item(drawn)
-    expected = drawn.dataset.sweep.maximum_range(detector_charts.PD_LEVEL).compute() / 1000
+    expected = drawn.dataset.sweep.maximum_range(detector_charts.REPORTED_PD_LEVEL).compute() / 1000
     (line,) = drawn_lines(chart, answer=detector_charts.UNBROKEN_LABEL).values()
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()

@@ -10,10 +10,10 @@ import rasterio
 from rasterio import Affine
 
 from sweep.scenes.map_frames import MapFrame, MetresPerUnit, degree_lengths, require_one_map
-from sweep.scenes.rasters import raster_digest, read_raster
+from sweep.scenes.rasters import raster_digest, read_raster_terrain
 from sweep.scenes.scene_files import SceneError
 from sweep.scenes.terrain import Terrain
-from sweep.scenes.tiles import join_tiles
+from sweep.scenes.tiles import extend_tiles_to_neighbours
 
 SLOPE = 0.2
 """Slope eastwards, on the ground, of the surveys written here."""
@@ -54,20 +54,20 @@ MERCATOR_METRES = 0.50126
 def test_web_mercator_far_from_the_equator_is_refused_with_its_scale_or_read_with_it(survey):
     path = survey("EPSG:3857", MERCATOR_60N, 20.0, MERCATOR_METRES)
     with pytest.raises(SceneError, match=r"off by up to 99.* %.*metres_per_unit: \[0.50126,"):
-        read_raster(path)
+        read_raster_terrain(path)
     with pytest.raises(SceneError, match=r"gdalwarp, e\.g\. -t_srs EPSG:32632"):
-        read_raster(path)
-    ground = read_raster(path, metres_per_unit=(0.50126, 0.500417))
+        read_raster_terrain(path)
+    ground = read_raster_terrain(path, metres_per_unit=(0.50126, 0.500417))
     assert slope(ground) == pytest.approx(SLOPE, rel=1e-5) and not ground.warnings
     assert ground.spacing == pytest.approx((10.0252, -10.00834), rel=1e-4)
 
 
 def test_a_scale_that_is_stated_wrongly_is_told_or_refused(survey):
     path = survey("EPSG:3857", MERCATOR_60N, 20.0, MERCATOR_METRES)
-    ground = read_raster(path, metres_per_unit=(0.51, 0.51))
+    ground = read_raster_terrain(path, metres_per_unit=(0.51, 0.51))
     assert len(ground.warnings) == 1 and "off by up to 1.9" in ground.warnings[0]
     with pytest.raises(SceneError, match=r"off by up to 99\.\d %"):
-        read_raster(path, metres_per_unit=(1.0, 1.0))
+        read_raster_terrain(path, metres_per_unit=(1.0, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_scale_that_is_stated_wrongly_is_told_or_refused(survey):
     ],
 )
 def test_maps_that_are_true_to_a_thousandth_are_taken_as_they_are(survey, crs, middle):
-    ground = read_raster(survey(crs, middle, 10.0, 1.0))
+    ground = read_raster_terrain(survey(crs, middle, 10.0, 1.0))
     assert ground.spacing == (10.0, -10.0) and not ground.warnings
     assert slope(ground) == pytest.approx(SLOPE)
 
@@ -96,20 +96,22 @@ def test_maps_that_are_true_to_a_thousandth_are_taken_as_they_are(survey, crs, m
 )
 def test_other_maps_are_refused(survey, crs, middle, said):
     with pytest.raises(SceneError, match=said):
-        read_raster(survey(crs, middle, 10.0, 1.0))
+        read_raster_terrain(survey(crs, middle, 10.0, 1.0))
 
 
 def test_a_large_raster_in_degrees_is_told_how_far_its_edges_are_off(survey):
     metres = degree_lengths(45.0)
     near = survey("EPSG:4326", (10.0, 45.0), 1e-3, metres[0], name="near.tif")
-    assert read_raster(near, metres_per_degree=metres).warnings == ()
+    assert read_raster_terrain(near, metres_per_degree=metres).warnings == ()
     far = survey("EPSG:4326", (10.0, 45.0), 0.2, metres[0], name="far.tif")
-    (warning,) = read_raster(far, metres_per_degree=metres).warnings
+    (warning,) = read_raster_terrain(far, metres_per_degree=metres).warnings
     # Half a degree off, the cosine of latitude differs by tan(45 deg) times that.
     off = float(warning.split("off by up to ")[1].split(" %")[0]) / 100
     assert off == pytest.approx(math.radians(0.5), rel=0.02)
     with pytest.raises(SceneError, match="off by up to"):
-        read_raster(near, metres_per_degree=metres[::-1])  # north and east in each other's place
+        read_raster_terrain(
+            near, metres_per_degree=metres[::-1]
+        )  # north and east in each other's place
 
 
 FEET = "EPSG:2232"  # Colorado central, US survey feet
@@ -120,34 +122,34 @@ SURVEY_FOOT = 1200 / 3937
 def test_a_map_in_feet_asks_for_the_unit_of_its_heights(survey):
     path = survey(FEET, COLORADO, 100.0, 1.0)  # a rise of 0.2 feet to a foot
     with pytest.raises(SceneError, match=r"US survey foot.*height_unit, 'm' or 'sft'"):
-        read_raster(path)
-    assert slope(read_raster(path, height_unit="sft")) == pytest.approx(0.2, rel=1e-9)
-    assert slope(read_raster(path, height_unit="ft")) == pytest.approx(0.2, rel=1e-5)
-    assert slope(read_raster(path, height_unit="m")) == pytest.approx(0.656, rel=1e-3)
+        read_raster_terrain(path)
+    assert slope(read_raster_terrain(path, height_unit="sft")) == pytest.approx(0.2, rel=1e-9)
+    assert slope(read_raster_terrain(path, height_unit="ft")) == pytest.approx(0.2, rel=1e-5)
+    assert slope(read_raster_terrain(path, height_unit="m")) == pytest.approx(0.656, rel=1e-3)
     told = survey(FEET, COLORADO, 100.0, 1.0, name="told.tif", unit="US survey foot")
-    assert slope(read_raster(told)) == pytest.approx(0.2, rel=1e-9)
+    assert slope(read_raster_terrain(told)) == pytest.approx(0.2, rel=1e-9)
     assert (
-        read_raster(path, has_height_scale=True).heights[0, 0] == 100
+        read_raster_terrain(path, has_height_scale=True).heights[0, 0] == 100
     )  # the spec's factor tells the unit
 
 
 def test_a_vertical_reference_system_tells_the_unit_of_heights(survey):
     compound = pyproj.CRS("EPSG:2232+6360").to_wkt("WKT1_GDAL")  # NAVD88 height, US survey feet
-    assert slope(read_raster(survey(compound, COLORADO, 100.0, 1.0))) == pytest.approx(0.2)
+    assert slope(read_raster_terrain(survey(compound, COLORADO, 100.0, 1.0))) == pytest.approx(0.2)
     metres = pyproj.CRS("EPSG:32633+5703").to_wkt("WKT1_GDAL")
     path = survey(metres, (500_000.0, 5_000_000.0), 10.0, 1.0, name="m.tif")
-    assert slope(read_raster(path)) == pytest.approx(SLOPE)
+    assert slope(read_raster_terrain(path)) == pytest.approx(SLOPE)
     with pytest.raises(SceneError, match="states heights in metre, and the spec says ft"):
-        read_raster(path, height_unit="ft")
+        read_raster_terrain(path, height_unit="ft")
 
 
 def test_a_band_that_contradicts_its_vertical_reference_system_is_refused(survey):
     feet = pyproj.CRS("EPSG:32613+6360").to_wkt("WKT1_GDAL")  # NAVD88 height, US survey feet
     place = (500_000.0, 4_300_000.0), 10.0
     with pytest.raises(SceneError, match=r"contradicts itself.*'m'.*NAVD88.*US survey foot"):
-        read_raster(survey(feet, *place, 1.0, unit="m"))
+        read_raster_terrain(survey(feet, *place, 1.0, unit="m"))
     # Either foot is written as 'ft'; the reference system tells which.
-    ground = read_raster(survey(feet, *place, 1.0, name="ft.tif", unit="ft"))
+    ground = read_raster_terrain(survey(feet, *place, 1.0, name="ft.tif", unit="ft"))
     assert slope(ground) == pytest.approx(SLOPE * 1200 / 3937, rel=1e-9)
 
 
@@ -165,7 +167,7 @@ def test_heights_above_two_surfaces_are_refused(survey, one, other, said):
     def map_frame(text, name):
         crs = pyproj.CRS("EPSG:32613").to_3d() if text == "3d" else pyproj.CRS(text)
         path = survey(crs.to_wkt(), (500_000.0, 4_300_000.0), 10.0, 1.0, name=f"{name}.tif")
-        return name, read_raster(path).map_frame
+        return name, read_raster_terrain(path).map_frame
 
     pair = [map_frame(one, "a"), map_frame(other, "b")]
     if not said:
@@ -178,25 +180,25 @@ def test_heights_above_two_surfaces_are_refused(survey, one, other, said):
 def test_a_remedy_near_a_pole_names_no_zone_of_utm(survey):
     path = survey("EPSG:3413", (0.0, 0.0), 100.0, 1.03)
     with pytest.raises(SceneError, match=r"-t_srs '\+proj=stere \+lon_0=\S+ \+lat_0=(90|89\.99)"):
-        read_raster(path)
+        read_raster_terrain(path)
 
 
 def test_depths_are_no_heights(survey):
     depth = pyproj.CRS("EPSG:32633+5715").to_wkt("WKT1_GDAL")  # mean sea level depth
     with pytest.raises(SceneError, match=r"holds depths.*'MSL depth'"):
-        read_raster(survey(depth, (500_000.0, 5e6), 10.0, 1.0))
+        read_raster_terrain(survey(depth, (500_000.0, 5e6), 10.0, 1.0))
 
 
 def test_a_unit_and_a_factor_of_heights_are_too_much(survey):
     path = survey("EPSG:32633", (500_000.0, 5e6), 10.0, 1.0, unit="ft")
     with pytest.raises(SceneError, match=r"heights in ft.*leave the scale out"):
-        read_raster(path, has_height_scale=True)
+        read_raster_terrain(path, has_height_scale=True)
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("metre", 1.0), ("foot", 0.3048)])
 def test_a_map_of_a_site_is_read_in_its_own_unit(survey, unit, metres):
     path = survey(TEXT_LOCAL.format(unit, metres), (50.0, 50.0), 2.0, 1.0)
-    ground = read_raster(path, height_unit="m")
+    ground = read_raster_terrain(path, height_unit="m")
     assert ground.spacing == pytest.approx((2 * metres, -2 * metres))
     assert raster_digest(path)
 
@@ -216,25 +218,25 @@ def write_asc(path, *, west, south, cell):
 def test_coordinates_that_could_be_degrees_are_asked_about(tmp_path, west, south, cell):
     path = write_asc(tmp_path / "dem.asc", west=west, south=south, cell=cell)
     with pytest.raises(SceneError, match=r"could be degrees.*state metres_per_degree.*.prj"):
-        read_raster(path)
-    ground = read_raster(path, metres_per_degree=degree_lengths(south))
+        read_raster_terrain(path)
+    ground = read_raster_terrain(path, metres_per_degree=degree_lengths(south))
     assert ground.spacing == pytest.approx(
         (cell * degree_lengths(south)[0], -cell * degree_lengths(south)[1])
     )
-    ground = read_raster(path, metres_per_unit=(1.0, 1.0))
+    ground = read_raster_terrain(path, metres_per_unit=(1.0, 1.0))
     assert ground.spacing == pytest.approx((cell, -cell))
 
 
 def test_metres_without_a_reference_system_are_metres(tmp_path):
     for west, south, cell in ((0.0, 0.0, 1.0), (500_000.0, 4e6, 0.05), (-50.0, -50.0, 10.0)):
         path = write_asc(tmp_path / "dem.asc", west=west, south=south, cell=cell)
-        assert read_raster(path).spacing == pytest.approx((cell, -cell))
+        assert read_raster_terrain(path).spacing == pytest.approx((cell, -cell))
 
 
 def test_rasters_of_two_maps_are_refused(survey):
     def map_frame(zone, name, **stated):
         path = survey(f"EPSG:{zone}", (500_000.0, 5e6), 10.0, 1.0, name=name)
-        return name, read_raster(path, **stated).map_frame
+        return name, read_raster_terrain(path, **stated).map_frame
 
     one, same, other = (
         map_frame(32632, "a.tif"),
@@ -274,7 +276,7 @@ def test_tiles_of_one_grid_have_no_seam_and_cover_all_once(spacing):
         for i, rows in enumerate((slice(0, 4), slice(4, 9)))
         for j, columns in enumerate((slice(0, 5), slice(5, 12)))
     }
-    joined, told = join_tiles(parts)
+    joined, told = extend_tiles_to_neighbours(parts)
     assert not told
     whole = tile(slice(0, 9), slice(0, 12), spacing=spacing)
     random = np.random.default_rng(5)
@@ -289,15 +291,15 @@ def test_tiles_of_one_grid_have_no_seam_and_cover_all_once(spacing):
 
 def test_tiles_that_overlap_or_lie_apart_stay_as_they_are():
     parts = {"a": tile(slice(0, 9), slice(0, 6)), "b": tile(slice(0, 9), slice(5, 12))}
-    joined, told = join_tiles(parts)
+    joined, told = extend_tiles_to_neighbours(parts)
     assert joined["a"] is parts["a"] and joined["b"] is parts["b"] and not told
     parts = {"a": tile(slice(0, 9), slice(0, 4)), "b": tile(slice(0, 9), slice(8, 12))}
-    joined, told = join_tiles(parts)
+    joined, told = extend_tiles_to_neighbours(parts)
     assert joined["a"] is parts["a"] and not told
 
 
 def test_a_gap_between_grids_that_differ_is_told():
     shifted = tile(slice(0, 9), slice(6, 12), shift=(0.7, 0.0))
-    joined, told = join_tiles({"a": tile(slice(0, 9), slice(0, 6)), "b": shifted})
+    joined, told = extend_tiles_to_neighbours({"a": tile(slice(0, 9), slice(0, 6)), "b": shifted})
     assert len(told) == 1 and "between it and a lies a gap of 2.7 m" in told[0]
     assert joined["b"] is shifted

@@ -80,7 +80,7 @@ def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(t
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 3 2 1\nf 2 2 3\nf 2 4 3\n")
     mesh, report = read_mesh(path).to_mesh()
     assert len(mesh.faces) == 2
-    assert (report.duplicate, report.degenerate) == (1, 1)
+    assert (report.n_duplicate_faces, report.n_degenerate_faces) == (1, 1)
 
 
 @pytest.mark.parametrize("unit", ["seconds", "furlonks"])
@@ -191,7 +191,7 @@ def test_faces_without_data_are_dropped_and_the_rest_kept_in_order():
     faces = np.vstack([CUBE[:5], [[0, 1, 8]], CUBE[5:], [[9, 1, 2]]])
     surface = np.arange(14)
     mesh, report = clean_mesh(vertices, faces, surface)
-    assert (report.non_finite, report.unreferenced) == (2, 2)
+    assert (report.n_non_finite_faces, report.n_unreferenced_vertices) == (2, 2)
     assert mesh.surface_index.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
     assert world(mesh) == exact(CORNERS, CUBE)
 
@@ -200,7 +200,7 @@ def test_faces_without_area_are_dropped_but_the_thinnest_with_area_is_kept():
     vertices = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1e-12, 0], [0, 0, 5], [1, 1, 5]]
     faces = [[0, 1, 2], [0, 2, 3], [4, 4, 5], [0, 1, 4]]
     mesh, report = clean_mesh(vertices, faces, [0, 1, 2, 3])
-    assert report.degenerate == 2
+    assert report.n_degenerate_faces == 2
     assert mesh.surface_index.tolist() == [1, 3]
 
 
@@ -209,8 +209,8 @@ def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_cop
     faces = np.vstack([CUBE, CUBE[:4, ::-1], CUBE[3:4] + 8, [[16, 12, 13]]])
     surface = np.r_[np.zeros(12, int), np.ones(6, int)]
     mesh, report = clean_mesh(vertices, faces, surface)
-    assert report.duplicate == 6
-    assert (report.merged, report.unreferenced) == (4, 5)
+    assert report.n_duplicate_faces == 6
+    assert (report.n_merged_vertices, report.n_unreferenced_vertices) == (4, 5)
     assert (mesh.surface_index == 0).all()
     assert world(mesh) == exact(CORNERS, CUBE)
 
@@ -218,7 +218,7 @@ def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_cop
 def test_a_soup_of_separate_triangles_becomes_watertight():
     vertices = CORNERS[CUBE].reshape(-1, 3)
     mesh, report = clean_mesh(vertices, np.arange(36).reshape(12, 3), 0)
-    assert report.merged == 28
+    assert report.n_merged_vertices == 28
     assert len(mesh.vertices) == 8 and world(mesh) == exact(CORNERS, CUBE)
 
 

@@ -6,8 +6,8 @@ import rasterio
 from PIL import Image
 from rasterio import Affine
 
-from sweep.scenes.height_checks import HEIGHT_MAX
-from sweep.scenes.rasters import read_array, read_image, read_raster
+from sweep.scenes.height_checks import PLAUSIBLE_HEIGHT_MAX
+from sweep.scenes.rasters import read_image_terrain, read_numpy_terrain, read_raster_terrain
 from sweep.scenes.scene_files import SceneError
 
 HILLS = 300 + 80 * np.sin(np.arange(30)[:, None] / 5) * np.cos(np.arange(40) / 7)
@@ -34,7 +34,7 @@ def dem(tmp_path):
 
 
 def test_ground_raises_no_doubts(dem):
-    ground = read_raster(dem())
+    ground = read_raster_terrain(dem())
     assert ground.warnings == () and np.isfinite(ground.heights).all()
 
 
@@ -45,46 +45,46 @@ def test_ground_raises_no_doubts(dem):
 )  # fmt: skip
 def test_an_undeclared_value_is_told_and_can_be_declared_in_the_spec(dem, value, kind):
     path = dem(value, kind=kind)
-    ground = read_raster(path)
+    ground = read_raster_terrain(path)
     shared, *cliffs = ground.warnings
     assert f"the value {value:g} stands in 20 cells" in shared and "state 'no_data:" in shared
     assert len(cliffs) == (value != 0) and all("neighbouring cells" in told for told in cliffs)
-    ground = read_raster(path, no_data=value)
+    ground = read_raster_terrain(path, no_data=value)
     assert ground.warnings == () and np.isnan(ground.heights).sum() == 20
 
 
 def test_a_value_that_the_file_declares_needs_no_word(dem):
-    ground = read_raster(dem(-9999, nodata=-9999))
+    ground = read_raster_terrain(dem(-9999, nodata=-9999))
     assert ground.warnings == () and np.isnan(ground.heights).sum() == 20
 
 
 def test_two_values_are_both_told(dem):
     heights = HILLS.copy()
     heights[10:12, :6] = -32768
-    told = read_raster(dem(-9999, heights=heights)).warnings
+    told = read_raster_terrain(dem(-9999, heights=heights)).warnings
     assert len(told) == 3 and "value -32768 stands in 12" in told[0] and "value -9999" in told[1]
 
 
-@pytest.mark.parametrize("value", [-3.4028234663852886e38, 3.4e38, -1e20, 2 * HEIGHT_MAX])
+@pytest.mark.parametrize("value", [-3.4028234663852886e38, 3.4e38, -1e20, 2 * PLAUSIBLE_HEIGHT_MAX])
 def test_heights_that_no_planet_has_are_refused_until_they_are_declared(dem, value):
     path = dem(value)
     with pytest.raises(SceneError, match="at 20 cells, farther than 1e") as refused:
-        read_raster(path)
+        read_raster_terrain(path)
     stated = float(refused.value.remedy.split("no_data: ")[1].rstrip("'"))
-    assert np.isnan(read_raster(path, no_data=stated).heights).sum() == 20
-    assert np.isnan(read_raster(path, no_data=value).heights).sum() == 20
+    assert np.isnan(read_raster_terrain(path, no_data=stated).heights).sum() == 20
+    assert np.isnan(read_raster_terrain(path, no_data=value).heights).sum() == 20
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_no_numbers_are_holes(dem, value):
-    ground = read_raster(dem(value))
+    ground = read_raster_terrain(dem(value))
     assert np.isnan(ground.heights).sum() == 20 and ground.warnings == ()
 
 
 def test_missing_heights_that_were_blended_as_the_grid_was_resampled_show_as_cliffs(dem):
     heights = HILLS.copy()
     heights[:, 10:15] = np.linspace(-9000, 200, 5)
-    (told,) = read_raster(dem(heights=heights)).warnings
+    (told,) = read_raster_terrain(dem(heights=heights)).warnings
     assert "neighbouring cells differ by up to" in told and "state it as no_data" in told
 
 
@@ -92,18 +92,20 @@ def test_buildings_and_steep_ground_are_no_cliffs(dem):
     heights = HILLS.copy()
     heights[5:8, 5:8] += 90  # a tower
     heights[:, 20:] += 550  # a wall as steep as any
-    assert read_raster(dem(heights=heights)).warnings == ()
+    assert read_raster_terrain(dem(heights=heights)).warnings == ()
 
 
 def test_arrays_and_images_are_looked_at_too(tmp_path):
     heights = HILLS.copy()
     heights[:2] = -9999
     np.save(tmp_path / "z.npy", heights)
-    ground = read_array(tmp_path / "z.npy", spacing=(30.0, 30.0))
+    ground = read_numpy_terrain(tmp_path / "z.npy", spacing=(30.0, 30.0))
     assert "the value -9999 stands in 80 cells" in ground.warnings[0]
-    assert read_array(tmp_path / "z.npy", spacing=(30.0, 30.0), no_data=-9999).warnings == ()
+    assert (
+        read_numpy_terrain(tmp_path / "z.npy", spacing=(30.0, 30.0), no_data=-9999).warnings == ()
+    )
     levels = (HILLS / 2).astype(np.uint8)
     levels[:2] = 0
     Image.fromarray(levels).save(tmp_path / "z.png")
-    ground = read_image(tmp_path / "z.png", pixel=30.0, white=500.0)
+    ground = read_image_terrain(tmp_path / "z.png", pixel=30.0, white=500.0)
     assert "the value 0 stands in 80 cells" in ground.warnings[0]

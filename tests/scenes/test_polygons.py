@@ -11,8 +11,8 @@ import trimesh
 from facet_areas import triangle_areas
 from matplotlib.path import Path as Outline
 
-from sweep.scenes.meshes import FACES_MAX, read_mesh
-from sweep.scenes.polygons import PolygonError, Polygons, triangulate
+from sweep.scenes.meshes import MESH_FACES_MAX, read_mesh
+from sweep.scenes.polygons import PolygonError, Polygons, triangulate_polygons
 from sweep.scenes.scene_files import SceneError
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], float)
@@ -24,7 +24,7 @@ def flat(outline, height=0.0):
 
 
 def cut(points, *counts):
-    return triangulate(
+    return triangulate_polygons(
         Polygons(
             np.asarray(points, float), np.arange(len(points)), np.array(counts or [len(points)])
         )
@@ -201,11 +201,13 @@ def test_polygons_without_area_or_data_are_dropped_and_counted(tmp_path):
     faces = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 0, 1, 1], [4, 5]]
     write_obj(tmp_path / "a.obj", points, faces)
     mesh, report = read_mesh(tmp_path / "a.obj").to_mesh()
-    assert len(mesh.faces) == 2 and report.degenerate == 5
+    assert len(mesh.faces) == 2 and report.n_degenerate_faces == 5
     points[0][0] = np.nan
     write_obj(tmp_path / "b.obj", points, faces[:2])
     mesh, report = read_mesh(tmp_path / "b.obj").to_mesh()
-    assert len(mesh.faces) == 2 and report.non_finite == 2 and report.degenerate == 0
+    assert (
+        len(mesh.faces) == 2 and report.n_non_finite_faces == 2 and report.n_degenerate_faces == 0
+    )
 
 
 def test_bent_polygons_are_told_and_those_bent_too_far_refused(tmp_path):
@@ -271,8 +273,8 @@ def test_declared_sizes_are_looked_at_before_anything_is_read(tmp_path, monkeypa
     (tmp_path / "a.off").write_text("OFF\n1000000000000 1 0\n0 0 0\n")
     with pytest.raises(SceneError, match="ends after 1 of 1,000,000,000,000 vertices"):
         read_mesh(tmp_path / "a.off")
-    monkeypatch.setattr("sweep.scenes.meshes.FACES_MAX", 10)
-    assert FACES_MAX == 100_000_000
+    monkeypatch.setattr("sweep.scenes.meshes.MESH_FACES_MAX", 10)
+    assert MESH_FACES_MAX == 100_000_000
     nodes = [{"children": list(range(1, 21))}, *[{"mesh": 0}] * 20]
     with pytest.raises(SceneError, match="make 20 triangles"):
         read_mesh(gltf(tmp_path / "many.gltf", nodes=nodes))

@@ -15,10 +15,10 @@ from rasterio import Affine
 from sweep.scenes.rasters import (
     degree_lengths,
     raster_digest,
-    read_array,
-    read_image,
-    read_jacksboro,
-    read_raster,
+    read_image_terrain,
+    read_jacksboro_terrain,
+    read_numpy_terrain,
+    read_raster_terrain,
 )
 from sweep.scenes.scene_files import SceneError
 
@@ -53,7 +53,7 @@ def tiff(tmp_path):
 
 
 def test_nodes_lie_at_the_centres_of_pixels_with_the_first_row_in_the_north(tiff):
-    ground = read_raster(tiff())
+    ground = read_raster_terrain(tiff())
     np.testing.assert_array_equal(ground.heights, HEIGHTS)
     assert ground.spacing == (2.0, -3.0)
     np.testing.assert_array_equal(ground.origin, [500_001.0, 3_999_998.5, 0.0])
@@ -62,7 +62,7 @@ def test_nodes_lie_at_the_centres_of_pixels_with_the_first_row_in_the_north(tiff
 
 
 def test_a_raster_that_runs_northwards_is_read_as_it_lies(tiff):
-    ground = read_raster(tiff(crs=None, transform=Affine(2, 0, 0, 0, 3, 0)))
+    ground = read_raster_terrain(tiff(crs=None, transform=Affine(2, 0, 0, 0, 3, 0)))
     assert ground.spacing == (2.0, 3.0)
     assert ground.height_at(np.array(1.0), np.array(1.5)) == HEIGHTS[0, 0]
 
@@ -70,7 +70,7 @@ def test_a_raster_that_runs_northwards_is_read_as_it_lies(tiff):
 def test_pixels_without_data_are_holes(tiff):
     heights = HEIGHTS.copy()
     heights[1, 2], heights[2, 3] = -9999, np.nan
-    ground = read_raster(tiff(heights, nodata=-9999))
+    ground = read_raster_terrain(tiff(heights, nodata=-9999))
     assert np.isnan(ground.heights[[1, 2], [2, 3]]).all()
     assert np.isnan(ground.heights).sum() == 2
 
@@ -78,18 +78,18 @@ def test_pixels_without_data_are_holes(tiff):
 def test_whole_numbers_may_have_holes_too(tiff):
     heights = HEIGHTS.astype(np.int16)
     heights[0, 0] = -32768
-    ground = read_raster(tiff(heights, nodata=-32768))
+    ground = read_raster_terrain(tiff(heights, nodata=-32768))
     assert np.isnan(ground.heights[0, 0]) and ground.heights[3, 4] == 19.0
 
 
 def test_a_stated_scale_and_offset_of_the_heights_are_applied(tiff):
-    ground = read_raster(tiff(scale=(0.5, 1000.0)))
+    ground = read_raster_terrain(tiff(scale=(0.5, 1000.0)))
     np.testing.assert_allclose(ground.heights, HEIGHTS * 0.5 + 1000)
 
 
 def test_feet_become_metres_both_ways(tiff):
     texan = Affine(2.0, 0.0, 2_500_000.0, 0.0, -3.0, 7_000_000.0)
-    ground = read_raster(tiff(crs=TEXAN_FEET, units="ft", transform=texan))
+    ground = read_raster_terrain(tiff(crs=TEXAN_FEET, units="ft", transform=texan))
     survey_foot = 1200 / 3937
     np.testing.assert_allclose(ground.spacing, (2 * survey_foot, -3 * survey_foot), rtol=1e-9)
     np.testing.assert_allclose(ground.origin[0], 2_500_001 * survey_foot, rtol=1e-9)
@@ -97,8 +97,8 @@ def test_feet_become_metres_both_ways(tiff):
 
 
 def test_a_window_cuts_out_its_part_where_it_lies(tiff):
-    whole = read_raster(tiff())
-    part = read_raster(tiff(), window=(500_002.0, 3_999_991.0, 500_008.0, 3_999_997.0))
+    whole = read_raster_terrain(tiff())
+    part = read_raster_terrain(tiff(), window=(500_002.0, 3_999_991.0, 500_008.0, 3_999_997.0))
     np.testing.assert_array_equal(part.heights, HEIGHTS[1:3, 1:4])
     x, y = np.meshgrid([500_003.0, 500_006.5], [3_999_993.0, 3_999_995.0])
     np.testing.assert_allclose(part.height_at(x, y), whole.height_at(x, y))
@@ -106,16 +106,16 @@ def test_a_window_cuts_out_its_part_where_it_lies(tiff):
 
 def test_another_band_can_be_read(tiff):
     bands = np.stack([HEIGHTS, 2 * HEIGHTS])
-    np.testing.assert_array_equal(read_raster(tiff(bands), band=2).heights, 2 * HEIGHTS)
+    np.testing.assert_array_equal(read_raster_terrain(tiff(bands), band=2).heights, 2 * HEIGHTS)
 
 
 def test_degrees_become_metres_of_a_stated_size(tiff):
     arc = Affine(1 / 1200, 0.0, -84.0, 0.0, -1 / 1200, 36.5)
     path = tiff(crs=DEGREES, transform=arc)
-    ground = read_raster(path, metres_per_degree=(90_000.0, 111_000.0))
+    ground = read_raster_terrain(path, metres_per_degree=(90_000.0, 111_000.0))
     np.testing.assert_allclose(ground.spacing, (75.0, -92.5))
     with pytest.raises(SceneError, match="degrees") as refused:
-        read_raster(path)
+        read_raster_terrain(path)
     # The remedy gives the size on the raster's own ellipsoid, to be copied.
     said = str(refused.value).split("[")[1].split("]")[0].split(",")
     assert [float(size) for size in said] == pytest.approx(degree_lengths(36.498333), abs=0.06)
@@ -124,7 +124,7 @@ def test_degrees_become_metres_of_a_stated_size(tiff):
 def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
     moon = rasterio.crs.CRS.from_proj4("+proj=longlat +R=1737400 +no_defs")
     with pytest.raises(SceneError, match="30323") as refused:
-        read_raster(tiff(crs=moon, transform=Affine(1e-3, 0, 0, 0, -1e-3, 0.01)))
+        read_raster_terrain(tiff(crs=moon, transform=Affine(1e-3, 0, 0, 0, -1e-3, 0.01)))
     assert math.radians(1737400) == pytest.approx(30323.3, abs=0.1)
     assert "metres_per_degree" in refused.value.remedy
 
@@ -132,13 +132,13 @@ def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
 def test_a_raster_without_scale_needs_the_size_of_a_pixel(tiff):
     path = tiff(crs=None, transform=None)
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
-        ground = read_raster(path, pixel=4.0)
+        ground = read_raster_terrain(path, pixel=4.0)
     assert ground.spacing == (4.0, -4.0) and ground.bounds == (2.0, 2.0, 18.0, 14.0)
     with (
         pytest.warns(rasterio.errors.NotGeoreferencedWarning),
         pytest.raises(SceneError, match="states no scale; state the size of a pixel"),
     ):
-        read_raster(path)
+        read_raster_terrain(path)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_a_raster_that_can_not_be_used_is_refused_with_file_rule_and_remedy(
 ):
     path = tiff(**profile)
     with pytest.raises(SceneError, match=said) as refused:
-        read_raster(path, **options)
+        read_raster_terrain(path, **options)
     assert str(refused.value).startswith(str(path)) and refused.value.remedy
 
 
@@ -169,18 +169,18 @@ def test_files_that_are_no_raster_or_not_there_are_refused(tmp_path, tiff):
     nonsense = tmp_path / "nonsense.tif"
     nonsense.write_text("no raster")
     with pytest.raises(SceneError, match="no raster"):
-        read_raster(nonsense)
+        read_raster_terrain(nonsense)
     with pytest.raises(SceneError, match=r"does not exist.*there is: nonsense.tif"):
-        read_raster(tmp_path / "dem2.tif")
+        read_raster_terrain(tmp_path / "dem2.tif")
     with pytest.raises(SceneError, match="is a folder"):
-        read_raster(tmp_path)
+        read_raster_terrain(tmp_path)
 
 
 def test_a_raster_too_large_to_read_asks_for_a_window(tiff, monkeypatch):
     monkeypatch.setattr("sweep.scenes.rasters.GRID_CELLS_MAX", 15)
     with pytest.raises(SceneError, match="give a window"):
-        read_raster(tiff())
-    assert read_raster(tiff(), window=(5e5, 3_999_988.0, 500_006.0, 4e6)).heights.size == 12
+        read_raster_terrain(tiff())
+    assert read_raster_terrain(tiff(), window=(5e5, 3_999_988.0, 500_006.0, 4e6)).heights.size == 12
 
 
 def test_a_degree_of_longitude_and_of_latitude_are_those_of_the_ellipsoid():
@@ -268,7 +268,7 @@ def test_a_raster_fetches_nothing_over_the_network(tiff, tmp_path, source):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         url = f"http://127.0.0.1:{server.server_address[1]}/dem.tif"
         over = vrt(tmp_path / "over.vrt", source.replace("URL", url))
-        for read in (read_raster, raster_digest):
+        for read in (read_raster_terrain, raster_digest):
             with pytest.raises(SceneError, match=r"over\.vrt: is no raster.*over the network"):
                 read(over)
         server.shutdown()
@@ -277,16 +277,16 @@ def test_a_raster_fetches_nothing_over_the_network(tiff, tmp_path, source):
 
 def test_a_raster_over_one_that_is_lost_is_refused_every_time(tmp_path, tiff):
     over = vrt(tmp_path / "over.vrt", vrt(tmp_path / "within.vrt", tiff()))
-    assert read_raster(over).heights.max() == 19
+    assert read_raster_terrain(over).heights.max() == 19
     tiff().unlink()
-    for read in (read_raster, raster_digest, read_raster):
+    for read in (read_raster_terrain, raster_digest, read_raster_terrain):
         with pytest.raises(SceneError, match=r"dem\.tif: does not exist"):
             read(over)
 
 
 def test_what_is_no_plain_file_is_refused_unread(tmp_path):
     os.mkfifo(tmp_path / "dem.tif")
-    for read in (read_raster, raster_digest):
+    for read in (read_raster_terrain, raster_digest):
         with pytest.raises(SceneError, match="pipe or a device; name a plain file"):
             read(tmp_path / "dem.tif")
         with pytest.raises(SceneError, match="no file of this machine; fetch it"):
@@ -306,7 +306,7 @@ def test_an_array_is_read_with_its_holes_steps_and_origin(tmp_path):
     heights = GRID.copy()
     heights[1, 1], heights[2, 2] = np.nan, -1e4
     np.save(tmp_path / "z.npy", heights)
-    ground = read_array(tmp_path / "z.npy", no_data=-1e4, **STEPS)
+    ground = read_numpy_terrain(tmp_path / "z.npy", no_data=-1e4, **STEPS)
     expected = np.where(np.isin(GRID, [5.0, 10.0]), np.nan, GRID)
     np.testing.assert_array_equal(ground.heights, expected)
     assert ground.spacing == (2.0, -2.0)
@@ -315,13 +315,13 @@ def test_an_array_is_read_with_its_holes_steps_and_origin(tmp_path):
 def test_the_grid_of_an_archive_is_found_or_named(tmp_path):
     path = tmp_path / "z.npz"
     np.savez(path, elevation=GRID, dx=np.array(3.0))
-    np.testing.assert_array_equal(read_array(path, **STEPS).heights, GRID)
+    np.testing.assert_array_equal(read_numpy_terrain(path, **STEPS).heights, GRID)
     np.savez(path, elevation=GRID, slope=2 * GRID)
-    np.testing.assert_array_equal(read_array(path, name="slope", **STEPS).heights, 2 * GRID)
+    np.testing.assert_array_equal(read_numpy_terrain(path, name="slope", **STEPS).heights, 2 * GRID)
     with pytest.raises(SceneError, match="2 grids; name one of: elevation, slope"):
-        read_array(path, **STEPS)
+        read_numpy_terrain(path, **STEPS)
     with pytest.raises(SceneError, match="holds no 'z'"):
-        read_array(path, name="z", **STEPS)
+        read_numpy_terrain(path, name="z", **STEPS)
 
 
 @pytest.mark.parametrize(
@@ -336,23 +336,23 @@ def test_the_grid_of_an_archive_is_found_or_named(tmp_path):
 def test_arrays_that_are_no_ground_are_refused(tmp_path, array, said):
     np.save(tmp_path / "z.npy", array)
     with pytest.raises(SceneError, match=said):
-        read_array(tmp_path / "z.npy", **STEPS)
+        read_numpy_terrain(tmp_path / "z.npy", **STEPS)
 
 
 def test_a_step_of_nothing_and_a_file_of_objects_are_refused(tmp_path):
     np.save(tmp_path / "z.npy", GRID)
     with pytest.raises(SceneError, match="steps"):
-        read_array(tmp_path / "z.npy", spacing=(0.0, 1.0))
+        read_numpy_terrain(tmp_path / "z.npy", spacing=(0.0, 1.0))
     np.save(tmp_path / "objects.npy", np.array([{}, {}], object), allow_pickle=True)
     with pytest.raises(SceneError, match="holds object of shape"):
-        read_array(tmp_path / "objects.npy", **STEPS)
+        read_numpy_terrain(tmp_path / "objects.npy", **STEPS)
 
 
 @pytest.mark.parametrize(("kind", "top"), [(np.uint8, 255), (np.uint16, 65535)])
 def test_grey_levels_become_heights_between_black_and_white(tmp_path, kind, top):
     levels = np.array([[0, top, 0], [top // 5, 0, top]], kind)
     path = saved(tmp_path / "z.png", levels)
-    ground = read_image(path, pixel=2.0, black=-10.0, white=40.0)
+    ground = read_image_terrain(path, pixel=2.0, black=-10.0, white=40.0)
     np.testing.assert_allclose(ground.heights, [[-10, 40, -10], [0, -10, 40]])
     # The picture's top is north.
     assert ground.height_at(np.array(0.0), np.array(-2.0)) == pytest.approx(0.0)
@@ -362,29 +362,29 @@ def test_grey_levels_become_heights_between_black_and_white(tmp_path, kind, top)
 def test_a_grey_picture_in_three_equal_bands_is_grey(tmp_path):
     levels = np.array([[0, 51], [102, 255]], np.uint8)
     path = saved(tmp_path / "z.png", np.stack([levels] * 3, axis=-1))
-    ground = read_image(path, pixel=1.0, white=5.0)
+    ground = read_image_terrain(path, pixel=1.0, white=5.0)
     np.testing.assert_allclose(ground.heights, [[0, 1], [2, 5]])
 
 
 def test_pictures_that_are_no_heights_are_refused(tmp_path):
     colours = saved(tmp_path / "c.png", np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
     with pytest.raises(SceneError, match="RGB; save it in grey"):
-        read_image(colours, pixel=1.0, white=5.0)
+        read_image_terrain(colours, pixel=1.0, white=5.0)
     palette = tmp_path / "p.png"
     Image.fromarray(np.zeros((3, 3), np.uint8)).convert("P").save(palette)
     with pytest.raises(SceneError, match="mode P"):
-        read_image(palette, pixel=1.0, white=5.0)
+        read_image_terrain(palette, pixel=1.0, white=5.0)
     nonsense = tmp_path / "n.png"
     nonsense.write_text("no picture")
     with pytest.raises(SceneError, match="no image"):
-        read_image(nonsense, pixel=1.0, white=5.0)
+        read_image_terrain(nonsense, pixel=1.0, white=5.0)
     with pytest.raises(SceneError, match="does not exist"):
-        read_image(tmp_path / "x.png", pixel=1.0, white=5.0)
+        read_image_terrain(tmp_path / "x.png", pixel=1.0, white=5.0)
 
 
 def test_the_default_terrain_has_the_size_and_heights_of_the_survey():
     """344 x 403 posts of 3 arc seconds, 236 to 1076 m; a minute of latitude is a nautical mile."""
-    ground = read_jacksboro()
+    ground = read_jacksboro_terrain()
     assert ground.heights.shape == (344, 403)
     assert (ground.heights.min(), ground.heights.max()) == (236, 1076)
     assert -ground.spacing[1] == pytest.approx(1852 / 20, rel=2e-3)
@@ -442,11 +442,11 @@ STACIT = (
 def test_files_that_stand_for_hosts_are_no_rasters(tmp_path, host, content, suffix):
     path = tmp_path / f"dem{suffix}"
     path.write_text(content.format(host))
-    for read in (read_raster, raster_digest):
+    for read in (read_raster_terrain, raster_digest):
         with pytest.raises(SceneError, match="is no raster that can be read"):
             read(path)
     over = vrt(tmp_path / "over.vrt", path)
-    for read in (read_raster, raster_digest):
+    for read in (read_raster_terrain, raster_digest):
         with pytest.raises(SceneError, match="is no raster that can be read"):
             read(over)
 
@@ -469,31 +469,31 @@ def test_files_that_stand_for_hosts_are_no_rasters(tmp_path, host, content, suff
 def test_a_virtual_raster_is_read_as_xml_and_its_sources_are_files_here(tmp_path, host, spell):
     over = vrt(tmp_path / "over.vrt", f"/vsicurl/{host}/dem.tif")
     over.write_text(spell(over.read_text()))
-    for read in (read_raster, raster_digest):
+    for read in (read_raster_terrain, raster_digest):
         with pytest.raises(SceneError, match=r"over\.vrt: is no raster that can be read"):
             read(over)
 
 
 def test_proxies_that_the_user_exempts_are_as_they_were_afterwards(tiff, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "example.org")
-    read_raster(tiff())
+    read_raster_terrain(tiff())
     assert os.environ["NO_PROXY"] == "example.org"
 
 
 def test_a_virtual_raster_over_itself_or_a_pipe_is_refused(tmp_path):
     over = vrt(tmp_path / "over.vrt", tmp_path / "over.vrt")
     with pytest.raises(SceneError, match="virtual raster over itself"):
-        read_raster(over)
+        read_raster_terrain(over)
     os.mkfifo(tmp_path / "pipe.tif")
     with pytest.raises(SceneError, match="pipe or a device"):
-        read_raster(vrt(tmp_path / "b.vrt", tmp_path / "pipe.tif"))
+        read_raster_terrain(vrt(tmp_path / "b.vrt", tmp_path / "pipe.tif"))
 
 
 @pytest.mark.parametrize("sidecar", ["dem.tfw", "dem.prj", "dem.tif.aux.xml", "dem.tif.ovr"])
 def test_a_pipe_beside_a_raster_is_not_opened(tiff, tmp_path, sidecar):
     path = tiff(crs=None, transform=None)
     os.mkfifo(tmp_path / sidecar)
-    for read in (read_raster, raster_digest):
+    for read in (read_raster_terrain, raster_digest):
         with pytest.raises(SceneError, match="which is a pipe or a device"):
             read(path)
 
@@ -509,7 +509,7 @@ def test_a_sparse_raster_is_refused_by_its_size(tmp_path):
     with pytest.raises(SceneError, match=r"declares 400,000 x 400,000 heights.*gdal_translate"):
         raster_digest(path)
     with pytest.raises(SceneError, match=r"400,000 x 400,000 heights, more than.*give a window"):
-        read_raster(path)
+        read_raster_terrain(path)
 
 
 def test_grids_larger_than_the_memory_are_refused_before_they_are_read(tiff, tmp_path, monkeypatch):
@@ -517,9 +517,9 @@ def test_grids_larger_than_the_memory_are_refused_before_they_are_read(tiff, tmp
     np.save(tmp_path / "z.npy", GRID)
     image = saved(tmp_path / "z.png", np.zeros((5, 5), np.uint8))
     for read in (
-        lambda: read_raster(tiff()),
-        lambda: read_array(tmp_path / "z.npy", **STEPS),
-        lambda: read_image(image, pixel=1.0, white=1.0),
+        lambda: read_raster_terrain(tiff()),
+        lambda: read_numpy_terrain(tmp_path / "z.npy", **STEPS),
+        lambda: read_image_terrain(image, pixel=1.0, white=1.0),
     ):
         with pytest.raises(SceneError, match=r"GB of memory, of which.*or coarsen it"):
             read()
@@ -539,11 +539,11 @@ def test_arrays_are_refused_by_their_headers(tmp_path):
     for shape, said in (((10**6, 10**6), "more than 5e"), ((3000, 3000), "bytes are too few")):
         npy.write_bytes(header(shape) + bytes(100))
         with pytest.raises(SceneError, match=said):
-            read_array(npy, **STEPS)
+            read_numpy_terrain(npy, **STEPS)
         with zipfile.ZipFile(npz, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("z.npy", header(shape) + bytes(100))
         with pytest.raises(SceneError, match=said):
-            read_array(npz, **STEPS)
+            read_numpy_terrain(npz, **STEPS)
 
 
 def test_only_the_heights_of_an_archive_are_unpacked(tmp_path):
@@ -552,17 +552,17 @@ def test_only_the_heights_of_an_archive_are_unpacked(tmp_path):
             np.lib.format.write_array(file, GRID)
         archive.writestr("bomb.npy", header((10**12,), "<u1") + bytes(10**6))
         archive.writestr("notes.txt", "of any kind")
-    np.testing.assert_array_equal(read_array(tmp_path / "z.npz", **STEPS).heights, GRID)
+    np.testing.assert_array_equal(read_numpy_terrain(tmp_path / "z.npz", **STEPS).heights, GRID)
 
 
 def test_pictures_are_refused_by_their_headers_and_formats(tmp_path, monkeypatch):
     image = saved(tmp_path / "z.png", np.zeros((50, 50), np.uint8))
     monkeypatch.setattr("sweep.scenes.rasters.GRID_CELLS_MAX", 100)
     with pytest.raises(SceneError, match="50 x 50 heights, more than"):
-        read_image(image, pixel=1.0, white=1.0)
+        read_image_terrain(image, pixel=1.0, white=1.0)
     (tmp_path / "z.eps").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
     with pytest.raises(SceneError, match="is no image"):
-        read_image(tmp_path / "z.eps", pixel=1.0, white=1.0)
+        read_image_terrain(tmp_path / "z.eps", pixel=1.0, white=1.0)
 
 
 def test_archives_that_can_not_be_unpacked_are_refused(tmp_path):
@@ -572,10 +572,10 @@ def test_archives_that_can_not_be_unpacked_are_refused(tmp_path):
         content[offset] |= 1  # encrypted
     (tmp_path / "z.npz").write_bytes(content)
     with pytest.raises(SceneError, match="no NumPy file"):
-        read_array(tmp_path / "z.npz", **STEPS)
+        read_numpy_terrain(tmp_path / "z.npz", **STEPS)
     (tmp_path / "z.npy").write_bytes(header((3, 3))[:40])
     with pytest.raises(SceneError, match="no NumPy file"):
-        read_array(tmp_path / "z.npy", **STEPS)
+        read_numpy_terrain(tmp_path / "z.npy", **STEPS)
 
 
 def test_a_raster_of_one_huge_block_is_refused_before_that_is_unpacked(tiff, monkeypatch):

@@ -36,7 +36,9 @@ def test_numbers_of_rocks_are_the_integral_of_their_area_law():
             epsabs=0,
             epsrel=1e-10,
         )
-        assert law.cumulative_density(diameter) == pytest.approx(number, rel=1e-8, abs=2 * error)
+        assert law.cumulative_number_density(diameter) == pytest.approx(
+            number, rel=1e-8, abs=2 * error
+        )
 
 
 @pytest.mark.parametrize("cover", [0.02, 0.1, 0.4])
@@ -44,7 +46,7 @@ def test_diameters_invert_the_cumulative_numbers(cover):
     law = scattered_objects.MartianRockLaw(area_fraction=cover)
     diameter = np.geomspace(1e-3, 30 / law.decay_rate, 200)
     np.testing.assert_allclose(
-        law.diameter_at_density(law.cumulative_density(diameter)), diameter, rtol=1e-9
+        law.diameter_at_number_density(law.cumulative_number_density(diameter)), diameter, rtol=1e-9
     )
 
 
@@ -61,7 +63,9 @@ def test_counts_and_cover_of_a_field_follow_the_law(smallest):
     x, y = (vertices[:, -16:, axis] for axis in (0, 1))
     area = 0.5 * (x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1)
     diameter = 2 * np.sqrt(area / math.pi)
-    expected = side**2 * (law.cumulative_density(smallest) - law.cumulative_density(5.0))
+    expected = side**2 * (
+        law.cumulative_number_density(smallest) - law.cumulative_number_density(5.0)
+    )
     assert abs((diameter >= smallest).sum() - expected) < 5 * math.sqrt(expected)
     cover = side**2 * (area_fraction(law, smallest) - area_fraction(law, 5.0))
     squares, _ = integrate.quad(
@@ -152,7 +156,7 @@ def one(x, y, diameter, freshness=1.0):
 @pytest.mark.parametrize("smallest", [5.0, 20.0, 60.0])
 def test_counts_of_craters_follow_trasks_equilibrium(smallest):
     """10^10.9 D^-2 per 10^6 km^2, D in metres, within 5 sigma of a Poisson number."""
-    x, y, diameter = scattered_objects.draw_scatter(
+    x, y, diameter = scattered_objects.draw_positions_and_diameters(
         np.random.default_rng(1),
         scattered_objects.lunar_crater_law(),
         bounds=(0.0, 0.0, 1000.0, 1000.0),
@@ -167,24 +171,30 @@ def test_counts_of_craters_follow_trasks_equilibrium(smallest):
 
 def test_beyond_equilibrium_counts_fall_as_craters_are_produced():
     law = scattered_objects.lunar_crater_law(equilibrium_diameter=50.0)
-    assert law.cumulative_density(20.0) == pytest.approx(10**-1.1 / 400)
-    assert law.cumulative_density(50.0) == pytest.approx(
-        scattered_objects.lunar_crater_law().cumulative_density(50.0)
+    assert law.cumulative_number_density(20.0) == pytest.approx(10**-1.1 / 400)
+    assert law.cumulative_number_density(50.0) == pytest.approx(
+        scattered_objects.lunar_crater_law().cumulative_number_density(50.0)
     )
-    slope = math.log(law.cumulative_density(400.0) / law.cumulative_density(100.0)) / math.log(4)
+    slope = math.log(
+        law.cumulative_number_density(400.0) / law.cumulative_number_density(100.0)
+    ) / math.log(4)
     assert slope == pytest.approx(-2.8)
     diameter = np.geomspace(1, 1000, 50)
     np.testing.assert_allclose(
-        law.diameter_at_density(law.cumulative_density(diameter)), diameter, rtol=1e-12
+        law.diameter_at_number_density(law.cumulative_number_density(diameter)),
+        diameter,
+        rtol=1e-12,
     )
 
 
 def test_a_fresh_crater_is_a_fifth_as_deep_as_it_is_wide():
     """Pike's earlier, rounder statement of 1974: depth about 0.2 of the diameter."""
     diameter = np.array([10.0, 100.0, 1000.0, 10_000.0])
-    np.testing.assert_allclose(scattered_objects.fresh_depth(diameter) / diameter, 0.2, atol=0.015)
-    assert scattered_objects.fresh_depth(1000.0) == pytest.approx(196.0)
-    assert scattered_objects.fresh_rim_height(1000.0) == pytest.approx(36.0)
+    np.testing.assert_allclose(
+        scattered_objects.fresh_crater_depth(diameter) / diameter, 0.2, atol=0.015
+    )
+    assert scattered_objects.fresh_crater_depth(1000.0) == pytest.approx(196.0)
+    assert scattered_objects.fresh_crater_rim_height(1000.0) == pytest.approx(36.0)
 
 
 def test_a_carved_crater_has_its_rim_its_floor_and_its_ejecta_where_they_belong():
@@ -192,7 +202,10 @@ def test_a_carved_crater_has_its_rim_its_floor_and_its_ejecta_where_they_belong(
         grid(origin=(1e6, 2e6, -50.0)), one(1e6 + 100, 2e6 + 90, 60.0)
     )
     z = ground.heights
-    depth, rim = scattered_objects.fresh_depth(60.0), scattered_objects.fresh_rim_height(60.0)
+    depth, rim = (
+        scattered_objects.fresh_crater_depth(60.0),
+        scattered_objects.fresh_crater_rim_height(60.0),
+    )
     assert np.unravel_index(z.argmin(), z.shape) == (90, 100)  # row along y, column along x
     assert z[90, 100] == pytest.approx(rim - depth)
     for place in ((90, 130), (90, 70), (120, 100), (60, 100)):
@@ -210,7 +223,10 @@ def test_a_crater_lies_where_it_should_on_a_grid_that_runs_southwards():
 
 
 def test_the_volume_dug_is_that_of_a_paraboloid():
-    depth, rim = scattered_objects.fresh_depth(60.0), scattered_objects.fresh_rim_height(60.0)
+    depth, rim = (
+        scattered_objects.fresh_crater_depth(60.0),
+        scattered_objects.fresh_crater_rim_height(60.0),
+    )
 
     def dug(r):
         return (
@@ -269,7 +285,7 @@ def test_a_crater_beside_the_ground_changes_nothing():
     assert not scattered_objects.carve_craters(grid(), one(-500.0, 900.0, 50.0)).heights.any()
 
 
-TREE = scattered_objects.MeanTree(variation=0.0)
+TREE = scattered_objects.MeanTreeDimensions(variation=0.0)
 
 
 def lawn(slope=0.0, origin=(0.0, 0.0, 0.0)):
@@ -314,7 +330,7 @@ def test_leaves_face_every_way():
 def test_gaps_in_a_crown_follow_beers_law():
     """Vertical rays through the middle third, several trees: exp(-G x leaf area x path)."""
     generator = np.random.default_rng(3)
-    tree = scattered_objects.MeanTree(variation=0.0, leaf_length=0.2, leaf_width=0.15)
+    tree = scattered_objects.MeanTreeDimensions(variation=0.0, leaf_length=0.2, leaf_width=0.15)
     a, depth = tree.crown_diameter / 2, tree.height - tree.crown_base
     density = tree.number_of_leaves * tree.leaf_area / (4 / 3 * math.pi * a**2 * depth / 2)
     rays, crowns, gaps, expected = 60, 8, 0, 0.0
@@ -357,7 +373,7 @@ def test_a_clump_stands_on_its_hill_apart_and_within_its_radius():
     origin = (5e5, 4e6, 200.0)
     hill = lawn(0.2, origin)
     centre = (origin[0] + 50.0, origin[1] + 50.0)
-    clump = scattered_objects.plant_clump(
+    clump = scattered_objects.draw_tree_clump(
         np.random.default_rng(5), hill, centre=centre, radius=15.0, number=9, tree=TREE
     )  # fmt: skip
     np.testing.assert_array_equal(clump.origin, origin)
@@ -374,8 +390,8 @@ def test_a_clump_stands_on_its_hill_apart_and_within_its_radius():
 
 
 def _clump(seed, **places):
-    return scattered_objects.plant_clump(
-        np.random.default_rng(seed), lawn(), tree=scattered_objects.MeanTree(), **places
+    return scattered_objects.draw_tree_clump(
+        np.random.default_rng(seed), lawn(), tree=scattered_objects.MeanTreeDimensions(), **places
     )
 
 
@@ -391,4 +407,4 @@ def test_trees_without_room_or_ground_are_refused():
     with pytest.raises(ValueError, match="beside the ground"):
         _clump(1, centre=(500, 50), radius=3.0, number=1)
     with pytest.raises(ValueError, match="crown"):
-        scattered_objects.MeanTree(height=5.0, crown_base=6.0)
+        scattered_objects.MeanTreeDimensions(height=5.0, crown_base=6.0)

@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 from sweep.model.geometry.quaternion import axis_angle
 from sweep.scenes import terrain as ground_
 from sweep.scenes.meshes import Facets, clean_mesh, join_facets
-from sweep.scenes.rasters import read_image, read_raster
-from sweep.scenes.terrain import Terrain, draw_fractal_relief, draw_hills, refine, smooth
+from sweep.scenes.rasters import read_image_terrain, read_raster_terrain
+from sweep.scenes.terrain import (
+    Terrain,
+    draw_fractal_relief,
+    draw_hills,
+    refine_terrain,
+    smooth_terrain,
+)
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 GALE = DATA / "gale_crater_hirise_1m.tif"
@@ -131,7 +137,7 @@ def test_facets_become_a_mesh_at_the_same_place():
 def test_refining_keeps_the_given_heights_and_reproduces_cubics():
     rows, columns = np.mgrid[:6, :7].astype(float)
     given = terrain(0.1 * rows**3 - 0.2 * columns**2 * rows + columns)
-    fine = refine(given, factor=4)
+    fine = refine_terrain(given, factor=4)
     assert fine.heights.shape == (21, 25) and fine.bounds == pytest.approx(given.bounds)
     np.testing.assert_allclose(fine.heights[::4, ::4], given.heights, atol=1e-11)
     rows, columns = np.mgrid[:21, :25] / 4
@@ -142,7 +148,7 @@ def test_refining_keeps_the_given_heights_and_reproduces_cubics():
 def test_refining_keeps_holes_and_no_more_than_their_cells():
     z = hilly(8, 8)
     z[3, 4] = np.nan
-    fine = refine(terrain(z), factor=3).heights
+    fine = refine_terrain(terrain(z), factor=3).heights
     missing = np.argwhere(np.isnan(fine))
     assert missing.min(axis=0) == pytest.approx([7, 10])  # the first node past row 2, column 3
     assert missing.max(axis=0) == pytest.approx([11, 14])
@@ -154,14 +160,14 @@ def test_smoothing_keeps_planes_and_holes_and_spreads_a_step_like_an_error_funct
 
     z = np.where(np.arange(60) < 30, 0.0, 1.0) + np.zeros((40, 60))
     z[5, 5] = np.nan
-    smoothed = smooth(terrain(z, spacing=(0.5, 0.5)), standard_deviation=2.0).heights
+    smoothed = smooth_terrain(terrain(z, spacing=(0.5, 0.5)), standard_deviation=2.0).heights
     assert np.isnan(smoothed[5, 5]) and np.isnan(smoothed).sum() == 1
     x = (np.arange(60) - 29.5) * 0.5
     expected = 0.5 * (1 + erf(x / (2.0 * math.sqrt(2))))
     np.testing.assert_allclose(smoothed[30], expected, atol=2e-3)  # a kernel of 4 sigma, sampled
-    assert smooth(terrain(np.full((9, 9), 7.0)), standard_deviation=3.0).heights == pytest.approx(
-        7.0
-    )
+    assert smooth_terrain(
+        terrain(np.full((9, 9), 7.0)), standard_deviation=3.0
+    ).heights == pytest.approx(7.0)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +180,7 @@ def test_a_grid_without_cells_is_refused(z, spacing):
 
 @pytest.mark.skipif(not GALE.exists(), reason="the shared terrain is not here")
 def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
-    ground = read_raster(GALE, metres_per_unit=(1.0, 1.0))  # a third of a per cent too wide
+    ground = read_raster_terrain(GALE, metres_per_unit=(1.0, 1.0))  # a third of a per cent too wide
     assert "off by up to 0.333 %" in ground.warnings[0] and len(ground.warnings) == 1
     assert ground.heights.shape == (337, 348) and ground.spacing == (1.0, -1.0)
     assert ground.heights.min() == pytest.approx(-4472.67, abs=0.005)
@@ -187,10 +193,10 @@ def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
 
 @pytest.mark.skipif(not APOLLO.exists(), reason="the shared terrain is not here")
 def test_real_lunar_ground_in_grey_levels_loses_its_terraces_when_smoothed():
-    ground = read_image(APOLLO, pixel=2.0, white=49.0)
+    ground = read_image_terrain(APOLLO, pixel=2.0, white=49.0)
     step = 49.0 / 255
     assert ground.bounds == (0.0, -512.0, 512.0, 0.0)
-    smoothed = smooth(ground, standard_deviation=4.0)
+    smoothed = smooth_terrain(ground, standard_deviation=4.0)
     flat = (np.diff(ground.heights, axis=1) == 0).mean()
     assert flat > 0.2  # a fifth of the steps lie on one grey level
     assert (np.diff(smoothed.heights, axis=1) == 0).mean() < 1e-3

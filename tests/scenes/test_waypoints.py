@@ -8,7 +8,7 @@ import pytest
 
 from sweep.model.geometry.body_motion import Waypoints
 from sweep.model.geometry.quaternion import axis_angle, from_heading, multiply, rotate
-from sweep.scenes.scene_files import SceneError, read_first_time, read_waypoints
+from sweep.scenes.scene_files import SceneError, read_first_waypoint_time, read_waypoints
 
 PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
 
@@ -158,7 +158,7 @@ def accelerating(first, unit="s", factor=1):
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1000), ("us", 10**6)])
 def test_seconds_of_gps_keep_all_their_digits(table, unit, factor):
     path = table(accelerating(GPS, unit, factor))
-    assert read_first_time(path) == GPS
+    assert read_first_waypoint_time(path) == GPS
     found, plain = read_waypoints(path, GPS), np.arange(200) / 100
     np.testing.assert_array_equal(found.time, plain)
     motion = Waypoints(found.time, found.position).motion(plain)
@@ -168,22 +168,22 @@ def test_seconds_of_gps_keep_all_their_digits(table, unit, factor):
 
 def test_a_first_time_is_read_from_a_table_that_is_one():
     with pytest.raises(SceneError, match="does not exist"):
-        read_first_time("nowhere.csv")
+        read_first_waypoint_time("nowhere.csv")
 
 
 def test_a_table_without_a_line_or_a_unit_has_no_first_time(table):
     with pytest.raises(SceneError, match="fewer than two lines"):
-        read_first_time(table("time [s], x [m], y [m], z [m]\n"))
+        read_first_waypoint_time(table("time [s], x [m], y [m], z [m]\n"))
     with pytest.raises(SceneError, match="no unit for column 'time'"):
-        read_first_time(table(PLAIN.replace("time [s]", "time")))
+        read_first_waypoint_time(table(PLAIN.replace("time [s]", "time")))
 
 
 def test_the_table_that_the_documentation_shows_is_read_as_it_says(table):
     page = Path(__file__).parents[2] / "docs" / "howto" / "fly_a_recorded_path.md"
     text = re.search(r'write_text\("""\\\n(.*?)"""\)', page.read_text("utf-8"), re.S)[1]
     path = table(text)
-    assert read_first_time(path) == 1350000000
-    found = read_waypoints(path, read_first_time(path))
+    assert read_first_waypoint_time(path) == 1350000000
+    found = read_waypoints(path, read_first_waypoint_time(path))
     np.testing.assert_array_equal(found.time, [0, 0.5, 1, 1.5])
     np.testing.assert_array_equal(found.position[2], [1, 39, 371])
     forward, left = (rotate(found.attitude[1], axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]))

@@ -160,9 +160,9 @@ def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
 
 
 def test_jacksboro_is_cut_about_its_middle_and_refined_through_its_posts():
-    from sweep.scenes.rasters import read_jacksboro
+    from sweep.scenes.rasters import read_jacksboro_terrain
 
-    survey = read_jacksboro()
+    survey = read_jacksboro_terrain()
     row, column = 150, 250
     spot = survey.origin[:2] + np.multiply([column, row], survey.spacing)
     ground = {

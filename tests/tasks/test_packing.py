@@ -124,8 +124,8 @@ def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
             other.false_points,
         )
     tree = sweep.open_scene(copy)
-    recording = find_axis_position(small_scene_spec(), {}).recording(tree, "three")
-    assert recording.computed_shots(slice(0, 12)).all()
+    recording = find_axis_position(small_scene_spec(), {}).open_recording(tree, "three")
+    assert recording.computed_shot_mask(slice(0, 12)).all()
 
 
 @pytest.mark.parametrize(

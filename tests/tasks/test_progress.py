@@ -105,7 +105,7 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
         (("export", "small.zarr", "s.csv"), "sweep.analysis.scene_results.point_export.export"),
         (
             ("compare", "small.zarr", "small.zarr"),
-            "sweep.analysis.answers.comparison.tabulated_differences",
+            "sweep.analysis.answers.comparison.compute_tabulated_differences",
         ),
     ],
 )

@@ -8,7 +8,7 @@ import yaml
 from click.testing import CliRunner
 
 import sweep
-from sweep.analysis.scene_results.consistency import check_consistency
+from sweep.analysis.scene_results.consistency import check_error_consistency
 from sweep.cli import main
 from sweep.report.study_report import write_report
 from sweep.spec import GridSpec, SpecError
@@ -209,9 +209,9 @@ def test_a_descent_onto_a_slope_is_as_good_as_it_says(tmp_path, instrument, velo
     for name, least in (("radial_velocity", velocity), ("range", far)):
         stated = four[f"{name}_interpolated_standard_error"].to_numpy()
         assert np.nanmin(stated) >= least
-    for each in check_consistency(tree):
+    for each in check_error_consistency(tree):
         assert each.is_consistent, each.message
     if instrument == "lander_ndl":
-        solved = {each.quantity: each.error_ratio for each in check_consistency(tree)}
+        solved = {each.quantity: each.error_ratio for each in check_error_consistency(tree)}
         assert solved["velocity"] == pytest.approx(1, abs=0.2)
         assert solved["altitude"] == pytest.approx(1, abs=0.2)

@@ -12,24 +12,27 @@ import xarray as xr
 from sweep.analysis import labels
 from sweep.analysis.answers import provenance
 from sweep.analysis.answers.dataset_lookup import (
-    STUDY_ID,
-    marker_names,
+    STUDY_ID_NAME,
+    coordinate_in_si,
     parameter_in_si,
     spec_of_dataset,
-    to_si,
+    study_marker_names,
 )
-from sweep.analysis.charts import LOG, Chart, ChartAxis, ChartLine, Panel
+from sweep.analysis.charts import LOG_SCALE, Chart, ChartAxis, ChartLine, Panel
 from sweep.model.error_budget import clopper_pearson_interval
 from sweep.model.error_budget import interval_half_width as interval_half_width
 from sweep.model.outputs import GRID_OUTPUTS, PD_OUTPUTS, SHOT_STATISTIC_VARIABLES, SPECTRA_OUTPUTS
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 
 PD_ROUNDING_MAX = 1e-12
-"""Largest difference of a probability by rounding on another processor."""
+"""Largest difference between probabilities that rounding on another processor explains."""
 
-_SIGNIFICANT_DIGITS = 12
+_MATCHED_SIGNIFICANT_DIGITS = 12
+"""Number of significant digits in which the coordinates of matching points agree."""
 
-MIXED_KINDS_MESSAGE = "a grid of points and a flight have nothing to match: compare two of a kind"
+GRID_WITH_FLIGHT_MESSAGE = (
+    "a grid of points and a flight have nothing to match: compare two of a kind"
+)
 """Error message for a comparison of a grid with a flight."""
 
 
@@ -58,7 +61,7 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
         The studies have no common point, or `other` is a flight.
     """
     if not isinstance(other, xr.Dataset):
-        raise ValueError(MIXED_KINDS_MESSAGE)
+        raise ValueError(GRID_WITH_FLIGHT_MESSAGE)
     ours, other = (
         provenance.check_single_study(dataset, require_axes=True) for dataset in (ours, other)
     )
@@ -73,12 +76,15 @@ def compute_differences(
     *,
     bounded_variables: Sequence[str],
 ) -> xr.Dataset:
-    """Return the differences of variables, other minus ours, at common points.
+    """Return the differences of variables, other minus ours, at the points of both datasets.
 
-    For ``bounded_variables`` the result also has the allowed differences and the agreement.
+    For ``bounded_variables`` the result also has the largest allowed differences, and whether they
+    are kept: `NAME_allowed` and `NAME_agrees`.
     """
-    matched_ours, matched_other = _match_points(ours, other)
-    result = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
+    matched_ours, matched_other = _restrict_to_common_points(ours, other)
+    result = xr.Dataset(
+        attrs={"ours": study_title_with_id(ours), "other": study_title_with_id(other)}
+    )
     for name in variables:
         result[name] = (matched_other[name] - matched_ours[name]).assign_attrs(
             matched_ours[name].attrs,
@@ -99,7 +105,7 @@ def compute_differences(
     return result
 
 
-def title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
+def study_title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
     """Return the title of a study, followed by the first eight digits of its id."""
     return (
         f"{opened_store.attrs.get('title', '')} ({str(opened_store.attrs.get('study_id', ''))[:8]})"
@@ -107,7 +113,7 @@ def title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
 
 
 def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Return the known bound on the error of a probability."""
+    """Return the bound on the error of a probability: half-width of draws, effects and beamlets."""
     error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
     return sum(
@@ -115,12 +121,17 @@ def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
     )
 
 
-def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return both datasets restricted to their common points, along equally named dimensions."""
+def _restrict_to_common_points(
+    ours: xr.Dataset, other: xr.Dataset
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return both datasets with nothing but their common points, and with equal coordinates."""
     other = _select_fixed_parameters(other, ours)
     ours = _select_fixed_parameters(ours, other)
     for dim in [d for d in ours.dims if d in other.dims]:
-        our_index, other_index = _dim_index(ours, str(dim)), _dim_index(other, str(dim))
+        our_index, other_index = (
+            _index_of_dimension_values(ours, str(dim)),
+            _index_of_dimension_values(other, str(dim)),
+        )
         common_index = our_index.intersection(other_index, sort=False)
         if not common_index.size:
             raise ValueError(f"along {dim} the two studies have no value in common")
@@ -130,12 +141,15 @@ def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.D
         other = other.drop_vars([n for n, c in other.coords.items() if dim in c.dims])
         other = other.assign_coords({n: c for n, c in ours.coords.items() if c.dims == (dim,)})
     scalar_names = [n for n, c in other.coords.items() if not c.dims]
-    ours = ours.drop_vars([STUDY_ID, *marker_names(ours)], errors="ignore")
+    ours = ours.drop_vars([STUDY_ID_NAME, *study_marker_names(ours)], errors="ignore")
     return ours, other.drop_vars(scalar_names)
 
 
 def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
-    """Select the values of parameters that are fixed, not on an axis, in the reference."""
+    """Select points with the values of all parameters that the reference dataset does not vary.
+
+    An axis without that value stays.
+    """
     varying_paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
     spec = spec_of_dataset(reference)
     for coord in list(dataset.coords.values()):
@@ -143,7 +157,7 @@ def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.D
         if not coord.dims or path in varying_paths or coord.name not in dataset.dims:
             continue
         fixed_value = parameter_in_si(reference, path, spec).values.item()
-        values = to_si(coord).values
+        values = coordinate_in_si(coord).values
         matches = (
             values == fixed_value
             if isinstance(fixed_value, str)
@@ -154,15 +168,15 @@ def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.D
     return dataset
 
 
-def _dim_index(dataset: xr.Dataset, dim: str) -> pandas.Index:
-    """Return an index of the SI values along a dimension, rounded to 12 significant digits.
+def _index_of_dimension_values(dataset: xr.Dataset, dim: str) -> pandas.Index:
+    """Return a pandas index of the coordinate values along a dimension, for matching.
 
-    Several coordinates of a dimension form a multi-index.
+    Values are in SI, rounded to 12 significant digits. Several coordinates make a multi-index.
     """
     coords = [c for c in dataset.coords.values() if c.dims == (dim,)]
     if not coords:
         return pandas.RangeIndex(dataset.sizes[dim])
-    columns = [_round_significant(np.asarray(to_si(c).values)) for c in
+    columns = [_round_significant(np.asarray(coordinate_in_si(c).values)) for c in
                sorted(coords, key=lambda c: str(c.attrs.get("path", c.name)))]  # fmt: skip
     index = columns[0] if len(columns) == 1 else pandas.MultiIndex.from_arrays(columns)
     index = pandas.Index(index)
@@ -182,7 +196,9 @@ def _round_significant(values: np.ndarray) -> np.ndarray:
     values = values.astype(float)
     with np.errstate(divide="ignore"):
         scale = 10.0 ** (
-            _SIGNIFICANT_DIGITS - 1 - np.floor(np.log10(np.abs(np.where(values, values, 1.0))))
+            _MATCHED_SIGNIFICANT_DIGITS
+            - 1
+            - np.floor(np.log10(np.abs(np.where(values, values, 1.0))))
         )
     return np.rint(values * scale) / scale
 
@@ -196,18 +212,18 @@ SHOT_POSITION_TOLERANCE = 1e-6
 BEAM_DIRECTION_TOLERANCE = 1e-9
 """Largest angle between the beam directions of matching shots [rad]."""
 
-DETECTED_VARIABLE = "detected"
-"""Name of the share of draws in which a shot has a true point."""
+DETECTED_FRACTION_VARIABLE = "detected"
+"""Name of the variable with the share of draws in which a shot has a true point, 0..1."""
 
 ERROR_BOUND_VARIABLES = ("effects_error", "beamlets_error")
-"""Names of the error bounds of a shot's probabilities."""
+"""Names of the variables that bound the errors of a shot's probabilities."""
 
-COMPARED_STATISTICS = tuple(
+COMPARED_SHOT_STATISTICS = tuple(
     name
     for name, output in SHOT_STATISTIC_VARIABLES.items()
     if output.dtype == "float64" and name not in ERROR_BOUND_VARIABLES
 )
-"""Statistics of a flight's shots that are compared."""
+"""Names of the shot statistics that a comparison of flights includes."""
 
 
 def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
@@ -237,24 +253,29 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
         The flights have no common scanner, or no common shot of a scanner; or `other` is a grid.
     """
     if not isinstance(other, xr.DataTree):
-        raise ValueError(MIXED_KINDS_MESSAGE)
+        raise ValueError(GRID_WITH_FLIGHT_MESSAGE)
     scanners = [name for name in scanner_names(ours) if name in scanner_names(other)]
     if not scanners:
         scanner_lists = (", ".join(scanner_names(tree)) for tree in (ours, other))
         raise ValueError("the flights have no scanner in common: {}; and {}".format(*scanner_lists))
     group_by_scanner = {name: _compare_scanner(ours, other, name) for name in scanners}
-    root = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
+    root = xr.Dataset(
+        attrs={"ours": study_title_with_id(ours), "other": study_title_with_id(other)}
+    )
     return xr.DataTree.from_dict({"/": root, **group_by_scanner})
 
 
 def scanner_names(tree: xr.DataTree) -> list[str]:
-    """Return the names of a flight's scanners; netCDF turns a list of one name into a string."""
+    """Return the names of the scanners of a flight's tree.
+
+    The attribute may be a string, because netCDF stores a list of one name as a string.
+    """
     names = tree.attrs["scanners"]
     return [names] if isinstance(names, str) else [str(name) for name in names]
 
 
 def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
-    """Return the differences at the common shots of a scanner."""
+    """Return the differences, other minus ours, at the common shots of a scanner."""
     our_group, other_group = (
         provenance.check_single_study(
             tree.children[scanner].to_dataset(inherit=False).assign_attrs(tree.attrs),
@@ -262,7 +283,7 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
         )
         for tree in (ours, other)
     )
-    our_shots, matching_shots = _match_shots(our_group, other_group, scanner)
+    our_shots, matching_shots = _common_shot_indices(our_group, other_group, scanner)
     shot_coords = {
         name: our_group[name].isel(shot=our_shots).compute() for name in ("time", "beam")
     }
@@ -278,29 +299,33 @@ def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.
     ]
     variables = [
         name
-        for name in (*COMPARED_STATISTICS, DETECTED_VARIABLE)
+        for name in (*COMPARED_SHOT_STATISTICS, DETECTED_FRACTION_VARIABLE)
         if all(name in quantities for quantities in quantities_of_both)
     ]
     result = compute_differences(
         quantities_of_both[0],
         quantities_of_both[1],
         variables,
-        bounded_variables=(*PD_OUTPUTS, DETECTED_VARIABLE),
+        bounded_variables=(*PD_OUTPUTS, DETECTED_FRACTION_VARIABLE),
     )
     return result.assign_coords(shot_coords).assign_attrs(
-        ours=title_with_id(ours), other=title_with_id(other), scanner=scanner,
+        ours=study_title_with_id(ours), other=study_title_with_id(other), scanner=scanner,
         shots=our_group.sizes["shot"], other_shots=other_group.sizes["shot"],
     )  # fmt: skip
 
 
-def _match_shots(
+def _common_shot_indices(
     ours: xr.Dataset, other: xr.Dataset, scanner: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of common shots in both groups, in rising order of ours.
+    """Find the shots that two flights have in common.
 
-    Both are empty if either group has no computed shots.
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Index of each common shot in `ours`, rising, and in `other`. Both arrays are empty if a
+        flight has no computed shots.
     """
-    our_frame, other_frame = _computed_shots(ours), _computed_shots(other)
+    our_frame, other_frame = _computed_shot_table(ours), _computed_shot_table(other)
     if our_frame.empty or other_frame.empty:
         return np.empty(0, int), np.empty(0, int)
     merged = pandas.merge_asof(
@@ -332,18 +357,21 @@ def _match_shots(
     return our_shots[is_match][order], matching_shots[is_match][order]
 
 
-def _computed_shots(group: xr.Dataset) -> pandas.DataFrame:
-    """Return time, beam and number of the computed shots, sorted by time."""
+def _computed_shot_table(group: xr.Dataset) -> pandas.DataFrame:
+    """Return a table with the time [s], beam and number of every computed shot, sorted by time."""
     frame = pandas.DataFrame({name: group[name].values for name in ("time", "beam")})
     return frame.assign(number=frame.index).dropna().sort_values("time")
 
 
 def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool) -> xr.Dataset:
-    """Return the compared quantities of a group's shots, over its axes and shots.
+    """Return the variables of a scanner's group that a comparison of flights needs.
 
-    With ``all_drawn`` they include `detected` and its half-width.
+    With ``all_drawn``, all draws are computed, and the variables include `detected` and its
+    half-width.
     """
-    variables = [name for name in (*COMPARED_STATISTICS, *ERROR_BOUND_VARIABLES) if name in group]
+    variables = [
+        name for name in (*COMPARED_SHOT_STATISTICS, *ERROR_BOUND_VARIABLES) if name in group
+    ]
     quantities = group[variables].assign_attrs(tree.attrs)
     if not all_drawn:
         return quantities
@@ -365,31 +393,31 @@ def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: boo
     }
     return quantities.assign(
         {
-            DETECTED_VARIABLE: detected_fraction,
-            f"{DETECTED_VARIABLE}_half_width": half_widths.where(is_computed),
+            DETECTED_FRACTION_VARIABLE: detected_fraction,
+            f"{DETECTED_FRACTION_VARIABLE}_half_width": half_widths.where(is_computed),
         }
     )
 
 
-DIFFERENCE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
+DIFFERENCE_TABLE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
 """Column names of the table of differences."""
 
 OpenedStore = xr.Dataset | xr.DataTree
-"""Dataset of a grid, or tree of a flight."""
+"""Dataset of a grid, or tree of a flight, as `sweep.open` and `sweep.open_scene` return them."""
 
-TABULATED_VARIABLES = (
+DIFFERENCE_TABLE_VARIABLES = (
     *PD_OUTPUTS, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
     "log10_pfa_shot", "p_leakage_up", "p_leakage_down", "snr_up", "snr_doppler", "snr_down",
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
-    "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_VARIABLE,
+    "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_FRACTION_VARIABLE,
 )  # fmt: skip
-"""Variables in the table of differences, in its order."""
+"""Variables in the table of differences, in the order of its rows."""
 
 
-def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
-    """Compute the differences in the table of a comparison, by scanner.
+def compute_tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
+    """Compute the differences, other minus ours, that the table of a comparison shows.
 
-    The only group of a grid has the name ''.
+    The result is a dataset for each scanner; for grids it is a single one with the name ''.
     """
     result = ours.sweep.compare(other)
     is_grid = isinstance(result, xr.Dataset)
@@ -397,7 +425,9 @@ def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr
         {"": result} if is_grid else {n: group.to_dataset() for n, group in result.children.items()}
     )
     tabulated = {
-        f"{name}{suffix}" for name in TABULATED_VARIABLES for suffix in ("", "_allowed", "_agrees")
+        f"{name}{suffix}"
+        for name in DIFFERENCE_TABLE_VARIABLES
+        for suffix in ("", "_allowed", "_agrees")
     }
     return {
         n: group_differences[[v for v in group_differences if v in tabulated]].compute()
@@ -405,17 +435,17 @@ def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr
     }
 
 
-def difference_rows(differences: xr.Dataset) -> list[list[str]]:
-    """Return a row for each quantity with values, in the columns of `DIFFERENCE_COLUMNS`."""
+def difference_table_rows(differences: xr.Dataset) -> list[list[str]]:
+    """Return the table rows of all variables that have values (`DIFFERENCE_TABLE_COLUMNS`)."""
     return [
-        _difference_row(differences, name)
-        for name in TABULATED_VARIABLES
+        _difference_table_row(differences, name)
+        for name in DIFFERENCE_TABLE_VARIABLES
         if name in differences and differences[name].notnull().any()
     ]
 
 
-def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
-    """Return a variable's row: number and size of differences, agreement, and worst point."""
+def _difference_table_row(differences: xr.Dataset, name: str) -> list[str]:
+    """Return the table row of a variable: its differences, their agreement, and the worst point."""
     array = differences[name]
     is_finite = np.isfinite(array.values)
     abs_difference = np.where(is_finite, np.abs(array.values), -1.0)
@@ -439,13 +469,13 @@ def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
 
 
 def _describe_point(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
-    """Return the coordinates of a point in words, in the order of the axes."""
+    """Return a text with the coordinates of the point at an index of an array."""
     point = array.isel(dict(zip(array.dims, map(int, index), strict=True)))
     return ", ".join(_describe_coordinate(c) for c in point.coords.values())
 
 
 def _describe_coordinate(coordinate: xr.DataArray) -> str:
-    """Return the value of a coordinate; without a unit its name precedes the value."""
+    """Return a text with the value of a coordinate, and its name if it has no unit."""
     units = str(coordinate.attrs.get("units", ""))
     value = labels.format_quantity(coordinate.values.item(), units)
     return (
@@ -456,7 +486,7 @@ def _describe_coordinate(coordinate: xr.DataArray) -> str:
 
 
 def describe_common_shots(differences: xr.Dataset) -> str:
-    """Return the number of common shots of two flights in words."""
+    """Return a text with the number of shots that two flights have in common."""
     n_common, n_ours, n_other = (
         differences.sizes["shot"],
         differences.attrs["shots"],
@@ -468,10 +498,10 @@ def describe_common_shots(differences: xr.Dataset) -> str:
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
-    """Return the verdict of a comparison, and a sentence that states it.
+    """Return the verdict of a comparison, and a sentence about it.
 
-    The verdict is ``same`` or ``different``, by the probabilities of detection, or ``nothing`` if
-    no common point is computed.
+    The verdict is ``same`` if all probabilities of detection agree, ``different`` if one does not,
+    and ``nothing`` if no common point is computed.
     """
     n_points, n_different, noun, count_note = 0, 0, "point", ""
     for differences in compared_groups:
@@ -495,17 +525,20 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
 
 
 PLOTTED_DIFFERENCE_MIN = 1e-16
-"""Smallest plotted difference; smaller ones are drawn at the left edge."""
+"""Smallest difference of pd on the plot's axis; smaller ones are drawn at the left edge."""
 
 
 def save_difference_figure(
     differences_by_scanner: Mapping[str, xr.Dataset], file_path: Path
 ) -> Path:
-    """Draw the share of points that exceed each difference of pd, in one colour per scanner."""
+    """Draw the share of points whose pd differs by more than an amount; return the picture's path.
+
+    Each scanner has its own colour.
+    """
     from sweep.analysis import canvas
 
     with canvas.uniform_style():
-        chart = difference_chart(differences_by_scanner)
+        chart = pd_difference_chart(differences_by_scanner)
         if chart is None:
             return canvas.save_sheet(
                 canvas.message_sheet("Nothing that both stores have is computed yet"), file_path
@@ -513,8 +546,8 @@ def save_difference_figure(
         return canvas.save_sheet(canvas.draw_chart(chart, chart.heading, ""), file_path)
 
 
-def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart | None:
-    """Return the chart of the differences, or None if no common point is computed."""
+def pd_difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart | None:
+    """Return the chart of the differences of pd, or None if no common point is computed."""
     compared_groups = list(differences_by_scanner.values())
     variables = [
         n
@@ -526,7 +559,7 @@ def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart 
     noun = "shot" if any("shot" in part.dims for part in compared_groups) else "point"
     n_common = sum(int(part[variables[0]].notnull().sum()) for part in compared_groups)
     y_axis = ChartAxis(f"share of {noun}s beyond (%)", limits=(-3, 103))
-    x_axis = ChartAxis("difference of pd, either way", LOG, (PLOTTED_DIFFERENCE_MIN, 1.0))
+    x_axis = ChartAxis("difference of pd, either way", LOG_SCALE, (PLOTTED_DIFFERENCE_MIN, 1.0))
     return Chart(
         f"{compared_groups[0].attrs['other']}\nless {compared_groups[0].attrs['ours']}",
         f"Shares of {noun}s that differ by more than some amount, of {', '.join(variables)}.",
@@ -545,7 +578,7 @@ def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart 
 def _exceedance_lines(
     differences: xr.Dataset, name: str, scanner: str, style_index: int
 ) -> list[ChartLine]:
-    """Return lines of the share of points above each actual and each allowed difference."""
+    """Return two lines: the share of points above each difference, and above each allowed one."""
     is_finite = np.isfinite(differences[name].values)
     lines = []
     for values, label_suffix, style in (

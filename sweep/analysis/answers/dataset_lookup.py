@@ -18,29 +18,33 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_number, read_quantity
 
-RELATIVE_TOLERANCE = 1e-9
-"""Relative tolerance for matching a value to one of the grid."""
+RELATIVE_VALUE_TOLERANCE = 1e-9
+"""Largest relative difference at which a value counts as a value of the grid."""
 
-STUDY_ID = "study_id"
-"""Name of the coordinate, and of the attribute, with the identity of the study."""
+STUDY_ID_NAME = "study_id"
+"""Name of the coordinate and of the attribute that hold the id of the study."""
 
 JOIN_REMEDY = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
 )
-"""Part of error messages: how to join stores so that answers are per design."""
+"""Advice in error messages on how to join the stores of several studies."""
 
 _STUDY_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
+"""Pattern of the name of a study's marker coordinate."""
 
-SPECS_ATTRIBUTE = "specs"
-"""Attribute of a join of studies: JSON of specs and variable names, by study id."""
+JOINED_SPECS_ATTRIBUTE = "specs"
+"""Name of the attribute of a join of studies with their specs and variable names.
+
+Its value is JSON, by study id.
+"""
 
 
-def marker_name(study_ids: Iterable[str]) -> str:
-    """Return the name of the marker coordinate of a study, or of a join of several studies.
+def study_marker_name(study_ids: Iterable[str]) -> str:
+    """Return the name of the coordinate that marks the data of a study, or of joined studies.
 
     xarray drops conflicting coordinates, or keeps that of the first dataset. It always keeps a
-    coordinate that only one dataset has. The study id is therefore in the name: a merge of two
-    studies has two markers.
+    coordinate that only one dataset has. The study id is therefore part of the marker's name: a
+    merge of two studies has two markers.
     """
     study_ids = list(study_ids)
     if len(study_ids) == 1:
@@ -48,33 +52,33 @@ def marker_name(study_ids: Iterable[str]) -> str:
     return f"study_{hashlib.sha256(' '.join(sorted(study_ids)).encode()).hexdigest()[:16]}"
 
 
-def marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
-    """Return the names of a dataset's marker coordinates, as defined by :func:`marker_name`."""
+def study_marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
+    """Return the names of a dataset's coordinates that mark studies (:func:`study_marker_name`)."""
     return [name for name in map(str, dataset.coords) if _STUDY_MARKER_PATTERN.fullmatch(name)]
 
 
 def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
-    """Return the spec of the study that a dataset, or a flight's tree, comes from.
+    """Return the spec of the study from which a dataset or tree comes.
 
-    Raise ValueError if it combines several studies, or lacks the spec or the marker.
+    Raise ValueError if the data combine several studies, or lack the spec or the marker.
     """
     spec_text = dataset.attrs.get("spec")
-    _check_marker(dataset)
-    if STUDY_ID in dataset.coords:
-        study_id_coord = dataset.coords[STUDY_ID]
+    _check_study_marker(dataset)
+    if STUDY_ID_NAME in dataset.coords:
+        study_id_coord = dataset.coords[STUDY_ID_NAME]
         if study_id_coord.dims:
             raise ValueError(
                 f"the dataset has several studies along '{study_id_coord.dims[0]}': select one of "
                 "them, "
                 f"ds.isel({study_id_coord.dims[0]}=0)"
             )
-        if SPECS_ATTRIBUTE in dataset.attrs:
+        if JOINED_SPECS_ATTRIBUTE in dataset.attrs:
             spec_text = (
-                json.loads(dataset.attrs[SPECS_ATTRIBUTE])
+                json.loads(dataset.attrs[JOINED_SPECS_ATTRIBUTE])
                 .get(str(study_id_coord.item()), {})
                 .get("spec")
             )
-        elif dataset.attrs.get(STUDY_ID) != str(study_id_coord.item()):
+        elif dataset.attrs.get(STUDY_ID_NAME) != str(study_id_coord.item()):
             spec_text = None
     if not spec_text:
         raise ValueError(
@@ -85,39 +89,41 @@ def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
     return _parse_stored_spec(spec_text)
 
 
-def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
-    """Raise a ValueError if a dataset combines several studies, or lacks its study's marker."""
-    dataset_markers = marker_names(dataset)
+def _check_study_marker(dataset: xr.Dataset | xr.DataTree) -> None:
+    """Raise ValueError if a dataset combines several studies, or lacks the marker of its study."""
+    dataset_markers = study_marker_names(dataset)
     if len(dataset_markers) > 1:
         short_ids = ", ".join(name.removeprefix("study_")[:8] for name in dataset_markers)
         raise ValueError(
             f"the dataset is put together of the studies {short_ids} and has the spec of the first "
             f"alone: {JOIN_REMEDY}"
         )
-    if STUDY_ID in dataset.coords and not dataset.coords[STUDY_ID].dims:
-        study_id = str(dataset.coords[STUDY_ID].item())
+    if STUDY_ID_NAME in dataset.coords and not dataset.coords[STUDY_ID_NAME].dims:
+        study_id = str(dataset.coords[STUDY_ID_NAME].item())
         joined_ids = (
-            json.loads(dataset.attrs[SPECS_ATTRIBUTE])
-            if SPECS_ATTRIBUTE in dataset.attrs
+            json.loads(dataset.attrs[JOINED_SPECS_ATTRIBUTE])
+            if JOINED_SPECS_ATTRIBUTE in dataset.attrs
             else [study_id]
         )
-        if dataset_markers != [marker_name(joined_ids)]:
+        if dataset_markers != [study_marker_name(joined_ids)]:
             raise ValueError(
-                f"the dataset lacks the coordinate '{marker_name(joined_ids)}', which proves that "
-                "no "
-                f"other study's variables are in it: take one that sweep.open gave, or "
+                f"the dataset lacks the coordinate '{study_marker_name(joined_ids)}', which proves "
+                f"that no other study's variables are in it: take one that sweep.open gave, or "
                 f"{JOIN_REMEDY}"
             )
 
 
 @lru_cache(maxsize=8)
 def _parse_stored_spec(spec_text: str) -> GridSpec | SceneSpec:
-    """Parse a stored spec; cached, because answers parse the spec of a dataset repeatedly."""
+    """Parse the text of a stored spec; the last eight results are cached."""
     return from_stored(spec_text)
 
 
 def grid_spec_of_dataset(dataset: xr.Dataset) -> GridSpec:
-    """Return the spec of the grid study that a dataset comes from; ValueError for a flight's."""
+    """Return the spec of the grid study from which a dataset comes.
+
+    Raise ValueError for the dataset of a flight.
+    """
     spec = spec_of_dataset(dataset)
     if not isinstance(spec, GridSpec):
         raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
@@ -125,7 +131,7 @@ def grid_spec_of_dataset(dataset: xr.Dataset) -> GridSpec:
 
 
 def require_variables(dataset: xr.Dataset, *names: str) -> None:
-    """Raise ValueError if a dataset lacks variables that an answer needs."""
+    """Raise ValueError if a dataset lacks one of the named variables."""
     if missing := [name for name in names if name not in dataset]:
         raise ValueError(
             f"the dataset lacks {', '.join(missing)}, which this answer needs: take all variables "
@@ -133,8 +139,11 @@ def require_variables(dataset: xr.Dataset, *names: str) -> None:
         )
 
 
-def parse_si(raw_value: object, *, si_unit: str, name: str) -> float:
-    """Parse a quantity such as ``"20 Hz"`` to SI; a number without unit is in SI."""
+def parse_to_si(raw_value: object, *, si_unit: str, name: str) -> float:
+    """Convert a quantity such as ``"20 Hz"`` to its SI value; return a plain number unchanged.
+
+    `name` names the quantity in errors.
+    """
     if isinstance(raw_value, int | float) and not isinstance(raw_value, bool):
         return float(raw_value)
     try:
@@ -145,7 +154,10 @@ def parse_si(raw_value: object, *, si_unit: str, name: str) -> float:
 
 
 def parse_pd_level(pd: object) -> float:
-    """Return a level of pd, ``0.9`` or ``"90 %"``, as a number; ValueError unless in (0, 1)."""
+    """Return a level of pd, such as 0.9 or ``"90 %"``, as a number between 0 and 1.
+
+    Raise ValueError for other values.
+    """
     is_number = isinstance(pd, np.number) and np.ndim(pd) == 0
     try:
         value, unit = read_number(pd.item() if is_number else pd)  # type: ignore[attr-defined]
@@ -158,7 +170,10 @@ def parse_pd_level(pd: object) -> float:
 
 
 def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """Return a coordinate by its name or by the dotted path of its parameter."""
+    """Return a dataset's coordinate by its name, or by the dotted path of its parameter.
+
+    Raise ValueError if there is none.
+    """
     for coord_name, coord in dataset.coords.items():
         if name in (coord_name, coord.attrs.get("path")):
             return coord
@@ -166,7 +181,7 @@ def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
     raise ValueError(f"'{name}' is no coordinate of this dataset: there is {names}")
 
 
-def to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
+def convert_to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
     """Convert a value such as ``"2 km"`` to a coordinate's units; leave a plain number as it is."""
     rule = parameter_rules().get(coord.attrs.get("path", ""))
     if isinstance(raw_value, int | float | np.number) and not isinstance(raw_value, bool):
@@ -179,8 +194,8 @@ def to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
         raise ValueError(f"{coord.name} {error}") from None
 
 
-def to_si(coord: xr.DataArray) -> xr.DataArray:
-    """Return a coordinate's values in SI, or as strings if they are words."""
+def coordinate_in_si(coord: xr.DataArray) -> xr.DataArray:
+    """Return a coordinate with its values in SI units; words become strings."""
     rule = parameter_rules().get(coord.attrs.get("path", ""))
     units = coord.attrs.get("units", "")
     if coord.dtype.kind not in "fiu":
@@ -198,10 +213,10 @@ def to_si(coord: xr.DataArray) -> xr.DataArray:
 def parameter_in_si(
     dataset: xr.Dataset, path: str, spec: GridSpec | SceneSpec | None = None
 ) -> xr.DataArray:
-    """Return a parameter in SI: over its axis, or as a scalar if all points share its value."""
+    """Return the SI values of a parameter along its axis, or one value if it is on no axis."""
     coord = parameter_coordinate(dataset, path)
     if coord is not None:
-        return to_si(coord).drop_vars(list(coord.coords), errors="ignore").assign_coords(
+        return coordinate_in_si(coord).drop_vars(list(coord.coords), errors="ignore").assign_coords(
             {n: c for n, c in coord.coords.items() if n in coord.dims}
         )  # fmt: skip
     spec = spec or grid_spec_of_dataset(dataset)
@@ -214,7 +229,7 @@ def parameter_in_si(
 
 
 def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
-    """Return the coordinate of a parameter, by its dotted path; None if there is none."""
+    """Return the coordinate of the parameter with a dotted path; None if there is none."""
     matches = (coord for coord in dataset.coords.values() if coord.attrs.get("path") == path)
     return next(matches, None)
 
@@ -256,20 +271,29 @@ def select_points(
 
 
 def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None) -> np.ndarray:
-    """Return the indices of the selected values; those of a slice in the coordinate's order."""
+    """Return the indices at which a coordinate has the selected values.
+
+    `selected` is a value, a list of values, or a slice that includes both ends.
+    """
     coord_values = np.atleast_1d(coord.values)
     if isinstance(selected, slice):
         low = (
-            -np.inf if selected.start is None else float(to_coordinate_units(coord, selected.start))
+            -np.inf
+            if selected.start is None
+            else float(convert_to_coordinate_units(coord, selected.start))
         )
-        high = np.inf if selected.stop is None else float(to_coordinate_units(coord, selected.stop))
-        tolerance = RELATIVE_TOLERANCE * np.abs(coord_values)
+        high = (
+            np.inf
+            if selected.stop is None
+            else float(convert_to_coordinate_units(coord, selected.stop))
+        )
+        tolerance = RELATIVE_VALUE_TOLERANCE * np.abs(coord_values)
         return np.flatnonzero(
             (coord_values >= low - tolerance) & (coord_values <= high + tolerance)
         )
     selected_values = selected if isinstance(selected, list | tuple | np.ndarray) else [selected]
     indices = [
-        _indices_of_value(coord, coord_values, to_coordinate_units(coord, value), method)
+        _indices_of_value(coord, coord_values, convert_to_coordinate_units(coord, value), method)
         for value in selected_values
     ]
     return np.concatenate(indices)
@@ -278,7 +302,10 @@ def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None
 def _indices_of_value(
     coord: xr.DataArray, coord_values: np.ndarray, value: float | str, method: str | None
 ) -> np.ndarray:
-    """Return the indices at which a coordinate has a value, or the nearest one."""
+    """Return the indices at which a coordinate has a value, or with ``nearest`` the nearest value.
+
+    Raise ValueError if the value is not on the grid.
+    """
     units = coord.attrs.get("units", "")
     if coord_values.dtype.kind not in "fiu":
         coord_words = [str(word) for word in coord_values]
@@ -290,9 +317,9 @@ def _indices_of_value(
     distance = np.abs(coord_values - float(value))
     low, high = float(coord_values.min()), float(coord_values.max())
     if (
-        not low - RELATIVE_TOLERANCE * abs(low)
+        not low - RELATIVE_VALUE_TOLERANCE * abs(low)
         <= float(value)
-        <= high + RELATIVE_TOLERANCE * abs(high)
+        <= high + RELATIVE_VALUE_TOLERANCE * abs(high)
     ):
         raise ValueError(
             f"{coord.name} {value:g} {units} lies outside the grid, which reaches from {low:g} to "
@@ -302,7 +329,7 @@ def _indices_of_value(
     if method == "nearest":
         return np.flatnonzero(coord_values == nearest_value)
     matches = np.flatnonzero(
-        distance <= RELATIVE_TOLERANCE * np.maximum(np.abs(coord_values), abs(float(value)))
+        distance <= RELATIVE_VALUE_TOLERANCE * np.maximum(np.abs(coord_values), abs(float(value)))
     )
     if not matches.size:
         raise ValueError(

@@ -14,19 +14,24 @@ from contourpy import contour_generator
 from scipy.special import ndtri
 
 from sweep.analysis.answers.dataset_lookup import find_coordinate, parse_pd_level, require_variables
-from sweep.analysis.answers.probability import confidence_attribute, pd_half_width, variable_name
+from sweep.analysis.answers.probability import (
+    confidence_attribute,
+    pd_half_width,
+    segment_variable_name,
+)
 
-LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED = range(4)
-REASON_MEANINGS = "found never_reached never_lost not_computed"
-"""Names of the outcomes of a search for a limit, separated by spaces: CF `flag_meanings`."""
+LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
+"""Flags of the outcomes of a search for a limit."""
+LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
+"""Names of these flags, separated by spaces, for the CF attribute `flag_meanings`."""
 
-_COMPLEMENT_ERROR_MAX = 1e-6
-"""Largest deviation of pd + miss from 1 by rounding and by averaging."""
+_PD_PLUS_MISS_ERROR_MAX = 1e-6
+"""Largest deviation from 1 of pd plus the probability of a miss, by rounding and averaging."""
 
-_DEVIATE_MAX = 38.0
-"""Largest magnitude of a normal deviate, used for pd of 0 and 1.
+_NORMAL_DEVIATE_MAX = 38.0
+"""Largest magnitude of a normal deviate, used for a pd of 0 or 1.
 
-It corresponds to about the smallest positive float.
+It corresponds to a probability near the smallest positive float.
 """
 
 
@@ -54,7 +59,7 @@ def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.Dat
     miss_or_complement = 1 - pd if miss is None else miss
 
     def clipped_deviate(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        if (np.abs(p + q - 1) > _COMPLEMENT_ERROR_MAX).any():
+        if (np.abs(p + q - 1) > _PD_PLUS_MISS_ERROR_MAX).any():
             raise ValueError(
                 "the probabilities of detection and of a miss do not add to 1, as after a maximum "
                 "or minimum of the dataset: ask for the answer first, of the whole dataset, and "
@@ -65,7 +70,7 @@ def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.Dat
         z = np.where(p < 0.5, p, q)
         ndtri(z, out=z)
         np.negative(z, out=z, where=p >= 0.5)
-        return np.clip(z, -_DEVIATE_MAX, _DEVIATE_MAX, out=z)
+        return np.clip(z, -_NORMAL_DEVIATE_MAX, _NORMAL_DEVIATE_MAX, out=z)
 
     return xr.apply_ufunc(
         clipped_deviate, pd, miss_or_complement, dask="parallelized", output_dtypes=[float]
@@ -123,21 +128,25 @@ def limit(
     """
     level = parse_pd_level(pd)
     coord = find_coordinate(dataset, along)
-    pd_name = variable_name("pd", segment)
+    pd_name = segment_variable_name("pd", segment)
     require_variables(dataset, pd_name)
-    sorted_dataset, dim = _sort_along(dataset, coord, from_highest)
-    miss = sorted_dataset.get(variable_name("miss", segment))
-    limits = _limits_along(sorted_dataset[pd_name], miss, sorted_dataset[coord.name], dim, level)
+    sorted_dataset, dim = _sort_by_coordinate(dataset, coord, from_highest)
+    miss = sorted_dataset.get(segment_variable_name("miss", segment))
+    limits = _limits_along_dimension(
+        sorted_dataset[pd_name], miss, sorted_dataset[coord.name], dim, level
+    )
     interval_half_width = pd_half_width(sorted_dataset, segment)
     if interval_half_width is not None:
         for end, sign in (("low", -1), ("high", 1)):
             shifted_pd = (sorted_dataset[pd_name] + sign * interval_half_width).clip(0, 1)
-            shifted_limits = _limits_along(shifted_pd, None, sorted_dataset[coord.name], dim, level)
+            shifted_limits = _limits_along_dimension(
+                shifted_pd, None, sorted_dataset[coord.name], dim, level
+            )
             limits |= {
                 f"{key}_{end}": a for key, a in shifted_limits.items() if not key.endswith("reason")
             }
     result = xr.Dataset(limits).assign_attrs(dataset.attrs)
-    return _set_attributes(
+    return _set_limit_attributes(
         result, coord, segment, level, confidence_attribute(dataset, interval_half_width)
     )
 
@@ -145,21 +154,24 @@ def limit(
 def maximum_range(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Return the maximum range at which pd reaches a level; otherwise as :func:`limit`."""
+    """Return the maximum range at which pd reaches a level, as :func:`limit` does."""
     return limit(dataset, "target.range", pd, segment=segment)
 
 
 def minimum_grazing_angle(
     dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
-    """Return the minimum grazing angle at which pd reaches a level; as :func:`limit`."""
+    """Return the minimum grazing angle at which pd reaches a level, as :func:`limit` does."""
     return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
 
 
-def _sort_along(
+def _sort_by_coordinate(
     dataset: xr.Dataset, coord: xr.DataArray, from_highest: bool
 ) -> tuple[xr.Dataset, str]:
-    """Sort a dataset by a coordinate, in the direction of the search; also return its dimension."""
+    """Sort a dataset by a coordinate; return the sorted dataset and the coordinate's dimension.
+
+    Values rise, or fall with ``from_highest``. Raise ValueError for a single or repeated value.
+    """
     if coord.ndim != 1 or coord.size < 2:
         raise ValueError(f"{coord.name} has a single value: there is nothing to go along")
     order = np.argsort(coord.values, kind="stable")
@@ -175,13 +187,23 @@ def _sort_along(
     return dataset.isel({coord.dims[0]: order}), str(coord.dims[0])
 
 
-def _limits_along(
+def _limits_along_dimension(
     pd: xr.DataArray, miss: xr.DataArray | None, coord: xr.DataArray, dim: str, level: float
 ) -> dict[str, xr.DataArray]:
-    """Return both limits along a dimension, with their reasons.
+    """Return the two limits of :func:`limit` along a dimension, with their reasons, by name.
 
-    Positions are counted in steps along the dimension, so that they rise in either direction of
-    search. A position that does not exist is infinite.
+    Parameters
+    ----------
+    pd
+        Probability of detection, sorted in the direction of the search.
+    miss
+        Probability of a miss; None if it is 1 - pd.
+    coord
+        Coordinate along the dimension.
+    dim
+        Name of the dimension.
+    level
+        Level of pd, 0..1.
     """
     z = normal_deviate(pd, miss) - float(ndtri(level))
     steps = xr.DataArray(np.arange(float(coord.size)), dims=[dim])
@@ -189,43 +211,50 @@ def _limits_along(
     is_falling = (z >= 0) & (next_z < 0)
     crossings = steps + z / (z - next_z).where(is_falling, 1.0)
     first_break, first_unknown = (
-        _first_step(crossings, is_falling, dim),
-        _first_step(steps, z.isnull(), dim),
+        _smallest_chosen_step(crossings, is_falling, dim),
+        _smallest_chosen_step(steps, z.isnull(), dim),
     )
     last_break, last_unknown = (
-        -_first_step(-crossings, is_falling, dim),
-        -_first_step(-steps, z.isnull(), dim),
+        -_smallest_chosen_step(-crossings, is_falling, dim),
+        -_smallest_chosen_step(-steps, z.isnull(), dim),
     )
     starts_above, ends_above = (z.isel({dim: end}, drop=True) >= 0 for end in (0, -1))
     unbroken_reason = xr.where(
         first_unknown < xr.where(starts_above, first_break, 0.5),
-        NOT_COMPUTED,
+        LIMIT_NOT_COMPUTED,
         xr.where(
-            ~starts_above, NEVER_REACHED, xr.where(np.isinf(first_break), NEVER_LOST, LIMIT_FOUND)
+            ~starts_above,
+            LEVEL_NEVER_REACHED,
+            xr.where(np.isinf(first_break), LEVEL_NEVER_LOST, LIMIT_FOUND),
         ),
     )
     farthest_reason = xr.where(
         last_unknown > xr.where(ends_above, float(coord.size), last_break),
-        NOT_COMPUTED,
+        LIMIT_NOT_COMPUTED,
         xr.where(
-            ends_above, NEVER_LOST, xr.where(np.isinf(last_break), NEVER_REACHED, LIMIT_FOUND)
+            ends_above,
+            LEVEL_NEVER_LOST,
+            xr.where(np.isinf(last_break), LEVEL_NEVER_REACHED, LIMIT_FOUND),
         ),
     )
     return {
-        "unbroken": _value_at_step(first_break.where(unbroken_reason == LIMIT_FOUND), coord),
-        "farthest": _value_at_step(last_break.where(farthest_reason == LIMIT_FOUND), coord),
+        "unbroken": _coordinate_at_step(first_break.where(unbroken_reason == LIMIT_FOUND), coord),
+        "farthest": _coordinate_at_step(last_break.where(farthest_reason == LIMIT_FOUND), coord),
         "unbroken_reason": unbroken_reason.astype("int8"),
         "farthest_reason": farthest_reason.astype("int8"),
     }
 
 
-def _first_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
-    """Return the smallest of the chosen positions along a dimension; infinity if none is chosen."""
+def _smallest_chosen_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
+    """Return the smallest of the chosen steps along a dimension; infinity if none is chosen.
+
+    A step is a position along the dimension: 0, 1, 2, and fractions between.
+    """
     return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
 
 
-def _value_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
-    """Return the interpolated value of a coordinate at a position in steps; nan stays nan."""
+def _coordinate_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
+    """Interpolate the value of a coordinate at a step, a fractional index; nan stays nan."""
     all_steps = np.arange(coord.size, dtype=float)
     return xr.apply_ufunc(
         lambda p: np.interp(p, all_steps, coord.values),
@@ -235,14 +264,14 @@ def _value_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
     )
 
 
-def _set_attributes(
+def _set_limit_attributes(
     result: xr.Dataset,
     coord: xr.DataArray,
     segment: str,
     level: float,
     confidence_attributes: dict[str, float],
 ) -> xr.Dataset:
-    """Set units and descriptions of the answers."""
+    """Set the units and long names of the variables of :func:`limit`."""
     long_names = {
         "unbroken": (
             f"farthest {coord.name} up to which pd of the {segment} stays {level:g} or more"
@@ -255,8 +284,13 @@ def _set_attributes(
             array.attrs = {
                 "long_name": f"why there is no {answer_name} value",
                 "units": "1",
-                "flag_values": [LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED],
-                "flag_meanings": REASON_MEANINGS,
+                "flag_values": [
+                    LIMIT_FOUND,
+                    LEVEL_NEVER_REACHED,
+                    LEVEL_NEVER_LOST,
+                    LIMIT_NOT_COMPUTED,
+                ],
+                "flag_meanings": LIMIT_REASON_MEANINGS,
             }
         else:
             end_text = {"low": ", lower end", "high": ", upper end"}.get(
@@ -295,8 +329,8 @@ def contour(
     -------
     xarray.Dataset
         Dataset over `vertex`, in order along each line: both coordinates in their units, and
-        `line`, the number of the line. It is empty if pd never equals the level. Between grid
-        points, positions are interpolated in the normal deviate.
+        `line`, the number of the line. The dataset is empty if pd never equals the level. Between
+        grid points the normal deviate of pd is interpolated linearly.
 
     Raises
     ------
@@ -305,7 +339,7 @@ def contour(
     """
     level = parse_pd_level(pd)
     x_coord, y_coord = find_coordinate(dataset, x), find_coordinate(dataset, y)
-    pd_name = variable_name("pd", segment)
+    pd_name = segment_variable_name("pd", segment)
     require_variables(dataset, pd_name)
     array = dataset[pd_name]
     if set(array.dims) != {x_coord.name, y_coord.name}:
@@ -318,7 +352,7 @@ def contour(
                 else "they share one, or lack it"
             )
         )
-    z = normal_deviate(array, dataset.get(variable_name("miss", segment))).transpose(
+    z = normal_deviate(array, dataset.get(segment_variable_name("miss", segment))).transpose(
         y_coord.name, x_coord.name
     )
     contour_lines = contour_generator(

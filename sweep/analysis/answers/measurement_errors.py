@@ -29,8 +29,10 @@ from sweep.model.sampling.speckle_wander import mean_wander_variance
 from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
-_SEGMENTS = ("up", "doppler", "down")
-_INSTRUMENT_PREFIX = "instrument."
+_SEGMENT_NAMES = ("up", "doppler", "down")
+"""Names of the segments of a shot, as parts of variable names."""
+_INSTRUMENT_PATH_PREFIX = "instrument."
+"""Beginning of the dotted paths of all instrument parameters."""
 _PATH_BY_PARAMETER = {
     "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
     "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
@@ -41,10 +43,10 @@ _PATH_BY_PARAMETER = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
-"""Paths of the needed instrument parameters, below `instrument`."""
+"""Dotted paths of the instrument parameters on which the bounds depend, without `instrument.`."""
 
-_RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
-"""Names of random effects, whose draws do not change the footprint of an echo."""
+_RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
+"""Names of the effects that are drawn at random."""
 
 _GROUPING_PARAMETERS = (
     "architecture",
@@ -55,7 +57,7 @@ _GROUPING_PARAMETERS = (
     "delay",
     "sample_rate",
 )
-"""Parameters that must be equal for points whose bounds are computed together."""
+"""Parameters by which points are grouped; the bounds of a group are computed together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -100,15 +102,18 @@ def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
-    """Return stored error, resolution and bound of `range` or `radial_velocity`."""
+    """Return the dataset of :func:`range_error` or :func:`velocity_error`.
+
+    `quantity` is ``range`` or ``radial_velocity``.
+    """
     if f"{quantity}_rmse" in dataset:
         statistics = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(statistics).assign_attrs(dataset.attrs)
     spec = grid_spec_of_dataset(dataset)
-    snr_names = [f"snr_{name}" for name in _SEGMENTS]
+    snr_names = [f"snr_{name}" for name in _SEGMENT_NAMES]
     require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
     parameters = {
-        n: parameter_in_si(dataset, _INSTRUMENT_PREFIX + p, spec)
+        n: parameter_in_si(dataset, _INSTRUMENT_PATH_PREFIX + p, spec)
         for n, p in _PATH_BY_PARAMETER.items()
     }
     parameters |= {
@@ -130,7 +135,7 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     bounds = xr.apply_ufunc(
         point_bounds, *snr, *parameters.values(), dask="parallelized", output_dtypes=[float]
     ).transpose(*snr[0].dims)
-    bounds = np.hypot(bounds, _speckle_deviation(dataset, quantity, spec))
+    bounds = np.hypot(bounds, _speckle_standard_deviation(dataset, quantity, spec))
     bin_frequency = parameters["sample_rate"] / parameters["fft_size"]
     bin_size = (
         SPEED_OF_LIGHT / 2 * parameters["duration"] / parameters["bandwidth"] * bin_frequency
@@ -156,8 +161,11 @@ def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     return result.assign_attrs(dataset.attrs)
 
 
-def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
-    """Return the standard deviation that speckle adds to an estimate; 0 without fading."""
+def _speckle_standard_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
+    """Return the standard deviation that speckle adds to an estimate [m or m/s]; 0 without fading.
+
+    `quantity` is ``range`` or ``radial_velocity``.
+    """
     is_fading = (dataset["effects"] & (1 << EFFECT_NAMES.index("fading"))) > 0
     if (
         spec.effect_modes()["fading"] == "off"
@@ -170,7 +178,7 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
         for axis in spec.axes
         for axis_parameter in axis.parameters
     }
-    pds, snrs = ([dataset[f"{kind}_{name}"] for name in _SEGMENTS] for kind in ("pd", "snr"))
+    pds, snrs = ([dataset[f"{kind}_{name}"] for name in _SEGMENT_NAMES] for kind in ("pd", "snr"))
 
     def point_deviation(flags: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(flags.shape, *(array.shape for array in arrays))
@@ -179,7 +187,9 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
         for flag_bits in np.unique(columns[0]):
             rows = np.flatnonzero(columns[0] == flag_bits)
             effects = [
-                name for name in unpack_effect_flags(int(flag_bits)) if name not in _RANDOM_EFFECTS
+                name
+                for name in unpack_effect_flags(int(flag_bits))
+                if name not in _RANDOM_EFFECT_NAMES
             ]
             if "fading" not in effects:
                 continue
@@ -203,9 +213,15 @@ def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr
 def _cramer_rao_bounds(
     snr: tuple[np.ndarray, ...], parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Return the bounds of points with arbitrary parameters.
+    """Return the Cramer-Rao bounds of range and radial velocity at each point.
 
-    Points with equal record parameters are computed together.
+    Parameters
+    ----------
+    snr
+        Signal-to-noise ratios of the three segments.
+    parameters
+        SI values at each point of the parameters in `_PATH_BY_PARAMETER`, of the target, and of the
+        flags ``walks``, ``moves`` and ``late``.
     """
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
     flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}
@@ -218,18 +234,21 @@ def _cramer_rao_bounds(
         list(grouping_frame), sort=False, dropna=False
     ).indices.values():
         group_parameters = {name: a[rows] for name, a in flat_parameters.items()}
-        deviations[:, rows] = _bounds_of_group([s[rows] for s in flat_snr], group_parameters)
+        deviations[:, rows] = _cramer_rao_bounds_of_group(
+            [s[rows] for s in flat_snr], group_parameters
+        )
     return estimators.RangeVelocityDeviation(*deviations.reshape(2, *shape))
 
 
-def _bounds_of_group(
+def _cramer_rao_bounds_of_group(
     snr: list[np.ndarray], parameters: dict[str, np.ndarray]
 ) -> estimators.RangeVelocityDeviation:
-    """Return the bounds of points that share architecture, waveform, window and record.
+    """Return the Cramer-Rao bounds of points that share all parameters in `_GROUPING_PARAMETERS`.
 
-    The CNR of each segment follows from its stored SNR, without the scalloping loss and the loss of
-    a late echo. It gives the bound of the beat frequency, to which the laser's phase noise is added
-    in quadrature. The bounds of three beats are combined to those of range and velocity.
+    The CNR of each segment follows from the stored SNR, after removal of the scalloping loss and of
+    the loss of a late echo. The CNR gives the bound of the beat frequency, to which the laser's
+    phase noise is added in quadrature. The bounds of the three beat frequencies combine to those of
+    range and radial velocity.
     """
     fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
     record_parameters = {
@@ -314,7 +333,7 @@ def _bounds_of_group(
         remaining_samples = record_length - np.where(
             parameters["late"], missing_samples, 0
         )  # samples of the record that contain the echo
-        remaining_sum, relative_width = tail_sum_and_width(taper)
+        remaining_sum, relative_width = window_tail_sum_and_width(taper)
         bin_offset = (
             (beat_bin - np.rint(beat_bin))
             * relative_width[remaining_samples]
@@ -357,8 +376,8 @@ def _bounds_of_group(
 
 
 @lru_cache(maxsize=8)
-def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Return relative sum and width of a window's last n samples.
+def window_tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sum and the width of the last n samples of a window, for every n.
 
     Parameters
     ----------
@@ -368,9 +387,9 @@ def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     tuple of numpy.ndarray
-        Sum and width for n = 0 to L, (L + 1,) each, relative to those of all samples. The width is
-        the standard deviation of time weighted by the window. The width of the main lobe is
-        inversely proportional to it.
+        Sums and widths for n = 0 to L, (L + 1,) each, relative to those of all L samples. The width
+        is the standard deviation of the samples' times, weighted by the window. The main lobe's
+        width in the spectrum is inversely proportional to it.
     """
     samples, times = taper.samples()[::-1], np.arange(taper.length) / taper.length
     cumulative_sum, first_moment, second_moment = (
@@ -386,6 +405,9 @@ def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
-    """Return a spline of |W(delta)| / W(0) over delta = 0 to 1/2 bin of fs/L, accurate to 1e-8."""
+    """Return a spline of a window's main lobe, |W(delta)| / W(0), accurate to 1e-8.
+
+    The offset delta from the peak is 0 to 1/2, in bins of sample rate over window length.
+    """
     taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
     return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

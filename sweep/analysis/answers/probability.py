@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.answers.dataset_lookup import (
+    coordinate_in_si,
     grid_spec_of_dataset,
     parameter_in_si,
-    parse_si,
+    parse_to_si,
     require_variables,
-    to_si,
 )
 from sweep.model import waveform
 from sweep.model.detection.looks import (
@@ -32,11 +32,14 @@ from sweep.model.threshold import THRESHOLD_PATHS, TNR_PATH, tnr_from_parameters
 from sweep.spec import GridSpec
 
 SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
-"""Segments with a probability of detection, and the shot."""
+"""Names with a probability of detection each: the segments of a shot, and the shot."""
 
 
-def variable_name(quantity: str, segment: str) -> str:
-    """Return the name of a variable of a segment, or of a shot."""
+def segment_variable_name(quantity: str, segment: str) -> str:
+    """Return the name of a quantity's variable for a segment or the shot, such as 'pd_up'.
+
+    Raise ValueError for an unknown segment.
+    """
     if segment not in SEGMENTS_AND_SHOT:
         raise ValueError(
             f"there is no segment '{segment}': take one of {', '.join(SEGMENTS_AND_SHOT)}"
@@ -45,12 +48,12 @@ def variable_name(quantity: str, segment: str) -> str:
 
 
 def pd_half_width(dataset: xr.Dataset, segment: str) -> xr.DataArray | None:
-    """Return the half-widths of pd's intervals, or None if pd is not drawn."""
-    return dataset.get(f"{variable_name('pd', segment)}_half_width")
+    """Return the half-width of pd's confidence interval; None if pd was computed without draws."""
+    return dataset.get(f"{segment_variable_name('pd', segment)}_half_width")
 
 
 def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Dataset:
-    """Return the probability of detection, and the interval that contains the true one.
+    """Return the probability of detection with its confidence interval.
 
     Parameters
     ----------
@@ -65,8 +68,8 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
         confidence level. Without draws pd is a closed form, and the interval has no width. The
         possible error of skipped effects is not included: it is the variable `effects_error`.
     """
-    require_variables(dataset, variable_name("pd", segment))
-    pd = dataset[variable_name("pd", segment)]
+    require_variables(dataset, segment_variable_name("pd", segment))
+    pd = dataset[segment_variable_name("pd", segment)]
     interval_half_width = pd_half_width(dataset, segment)
     low, high = (
         (pd, pd)
@@ -86,9 +89,9 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
 def confidence_attribute(
     dataset: xr.Dataset, interval_half_width: xr.DataArray | None
 ) -> dict[str, float]:
-    """Return an interval's confidence as an attribute, if it is the same at all points.
+    """Return the confidence level of pd's intervals as a dict of attributes.
 
-    Without draws the confidence is 1.
+    The dict is empty if the level differs between points. Without draws the level is 1.
     """
     if interval_half_width is None:
         return {"confidence": 1.0}
@@ -141,7 +144,7 @@ def false_alarms_per_second(
         )
         shots_per_second = 1 / (looks * (n_segments * (duration + gap)))
     else:
-        shots_per_second = parse_si(rate, si_unit="Hz", name="the rate of shots")
+        shots_per_second = parse_to_si(rate, si_unit="Hz", name="the rate of shots")
         if not shots_per_second > 0:
             raise ValueError("the rate of shots is a positive number")
     alarm_rate = (shots_per_second * false_alarms_per_shot(dataset, leakage)).rename(
@@ -181,7 +184,7 @@ def false_alarms_per_kilometre(
     ValueError
         Speed or rate can't be read, or are not positive.
     """
-    metres_per_second = parse_si(speed, si_unit="m/s", name="the speed")
+    metres_per_second = parse_to_si(speed, si_unit="m/s", name="the speed")
     if not metres_per_second > 0:
         raise ValueError("the speed is a positive number")
     alarms_per_second = false_alarms_per_second(dataset, rate, leakage=leakage)
@@ -194,9 +197,10 @@ def false_alarms_per_kilometre(
 
 
 def false_alarms_per_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
-    """Return the probability of a false alarm in both chirps of a shot.
+    """Return the probability that both chirps of a shot have a false alarm.
 
-    For a study that draws whole spectra, return the mean number of false alarms of a shot.
+    With ``leakage`` the alarms of leaked signal count too. For a study that draws whole spectra,
+    the result is the mean number of false alarms of a shot.
     """
     if "pfa_both_chirps" not in dataset:
         # Drawn spectra: false alarms were counted in all segments, including those of leakage.
@@ -217,7 +221,7 @@ def pfa_both_chirps_with_leakage(
     p_leakage_up: xr.DataArray,
     p_leakage_down: xr.DataArray,
 ) -> xr.DataArray:
-    """Return the probability that noise or leakage raises an extra group in both chirps, 0..1.
+    """Return the probability that both chirps have a false alarm, by noise or by leakage, 0..1.
 
     Parameters
     ----------
@@ -226,13 +230,14 @@ def pfa_both_chirps_with_leakage(
     pfa_both_chirps
         Probability of a false alarm by noise in both chirps.
     p_leakage_up, p_leakage_down
-        Probability of an extra group by leakage in each chirp.
+        Probability of a false alarm by leakage in the up-chirp and in the down-chirp.
 
     Notes
     -----
-    Noise and leakage are independent, so a chirp has an extra group with probability p + l (1 - p).
-    The result is the product over both chirps. In the down-chirp, p is `pfa_both_chirps` over
-    `pfa_segment`, as the chirps may have different numbers of bins.
+    Noise and leakage are independent. A chirp with the probabilities p by noise and l by leakage
+    has a false alarm with the probability p + l (1 - p). The result is the product over both
+    chirps. In the down-chirp, p is `pfa_both_chirps` over `pfa_segment`, because the chirps may
+    have different numbers of bins.
     """
     pfa_down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # 0 / 1 if pfa_segment is 0
     p_extra_up = pfa_segment + p_leakage_up * (1 - pfa_segment)
@@ -240,11 +245,11 @@ def pfa_both_chirps_with_leakage(
 
 
 SUMMARY_STATISTICS = ("mean", "least", "largest", "number")
-"""Statistics of a summary, in the order of its coordinate."""
+"""Names of the statistics of :func:`summary`, in the order of its coordinate `statistic`."""
 
 
 def summary(dataset: xr.Dataset) -> xr.Dataset:
-    """Return mean, extremes and number of the computed points of every output.
+    """Return the mean, the extremes and the number of finite values of every output.
 
     Returns
     -------
@@ -262,7 +267,7 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
-    """Return the statistics of an array, (4,), as a lazy array."""
+    """Return the `SUMMARY_STATISTICS` (4,) of an array, as a lazy array."""
     delayed_chunks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
     delayed_statistics = [
         dask.delayed(_chunk_statistics)(delayed_chunk) for delayed_chunk in delayed_chunks
@@ -273,7 +278,7 @@ def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
 
 
 def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
-    """Return sum, minimum, maximum and number of the finite values of a chunk, (4,)."""
+    """Return the sum, minimum, maximum and number (4,) of the finite values of a chunk."""
     finite_values = chunk[np.isfinite(chunk)]
     minimum, maximum = (
         (finite_values.min(), finite_values.max()) if finite_values.size else (np.inf, -np.inf)
@@ -282,7 +287,7 @@ def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
 
 
 def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
-    """Return mean, minimum, maximum and number over all chunks, (4,)."""
+    """Combine the results of `_chunk_statistics` to the `SUMMARY_STATISTICS` (4,)."""
     sums, minima, maxima, counts = np.array(chunk_statistics).T
     if not counts.sum():
         return np.array([np.nan, np.nan, np.nan, 0.0])
@@ -303,28 +308,32 @@ def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
 # tolerance.
 
 ROC_POINTS_MAX = 20_000
+"""Largest number of points for which :func:`roc` computes curves."""
 ROC_SIMULATED_POINTS_MAX = 200
-"""Largest number of points with curves, and of points that are simulated again."""
+"""Largest number of points that :func:`roc` simulates again."""
 
 PD_MATCH_TOLERANCE = 1e-9
-"""Largest difference of pd at which the closed form counts as reproducing the stored pd."""
+"""Largest difference from the stored pd at which the closed form of pd counts as exact."""
 
-CURVE_TNR = "curve_tnr"
-"""Name of the TNR along a curve; `tnr` may be a coordinate of the study."""
+CURVE_TNR_VARIABLE = "curve_tnr"
+"""Name of the variable with the threshold-to-noise ratio along a ROC curve.
 
-ROC_KEY_DOMAIN = "sweep.analysis.roc"
-"""Domain of the random-number keys of simulated ROC curves."""
+It is not `tnr`, which may be a coordinate of the study.
+"""
 
-_RANDOM_EFFECT_FLAGS = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
-"""Bit mask of the random effects."""
+ROC_RANDOM_KEY_DOMAIN = "sweep.analysis.roc"
+"""Text that separates the random numbers of ROC curves from all other random numbers."""
 
-_DETECTING_SEGMENTS = {
+_RANDOM_EFFECTS_MASK = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
+"""Bit mask of the random effects in the variable `effects`."""
+
+_SEGMENTS_THAT_MUST_DETECT = {
     "up": ("up",),
     "doppler": ("doppler",),
     "down": ("down",),
     "shot": ("up", "down"),
 }
-"""Segments that must detect for a detection in each segment or in a shot."""
+"""Segments that must all exceed the threshold for a detection, by segment or shot."""
 
 
 def roc(
@@ -375,10 +384,12 @@ def roc(
     pfas = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
     if not ((pfas > 0) & (pfas < 1)).all():
         raise ValueError("probabilities of a false alarm lie between 0 and 1")
-    variables = [f"{kind}_{s}" for s in _DETECTING_SEGMENTS[segment] for kind in ("snr", "pd")]
-    variables += [variable_name("pd", segment), "log10_pfa_bin", "effects"]
+    variables = [
+        f"{kind}_{s}" for s in _SEGMENTS_THAT_MUST_DETECT[segment] for kind in ("snr", "pd")
+    ]
+    variables += [segment_variable_name("pd", segment), "log10_pfa_bin", "effects"]
     require_variables(dataset, *variables)
-    n_points = dataset[variable_name("pd", segment)].size
+    n_points = dataset[segment_variable_name("pd", segment)].size
     if n_points > ROC_POINTS_MAX:
         raise ValueError(
             f"{n_points:,} points make too many curves (at most {ROC_POINTS_MAX:,}): select some"
@@ -398,17 +409,22 @@ def roc(
     is_exact = is_exact & (peak_rule == waveform.ALL_PEAKS)
     tnr = threshold_ratio * _study_tnr(dataset) / _study_threshold_ratio(dataset, looks)
     result = xr.Dataset(
-        {"pd": pd, CURVE_TNR: tnr, "simulated": ~is_exact, "half_width": xr.zeros_like(pd)},
+        {
+            "pd": pd,
+            CURVE_TNR_VARIABLE: tnr,
+            "simulated": ~is_exact,
+            "half_width": xr.zeros_like(pd),
+        },
         {"pfa_bin": ("pfa_bin", pfas)},
     )
-    result = result.transpose("pfa_bin", *dataset[variable_name("pd", segment)].dims)
+    result = result.transpose("pfa_bin", *dataset[segment_variable_name("pd", segment)].dims)
     if not is_exact.all():
-        _replace_by_simulation(dataset, result, segment, draws)
-    return _set_attributes(result, dataset, segment)
+        _replace_curves_by_simulation(dataset, result, segment, draws)
+    return _set_roc_attributes(result, dataset, segment)
 
 
 def _looks_of_study(spec: GridSpec) -> Looks:
-    """Return the looks of a study; raise ValueError if they vary between points."""
+    """Return the settings of a study's looks; raise ValueError if they vary between points."""
     axis_paths = (axis_parameter.path for axis in spec.axes for axis_parameter in axis.parameters)
     if varying_paths := sorted(
         {LOOKS_NUMBER_PATH, LOOKS_COMBINE_PATH, LOOKS_VOTES_PATH} & set(axis_paths)
@@ -424,18 +440,26 @@ def _looks_of_study(spec: GridSpec) -> Looks:
 def _closed_form_pd(
     dataset: xr.Dataset, segment: str, threshold_ratio: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return pd in closed form at each threshold ratio, and a mask of points where it is exact."""
+    """Compute pd in closed form at each threshold.
+
+    Returns
+    -------
+    pd : xarray.DataArray
+        Probability of detection, over the points and `pfa_bin`.
+    is_exact : xarray.DataArray
+        Mask of the points at which the closed form gives the stored pd.
+    """
     study_ratio = _study_threshold_ratio(dataset, looks)
     pd = xr.ones_like(threshold_ratio)
-    is_exact = (dataset["effects"] & _RANDOM_EFFECT_FLAGS) == 0
-    for segment_name in _DETECTING_SEGMENTS[segment]:
+    is_exact = (dataset["effects"] & _RANDOM_EFFECTS_MASK) == 0
+    for segment_name in _SEGMENTS_THAT_MUST_DETECT[segment]:
         stored_pd = dataset[f"pd_{segment_name}"]
         signal_ratio = (2 * dataset[f"snr_{segment_name}"]) ** 0.5
         pd = pd * xr.apply_ufunc(
-            _crossing_probability, signal_ratio, threshold_ratio, kwargs={"looks": looks}
+            _threshold_crossing_probability, signal_ratio, threshold_ratio, kwargs={"looks": looks}
         )
         recomputed_pd = xr.apply_ufunc(
-            _crossing_probability, signal_ratio, study_ratio, kwargs={"looks": looks}
+            _threshold_crossing_probability, signal_ratio, study_ratio, kwargs={"looks": looks}
         )
         is_exact = is_exact & (
             (abs(recomputed_pd - stored_pd) <= PD_MATCH_TOLERANCE) | stored_pd.isnull()
@@ -469,15 +493,21 @@ def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def _point_parameters(coordinates: Mapping[Any, xr.DataArray], spec: GridSpec) -> dict[str, Any]:
-    """Return the SI values of all parameters at the point with these coordinates."""
+    """Return the SI values of all parameters at a point, by path, from the point's coordinates."""
     values = {str(c.attrs["path"]): c for c in coordinates.values() if "path" in c.attrs}
-    return spec.parameters() | {path: to_si(value).values.item() for path, value in values.items()}
+    return spec.parameters() | {
+        path: coordinate_in_si(value).values.item() for path, value in values.items()
+    }
 
 
-def _crossing_probability(
+def _threshold_crossing_probability(
     signal_ratio: np.ndarray, threshold_ratio: np.ndarray, looks: Looks
 ) -> np.ndarray:
-    """Return Q_1, or its equivalent for several looks; nan if an argument is not finite."""
+    """Return the probability that a bin with a steady signal exceeds the threshold.
+
+    It is the Marcum function Q_1, or its equivalent for several looks. Signal and threshold are
+    relative to the noise per quadrature. The result is nan if one of them is not finite.
+    """
     is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
     probability = looks.pd_and_miss_steady(
         np.where(is_finite, signal_ratio, 0), np.where(is_finite, threshold_ratio, 0)
@@ -485,10 +515,10 @@ def _crossing_probability(
     return np.where(is_finite, probability, np.nan)
 
 
-def _replace_by_simulation(
+def _replace_curves_by_simulation(
     dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int
 ) -> None:
-    """Replace the curves of points without a closed form by simulated ones, in place."""
+    """Simulate the curves of points without a closed form, and write them into `result`."""
     spec = grid_spec_of_dataset(dataset)
     point_indices = np.argwhere(np.asarray(result["simulated"].values))
     if len(point_indices) > ROC_SIMULATED_POINTS_MAX:
@@ -497,41 +527,41 @@ def _replace_by_simulation(
             f"{ROC_SIMULATED_POINTS_MAX}): select "
             "fewer"
         )
-    dims = dataset[variable_name("pd", segment)].dims
+    dims = dataset[segment_variable_name("pd", segment)].dims
     pd, half_widths = result["pd"].values.copy(), result["half_width"].values.copy()
     for point_index in point_indices:
         index_by_dim = dict(zip(dims, map(int, point_index), strict=True))
         point = dataset.isel(index_by_dim)
-        tnr = result[CURVE_TNR].isel(index_by_dim).values
+        tnr = result[CURVE_TNR_VARIABLE].isel(index_by_dim).values
         curve_index = (slice(None), *point_index)
-        pd[curve_index], half_widths[curve_index] = _simulate_curve(
+        pd[curve_index], half_widths[curve_index] = _simulate_roc_curve(
             spec, point, tnr, segment, draws
         )
     result["pd"] = result["pd"].copy(data=pd)
     result["half_width"] = result["half_width"].copy(data=half_widths)
 
 
-def _simulate_curve(
+def _simulate_roc_curve(
     spec: GridSpec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pd and its half-width at several threshold-to-noise ratios of a point."""
+    """Simulate a point at several threshold-to-noise ratios; return pd and its half-widths."""
     parameters = _point_parameters(point.coords, spec)
     is_finite = np.isfinite(tnr)
     if not is_finite.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
     flags = int(point["effects"])
     effects = unpack_effect_flags(flags)
-    pd_name = variable_name("pd", segment)
+    pd_name = segment_variable_name("pd", segment)
     parameter_arrays = {
         p: np.full(tnr.size, value) for p, value in parameters.items() if p not in THRESHOLD_PATHS
     }
     parameter_arrays[TNR_PATH] = tnr
-    if flags & _RANDOM_EFFECT_FLAGS:
+    if flags & _RANDOM_EFFECTS_MASK:
         # All thresholds have one key and thus the same draws, so that curves are monotonic.
         key_parameters = {p: v for p, v in sorted(parameters.items()) if p not in THRESHOLD_PATHS}
         key_values = [[v for v in key_parameters.values() if not isinstance(v, str)]]
         keys = np.repeat(
-            point_keys(np.array(key_values, float), domain=ROC_KEY_DOMAIN, seed=spec.seed),
+            point_keys(np.array(key_values, float), domain=ROC_RANDOM_KEY_DOMAIN, seed=spec.seed),
             tnr.size,
             0,
         )
@@ -542,11 +572,11 @@ def _simulate_curve(
     return evaluate(parameter_arrays, effects)[pd_name], np.zeros(tnr.size)
 
 
-def _set_attributes(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
-    """Set units and descriptions of the variables."""
+def _set_roc_attributes(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
+    """Set the units and long names of the variables of a ROC dataset."""
     long_names = {
         "pd": f"probability of detection, {segment}",
-        CURVE_TNR: "threshold to noise ratio",
+        CURVE_TNR_VARIABLE: "threshold to noise ratio",
         "simulated": "whether the point was simulated anew at every threshold",
         "half_width": f"half-width of the interval of the probability of detection, {segment}",
         "pfa_bin": "probability of false alarm in one bin, from noise alone",

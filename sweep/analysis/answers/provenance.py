@@ -20,21 +20,21 @@ import xarray as xr
 from sweep.analysis import labels
 from sweep.analysis.answers.dataset_lookup import (
     JOIN_REMEDY,
-    SPECS_ATTRIBUTE,
-    STUDY_ID,
-    marker_name,
-    marker_names,
+    JOINED_SPECS_ATTRIBUTE,
+    STUDY_ID_NAME,
+    coordinate_in_si,
     parameter_coordinate,
     spec_of_dataset,
-    to_si,
+    study_marker_name,
+    study_marker_names,
 )
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.axes import AxisParameter, convert_from_si
 from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
-RELATIVE_TOLERANCE = 1e-9
-"""Relative tolerance for matching a value to the values of an axis."""
+RELATIVE_VALUE_TOLERANCE = 1e-9
+"""Largest relative difference at which a value counts as a value of an axis."""
 
 
 def compute_answer_per_study(
@@ -62,7 +62,13 @@ def compute_answer_per_study(
     ValueError
         The dataset does not prove that it comes from one study.
     """
-    names_from_sweep = {STUDY_ID, SPECS_ATTRIBUTE, "spec", "model_version", *marker_names(dataset)}
+    names_from_sweep = {
+        STUDY_ID_NAME,
+        JOINED_SPECS_ATTRIBUTE,
+        "spec",
+        "model_version",
+        *study_marker_names(dataset),
+    }
     if not require_axes and not names_from_sweep & {*dataset.coords, *dataset.attrs}:
         return answer(dataset)  # not from a store: the answer needs nothing but the arrays
     dim = _join_dimension(dataset)
@@ -74,7 +80,7 @@ def compute_answer_per_study(
     ]
     design_names = dataset[dim]
     answers = [
-        design_answer.drop_vars([dim, STUDY_ID], errors="ignore") for design_answer in answers
+        design_answer.drop_vars([dim, STUDY_ID_NAME], errors="ignore") for design_answer in answers
     ]
     if any("vertex" in design_answer.dims for design_answer in answers):
         contours = [
@@ -83,12 +89,12 @@ def compute_answer_per_study(
         ]
         return xr.concat(contours, "vertex", combine_attrs="drop_conflicts")
     result = concatenate_designs(answers, dim, design_names.values.tolist())
-    result = result.assign_coords({STUDY_ID: dataset[STUDY_ID]})
+    result = result.assign_coords({STUDY_ID_NAME: dataset[STUDY_ID_NAME]})
     return result.assign_attrs(dataset.attrs) if isinstance(result, xr.Dataset) else result
 
 
 def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset:
-    """Check that a dataset comes from one study; return it with coordinate attributes restored.
+    """Check that a dataset comes from one study; return it with restored coordinate attributes.
 
     Raises
     ------
@@ -99,9 +105,9 @@ def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset
     _join_dimension(dataset, refuse_join=True)
     spec = spec_of_dataset(dataset)
     dataset = _restore_coordinate_attributes(dataset, spec)
-    if SPECS_ATTRIBUTE in dataset.attrs:
-        dataset = _select_design(dataset, spec)
-    _check_coordinates(dataset, spec)
+    if JOINED_SPECS_ATTRIBUTE in dataset.attrs:
+        dataset = _restrict_to_design(dataset, spec)
+    _check_coordinate_values(dataset, spec)
     _check_dimensions(dataset, spec)
     if require_axes:
         check_axis_coordinates(dataset, spec)
@@ -114,7 +120,7 @@ def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset
 
 
 def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise ValueError if the coordinate of an axis is missing, so that its value is unknown."""
+    """Raise ValueError if a dataset lacks the coordinate of one of its study's axes."""
     for axis_parameter in _axis_parameters(spec):
         if parameter_coordinate(dataset, axis_parameter.path) is None:
             raise ValueError(
@@ -126,24 +132,24 @@ def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> N
 
 
 def _join_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
-    """Return the dimension along which a dataset joins studies, or '' for a single study.
+    """Return the dimension along which a dataset joins several studies, or '' for a single study.
 
-    Raise ValueError if the dataset proves neither; with ``refuse_join`` also for a join.
+    Raise ValueError if the dataset proves neither. With ``refuse_join`` a join is an error too.
     """
-    if STUDY_ID not in dataset.coords:
+    if STUDY_ID_NAME not in dataset.coords:
         raise ValueError(
-            f"the dataset lacks the coordinate '{STUDY_ID}', which proves that it is one study's: "
-            "it is no dataset of sweep.open, or is made of several studies. Take one that "
+            f"the dataset lacks the coordinate '{STUDY_ID_NAME}', which proves that it is one "
+            "study's: it is no dataset of sweep.open, or is made of several studies. Take one that "
             f"sweep.open gave, or {JOIN_REMEDY}"
         )
-    study_id_coord = dataset[STUDY_ID]
+    study_id_coord = dataset[STUDY_ID_NAME]
     if not study_id_coord.dims:
         return ""
     dim = str(study_id_coord.dims[0])
     if (
         not refuse_join
         and study_id_coord.ndim == 1
-        and SPECS_ATTRIBUTE in dataset.attrs
+        and JOINED_SPECS_ATTRIBUTE in dataset.attrs
         and dim in dataset.coords
     ):
         return dim
@@ -151,7 +157,7 @@ def _join_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
         str(value)[:8] for value in dict.fromkeys(study_id_coord.values.ravel().tolist())
     )
     remedy = f"it has the spec of the first alone; {JOIN_REMEDY}"
-    if SPECS_ATTRIBUTE in dataset.attrs:
+    if JOINED_SPECS_ATTRIBUTE in dataset.attrs:
         remedy = f"select one of them, ds.isel({dim}=0)"
     raise ValueError(
         f"the dataset is put together along '{dim}' of the studies {short_ids}: {remedy}"
@@ -164,7 +170,10 @@ def _axis_parameters(spec: GridSpec | SceneSpec) -> list[AxisParameter]:
 
 
 def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Restore path and units of coordinates if an operation dropped both."""
+    """Return a dataset whose axis coordinates have the attributes `path` and `units` again.
+
+    Only coordinates that lack both are changed.
+    """
     restored_coords = {}
     for axis_parameter in _axis_parameters(spec):
         coord = dataset.coords.get(axis_parameter.coordinate)
@@ -175,8 +184,8 @@ def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSp
     return dataset.assign_coords(restored_coords) if restored_coords else dataset
 
 
-def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
-    """Return a mask of the values of a parameter's coordinate that the study has."""
+def _study_value_mask(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
+    """Return a mask of a coordinate's values that are among the study's values of the parameter."""
     path = coord.attrs["path"]
     axis_values = [
         np.asarray(axis_parameter.values)
@@ -184,7 +193,7 @@ def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.nd
         if axis_parameter.path == path
     ]
     study_values = axis_values[0] if axis_values else np.atleast_1d(spec.parameters()[path])
-    values = np.atleast_1d(to_si(coord).values)
+    values = np.atleast_1d(coordinate_in_si(coord).values)
     if study_values.dtype.kind not in "fiu" or values.dtype.kind not in "fiu":
         return np.isin(values.astype(str), study_values.astype(str))
     study_values = np.sort(study_values.astype(float))
@@ -198,7 +207,7 @@ def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.nd
     return np.asarray(
         (
             np.abs(neighbours - values)
-            <= RELATIVE_TOLERANCE * np.maximum(np.abs(values), np.abs(neighbours))
+            <= RELATIVE_VALUE_TOLERANCE * np.maximum(np.abs(values), np.abs(neighbours))
         ).any(axis=0)
     )
 
@@ -211,11 +220,11 @@ def _parameter_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> l
             if coord.attrs.get("path") in axis_paths | fixed_parameters.keys()]  # fmt: skip
 
 
-def _check_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
+def _check_coordinate_values(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
     """Raise ValueError if a coordinate has values that the study does not have."""
     for coord in _parameter_coordinates(dataset, spec):
-        is_value_known = _is_value_of_study(coord, spec)
-        if SPECS_ATTRIBUTE in dataset.attrs and not coord.dims:
+        is_value_known = _study_value_mask(coord, spec)
+        if JOINED_SPECS_ATTRIBUTE in dataset.attrs and not coord.dims:
             continue  # a value of another design, at which this design has no points
         if not is_value_known.all():
             value = np.atleast_1d(coord.values)[np.argmin(is_value_known)]
@@ -228,7 +237,7 @@ def _check_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
 
 
 def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
-    """Raise ValueError if a dimension is neither an axis nor a parameter coordinate's dimension."""
+    """Raise ValueError if a dimension of a dataset is no axis of its study and has no parameter."""
     known_dims = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
     known_dims |= {
         str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims
@@ -246,13 +255,15 @@ def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
 # Joins of several studies.
 
 
-def _select_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
-    """Restrict one design of a join to the points and variables of its study."""
-    design_record = json.loads(dataset.attrs[SPECS_ATTRIBUTE])[str(dataset[STUDY_ID].item())]
+def _restrict_to_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
+    """Return the dataset of one design of a join without points and variables of other designs."""
+    design_record = json.loads(dataset.attrs[JOINED_SPECS_ATTRIBUTE])[
+        str(dataset[STUDY_ID_NAME].item())
+    ]
     dataset = dataset.drop_vars(set(dataset.data_vars) - set(design_record["variables"]))
     for coord in _parameter_coordinates(dataset, spec):
         if coord.name in dataset.dims:
-            dataset = dataset.isel({coord.name: np.flatnonzero(_is_value_of_study(coord, spec))})
+            dataset = dataset.isel({coord.name: np.flatnonzero(_study_value_mask(coord, spec))})
     return dataset
 
 
@@ -280,26 +291,28 @@ def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
     """
     specs = {name: spec_of_dataset(dataset) for name, dataset in datasets.items()}
     _check_join_names(datasets, dim)
-    reference_coords = _reference_coordinates(datasets)
+    reference_coords = _reference_coordinate_by_path(datasets)
     aligned = [
         _align_coordinates(datasets[name], specs[name], reference_coords) for name in datasets
     ]
     dim_order = list(dict.fromkeys(str(d) for part in aligned for d in part.dims))
     aligned = [part.transpose(*[d for d in dim_order if d in part.dims]) for part in aligned]
-    study_ids = [part[STUDY_ID].item() for part in aligned]
-    aligned = [part.drop_vars([STUDY_ID, *marker_names(part)]) for part in aligned]
+    study_ids = [part[STUDY_ID_NAME].item() for part in aligned]
+    aligned = [part.drop_vars([STUDY_ID_NAME, *study_marker_names(part)]) for part in aligned]
     result = concatenate_designs(aligned, dim, list(datasets))
-    result = result.assign_coords({STUDY_ID: (dim, study_ids), marker_name(study_ids): True})
+    result = result.assign_coords(
+        {STUDY_ID_NAME: (dim, study_ids), study_marker_name(study_ids): True}
+    )
     result.attrs = _joined_attributes(datasets)
     return result
 
 
 _SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
-"""Attributes that a join sums over its designs."""
+"""Attributes of datasets that a join sums over its designs."""
 
 
 def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes of a join: common ones, summed counts, and all specs."""
+    """Return the attributes of a join: those that all datasets share, summed counts, all specs."""
     first_attributes, *other_attributes = (dataset.attrs for dataset in datasets.values())
     common_attributes = {
         key: value
@@ -308,20 +321,20 @@ def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
         and all(str(attributes.get(key)) == str(value) for attributes in other_attributes)
     }
     specs = {
-        dataset[STUDY_ID].item(): {
+        dataset[STUDY_ID_NAME].item(): {
             "spec": dataset.attrs["spec"], "variables": [str(name) for name in dataset.data_vars],
         }
         for dataset in datasets.values()
     }  # fmt: skip
     return common_attributes | {
         "title": f"Designs: {', '.join(datasets)}",
-        SPECS_ATTRIBUTE: json.dumps(specs, ensure_ascii=False),
+        JOINED_SPECS_ATTRIBUTE: json.dumps(specs, ensure_ascii=False),
         **{key: sum(int(d.attrs[key]) for d in datasets.values()) for key in _SUMMED_ATTRIBUTES},
     }
 
 
 def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
-    """Raise ValueError if the name of the dimension is taken, or a study occurs twice."""
+    """Raise ValueError if the name of a join's dimension is taken, or a study occurs twice."""
     used_names = {
         str(name) for d in datasets.values() for name in [*d.dims, *d.coords, *d.data_vars]
     }
@@ -329,13 +342,13 @@ def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
         raise ValueError(f"'{dim}' can't name the dimension of designs: it is taken, or no word")
     name_by_study_id: dict[str, str] = {}
     for name, dataset in datasets.items():
-        first_name = name_by_study_id.setdefault(dataset[STUDY_ID].item(), name)
+        first_name = name_by_study_id.setdefault(dataset[STUDY_ID_NAME].item(), name)
         if first_name != name:
             raise ValueError(f"the designs '{first_name}' and '{name}' are the same study")
 
 
-def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
-    """Return for each parameter path the coordinate of the first dataset that has it."""
+def _reference_coordinate_by_path(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
+    """Return a coordinate for each parameter path, taken from the first dataset that has one."""
     coord_by_path: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
         for coord in dataset.coords.values():
@@ -347,7 +360,10 @@ def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.D
 def _align_coordinates(
     dataset: xr.Dataset, spec: GridSpec | SceneSpec, reference_coords: Mapping[str, xr.DataArray]
 ) -> xr.Dataset:
-    """Give a dataset the coordinates of ``reference_coords``, in their names and units."""
+    """Return a dataset with the coordinates of ``reference_coords``, with their names and units.
+
+    A parameter that the study does not vary becomes a dimension with one value.
+    """
     for path, reference_coord in reference_coords.items():
         coord = parameter_coordinate(dataset, path)
         if reference_coord.name not in reference_coord.dims:
@@ -364,7 +380,9 @@ def _align_coordinates(
             continue
         units = str(reference_coord.attrs.get("units", ""))
         if coord is None:
-            axis_values = _to_display_units(np.atleast_1d(spec.parameters()[path]), path, units)
+            axis_values = _convert_to_display_units(
+                np.atleast_1d(spec.parameters()[path]), path, units
+            )
             dataset = dataset.expand_dims({str(reference_coord.name): axis_values})
         elif coord.name not in coord.dims:
             raise ValueError(
@@ -373,7 +391,9 @@ def _align_coordinates(
             )
         else:
             if coord.attrs.get("units", "") != units:
-                axis_values = _to_display_units(np.asarray(to_si(coord).values), path, units)
+                axis_values = _convert_to_display_units(
+                    np.asarray(coordinate_in_si(coord).values), path, units
+                )
                 dataset = dataset.assign_coords({coord.name: axis_values})
             if coord.name != reference_coord.name:
                 dataset = dataset.rename({coord.name: reference_coord.name})
@@ -381,8 +401,8 @@ def _align_coordinates(
     return dataset
 
 
-def _to_display_units(si_values: np.ndarray, path: str, units: str) -> np.ndarray:
-    """Convert SI values to display units; return words unchanged."""
+def _convert_to_display_units(si_values: np.ndarray, path: str, units: str) -> np.ndarray:
+    """Convert SI values of the parameter at a path to display units; return words unchanged."""
     rule = parameter_rules()[path]
     if not isinstance(rule, NumericRule) or not units:
         return si_values
@@ -390,12 +410,15 @@ def _to_display_units(si_values: np.ndarray, path: str, units: str) -> np.ndarra
 
 
 def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence[str]) -> Any:
-    """Concatenate datasets or arrays along a new dimension; missing points get a fill value."""
+    """Concatenate the datasets or arrays of designs along a new dimension.
+
+    Points that a design lacks get the fill values of `_FILL_VALUE_BY_DTYPE_KIND`, or nan.
+    """
     fill_values: Any = np.nan
     if isinstance(designs[0], xr.Dataset):
         variables = {name: array for part in designs for name, array in part.data_vars.items()}
         fill_values = {
-            name: _MISSING_VALUE_BY_KIND.get(array.dtype.kind, np.nan)
+            name: _FILL_VALUE_BY_DTYPE_KIND.get(array.dtype.kind, np.nan)
             for name, array in variables.items()
         }
         designs = [
@@ -417,5 +440,5 @@ def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence
     )  # fmt: skip
 
 
-_MISSING_VALUE_BY_KIND = {"i": -1, "u": 0, "b": False}
-"""Fill values of points that a design lacks, by NumPy kind; nan for other kinds."""
+_FILL_VALUE_BY_DTYPE_KIND = {"i": -1, "u": 0, "b": False}
+"""Values for the points that a design lacks, by NumPy's kind of data type; nan for other kinds."""

@@ -1,4 +1,4 @@
-"""Pictures of point clouds, oblique or along a world axis, and scatter plots of quantities."""
+"""Pictures of point clouds, oblique or along a world axis, and scatter plots."""
 
 from __future__ import annotations
 
@@ -28,34 +28,37 @@ from sweep.analysis.scene_results.recordings import (
     ColumnArrays,
     PointCloud,
     ThinnedRows,
-    is_within,
     quantity_label,
-    to_shown_units,
+    to_displayed_values,
+    within_limits_mask,
 )
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.storage.store_format import TERRAIN_MAP_GROUP
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
-"""Azimuth (from north towards east) and elevation of the light that shades the ground [deg]."""
+"""Azimuth and elevation of the light that shades the ground [deg].
 
-DRAWN_SLOPE_MAX = 1.5
-"""Slope above which the ground is not drawn: edges of crowns and walls would hide points."""
+The azimuth is measured from north towards east.
+"""
+
+DRAWN_GROUND_SLOPE_MAX = 1.5
+"""Slope above which the ground is not drawn, as walls and edges of crowns would hide points."""
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Heights of the ground (rows, columns) on a regular grid [m]; nan where unknown.
-
-    World coordinates x (columns,) and y (rows,) are in rising order [m].
-    """
+    """Heights of the ground on a regular grid."""
 
     x: np.ndarray
+    """World x of the columns [m], rising."""
     y: np.ndarray
+    """World y of the rows [m], rising."""
     height: np.ndarray
+    """Heights (rows, columns) [m]; nan where unknown."""
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
-        """Return the map of a store, or None if it has no map or an empty one."""
+        """Return the height map of a flight's tree; None if it has no known height."""
         if TERRAIN_MAP_GROUP not in tree.children:
             return None
         x, y, height = (
@@ -66,9 +69,10 @@ class HeightMap:
     def crop(
         self, x: tuple[float, float], y: tuple[float, float], nodes_max: int = 120
     ) -> HeightMap | None:
-        """Return the map interpolated within limits, or None if the limits lie outside the map.
+        """Return the part of the map between limits of x and y [m], interpolated on a new grid.
 
-        ``nodes_max``: number of nodes along the longer side.
+        The longer side of the new grid has ``nodes_max`` nodes. The result is None if the limits
+        lie outside the map.
         """
         overlaps = [
             (max(float(coordinates[0]), low), min(float(coordinates[-1]), high))
@@ -84,13 +88,16 @@ class HeightMap:
         )
         return HeightMap(x_nodes, y_nodes, height.values)
 
-    def mask_walls(self) -> HeightMap:
-        """Return the map with nan where the ground is too steep to be drawn as a surface."""
-        is_steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > DRAWN_SLOPE_MAX
+    def mask_steep_ground(self) -> HeightMap:
+        """Return the map with nan where the slope exceeds `DRAWN_GROUND_SLOPE_MAX`."""
+        is_steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > DRAWN_GROUND_SLOPE_MAX
         return HeightMap(self.x, self.y, np.where(is_steep, np.nan, self.height))
 
     def hillshade(self) -> np.ndarray:
-        """Return the brightness of the ground under a low sun, 0..1; slopes are exaggerated."""
+        """Return the brightness of the ground in the light of a low sun (rows, columns), 0..1.
+
+        Slopes are exaggerated.
+        """
         slope_y, slope_x = np.gradient(self.height, self.y, self.x)
         slope = np.hypot(slope_y, slope_x)
         finite_slopes = slope[np.isfinite(slope)]
@@ -105,15 +112,16 @@ class HeightMap:
 
 
 DROPOUT_COLOUR, PATH_COLOUR, GROUND_COLOUR = "#C1121F", "#1A1A1A", "0.86"
+"""Colours of shots without a point, of the flight path, and of the ground seen from the side."""
 
 OBLIQUE_WIDTH_MAX_INCHES, OBLIQUE_HEIGHT_MAX_INCHES = 7.6, 6.4
-"""Largest size of the projected box [inches]."""
+"""Largest width and height of the projected box around the points [inches]."""
 
 OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
-"""Margins for ticks and labels: left, below, right and above [inches]."""
+"""Margins of an oblique picture for ticks and labels: left, below, right and above [inches]."""
 
-_TRIAL_SIDE_INCHES = 10.0
-"""Side of the square sheet on which the projected box is measured [inches]."""
+_TRIAL_SHEET_SIDE_INCHES = 10.0
+"""Side of the square sheet on which the projection of the box is measured [inches]."""
 
 
 class ObliqueView:
@@ -124,6 +132,7 @@ class ObliqueView:
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
+    """Options of matplotlib\'s `scatter` for this kind of view."""
 
     def __init__(
         self, cloud: PointCloud, azimuth: float, elevation: float, *, title: str, caption: str
@@ -156,27 +165,27 @@ class ObliqueView:
             projection="3d",
             computed_zorder=False,
         )
-        self._set_axes(self.axes, azimuth, elevation)
+        self._set_box_axes(self.axes, azimuth, elevation)
         side_ratios = self._side_ratios()
         for name, side_ratio in zip(WORLD_AXES, side_ratios, strict=True):
             side_inches = 0.62 * inches_per_unit * side_ratio
             axis = getattr(self.axes, f"{name}axis")
             tick_spacing = (
-                point_styles.TICK_SPACING_Y_INCHES
+                point_styles.TICK_SPACING_MIN_Y_INCHES
                 if name == "z"
-                else point_styles.TICK_SPACING_X_INCHES
+                else point_styles.TICK_SPACING_MIN_X_INCHES
             )
             point_styles.set_length_axis(axis, name, cloud.box[name], side_inches, tick_spacing)
             axis.labelpad = 2 if side_inches < 0.8 else 9 + 4 * (name == "z")
             axis.set_tick_params(pad=2 + 4 * (name == "z") * side_ratio)
 
     def _side_ratios(self) -> np.ndarray:
-        """Return the sides of the box relative to its longest side, (3,)."""
+        """Return the sides of the cloud's box (3,), relative to the longest side."""
         sides = np.array([self.cloud.box[axis][1] - self.cloud.box[axis][0] for axis in WORLD_AXES])
         return sides / sides.max()
 
-    def _set_axes(self, axes: Any, azimuth: float, elevation: float) -> None:
-        """Set projection, limits, walls and grid of the axes."""
+    def _set_box_axes(self, axes: Any, azimuth: float, elevation: float) -> None:
+        """Set the projection, the limits and the background of three-dimensional axes."""
         axes.patch.set_visible(False)
         axes.set_proj_type("ortho")
         axes.view_init(elev=elevation, azim=azimuth)
@@ -188,10 +197,17 @@ class ObliqueView:
             axis.pane.set_edgecolor("0.8")
 
     def _projected_box(self, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the box's lower left and upper right corner, as fractions of the square axes."""
-        trial_sheet = PictureSheet(_TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, title="", caption="")
-        axes = trial_sheet.add_axes(0, 0, _TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, projection="3d")
-        self._set_axes(axes, azimuth, elevation)
+        """Return the lower left and upper right corner of the projected box.
+
+        They are fractions of matplotlib's square axes, (2,) each.
+        """
+        trial_sheet = PictureSheet(
+            _TRIAL_SHEET_SIDE_INCHES, _TRIAL_SHEET_SIDE_INCHES, title="", caption=""
+        )
+        axes = trial_sheet.add_axes(
+            0, 0, _TRIAL_SHEET_SIDE_INCHES, _TRIAL_SHEET_SIDE_INCHES, projection="3d"
+        )
+        self._set_box_axes(axes, azimuth, elevation)
         corners = np.array(list(product(*(self.cloud.box[axis] for axis in WORLD_AXES)))).T
         projected = self._project(axes, corners)
         return projected.min(axis=1), projected.max(axis=1)
@@ -206,30 +222,30 @@ class ObliqueView:
         )
 
     def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Return world positions (3, n) as plot coordinates of the axes."""
+        """Return the coordinates of world positions (3, n) that the axes plot: x, y and z."""
         return list(positions)
 
-    def to_inches(self, positions: np.ndarray) -> np.ndarray:
+    def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
         """Return world positions (3, n) as positions on the picture, (2, n) [inches]."""
         return self.inches_per_unit * self._project(self.axes, positions)
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw a shaded relief, clipped to the box and without walls.
+        """Draw a shaded relief within the box, without steep ground.
 
-        Return False: the legend needs no entry for it.
+        Return False, because the legend needs no entry for the relief.
         """
         cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"])
         if cropped is None:
             return False
         low, high = self.cloud.box["z"]
-        cropped = cropped.mask_walls()
+        cropped = cropped.mask_steep_ground()
         is_in_box = (cropped.height >= low) & (cropped.height <= high)
         x, y = np.meshgrid(cropped.x, cropped.y)
         self.axes.plot_surface(
             x,
             y,
             np.where(is_in_box, cropped.height, np.nan),
-            facecolors=_shaded_colours(cropped),
+            facecolors=_shaded_ground_colours(cropped),
             rcount=200,
             ccount=200,
             shade=False,
@@ -241,20 +257,21 @@ class ObliqueView:
 
 
 AXIS_MARGINS_INCHES = 0.8, 0.55
-"""Margins for ticks and labels at the left and at the bottom [inches]."""
+"""Margins of a picture for ticks and labels, at the left and at the bottom [inches]."""
 
 AXIS_VIEW_WIDTH_MAX_INCHES, AXIS_VIEW_HEIGHT_MAX_INCHES, AXIS_VIEW_SIDE_MIN_INCHES = 7.4, 7.0, 1.5
-"""Largest width and height of the picture, and its smallest side [inches]."""
+"""Largest width and height of a picture along a world axis, and its smallest side [inches]."""
 
 
-class AxisView:
-    """Picture of a point cloud along a world axis.
+class AxisAlignedView:
+    """Picture of a point cloud, viewed along a world axis.
 
-    `axis_names` are horizontal, vertical and viewing axis. `nearest_sign` is 1 if the eye is at the
-    upper end of the viewing axis, and -1 at its lower end.
+    `axis_names` are the horizontal, the vertical and the viewing axis. `nearest_sign` is
+    1 if the eye is at the upper end of the viewing axis, and -1 at its lower end.
     """
 
     scatter_options: ClassVar[dict[str, Any]] = {}
+    """Options of matplotlib\'s `scatter` for this kind of view."""
 
     def __init__(
         self,
@@ -292,26 +309,26 @@ class AxisView:
             y_name,
             cloud.box[y_name],
             self.size_inches[1],
-            point_styles.TICK_SPACING_Y_INCHES,
+            point_styles.TICK_SPACING_MIN_Y_INCHES,
         )
-        self._set_limits()
+        self._set_axis_limits()
 
-    def _set_limits(self) -> None:
-        """Set the axis limits to the box, whatever was drawn."""
+    def _set_axis_limits(self) -> None:
+        """Set the limits of both axes to the cloud's box."""
         self.axes.set(
             xlim=self.cloud.box[self.axis_names[0]], ylim=self.cloud.box[self.axis_names[1]]
         )
 
     def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
-        """Return world positions (3, n) as plot coordinates of the axes."""
+        """Return two of the coordinates of world positions (3, n): those that the axes plot."""
         return [positions[WORLD_AXES.index(axis)] for axis in self.axis_names[:2]]
 
-    def to_inches(self, positions: np.ndarray) -> np.ndarray:
+    def to_picture_inches(self, positions: np.ndarray) -> np.ndarray:
         """Return world positions (3, n) as positions on the picture, (2, n) [inches]."""
         return self.inches_per_unit * np.array(self.plot_coordinates(positions))
 
     def draw_ground(self, height_map: HeightMap) -> bool:
-        """Draw relief and contours from above, or the extent of heights from the side.
+        """Draw the ground: from above as relief with contours, from the side as an area.
 
         Return True if the legend needs an entry for the ground.
         """
@@ -319,14 +336,14 @@ class AxisView:
         if cropped is None:
             return False
         if self.axis_names[2] == "z":
-            self._draw_relief(cropped.mask_walls())
+            self._draw_relief(cropped.mask_steep_ground())
         else:
             self._draw_profile(cropped)
-        self._set_limits()
+        self._set_axis_limits()
         return self.axis_names[2] != "z"
 
     def _draw_relief(self, height_map: HeightMap) -> None:
-        """Draw the shaded relief from above, with labelled contours."""
+        """Draw a shaded relief from above, with labelled contours."""
         half_dx, half_dy = ((nodes[1] - nodes[0]) / 2 for nodes in (height_map.x, height_map.y))
         extent = (
             height_map.x[0] - half_dx,
@@ -335,7 +352,7 @@ class AxisView:
             height_map.y[-1] + half_dy,
         )
         self.axes.imshow(
-            _shaded_colours(height_map),
+            _shaded_ground_colours(height_map),
             extent=extent,
             origin="lower",
             zorder=0,
@@ -355,7 +372,7 @@ class AxisView:
             self.axes.clabel(contours, fontsize=7, fmt="%g m")
 
     def _draw_profile(self, height_map: HeightMap) -> None:
-        """Fill the area between lowest and highest ground along the viewing axis."""
+        """Fill the area between the lowest and the highest ground, seen from the side."""
         coordinates, collapsed_axis = (
             (height_map.x, 0) if self.axis_names[0] == "x" else (height_map.y, 1)
         )
@@ -373,12 +390,12 @@ class AxisView:
         )
 
 
-def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> None:
-    """Draw true points, false points as crosses, dropouts, and the flight path."""
+def _draw_cloud_marks(picture: AxisAlignedView | ObliqueView, point_colours: np.ndarray) -> None:
+    """Draw the true points, the false points, the shots without a point, and the flight path."""
     axes: Any = picture.axes
     cloud, to_columns = picture.cloud, picture.plot_coordinates
     positions = np.array([cloud.points[axis] for axis in WORLD_AXES])
-    area = point_styles.mark_area(picture.to_inches(positions), *picture.size_inches)
+    area = point_styles.marker_area(picture.to_picture_inches(positions), *picture.size_inches)
     is_true = cloud.is_true[picture.draw_order]
     true_indices, false_indices = picture.draw_order[is_true], picture.draw_order[~is_true]
     axes.scatter(
@@ -395,7 +412,7 @@ def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> N
             c=point_colours[false_indices],
             zorder=4,
             **picture.scatter_options,
-            **point_styles.false_mark_style(area),
+            **point_styles.false_point_marker_style(area),
         )
     if cloud.dropouts:
         axes.scatter(
@@ -416,24 +433,24 @@ def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> N
 
 
 def _positions_in_box(cloud: PointCloud, column_arrays: ColumnArrays) -> np.ndarray:
-    """Return world positions (3, n), with nan outside the box."""
+    """Return the x, y and z columns of a table as positions (3, n), with nan outside the box."""
     positions = np.array([column_arrays[axis] for axis in WORLD_AXES])
-    return np.where(is_within(column_arrays, cloud.box), positions, np.nan)
+    return np.where(within_limits_mask(column_arrays, cloud.box), positions, np.nan)
 
 
-def _shaded_colours(height_map: HeightMap) -> np.ndarray:
-    """Return pale shades of the ground, (rows, columns, 4); transparent where unknown."""
+def _shaded_ground_colours(height_map: HeightMap) -> np.ndarray:
+    """Return the shaded colours of the ground (rows, columns, 4); transparent where unknown."""
     rgba = np.array(colormaps["gray"](0.62 + 0.36 * height_map.hillshade()))
     rgba[~np.isfinite(height_map.height)] = 0.0
     return rgba
 
 
-AXIS_VIEWS = {
+AXIS_ALIGNED_VIEWS = {
     "above": (("x", "y", "z"), 1),
     "side": (("x", "z", "y"), -1),
     "front": (("y", "z", "x"), 1),
 }
-"""Views along an axis: horizontal, vertical and viewing axis, and sign of its nearest end."""
+"""Axes and sign of the views along a world axis, by name, for :class:`AxisAlignedView`."""
 
 OBLIQUE_ANGLES_DEG = -60.0, 28.0
 """Azimuth and elevation of the default oblique view [deg]."""
@@ -451,21 +468,36 @@ def draw_cloud_sheet(
 ) -> Sheet:
     """Return the sheet of a point cloud, coloured by a quantity.
 
-    ``view`` is the name of a view, or azimuth and elevation of the eye [deg].
+    Parameters
+    ----------
+    cloud
+        Points, flight path and dropouts.
+    quantity
+        Name of the quantity that colours the points.
+    surfaces
+        Display names of the surfaces.
+    view
+        Name of a view, or azimuth and elevation of the eye [deg].
+    height_map
+        Ground to draw below the points; None for none.
+    title
+        Title of the sheet.
+    remarks
+        Further sentences of the caption.
     """
-    values = to_shown_units(quantity, cloud.points[quantity])
+    values = to_displayed_values(quantity, cloud.points[quantity])
     colouring = point_styles.choose_colours(
         quantity, values, is_trusted=cloud.is_true, surfaces=surfaces
     )
     caption = labels.join_sentences([*cloud.remarks, *remarks])
-    picture: AxisView | ObliqueView
-    if isinstance(view, str) and view in AXIS_VIEWS:
-        picture = AxisView(cloud, *AXIS_VIEWS[view], title=title, caption=caption)
+    picture: AxisAlignedView | ObliqueView
+    if isinstance(view, str) and view in AXIS_ALIGNED_VIEWS:
+        picture = AxisAlignedView(cloud, *AXIS_ALIGNED_VIEWS[view], title=title, caption=caption)
     else:
         angles = OBLIQUE_ANGLES_DEG if isinstance(view, str) else view
         picture = ObliqueView(cloud, *angles, title=title, caption=caption)
     ground_in_legend = height_map is not None and picture.draw_ground(height_map)
-    _draw_cloud(picture, colouring.map_values(values))
+    _draw_cloud_marks(picture, colouring.to_rgba_colours(values))
     picture.picture_sheet.draw_legends(
         colouring, _legend_handles(cloud, shows_ground=ground_in_legend)
     )
@@ -473,13 +505,13 @@ def draw_cloud_sheet(
 
 
 def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
-    """Return the legend entries for the marks of a picture."""
+    """Return the legend entries for everything in a picture except the colours of points."""
     handles: list[Any] = []
     if not cloud.is_true.all():
-        handles.append(point_styles.false_point_mark())
+        handles.append(point_styles.false_point_legend_marker())
     if cloud.dropouts and cloud.dropouts["x"].size:
         style = {"markerfacecolor": "none", "markeredgecolor": DROPOUT_COLOUR, "markersize": 5}
-        handles.append(point_styles.legend_mark("o", "shot without\na point", **style))
+        handles.append(point_styles.legend_marker("o", "shot without\na point", **style))
     if cloud.path:
         handles.append(
             Line2D([], [], color=PATH_COLOUR, linewidth=1.6, label="flight path,\ndot: start")
@@ -510,11 +542,11 @@ def draw_scatter_sheet(
         if "flags" in column_arrays
         else np.ones(len(column_arrays[x]), bool)
     )
-    values = to_shown_units(colour, column_arrays[colour])
+    values = to_displayed_values(colour, column_arrays[colour])
     colouring = point_styles.choose_colours(colour, values, is_trusted=is_true, surfaces=surfaces)
-    columns = {name: to_shown_units(name, column_arrays[name]) for name in (x, y)}
-    limits = {name: _axis_limits(name, columns[name], is_true) for name in (x, y)}
-    is_inside = is_within(columns, limits)
+    columns = {name: to_displayed_values(name, column_arrays[name]) for name in (x, y)}
+    limits = {name: _scatter_axis_limits(name, columns[name], is_true) for name in (x, y)}
+    is_inside = within_limits_mask(columns, limits)
     count_texts = [thinned_rows.describe_count("point" if "flags" in column_arrays else "shot")]
     if n_outside := int((~is_inside & ~is_true).sum()) * thinned_rows.step:
         count_texts.append(f"{labels.counted(n_outside, 'false point')} outside of the picture")
@@ -525,11 +557,11 @@ def draw_scatter_sheet(
         caption=labels.join_sentences([*count_texts, *remarks]),
     )
     axes = picture_sheet.add_axes(*AXIS_MARGINS_INCHES, *SCATTER_SIZE_INCHES)
-    _set_axes(axes, limits, (x, y))
-    rgba = colouring.map_values(values)
+    _set_scatter_axes(axes, limits, (x, y))
+    rgba = colouring.to_rgba_colours(values)
     positions = np.array([columns[x], columns[y]])
-    area = point_styles.mark_area(
-        axes.transData.transform(positions[:, is_inside].T).T / canvas.DPI, *SCATTER_SIZE_INCHES
+    area = point_styles.marker_area(
+        axes.transData.transform(positions[:, is_inside].T).T / canvas.PNG_DPI, *SCATTER_SIZE_INCHES
     )
     is_true_inside, is_false_inside = is_inside & is_true, is_inside & ~is_true
     x_values, y_values = positions
@@ -541,7 +573,7 @@ def draw_scatter_sheet(
         linewidths=0,
         zorder=3,
     )
-    false_style = point_styles.false_mark_style(area)
+    false_style = point_styles.false_point_marker_style(area)
     axes.scatter(
         x_values[is_false_inside],
         y_values[is_false_inside],
@@ -550,15 +582,17 @@ def draw_scatter_sheet(
         **false_style,
     )
     picture_sheet.draw_legends(
-        colouring, [point_styles.false_point_mark()] if is_false_inside.any() else []
+        colouring, [point_styles.false_point_legend_marker()] if is_false_inside.any() else []
     )
     return picture_sheet.sheet
 
 
-def _axis_limits(quantity: str, values: np.ndarray, is_true: np.ndarray) -> tuple[float, float]:
-    """Return the limits of an axis around the true points, with a margin.
+def _scatter_axis_limits(
+    quantity: str, values: np.ndarray, is_true: np.ndarray
+) -> tuple[float, float]:
+    """Return the limits of an axis that contain all finite values of true points, with a margin.
 
-    Without finite true values all finite values count.
+    If true points have none, all finite values count.
     """
     finite_values = values[is_true & np.isfinite(values)]
     finite_values = finite_values if finite_values.size else values[np.isfinite(values)]
@@ -574,10 +608,10 @@ def _axis_limits(quantity: str, values: np.ndarray, is_true: np.ndarray) -> tupl
     return low - margin, high + margin
 
 
-def _set_axes(
+def _set_scatter_axes(
     axes: Axes, limits: dict[str, tuple[float, float]], quantities: tuple[str, str]
 ) -> None:
-    """Set limits, scales, labels and grid of the axes."""
+    """Set the limits, scales, labels and grid of a scatter plot of two quantities."""
     axis_names: tuple[Literal["x", "y"], ...] = ("x", "y")
     for axis_name, quantity in zip(axis_names, quantities, strict=True):
         axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_QUANTITIES else "linear"})

@@ -1,4 +1,4 @@
-"""Consistency of a flight's errors with their standard errors, checked against the stored truth.
+"""Comparison of a flight's actual errors with the standard errors that it states.
 
 A flight's store contains the truth. Errors of true points divided by their standard errors should
 have a size of about 1. So should errors of velocity and altitude relative to their covariances. Far
@@ -21,64 +21,66 @@ from sweep.storage.locations import Location
 ERROR_RATIO_MAX = 2.0
 """Largest ratio of errors to standard errors that counts as consistent."""
 
-_ERRORS_MIN = 20
-"""Least number of errors for a judgement."""
+_JUDGED_ERRORS_MIN = 20
+"""Least number of errors for a judgement of their size."""
 
-_SAMPLED_SHOTS, _SAMPLED_DRAWS, _SAMPLED_VALUES_PER_AXIS = 1 << 15, 16, 6
-"""Largest numbers of shots, draws, and values per axis in a sample; shots and values are spread."""
+_SAMPLED_SHOTS_MAX, _SAMPLED_DRAWS_MAX, _SAMPLED_VALUES_PER_AXIS_MAX = 1 << 15, 16, 6
+"""Largest numbers of shots, of draws, and of values per axis that are read for the comparison."""
 
-_SAMPLED_INTERVALS = 16
-"""Number of intervals in which a long flight is sampled."""
+_SAMPLED_FLIGHT_INTERVALS = 16
+"""Number of evenly spaced intervals of a long flight that are read."""
 
-_ERROR_QUANTILES = 0.6827, 0.9545
-"""Quantiles of the errors that are compared with those of normal errors."""
+_COMPARED_QUANTILES = 0.6827, 0.9545
+"""Fractions at which quantiles of the errors are compared with those of a normal distribution."""
 
-_SCALAR_REFERENCE, _VECTOR_REFERENCE = (1.0, 2.0), (1.8780, 2.8328)
-"""Quantiles of normal errors in standard errors, for a scalar and for a vector of three."""
+_SCALAR_NORMAL_QUANTILES, _VECTOR_NORMAL_QUANTILES = (1.0, 2.0), (1.8780, 2.8328)
+"""Quantiles of the length of a normal error, in standard errors: of a number, and of a 3-vector."""
 
 
-_REMEDIES = {
+_LIKELY_CAUSE_BY_QUANTITY = {
     "range": "Ground steeper than navigation.terrain_slope, or targets that move otherwise than "
     "navigation.target_speed and target_acceleration state, may be the cause.",
     "radial velocity": "Targets that move otherwise than navigation.target_speed and "
     "target_acceleration state may be the cause.",
     "altitude": "Relief other than navigation.relief states may be the cause.",
 }
-"""Likely causes of errors far larger than stated, by quantity."""
+"""Sentences on the likely cause of errors far larger than stated, by quantity."""
 
 
 class ConsistencyResult(NamedTuple):
     """Ratio of a quantity's errors to their stated standard errors, for one scanner."""
 
     scanner: str
+    """Name of the scanner."""
     quantity: str
+    """Name of the quantity in messages."""
     error_ratio: float
-    """Quantile of the errors over that of normal errors of the stated size; ideally 1."""
+    """Size of the errors over their stated standard errors; ideally 1."""
     n_errors: int
-    """Number of sampled errors."""
+    """Number of errors that were read."""
 
     @property
     def is_consistent(self) -> bool:
         """True if errors are about as large as stated, or too few for a judgement."""
-        return self.n_errors < _ERRORS_MIN or not self.error_ratio > ERROR_RATIO_MAX
+        return self.n_errors < _JUDGED_ERRORS_MIN or not self.error_ratio > ERROR_RATIO_MAX
 
     @property
     def message(self) -> str:
-        """Sentence about errors that are far larger than stated."""
+        """Sentence that says how much larger the errors are than stated, and why."""
         return (
             f"{self.scanner}: {self.quantity} is inconsistent: residuals are "
             f"{self.error_ratio:.3g} "
-            f"times the stated errors. {_REMEDIES.get(self.quantity, '')}".rstrip()
+            f"times the stated errors. {_LIKELY_CAUSE_BY_QUANTITY.get(self.quantity, '')}".rstrip()
         )
 
 
-def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
-    """Return the ratio of errors to standard errors for each scanner and quantity of a flight.
+def check_error_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
+    """Compare errors with stated standard errors, for each scanner and quantity of a flight.
 
     Parameters
     ----------
     tree
-        Tree of `sweep.open_scene`. A long flight is sampled.
+        Tree of `sweep.open_scene`. Only evenly spaced parts of a long flight are read.
 
     Returns
     -------
@@ -88,14 +90,15 @@ def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
 
     Notes
     -----
-    Absolute errors are divided by their standard errors, and velocity errors by their covariance
-    (Mahalanobis distance). The ratio is the larger of two: the 68.27 % and the 95.45 % quantile
-    over that of normal errors.
+    The size of an error is relative to its standard error. For a velocity vector it is the
+    Mahalanobis distance by the stated covariance. At 68.27 % and at 95.45 %, the quantile of these
+    sizes is divided by the quantile for normal errors; the ratio is the larger quotient.
     """
     results = []
     for scanner in map(str, tree.attrs["scanners"]):
         errors_by_sample = [
-            _normalised_errors(sample) for sample in _iter_samples(tree[scanner].to_dataset())
+            _normalised_errors(sample)
+            for sample in _iter_flight_samples(tree[scanner].to_dataset())
         ]
         for quantity in dict.fromkeys(key for sample in errors_by_sample for key in sample):
             normalised_errors = np.concatenate(
@@ -104,10 +107,12 @@ def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
             error_ratio = float("nan")
             if normalised_errors.size:
                 reference_quantiles = (
-                    _VECTOR_REFERENCE if quantity == _VELOCITY else _SCALAR_REFERENCE
+                    _VECTOR_NORMAL_QUANTILES
+                    if quantity == _VELOCITY_QUANTITY
+                    else _SCALAR_NORMAL_QUANTILES
                 )
                 error_ratio = np.max(
-                    np.quantile(normalised_errors, _ERROR_QUANTILES) / reference_quantiles
+                    np.quantile(normalised_errors, _COMPARED_QUANTILES) / reference_quantiles
                 )
             results.append(
                 ConsistencyResult(scanner, quantity, float(error_ratio), normalised_errors.size)
@@ -116,40 +121,41 @@ def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
 
 
 def inconsistency_messages(store: str | Location, scanner: str | None = None) -> list[str]:
-    """Return a sentence for each quantity whose errors are far larger than the store states.
+    """Return a sentence for each quantity of a store whose errors are far larger than stated.
 
-    ``scanner``: the only scanner to check; None for all. A grid's store gives no sentences.
+    ``scanner`` is the only scanner to check; None stands for all. The store of a grid has no such
+    errors, and gives an empty list.
     """
-    from sweep.analysis.datasets import open_tree
+    from sweep.analysis.datasets import open_scene_tree
     from sweep.storage.locations import parse_location
 
-    tree = open_tree(parse_location(store))
+    tree = open_scene_tree(parse_location(store))
     if "scanners" not in tree.attrs:
         return []
     return [
         result.message
-        for result in check_consistency(tree)
+        for result in check_error_consistency(tree)
         if not result.is_consistent and scanner in (None, result.scanner)
     ]
 
 
-def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Yield samples of a scanner's arrays, loaded into memory.
+def _iter_flight_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Yield parts of a scanner's arrays, loaded into memory.
 
-    A short flight is one sample, a long flight is sampled in evenly spaced intervals.
+    A short flight is one part. Of a long flight the parts are evenly spaced intervals.
     """
     n_shots, shots_per_cycle = group.sizes["shot"], int(group.attrs["shots_a_cycle"])
     axis_indices = {
         str(dim): np.unique(
-            np.linspace(0, size - 1, min(size, _SAMPLED_VALUES_PER_AXIS)).astype(int)
+            np.linspace(0, size - 1, min(size, _SAMPLED_VALUES_PER_AXIS_MAX)).astype(int)
         )
         for dim, size in group["pd_shot"].sizes.items()
         if dim != "shot"
     }
-    group = group.isel({"draw": slice(_SAMPLED_DRAWS), **axis_indices})
+    group = group.isel({"draw": slice(_SAMPLED_DRAWS_MAX), **axis_indices})
     n_cycles = n_shots // shots_per_cycle
-    n_sampled_cycles = min(n_cycles, max(1, _SAMPLED_SHOTS // shots_per_cycle))
-    n_intervals = 1 if n_sampled_cycles == n_cycles else _SAMPLED_INTERVALS
+    n_sampled_cycles = min(n_cycles, max(1, _SAMPLED_SHOTS_MAX // shots_per_cycle))
+    n_intervals = 1 if n_sampled_cycles == n_cycles else _SAMPLED_FLIGHT_INTERVALS
     cycles_per_interval = max(1, n_sampled_cycles // n_intervals)
     for first_cycle in np.unique(
         np.linspace(0, n_cycles - cycles_per_interval, n_intervals).astype(int)
@@ -165,9 +171,10 @@ def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
         yield sample[variables].load()
 
 
-_VELOCITY = "velocity"
+_VELOCITY_QUANTITY = "velocity"
+"""Name of the velocity vector of navigation, as a quantity."""
 _VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
-"""Stored variables of a point, by the name of the quantity in messages."""
+"""Stored variables of the quantities of a point, by the quantity's name in messages."""
 
 _NEEDED_VARIABLES = (
     "flags",
@@ -186,11 +193,11 @@ _NEEDED_VARIABLES = (
     ),
     *(f"true_{q}" for q in _VARIABLE_BY_QUANTITY.values()),
 )
-"""Variables that are read from a store."""
+"""Variables that the comparison reads from a store."""
 
 
 def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Return absolute errors in standard errors, by quantity; only finite ones."""
+    """Return the sizes of all finite errors, relative to their standard errors, by quantity."""
     is_true = (sample["flags"] & TRUE_FLAG).values > 0
     errors_by_quantity: dict[str, np.ndarray] = {}
     for quantity, variable in _VARIABLE_BY_QUANTITY.items():
@@ -198,28 +205,31 @@ def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
         error = np.abs(reported - sample[f"true_{variable}"].values[is_true])
         standard_error = sample[f"{variable}_interpolated_standard_error"].values[is_true]
         # Interpolation between bins is accurate to about 1e-9 of the value.
-        errors_by_quantity[quantity] = _finite_only(
+        errors_by_quantity[quantity] = _finite_values(
             error / np.maximum(standard_error, 1e-9 * np.abs(reported))
         )
     if "velocity" in sample:
-        is_solved = _is_solved(sample["velocity_status"])
+        is_solved = _solved_mask(sample["velocity_status"])
         dims = (*sample["velocity_status"].dims, "xyz")
         error = (sample["velocity"] - sample["true_velocity"]).transpose(*dims).values[is_solved]
         covariance = sample["velocity_covariance"].values[is_solved]
-        errors_by_quantity[_VELOCITY] = _mahalanobis_distances(error, covariance)
-        is_solved = _is_solved(sample["altitude_status"])
+        errors_by_quantity[_VELOCITY_QUANTITY] = _mahalanobis_distances(error, covariance)
+        is_solved = _solved_mask(sample["altitude_status"])
         dims = sample["altitude_status"].dims
         altitude_error = (
             (sample["altitude"] - sample["true_altitude"]).transpose(*dims).values[is_solved]
         )
-        errors_by_quantity["altitude"] = _finite_only(
+        errors_by_quantity["altitude"] = _finite_values(
             np.abs(altitude_error) / np.sqrt(sample["altitude_variance"].values[is_solved])
         )
     return errors_by_quantity
 
 
-def _is_solved(status: xr.DataArray) -> np.ndarray:
-    """Return a mask of solutions that exist; a status of -1 means not computed yet."""
+def _solved_mask(status: xr.DataArray) -> np.ndarray:
+    """Return a mask of the navigation solutions that exist, by their status.
+
+    A negative status means that the solution is not computed yet.
+    """
     return ((status >= 0) & (status <= STATUS_EXCLUDED)).values
 
 
@@ -235,5 +245,6 @@ def _mahalanobis_distances(error: np.ndarray, covariance: np.ndarray) -> np.ndar
     return np.asarray(np.sqrt(np.maximum(chi_square, 0.0)))
 
 
-def _finite_only(values: np.ndarray) -> np.ndarray:
+def _finite_values(values: np.ndarray) -> np.ndarray:
+    """Return the finite values of an array, (n,)."""
     return values[np.isfinite(values)]

@@ -1,4 +1,4 @@
-"""Reports of a lidar unit's interface: quantised, clipped, flagged, at its own rate, and delayed.
+"""Reports that a lidar unit sends over its interface: quantised, clipped, flagged and delayed.
 
 Reports are made from stored points, which stay unchanged. A shot is valid if it has a return that a
 Doppler peak confirms, as far as the instrument can tell. Without a Doppler segment any return is
@@ -17,7 +17,11 @@ import xarray as xr
 
 from sweep.analysis import labels
 from sweep.analysis.scene_results.point_export import resolve_recording
-from sweep.analysis.scene_results.recordings import INTERPOLATED, Recording, array_name
+from sweep.analysis.scene_results.recordings import (
+    INTERPOLATED_RANGES,
+    Recording,
+    quantity_array_name,
+)
 from sweep.analysis.study_figures import SceneResults
 from sweep.messages import STORE_PLACEHOLDER, suggested_call
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
@@ -29,33 +33,38 @@ MEASURED_QUANTITIES = ("range", "radial_velocity")
 """Quantities that a unit reports."""
 
 REPORT_COLUMNS = {
-    "time": ("s", "time stamp: that of the measurement, and the latency"),
+    "time": ("s", "time stamp: time of the measurement plus the latency"),
     "beam": ("1", "number of the beam"),
     "range": ("m", "range as reported"),
     "radial_velocity": ("m s-1", "radial velocity as reported, positive when closing"),
-    "range_standard_error": ("m", "standard error of the range, its quantum's among it"),
+    "range_standard_error": ("m", "standard error of the range, quantisation included"),
     "radial_velocity_standard_error": (
-        "m s-1", "standard error of the radial velocity, its quantum's among it"
+        "m s-1", "standard error of the radial velocity, quantisation included"
     ),
-    "valid": ("1", "1: enough valid shots, and neither value beyond its limits"),
-    "range_saturated": ("1", "1: range beyond its limits, and clipped to them"),
-    "radial_velocity_saturated": ("1", "1: radial velocity beyond its limits, and clipped to them"),
-    "shots": ("1", "valid shots in the report's period"),
+    "valid": ("1", "1: enough valid shots, and no value outside its limits"),
+    "range_saturated": ("1", "1: range clipped, as it lies outside its limits"),
+    "radial_velocity_saturated": (
+        "1", "1: radial velocity clipped, as it lies outside its limits"
+    ),
+    "shots": ("1", "number of valid shots in the report's period"),
     "true_range": ("m", "true range of the beam's axis at the time stamp"),
     "true_radial_velocity": ("m s-1", "true radial velocity of the beam's axis at the time stamp"),
 }  # fmt: skip
 """Units and description of each column of reports."""
 
-_TRUTH_VARIABLES = {"true_range": "beam_range", "true_radial_velocity": "beam_radial_velocity"}
-"""Stored variables with the true values, by column of reports."""
+_TRUTH_VARIABLE_BY_COLUMN = {
+    "true_range": "beam_range",
+    "true_radial_velocity": "beam_radial_velocity",
+}
+"""Stored variables with the truth along the beam, by column of the reports."""
 
-_PERIOD_EDGE_FRACTION = 1e-6
-"""Fraction of a period before its end within which a shot counts to the next one.
+_PERIOD_END_TOLERANCE_FRACTION = 1e-6
+"""Time before the end of a period from which a shot counts to the next period [periods].
 
-It absorbs rounding errors of times.
+It allows for rounding errors of times.
 """
 _REPORTS_PER_SHOT_MAX = 10
-"""Largest number of reports per shot; a higher rate is refused, as most reports would be empty."""
+"""Largest number of reports per shot. A higher rate of reports is refused: most would be empty."""
 
 ColumnArrays = dict[str, np.ndarray]
 """Columns of a table by name, all of equal length."""
@@ -67,7 +76,7 @@ def reports(
     *,
     scanner: str | None = None,
     draw: int = 0,
-    ranges: str = INTERPOLATED,
+    ranges: str = INTERPOLATED_RANGES,
     where: Mapping[str, object] | None = None,
     interface: Mapping[str, object] | None = None,
 ) -> xr.Dataset:
@@ -103,7 +112,7 @@ def reports(
         remedy = "name a .csv, or export points"
         mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
     recording, _ = resolve_recording(results, scanner, draw, ranges, where or {}, mistakes)
-    shot_columns = _read_shots(recording, draw, ranges)
+    shot_columns = _read_shot_columns(recording, draw, ranges)
     report_columns = make_reports(
         shot_columns, results.spec.interface_with_overrides(interface or {})
     )
@@ -123,19 +132,23 @@ def reports(
     return xr.Dataset(arrays)
 
 
-def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
-    """Return columns over the computed shots of a draw: geometry, and the first return of each."""
+def _read_shot_columns(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
+    """Return the columns over computed shots that :func:`make_reports` needs, for one draw."""
     stored_by_name = {
-        name: array_name(name, ranges)
+        name: quantity_array_name(name, ranges)
         for name in (*MEASURED_QUANTITIES, *map(_standard_error_name, MEASURED_QUANTITIES))
     }
     column_parts: list[ColumnArrays] = []
-    for shot_slice in recording.shot_slices():
-        is_computed = recording.computed_shots(shot_slice, draw)
-        names = ("time", "beam", *_TRUTH_VARIABLES.values())
-        column_arrays = {name: recording.read(name, shot_slice)[is_computed] for name in names}
+    for shot_slice in recording.iter_shot_slices():
+        is_computed = recording.computed_shot_mask(shot_slice, draw)
+        names = ("time", "beam", *_TRUTH_VARIABLE_BY_COLUMN.values())
+        column_arrays = {
+            name: recording.read_array(name, shot_slice)[is_computed] for name in names
+        }
         for name, stored_name in (stored_by_name | {"flags": "flags"}).items():
-            column_arrays[name] = recording.read(stored_name, shot_slice, draw)[is_computed, 0]
+            column_arrays[name] = recording.read_array(stored_name, shot_slice, draw)[
+                is_computed, 0
+            ]
         column_parts.append(column_arrays)
     if not any(column_part["time"].size for column_part in column_parts):
         problem = f"holds no shot of {recording.scanner} and draw {draw} yet"
@@ -170,7 +183,7 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
     q.
     """
     is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED_FLAG == 0)
-    report_index, report_periods = _assign_periods(shot_columns, interface.rate)
+    report_index, report_periods = _assign_shots_to_reports(shot_columns, interface.rate)
     n_valid = np.bincount(report_index[is_valid_shot], minlength=report_periods["beam"].size)
     weights = _shot_weights(report_index, is_valid_shot, n_valid, interface.value)
 
@@ -188,7 +201,7 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
     for name in MEASURED_QUANTITIES:
         quantisation_step = getattr(interface, f"{name}_quantum")
         limits = getattr(interface, f"min_{name}"), getattr(interface, f"max_{name}")
-        columns[name], is_saturated = quantise(
+        columns[name], is_saturated = quantise_and_clip(
             weighted_sum(shot_columns[name]), quantisation_step, *limits
         )
         variance = (
@@ -199,22 +212,22 @@ def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArra
         columns[f"{name}_saturated"] = is_saturated.astype(np.int8)
         is_valid_report &= ~is_saturated
     columns |= {"valid": is_valid_report.astype(np.int8), "shots": n_valid}
-    for name, truth_name in _TRUTH_VARIABLES.items():
+    for name, truth_name in _TRUTH_VARIABLE_BY_COLUMN.items():
         columns[name] = _interpolate_truth(
             columns["time"], columns["beam"], shot_columns, truth_name
         )
     return {name: columns[name] for name in REPORT_COLUMNS}
 
 
-def quantise(
+def quantise_and_clip(
     values: np.ndarray, quantisation_step: float | None, low: float | None, high: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values rounded to quantisation steps and clipped, and a mask of those beyond limits.
+    """Round values to quantisation steps and clip them; also return a mask of values out of limits.
 
-    ``quantisation_step``, ``low`` and ``high`` are optional (None). Limits are rounded to the
-    nearest step, so that a value within them changes by at most half a step.
+    ``quantisation_step`` and the limits ``low`` and ``high`` are optional (None). Limits are
+    rounded to the nearest step, so that a value within them changes by at most half a step.
 
-    >>> values, beyond = quantise(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
+    >>> values, beyond = quantise_and_clip(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
     >>> values.tolist(), beyond.tolist()
     ([0.5, 2.5, 4.0], [False, False, True])
     """
@@ -231,15 +244,24 @@ def quantise(
 
 
 def _standard_error_name(quantity: str) -> str:
+    """Return the name of the column with the standard error of a quantity."""
     return f"{quantity}_standard_error"
 
 
-def _assign_periods(
+def _assign_shots_to_reports(
     shot_columns: ColumnArrays, rate: float | None
 ) -> tuple[np.ndarray, ColumnArrays]:
-    """Return the report index of each shot (n,), and beam and time of each report (m,).
+    """Assign n shots to m reports, one for each beam and period of the rate.
 
-    The time is the middle of the report's period, or that of the shot if there is no rate.
+    Without a rate each shot has its own report.
+
+    Returns
+    -------
+    report_index : numpy.ndarray
+        Index of each shot's report, (n,).
+    report_periods : dict of numpy.ndarray
+        ``beam`` and ``time`` of each report, (m,). The time [s] is the middle of the period, or the
+        time of the shot.
     """
     if rate is None:
         return np.arange(shot_columns["time"].size), {
@@ -247,9 +269,9 @@ def _assign_periods(
         }
     start = shot_columns["time"][0]
     beams, beam_index = np.unique(shot_columns["beam"], return_inverse=True)
-    period_index = np.floor((shot_columns["time"] - start) * rate + _PERIOD_EDGE_FRACTION).astype(
-        np.int64
-    )
+    period_index = np.floor(
+        (shot_columns["time"] - start) * rate + _PERIOD_END_TOLERANCE_FRACTION
+    ).astype(np.int64)
     if (period_index[-1] + 1) * beams.size > _REPORTS_PER_SHOT_MAX * (beam_index.size + beams.size):
         beam_rate = beam_index.size / beams.size / max(np.ptp(shot_columns["time"]), 1 / rate)
         problem = (
@@ -268,7 +290,11 @@ def _assign_periods(
 def _shot_weights(
     report_index: np.ndarray, is_valid_shot: np.ndarray, n_valid: np.ndarray, reported_value: str
 ) -> np.ndarray:
-    """Return the weight of each shot in its report (n,): equal weights, or 1 for the last shot."""
+    """Return the weight of each shot (n,) in the value of its report.
+
+    The valid shots of a report have equal weights if `reported_value` is ``mean``. Otherwise the
+    last of them has the weight 1, and all others 0.
+    """
     if reported_value == "mean":
         return np.where(is_valid_shot, 1 / np.maximum(n_valid[report_index], 1), 0.0)
     last_shot = np.full(n_valid.size, -1)
@@ -279,7 +305,10 @@ def _shot_weights(
 def _interpolate_truth(
     time: np.ndarray, beam: np.ndarray, shot_columns: ColumnArrays, name: str
 ) -> np.ndarray:
-    """Return the truth of beams at given times, linear between their shots; nan outside of them."""
+    """Interpolate a true value between the shots of each beam, at the times and beams of reports.
+
+    The result is nan before the first and after the last shot of the beam.
+    """
     truth_at_times = np.full(time.size, np.nan)
     truth = np.where(np.isfinite(shot_columns[name]), shot_columns[name], np.nan)
     for beam_number in np.unique(beam):

@@ -11,13 +11,14 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.charts import LINEAR, LOG, Chart, ChartAxis, ChartLine, Panel
-from sweep.analysis.datasets import chunk_length, read_slices
+from sweep.analysis.charts import LINEAR_SCALE, LOG_SCALE, Chart, ChartAxis, ChartLine, Panel
+from sweep.analysis.datasets import chunk_aligned_slices, stored_chunk_length
 from sweep.analysis.scene_results.recordings import Recording
-from sweep.analysis.tables import Cell, PageTable, TablePage
+from sweep.analysis.tables import PageTable, TableCell, TablePage
 from sweep.model.pointcloud.navigation import STATUS_EXCLUDED, STATUS_SOLVED
 
-VELOCITY, ALTITUDE = "velocity", "altitude"
+VELOCITY_QUANTITY, ALTITUDE_QUANTITY = "velocity", "altitude"
+"""Names of the quantities that navigation solves for."""
 
 SOLUTIONS_PER_READ = 65_536
 """Approximate number of solutions that are read at once."""
@@ -25,17 +26,21 @@ SOLUTIONS_PER_READ = 65_536
 
 @dataclass(frozen=True, eq=False)
 class ErrorTally:
-    """Error statistics of a vector of m components, by altitude bin; tallies of parts can be added.
+    """Error statistics of solutions with m components, by altitude bin.
 
-    Fields: numbers of attempts and of solutions (bins,), mean error, sum of squared deviations from
-    the mean, and mean of the stated variances (bins, m).
+    The sum of two tallies is the tally of all their solutions.
     """
 
-    attempts: np.ndarray
+    n_attempts: np.ndarray
+    """Number of attempts at a solution (bins,)."""
     n_solutions: np.ndarray
+    """Number of attempts that gave a solution (bins,)."""
     mean_error: np.ndarray
+    """Mean error of the solutions (bins, m)."""
     squared_deviation: np.ndarray
+    """Sum of the squared deviations of errors from their mean (bins, m)."""
     mean_stated_variance: np.ndarray
+    """Mean of the variances that the solutions state (bins, m)."""
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
         """Return the tally of both, by the method of Chan, Golub and LeVeque (1983).
@@ -49,7 +54,7 @@ class ErrorTally:
             self.n_solutions[..., None] * other_fraction * mean_difference * mean_difference
         )
         return ErrorTally(
-            self.attempts + other.attempts,
+            self.n_attempts + other.n_attempts,
             n_solutions,
             self.mean_error + other_fraction * mean_difference,
             self.squared_deviation + other.squared_deviation + between_squares,
@@ -59,17 +64,17 @@ class ErrorTally:
 
     @property
     def availability(self) -> np.ndarray:
-        """Share of attempts with a solution (...,), 0..1; nan without attempts."""
-        return _quotient_or_nan(self.n_solutions, self.attempts)
+        """Share of attempts that gave a solution (bins,), 0..1; nan without attempts."""
+        return _quotient_or_nan(self.n_solutions, self.n_attempts)
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean error (..., m); nan without solutions."""
+        """Mean error of each component (bins, m); nan without solutions."""
         return np.where(self.n_solutions[..., None] > 0, self.mean_error, np.nan)
 
     @property
     def rmse(self) -> np.ndarray:
-        """RMS error of each component (..., m), including the bias; nan without solutions."""
+        """RMS error of each component (bins, m), including the bias; nan without solutions."""
         return np.sqrt(
             _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None])
             + self.mean_error**2
@@ -77,23 +82,27 @@ class ErrorTally:
 
     @property
     def variance(self) -> np.ndarray:
-        """Unbiased variance of the errors (..., m); nan with fewer than two solutions."""
+        """Unbiased variance of the errors (bins, m); nan with fewer than two solutions."""
         return _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None] - 1)
 
     @property
     def stated_variance(self) -> np.ndarray:
-        """Mean variance stated by the solutions (..., m); nan without solutions."""
+        """Mean of the variances that the solutions state (bins, m); nan without solutions."""
         return np.where(self.n_solutions[..., None] > 0, self.mean_stated_variance, np.nan)
 
 
 @dataclass(frozen=True)
 class ErrorCurve:
-    """Errors of a scanner's velocity or altitude, by bins of true altitude with given edges [m]."""
+    """Errors of the velocity or altitude that a scanner's navigation gives, over true altitude."""
 
     scanner: str
+    """Name of the scanner, or label of its recording."""
     quantity: str
+    """``velocity`` or ``altitude``."""
     altitude_edges: np.ndarray
+    """Edges of the altitude bins (bins + 1,) [m]."""
     tally: ErrorTally
+    """Error statistics in each bin."""
 
     @property
     def label(self) -> str:
@@ -102,7 +111,7 @@ class ErrorCurve:
 
     @property
     def bin_centres(self) -> np.ndarray:
-        """Altitudes of the bin centres [m]."""
+        """Altitudes at the centres of the bins (bins,) [m]."""
         return (self.altitude_edges[1:] + self.altitude_edges[:-1]) / 2
 
     @property
@@ -112,23 +121,29 @@ class ErrorCurve:
 
     @property
     def rmse(self) -> np.ndarray:
-        """RMS error of each component, and for vectors also of their length: (bins, m [+ 1])."""
-        return _append_length(self.tally.rmse)
+        """RMS error of each component, and of the whole vector if there are several.
+
+        The shape is (bins, 1) for altitude and (bins, 4) for velocity.
+        """
+        return _append_vector_length(self.tally.rmse)
 
     @property
     def stated_deviation(self) -> np.ndarray:
-        """Root mean stated variance of the solutions, in the shape of `rmse`."""
-        return _append_length(np.sqrt(self.tally.stated_variance))
+        """Standard deviation that the solutions state, as a root mean square, like `rmse`."""
+        return _append_vector_length(np.sqrt(self.tally.stated_variance))
 
 
-def _append_length(components: np.ndarray) -> np.ndarray:
-    """Append to vectors (..., m) their lengths; return a single component unchanged."""
+def _append_vector_length(components: np.ndarray) -> np.ndarray:
+    """Return vectors (..., m) with their lengths as a further component (..., m + 1).
+
+    Vectors with a single component are returned unchanged.
+    """
     if components.shape[-1] == 1:
         return components
     return np.concatenate([components, np.linalg.norm(components, axis=-1, keepdims=True)], axis=-1)
 
 
-def navigation_curves(
+def navigation_error_curves(
     named_recordings: Sequence[tuple[str, Recording]], *, quantity: str, n_bins: int
 ) -> list[ErrorCurve]:
     """Return the error curves of scanners that navigate, all with the same altitude bins.
@@ -147,7 +162,7 @@ def navigation_curves(
         for name, recording in named_recordings
         if "velocity_status" in recording.dataset
     ]
-    altitude_edges = _altitude_edges([dataset for _, dataset in navigating], n_bins)
+    altitude_edges = _altitude_bin_edges([dataset for _, dataset in navigating], n_bins)
     if altitude_edges is None:
         return []
     return [
@@ -155,14 +170,17 @@ def navigation_curves(
             name,
             quantity,
             altitude_edges,
-            merge_tallies(list(_iter_tallies(dataset, quantity, altitude_edges))),
+            merge_tallies(list(_iter_error_tallies(dataset, quantity, altitude_edges))),
         )
         for name, dataset in navigating
     ]
 
 
-def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray | None:
-    """Return the edges of the altitude bins, or None if no altitude is known."""
+def _altitude_bin_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray | None:
+    """Return the edges of equal altitude bins [m] that contain all true altitudes of all datasets.
+
+    The result is None if no altitude is known.
+    """
     altitudes = [dataset["true_altitude"].chunk(cycle=SOLUTIONS_PER_READ) for dataset in datasets]
     extremes = dask.compute([altitude.min() for altitude in altitudes],
                         [altitude.max() for altitude in altitudes])  # fmt: skip
@@ -176,26 +194,28 @@ def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray |
     return edges
 
 
-def _iter_tallies(
+def _iter_error_tallies(
     dataset: xr.Dataset, quantity: str, altitude_edges: np.ndarray
 ) -> Iterator[ErrorTally]:
-    """Yield the tallies of a scanner's solutions, part by part."""
+    """Yield the error tallies of consecutive parts of a scanner's navigation solutions."""
     status = dataset[f"{quantity}_status"]
-    draws_per_chunk = chunk_length(status, "draw")
-    draw_slices = read_slices(status, "draw", draws_per_chunk)
-    cycle_slices = read_slices(status, "cycle", max(1, SOLUTIONS_PER_READ // draws_per_chunk))
+    draws_per_chunk = stored_chunk_length(status, "draw")
+    draw_slices = chunk_aligned_slices(status, "draw", draws_per_chunk)
+    cycle_slices = chunk_aligned_slices(
+        status, "cycle", max(1, SOLUTIONS_PER_READ // draws_per_chunk)
+    )
     for cycle_slice, draw_slice in product(cycle_slices, draw_slices):
         part = dataset.isel(cycle=cycle_slice, draw=draw_slice)
         status_values, solution = part[f"{quantity}_status"].values, part[quantity].values
         altitude = np.broadcast_to(part["true_altitude"].values[:, None], status_values.shape)
         altitude_bin = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), altitude_edges) - 1
         altitude_bin = np.where(status_values.ravel() >= STATUS_SOLVED, altitude_bin, -1)
-        if quantity == ALTITUDE:
+        if quantity == ALTITUDE_QUANTITY:
             variance = part["altitude_variance"].values
         else:
             variance = np.diagonal(part["velocity_covariance"].values, axis1=-2, axis2=-1)
         error = solution - part[f"true_{quantity}"].values[:, None]
-        component_shape = -1, len(COMPONENTS[quantity])
+        component_shape = -1, len(COMPONENT_NAMES_BY_QUANTITY[quantity])
         yield tally_errors(
             error.reshape(component_shape),
             variance.reshape(component_shape),
@@ -212,24 +232,26 @@ def tally_errors(
     altitude_bin: np.ndarray,
     n_bins: int,
 ) -> ErrorTally:
-    """Return the tally of n solutions by altitude bin, computed in two passes for accuracy.
+    """Return the error tally of n attempts at a solution, by altitude bin.
+
+    Sums are computed in two passes for accuracy.
 
     Parameters
     ----------
     error
-        Errors of the solutions, (n, m).
+        Errors of the m components, (n, m).
     variance
         Variances that the solutions state, (n, m).
     is_available
-        Mask of the attempts that have a solution, (n,).
+        Mask of the attempts that gave a solution, (n,).
     altitude_bin
-        Index of each solution's altitude bin, (n,). Indices outside 0 to ``n_bins`` - 1 do not
-        count.
+        Index of each attempt's altitude bin, (n,). Attempts with an index outside 0 to ``n_bins`` -
+        1 do not count.
     n_bins
         Number of bins.
     """
     is_in_range = (altitude_bin >= 0) & (altitude_bin < n_bins)
-    attempts = np.bincount(altitude_bin[is_in_range], minlength=n_bins)
+    n_attempts = np.bincount(altitude_bin[is_in_range], minlength=n_bins)
     is_counted = is_in_range & is_available
     error, variance, altitude_bin = (
         error[is_counted],
@@ -246,12 +268,16 @@ def tally_errors(
     squared_deviation = _sum_by_bin(residual * residual, altitude_bin, n_bins)
     mean_stated_variance = _sum_by_bin(variance, altitude_bin, n_bins) / divisor
     return ErrorTally(
-        attempts, n_solutions, mean_error + mean_correction, squared_deviation, mean_stated_variance
+        n_attempts,
+        n_solutions,
+        mean_error + mean_correction,
+        squared_deviation,
+        mean_stated_variance,
     )
 
 
 def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
-    """Return the sum of tallies, added pairwise in a fixed order for reproducible bits."""
+    """Return the sum of tallies. They are added in pairs, so that rounding is always the same."""
     if not tallies:
         raise ValueError("there is no tally to merge")
     remaining_tallies = list(tallies)
@@ -264,33 +290,41 @@ def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
 
 
 def _sum_by_bin(values: np.ndarray, bin_index: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the sums of values (n, m) in each bin (n_bins, m), added in the order of the rows."""
+    """Return the sums (n_bins, m) of the values (n, m) in each bin.
+
+    `bin_index` (n,) is the bin of each row.
+    """
     return np.stack([np.bincount(bin_index, column, n_bins) for column in values.T], axis=-1)
 
 
 def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the quotient, or nan where the divisor is not positive."""
+    """Return a total divided by a count; nan where the count is not positive."""
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
-COMPONENTS = {VELOCITY: ("x", "y", "z"), ALTITUDE: ("",)}
-"""Names of the components of each quantity."""
+"""Names of the statistics of navigation errors."""
+COMPONENT_NAMES_BY_QUANTITY = {VELOCITY_QUANTITY: ("x", "y", "z"), ALTITUDE_QUANTITY: ("",)}
+"""Names of the components of each quantity; altitude has a single one without a name."""
 
-UNIT_BY_QUANTITY = {VELOCITY: "m/s", ALTITUDE: "m"}
-LENGTH_NAME = "vector"
-"""Label of a vector's length where it is listed after the components x, y, z."""
+UNIT_BY_QUANTITY = {VELOCITY_QUANTITY: "m/s", ALTITUDE_QUANTITY: "m"}
+"""Units of the errors of each quantity."""
+VECTOR_LENGTH_LABEL = "vector"
+"""Label of the error of the whole vector, which is listed after the components x, y and z."""
 
 ComponentStatistic = tuple[str, int]
-"""Name of a statistic, and index of its component; the index m stands for the length."""
+"""Name of a statistic, and index of a component; an index after the last stands for the vector."""
 
 
-def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
-    """Return the chart of errors over altitude: a panel per statistic, a line per curve."""
+def navigation_error_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
+    """Return the chart of navigation errors over altitude: a panel per statistic, a line per curve.
+
+    ``show`` is ``availability``, ``bias``, ``rmse``, or ``all``.
+    """
     panels, panels_per_row = [], []
     for quantity in dict.fromkeys(curve.quantity for curve in curves):
         quantity_curves = [curve for curve in curves if curve.quantity == quantity]
-        panel_rows = _panel_rows(quantity, show)
+        panel_rows = _statistics_of_panel_rows(quantity, show)
         panels_per_row += [len(row) for row in panel_rows]
         panels += [
             _statistic_panel(quantity_curves, quantity, *statistic)
@@ -309,12 +343,12 @@ def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
     )  # fmt: skip
 
 
-def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
-    """Return the statistics of each row of panels.
+def _statistics_of_panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
+    """Return the statistics that the panels of each row show.
 
-    Availability and the error of the vector's length come first, then those of each component.
+    Availability and the error of the whole vector come first, and then the components.
     """
-    n_components = len(COMPONENTS[quantity])
+    n_components = len(COMPONENT_NAMES_BY_QUANTITY[quantity])
     component_indices = list(range(n_components))
     if n_components == 1:
         statistics = [AVAILABILITY, BIAS, RMSE] if show == "all" else [show]
@@ -334,10 +368,12 @@ def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
 def _statistic_panel(
     curves: Sequence[ErrorCurve], quantity: str, statistic: str, component_index: int
 ) -> Panel:
-    """Return the panel of one statistic of a component, with a line for each curve."""
-    component_names = COMPONENTS[quantity]
+    """Return the panel with one statistic of a component over altitude, with a line per curve."""
+    component_names = COMPONENT_NAMES_BY_QUANTITY[quantity]
     component = (
-        component_names[component_index] if component_index < len(component_names) else LENGTH_NAME
+        component_names[component_index]
+        if component_index < len(component_names)
+        else VECTOR_LENGTH_LABEL
     )
     phrase = f"of the {quantity}" + (f", {component}" if len(component_names) > 1 else "")
     units, altitudes = UNIT_BY_QUANTITY[quantity], curves[0].bin_centres
@@ -366,7 +402,9 @@ def _statistic_panel(
         is_wide = positive_values.size > 0 and positive_values.max() > 4 * positive_values.min()
         title = f"RMS error {phrase}"
         y_axis = ChartAxis(
-            f"error ({units})", LOG if is_wide else LINEAR, None if is_wide else (0.0, None)
+            f"error ({units})",
+            LOG_SCALE if is_wide else LINEAR_SCALE,
+            None if is_wide else (0.0, None),
         )
         for k, curve in enumerate(curves):
             lines.append(ChartLine(altitudes, curve.rmse[:, component_index], curve.label, k))
@@ -385,15 +423,18 @@ def _statistic_panel(
     return Panel({"statistic": title}, ChartAxis("altitude above ground (m)"), y_axis, lines)
 
 
-def navigation_page(
+def navigation_error_page(
     curves: Sequence[ErrorCurve], *, show: str, title: str, remarks: Sequence[str]
 ) -> TablePage:
-    """Return a page with a table for each curve, and a row for each altitude bin."""
+    """Return a page of navigation errors with a table for each curve, and a row per altitude bin.
+
+    ``show`` is ``availability``, ``bias``, ``rmse``, or ``all``.
+    """
     statistics = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
     page_tables, records = [], []
     for curve in curves:
         curve_records = [
-            _bin_record(curve, i, statistics) for i in range(curve.altitude_edges.size - 1)
+            _altitude_bin_record(curve, i, statistics) for i in range(curve.altitude_edges.size - 1)
         ]
         columns = [name for name in curve_records[0] if name != "scanner"]
         rows = [[record[name] for name in columns] for record in curve_records]
@@ -409,16 +450,18 @@ def navigation_page(
     return TablePage(title, page_tables, notes, records)
 
 
-def _bin_record(curve: ErrorCurve, bin_index: int, statistics: Sequence[str]) -> dict[str, Cell]:
-    """Return the statistics of an altitude bin as a row of the CSV file."""
-    record: dict[str, Cell] = {
+def _altitude_bin_record(
+    curve: ErrorCurve, bin_index: int, statistics: Sequence[str]
+) -> dict[str, TableCell]:
+    """Return the statistics of an altitude bin, by column name of the CSV file."""
+    record: dict[str, TableCell] = {
         "scanner": curve.scanner,
         "from": float(curve.altitude_edges[bin_index]),
         "to": float(curve.altitude_edges[bin_index + 1]),
-        "cycles": int(curve.tally.attempts[bin_index]),
+        "cycles": int(curve.tally.n_attempts[bin_index]),
         "solved": int(curve.tally.n_solutions[bin_index]),
     }
-    component_names = COMPONENTS[curve.quantity]
+    component_names = COMPONENT_NAMES_BY_QUANTITY[curve.quantity]
     if AVAILABILITY in statistics:
         record["available"] = float(curve.tally.availability[bin_index])
     if BIAS in statistics:
@@ -427,7 +470,7 @@ def _bin_record(curve: ErrorCurve, bin_index: int, statistics: Sequence[str]) ->
             record[f"error of bias {name}".strip()] = float(curve.bias_standard_error[bin_index, k])
     if RMSE in statistics:
         for k, name in enumerate(
-            (*component_names, LENGTH_NAME) if len(component_names) > 1 else component_names
+            (*component_names, VECTOR_LENGTH_LABEL) if len(component_names) > 1 else component_names
         ):
             record[f"rmse {name}".strip()] = float(curve.rmse[bin_index, k])
             record[f"stated {name}".strip()] = float(curve.stated_deviation[bin_index, k])

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from sweep.analysis import labels
-from sweep.analysis.scene_results.consistency import check_consistency
+from sweep.analysis.scene_results.consistency import check_error_consistency
 from sweep.analysis.scene_results.recordings import (
-    INTERPOLATED,
-    QUANTISED,
+    INTERPOLATED_RANGES,
+    QUANTISED_RANGES,
     QUANTITY_BY_NAME,
     AxisPosition,
     Recording,
@@ -38,7 +38,7 @@ POINT_DTYPE = np.dtype(
         ("return_number", "|u1"), ("number_of_returns", "|u1"), ("scan_angle", "<f8"),
     ]
 )  # fmt: skip
-"""Columns of a point, in the order of files.
+"""NumPy type of a point in a file: its columns in order.
 
 The returns of a shot and draw are numbered from 1 in stored order, with confirmed and strong ones
 first. The scan angle is the angle between beam and nadir [deg]. It is negative to the left of the
@@ -46,7 +46,7 @@ ground track, or of the x axis if the platform has no horizontal velocity.
 """
 
 POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
-"""Names of the columns, in the order of files."""
+"""Names of the columns of points, in the order of files."""
 
 UNIT_BY_COLUMN = {
     n: QUANTITY_BY_NAME[n].units
@@ -57,7 +57,7 @@ UNIT_BY_COLUMN = {
 UNIT_BY_COLUMN["scan_angle"] = "deg"
 
 REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING_SIGN_NOTE)
-"""Meaning of a column's values that its units do not tell."""
+"""Remarks on columns whose units do not explain the values: signs of velocities."""
 
 DESCRIPTION_BY_COLUMN = {
     name: "; ".join(filter(None, [UNIT_BY_COLUMN.get(name), REMARK_BY_COLUMN.get(name)]))
@@ -71,21 +71,24 @@ class PointTable:
     """Points of one draw of a recording, in the coordinates and times of the scene's files."""
 
     recording: Recording
+    """Recording of a scanner."""
     draw: int
+    """Number of the draw."""
     ranges: str
+    """Kind of ranges: ``interpolated`` or ``quantised``."""
     origin: np.ndarray
-    """Origin of the stored coordinates, which is added to them (3,) [m]."""
+    """Offset that is added to the stored coordinates (3,) [m]."""
     time_origin: float = 0.0
-    """Origin of the stored times, which is added to them [s]."""
+    """Offset that is added to the stored times [s]."""
     projection_wkt: str = ""
     """WKT of the map projection of the coordinates; empty if unknown."""
 
     def iter_rows(self) -> Iterator[np.ndarray]:
-        """Yield rows (m,) of `POINT_DTYPE`, one part of the flight at a time."""
+        """Yield arrays of points (m,) of type `POINT_DTYPE`, one part of the flight at a time."""
         stored_columns = [
             name for name in POINT_COLUMNS if name not in ("number_of_returns", "scan_angle")
         ]
-        for shot_slice in self.recording.shot_slices():
+        for shot_slice in self.recording.iter_shot_slices():
             column_arrays = self.recording.point_columns(
                 [*stored_columns, "returns"], shot_slice, self.draw, self.ranges
             )
@@ -101,9 +104,9 @@ class PointTable:
             yield rows
 
     def _scan_angles(self, shot_slice: slice) -> np.ndarray:
-        """Return the angle between each shot's beam and nadir (k,) [deg], negative to the left."""
+        """Return the scan angles (k,) of the k shots of a slice [deg] (see `POINT_DTYPE`)."""
         beam_directions, velocities = (
-            self.recording.read(name, shot_slice)
+            self.recording.read_array(name, shot_slice)
             for name in ("beam_direction", "platform_velocity")
         )
         is_still = np.hypot(velocities[:, 0], velocities[:, 1]) < 1e-9 * np.linalg.norm(
@@ -121,16 +124,19 @@ class PointTable:
         return np.where(right_component < 0, -nadir_angle, nadir_angle)
 
     def count_points(self) -> int:
-        """Return the number of points."""
+        """Return the number of points of the table."""
         return sum(
-            int((self.recording.read("flags", shot_slice, self.draw) > 0).sum())
-            for shot_slice in self.recording.shot_slices()
+            int((self.recording.read_array("flags", shot_slice, self.draw) > 0).sum())
+            for shot_slice in self.recording.iter_shot_slices()
         )
 
     def coordinate_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and highest coordinates, (3,) each [m]; infinite without points."""
+        """Return the lowest and the highest x, y and z of all points, (3,) each [m].
+
+        Without points the limits are infinite.
+        """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for shot_slice in self.recording.shot_slices():
+        for shot_slice in self.recording.iter_shot_slices():
             column_arrays = self.recording.point_columns("xyz", shot_slice, self.draw, self.ranges)
             coordinates = np.array([*column_arrays.values()]) + self.origin[:, None]
             low = np.minimum(low, coordinates.min(axis=1, initial=np.inf))
@@ -139,12 +145,12 @@ class PointTable:
 
 
 Remarks = Sequence[str]
-"""Remarks that are written to a file, as far as its format allows."""
+"""Remarks on the contents of a file; they are written to it if its format allows."""
 
 _PLY_TYPE_BY_DTYPE = {
     "<f8": "double", "<i2": "short", "|u1": "uchar", "<i4": "int", "<u4": "uint",
 }  # fmt: skip
-"""PLY types of the columns' NumPy types."""
+"""PLY types of columns, by their NumPy types."""
 
 
 def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
@@ -186,38 +192,40 @@ def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
     return n_points
 
 
-LAS_STEP_MIN = 1e-4
-"""Least quantisation step of coordinates in a LAS file [m]; coarser for a large extent."""
+LAS_COORDINATE_STEP_MIN = 1e-4
+"""Least quantisation step of coordinates in a LAS file [m]; a large cloud needs a larger step."""
 
-LAS_COORDINATE_MAX = 2.0**31 - 1
+LAS_COORDINATE_STEPS_MAX = 2.0**31 - 1
+"""Largest distance of a coordinate from the file's offset in a LAS file [quantisation steps]."""
 LAS_RETURN_NUMBER_MAX = 15
-"""Largest coordinate in steps from the offset, and largest return number, of a LAS file."""
+"""Largest return number in a LAS file."""
 
 _LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
-"""Columns that point format 6 has fields for; the others become extra bytes."""
+"""Columns with a field in LAS point format 6. All other columns become extra bytes."""
 
 _LAS_SCAN_ANGLE_STEP_DEG = 0.006
 """Quantisation step of scan angles in a LAS file [deg]."""
 
-_STORED_RETURN_FIELD = "stored_return"
+_STORED_RETURN_NUMBER_FIELD = "stored_return"
 """Name of the extra field with the stored return number, from 1."""
 
-_LAS_BEAM_MAX = 255
-"""Largest beam number that a LAS file's user data can hold."""
+_LAS_BEAM_NUMBER_MAX = 255
+"""Largest beam number that the user data of a LAS point can hold."""
 
-LAS_UNCLASSIFIED, LAS_NOISE = 1, 7
+LAS_UNCLASSIFIED_CLASS, LAS_NOISE_CLASS = 1, 7
 """LAS classes of true points and of false points."""
 
 
 def write_las(
     table: PointTable, file_path: Path, remarks: Remarks, *, compressed: bool = False
 ) -> int:
-    """Write a LAS 1.4 file, point format 6, with the other columns as extra bytes.
+    """Write a LAS 1.4 file of point format 6; return the number of points.
 
-    True returns of a shot are numbered by rising range, as the format requires. False points have
-    the class of noise, and are numbered separately. User data contains the beam number (255 for any
-    larger one). Times are GPS times. The intensity is the signal-to-noise ratio in 0.01 dB. The map
-    projection is stated if it is known. Return the number of points.
+    Columns without a field in this format become extra bytes. True returns of a shot are numbered
+    by rising range, as the format requires. False points have the class of noise, and are numbered
+    separately. User data contains the beam number (255 for any larger one). Times are GPS times.
+    The intensity is the signal-to-noise ratio in 0.01 dB. The map projection is stated if it is
+    known.
     """
     import laspy
 
@@ -230,7 +238,7 @@ def write_las(
                 for n in extra_columns
             ),
             laspy.ExtraBytesParams(
-                _STORED_RETURN_FIELD, "|u1", description="return_number in the store"
+                _STORED_RETURN_NUMBER_FIELD, "|u1", description="return_number in the store"
             ),
         ]
     )
@@ -240,26 +248,34 @@ def write_las(
     if table.projection_wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(table.projection_wkt))
     header.offsets = np.round((low + high) / 2) + 0.0 if has_points else np.zeros(3)
-    header.scales = np.full(3, _las_step(float((high - low).max()) if has_points else 0.0))
+    header.scales = np.full(
+        3, _las_coordinate_step(float((high - low).max()) if has_points else 0.0)
+    )
     header.generating_software = "sweep"
     header.system_identifier = "simulated FMCW Doppler lidar"[:32]
     n_points = 0
     with laspy.open(file_path, mode="w", header=header, do_compress=compressed) as writer:
         for rows in table.iter_rows():
-            writer.write_points(_las_points(rows, header, extra_columns))
+            writer.write_points(_to_las_points(rows, header, extra_columns))
             n_points += rows.size
     return n_points
 
 
-def _las_step(extent: float) -> float:
-    """Return the quantisation step of coordinates with an extent [m]: a power of ten."""
-    return LAS_STEP_MIN * 10.0 ** max(
-        0, math.ceil(math.log10((extent / 2 + 1) / (LAS_STEP_MIN * LAS_COORDINATE_MAX)))
+def _las_coordinate_step(extent: float) -> float:
+    """Return the quantisation step [m] for coordinates of a given extent [m]: a power of ten."""
+    return LAS_COORDINATE_STEP_MIN * 10.0 ** max(
+        0,
+        math.ceil(
+            math.log10((extent / 2 + 1) / (LAS_COORDINATE_STEP_MIN * LAS_COORDINATE_STEPS_MAX))
+        ),
     )
 
 
-def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type: ignore[no-untyped-def]
-    """Return rows as points of a LAS file."""
+def _to_las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type: ignore[no-untyped-def]
+    """Convert points of `POINT_DTYPE` to points of a LAS file with the given header.
+
+    `extra_columns` are the columns that become extra bytes.
+    """
     import laspy
 
     points = laspy.ScaleAwarePointRecord.zeros(rows.size, header=header)
@@ -267,13 +283,15 @@ def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type
         points[axis] = rows[axis]
     points["gps_time"] = rows["time"]
     for name, return_numbers in zip(
-        ("return_number", "number_of_returns"), _number_by_range(rows), strict=True
+        ("return_number", "number_of_returns"), _number_returns_by_range(rows), strict=True
     ):
         points[name] = np.minimum(return_numbers, LAS_RETURN_NUMBER_MAX)
-    points[_STORED_RETURN_FIELD] = rows["return_number"]
-    points["user_data"] = np.minimum(rows["beam"], _LAS_BEAM_MAX)
+    points[_STORED_RETURN_NUMBER_FIELD] = rows["return_number"]
+    points["user_data"] = np.minimum(rows["beam"], _LAS_BEAM_NUMBER_MAX)
     points["scan_angle"] = np.round(rows["scan_angle"] / _LAS_SCAN_ANGLE_STEP_DEG)
-    points["classification"] = np.where(rows["flags"] & TRUE_FLAG, LAS_UNCLASSIFIED, LAS_NOISE)
+    points["classification"] = np.where(
+        rows["flags"] & TRUE_FLAG, LAS_UNCLASSIFIED_CLASS, LAS_NOISE_CLASS
+    )
     snr_db = 10 * np.log10(np.maximum(rows["snr"], 1e-30))
     points["intensity"] = np.clip(np.round(100 * np.nan_to_num(snr_db)), 0, 65535)
     for name in extra_columns:
@@ -281,10 +299,16 @@ def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type
     return points
 
 
-def _number_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each row its return number by rising range, from 1, and the number of returns.
+def _number_returns_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Assign return numbers to the points of each shot, from 1 by rising range.
 
-    True and false points are numbered separately. All rows of a shot must be in ``rows``.
+    True and false points are numbered separately. ``rows`` are points of `POINT_DTYPE`, and contain
+    all points of each shot.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Return number of each point, and the number of returns of its shot and kind.
     """
     is_false = (rows["flags"] & TRUE_FLAG) == 0
     order = np.lexsort((rows["range"], is_false, rows["shot"]))
@@ -305,7 +329,7 @@ WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
     ".laz": partial(write_las, compressed=True),
     ".csv": write_csv,
 }
-"""Writer of each file format, by suffix."""
+"""Functions that write the points to a file and return their number, by suffix of the file."""
 
 
 def export(
@@ -314,7 +338,7 @@ def export(
     *,
     scanner: str | None = None,
     draw: int = 0,
-    ranges: str = INTERPOLATED,
+    ranges: str = INTERPOLATED_RANGES,
     where: Mapping[str, object] | None = None,
 ) -> int:
     """Write the points of one scanner and draw to a file.
@@ -384,23 +408,41 @@ def resolve_recording(
     where: Mapping[str, object],
     mistakes: Sequence[Mistake] = (),
 ) -> tuple[Recording, AxisPosition]:
-    """Return the requested recording, and its position along the axes.
+    """Return the recording that a user requests, and its position along the study's axes.
+
+    Parameters
+    ----------
+    results
+        Opened store of a flight.
+    scanner
+        Name of the scanner; None for the only one.
+    draw
+        Number of the draw.
+    ranges
+        ``interpolated`` or ``quantised``.
+    where
+        Values of coordinates, written as in a spec.
+    mistakes
+        Further mistakes of the request, which the error also lists.
 
     Raises
     ------
     SpecError
-        The request has mistakes; those passed in ``mistakes`` are listed too.
+        The request has mistakes.
     """
     axis_position = find_axis_position(results.spec, where)
-    if all_mistakes := [*mistakes, *_find_mistakes(results, scanner, draw, ranges, axis_position)]:
+    if all_mistakes := [
+        *mistakes,
+        *_find_request_mistakes(results, scanner, draw, ranges, axis_position),
+    ]:
         raise SpecError(all_mistakes)
-    return axis_position.recording(results.tree, scanner or results.scanners[0]), axis_position
+    return axis_position.open_recording(results.tree, scanner or results.scanners[0]), axis_position
 
 
-def _find_mistakes(
+def _find_request_mistakes(
     results: SceneResults, scanner: str | None, draw: int, ranges: str, axis_position: AxisPosition
 ) -> list[Mistake]:
-    """Return the mistakes in a request for a recording."""
+    """Return the mistakes in a user's request for the points of a scanner and draw."""
     mistakes = []
     scanner_list = ", ".join(results.scanners)
     if scanner is None and len(results.scanners) > 1:
@@ -416,9 +458,9 @@ def _find_mistakes(
     if not 0 <= draw < n_draws:
         problem, remedy = "is no draw of this study", f"they are numbered 0 to {n_draws - 1}"
         mistakes.append(Mistake("draw", problem, str(draw), remedy))
-    if ranges not in (INTERPOLATED, QUANTISED):
-        problem = f"must be {INTERPOLATED} or {QUANTISED}"
-        remedy = suggest_similar_name(ranges, (INTERPOLATED, QUANTISED))
+    if ranges not in (INTERPOLATED_RANGES, QUANTISED_RANGES):
+        problem = f"must be {INTERPOLATED_RANGES} or {QUANTISED_RANGES}"
+        remedy = suggest_similar_name(ranges, (INTERPOLATED_RANGES, QUANTISED_RANGES))
         mistakes.append(Mistake("ranges", problem, ranges, remedy))
     for axis in results.spec.axes:
         if axis.name in axis_position.open_axes:  # the request leaves several values
@@ -439,7 +481,7 @@ def _find_mistakes(
 def _file_remarks(
     results: SceneResults, table: PointTable, axis_position: AxisPosition
 ) -> list[str]:
-    """Return the remarks about a file's contents that are written into it."""
+    """Return the remarks that are written into a file of points: source, selection and numbers."""
     surface_remarks = [f"surface {i}: {name}" for i, name in enumerate(results.surface_labels)]
     flag_remarks = [
         f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAG_BITS.items()
@@ -449,7 +491,7 @@ def _file_remarks(
     )
     consistency_messages = [
         result.message
-        for result in check_consistency(results.tree)
+        for result in check_error_consistency(results.tree)
         if not result.is_consistent and result.scanner == table.recording.scanner
     ]
     return [

@@ -1,4 +1,4 @@
-"""Styles of pictures of points: colours, marks, legends and ticks."""
+"""Styles of pictures of point clouds: colours, markers, legends and ticks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sweep.analysis import canvas, labels
 from sweep.analysis.scene_results.recordings import (
     CATEGORICAL_QUANTITIES,
     LOG_QUANTITIES,
-    POINT_KINDS,
+    POINT_KIND_BITS,
     SIGNED_QUANTITIES,
     quantity_label,
 )
@@ -31,33 +31,37 @@ DIVERGING_COLOUR_MAP = LinearSegmentedColormap.from_list(
     "both_signs",
     [(0.0, "#7CC6EE"), (0.36, "#0072B2"), (0.5, "#2B2B33"), (0.64, "#D55E00"), (1.0, "#F5B26B")],
 )
-"""Diverging colours: dark at zero, blue for negative and orange for positive values.
+"""Colour map for values of both signs: dark at zero, blue below and orange above.
 
-They are distinct for colour-blind readers and on a pale ground. Small values already have the
-colour of their sign; larger ones are paler.
+The colours are distinct for colour-blind readers and on a pale ground. Small values already show
+their sign; larger ones are paler.
 """
 
 MISSING_POINT_COLOUR = "0.6"
-"""Colour of points without a value or name."""
+"""Colour of points whose value is not known, or whose category has no colour of its own."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
-"""Largest distance of outliers from the 0.5 % and 99.5 % quantiles, as a fraction of their span.
+"""Distance beyond the 0.5 % or 99.5 % quantile from which values do not extend a colour scale.
 
-Outliers farther away do not extend the colour scale.
+It is a fraction of the span between both quantiles.
 """
 
 
 @dataclass(frozen=True)
-class ContinuousColours:
+class ContinuousColourScale:
     """Colours of a quantity with continuous values."""
 
     cmap: Colormap
+    """Colour map."""
     norm: Normalize
+    """Normalisation of values to 0..1."""
     label: str
+    """Label of the colour bar, with units."""
     extend: str = "neither"
+    """Ends of the colour bar beyond which there are values: neither, min, max or both."""
 
-    def map_values(self, values: np.ndarray) -> np.ndarray:
-        """Return the colours of values, (n, 4)."""
+    def to_rgba_colours(self, values: np.ndarray) -> np.ndarray:
+        """Return the colours (n, 4) of values (n,), as red, green, blue and opacity, 0..1."""
         is_finite = np.isfinite(values)
         colours = np.asarray(self.cmap(self.norm(np.where(is_finite, values, 1.0))))
         colours[~is_finite] = to_rgba(MISSING_POINT_COLOUR)
@@ -66,19 +70,21 @@ class ContinuousColours:
 
 @dataclass(frozen=True)
 class CategoryColours:
-    """Colours of categories, by number."""
+    """Colours of categories that have numbers, such as beams or surfaces."""
 
     title: str
+    """Title of the legend."""
     label_by_number: Mapping[int, str]
+    """Name of each category in the legend, by its number."""
 
     @property
     def colour_by_number(self) -> dict[int, str]:
-        """Colour of each category; further categories are grey."""
+        """Colour of each category by its number, as far as there are colours."""
         named_numbers = [number for number in self.label_by_number if number >= 0]
         return dict(zip(named_numbers, canvas.LINE_COLOURS, strict=False))
 
-    def map_values(self, values: np.ndarray) -> np.ndarray:
-        """Return the colours of category numbers, (n, 4)."""
+    def to_rgba_colours(self, values: np.ndarray) -> np.ndarray:
+        """Return the colours (n, 4) of category numbers, as red, green, blue and opacity, 0..1."""
         rgba = np.tile(to_rgba(MISSING_POINT_COLOUR), (np.size(values), 1))
         for number, colour in self.colour_by_number.items():
             rgba[np.asarray(values) == number] = to_rgba(colour)
@@ -87,33 +93,34 @@ class CategoryColours:
     def legend_handles(self) -> list[Line2D]:
         """Return a legend entry for each category."""
         return [
-            legend_mark("o", name, color=self.colour_by_number.get(number, MISSING_POINT_COLOUR))
+            legend_marker("o", name, color=self.colour_by_number.get(number, MISSING_POINT_COLOUR))
             for number, name in self.label_by_number.items()
         ]
 
 
-def legend_mark(marker: str, label: str, **style: Any) -> Line2D:
-    """Return a legend entry for a mark."""
+def legend_marker(marker: str, label: str, **style: Any) -> Line2D:
+    """Return a legend entry for a marker of matplotlib."""
     return Line2D([], [], linestyle="", marker=marker, label=label, **{"markersize": 6} | style)
 
 
-def false_point_mark() -> Line2D:
-    """Return a legend entry for false points."""
-    return legend_mark("x", "false point", color="0.2", markersize=5)
+def false_point_legend_marker() -> Line2D:
+    """Return the legend entry for false points."""
+    return legend_marker("x", "false point", color="0.2", markersize=5)
 
 
 def choose_colours(
     quantity: str, values: np.ndarray, *, is_trusted: np.ndarray, surfaces: Sequence[str]
-) -> ContinuousColours | CategoryColours:
-    """Return the colours for values of a quantity.
+) -> ContinuousColourScale | CategoryColours:
+    """Return the colours for the values of a quantity: continuous, or by category.
 
-    ``is_trusted``: mask of the values that set the ends of the scale.
+    ``is_trusted`` is a mask of the values that determine the ends of a continuous scale, and
+    ``surfaces`` are the names of the surfaces.
     """
     if quantity in CATEGORICAL_QUANTITIES:
         numbers = [int(n) for n in np.unique(values[np.isfinite(values)])]
         if quantity == "flags":
             return CategoryColours(
-                "point", {n: labels.coordinate_label(list(POINT_KINDS)[n]) for n in numbers}
+                "point", {n: labels.coordinate_label(list(POINT_KIND_BITS)[n]) for n in numbers}
             )
         if len(numbers) <= len(canvas.LINE_COLOURS):
             surface_by_number = dict(enumerate(surfaces)) if quantity == "surface" else {}
@@ -121,11 +128,11 @@ def choose_colours(
                 n: surface_by_number.get(n, "none" if n < 0 else f"{n}") for n in numbers
             }
             return CategoryColours(labels.coordinate_label(quantity), label_by_number)
-    return _continuous_colours(quantity, values, is_trusted)
+    return _continuous_colour_scale(quantity, values, is_trusted)
 
 
-def _scale_ends(values: np.ndarray) -> tuple[float, float]:
-    """Return the ends of a scale: lowest and highest value, without a few outliers."""
+def _colour_scale_ends(values: np.ndarray) -> tuple[float, float]:
+    """Return the lowest and highest value of a colour scale, without far outliers."""
     if not values.size:
         return 1.0, 1.0
     low, low_quantile, high_quantile, high = (
@@ -137,22 +144,22 @@ def _scale_ends(values: np.ndarray) -> tuple[float, float]:
     )
 
 
-def _continuous_colours(
+def _continuous_colour_scale(
     quantity: str, values: np.ndarray, is_trusted: np.ndarray
-) -> ContinuousColours:
+) -> ContinuousColourScale:
     """Return a continuous colour scale that spans the trusted values, without outliers."""
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values
     is_log = quantity in LOG_QUANTITIES
-    low, high = _scale_ends(trusted_values[trusted_values > 0] if is_log else trusted_values)
+    low, high = _colour_scale_ends(trusted_values[trusted_values > 0] if is_log else trusted_values)
     cmap = colormaps[canvas.COLOUR_MAP_NAME]
     if quantity in SIGNED_QUANTITIES and low < 0 < high:
         cmap, low, high = DIVERGING_COLOUR_MAP, -max(-low, high), max(-low, high)
     if high <= low:
         low, high = (low / 2, high * 2) if is_log else (low - 0.5, high + 0.5)
     has_below, has_above = bool((finite_values < low).any()), bool((finite_values > high).any())
-    return ContinuousColours(
+    return ContinuousColourScale(
         cmap,
         LogNorm(low, high) if is_log else Normalize(low, high),
         textwrap.fill(quantity_label(quantity), 44),
@@ -161,14 +168,14 @@ def _continuous_colours(
 
 
 LEGEND_WIDTH_INCHES = 1.75
-"""Width of the legends at the right [inches]."""
+"""Width of the space for legends at the right of a picture [inches]."""
 
 TITLE_HEIGHT_INCHES, CAPTION_HEIGHT_INCHES, CAPTION_LINE_HEIGHT_INCHES = 0.75, 0.55, 0.17
 """Heights of the title, of the caption's first line, and of each further line [inches]."""
 
 
 class PictureSheet:
-    """Sheet with a picture of a given size, and the legends of colours and marks at its right."""
+    """Sheet with a picture of a given size [inches], and with legends at its right."""
 
     def __init__(self, width: float, height: float, *, title: str, caption: str) -> None:
         self.width, self.height = width, height
@@ -185,7 +192,10 @@ class PictureSheet:
     def to_sheet_fractions(
         self, left: float, bottom: float, width: float, height: float
     ) -> tuple[float, float, float, float]:
-        """Convert a rectangle in inches from the lower left corner to fractions of the sheet."""
+        """Convert a rectangle [inches] from the picture's lower left corner to sheet fractions.
+
+        The result is left, bottom, width and height.
+        """
         sheet_width, sheet_height = self.sheet.get_size_inches()
         return (
             left / sheet_width,
@@ -195,14 +205,14 @@ class PictureSheet:
         )
 
     def add_axes(self, *rectangle_inches: float, **options: Any) -> Axes:
-        """Add axes in a rectangle, in inches relative to the picture's lower left corner."""
+        """Add axes at left, bottom, width, height [inches] from the picture's lower left corner."""
         return self.sheet.add_axes(self.to_sheet_fractions(*rectangle_inches), **options)
 
     def draw_legends(
-        self, colouring: ContinuousColours | CategoryColours, handles: Sequence[Artist]
+        self, colouring: ContinuousColourScale | CategoryColours, handles: Sequence[Artist]
     ) -> None:
-        """Draw the colour bar or the legend of categories, and the legend of marks."""
-        if isinstance(colouring, ContinuousColours):
+        """Draw the colour bar or the legend of categories, and the legend of further markers."""
+        if isinstance(colouring, ContinuousColourScale):
             bar_height = min(0.72 * self.height, 4.2)
             axes = self.add_axes(
                 self.width + 0.15, (self.height - bar_height) * 0.62, 0.17, bar_height
@@ -222,6 +232,7 @@ class PictureSheet:
             self._draw_legend(handles, 0.0, "", "lower left")
 
     def _draw_legend(self, handles: Sequence[Artist], bottom: float, title: str, loc: Any) -> None:
+        """Draw a legend at the right of the picture, at a height [inches]."""
         x, y, *_ = self.to_sheet_fractions(self.width + 0.02, bottom, 0, 0)
         self.sheet.legend(
             handles=list(handles), title=title or None, loc=loc, bbox_to_anchor=(x, y),
@@ -229,35 +240,40 @@ class PictureSheet:
         )  # fmt: skip
 
 
-MARK_AREA_MAX = 24.0
-"""Largest area of a point's mark [square points]."""
+MARKER_AREA_MAX = 24.0
+"""Largest area of the marker of a point of the cloud [(1/72 inch)^2]."""
 
-MARK_AREA_MIN_BY_POINTS = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
-"""Least area of a mark [square points], by the largest number of points to which it applies."""
+MARKER_AREA_MIN_BY_POINT_COUNT = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
+"""Least areas of markers [(1/72 inch)^2], each with the largest number of points that it is for."""
 
-TICK_SPACING_X_INCHES, TICK_SPACING_Y_INCHES = 0.42, 0.25
+TICK_SPACING_MIN_X_INCHES, TICK_SPACING_MIN_Y_INCHES = 0.42, 0.25
 """Least spacing of legible ticks on horizontal and vertical axes [inches]."""
 
-OFFSET_COORDINATE_MIN = 1e5
-"""Coordinate [m] above which an axis is labelled relative to a round number."""
+OFFSET_LABEL_COORDINATE_MIN = 1e5
+"""Magnitude of coordinates [m] above which an axis shows differences from a round number."""
 
 
-def mark_area(positions: np.ndarray, width: float, height: float) -> float:
-    """Return the mark area [square points] that keeps points (2, n) [inches] apart on a picture."""
+def marker_area(positions: np.ndarray, width: float, height: float) -> float:
+    """Return the area of markers [(1/72 inch)^2] at which most points of a picture stay apart.
+
+    `positions` (2, n), `width` and `height` of the picture are in inches.
+    """
     n_points = positions.shape[1]
     if n_points < 2:
-        return MARK_AREA_MAX
+        return MARKER_AREA_MAX
     neighbour_distances = cKDTree(positions.T).query(positions.T[:: max(1, n_points // 1000)], k=2)[
         0
     ][:, 1]
     separate_area = (0.85 * 72 * float(np.median(neighbour_distances))) ** 2
     covering_area = 0.1 * 72 * 72 * width * height / n_points
-    area_min = next(area for points_max, area in MARK_AREA_MIN_BY_POINTS if n_points <= points_max)
-    return min(max(min(separate_area, covering_area), area_min), MARK_AREA_MAX)
+    area_min = next(
+        area for points_max, area in MARKER_AREA_MIN_BY_POINT_COUNT if n_points <= points_max
+    )
+    return min(max(min(separate_area, covering_area), area_min), MARKER_AREA_MAX)
 
 
-def false_mark_style(area: float) -> dict[str, Any]:
-    """Return the style of false points among true points of a given mark area."""
+def false_point_marker_style(area: float) -> dict[str, Any]:
+    """Return the style of markers of false points, given the area of those of true points."""
     return {"marker": "x", "s": max(1.2 * area, 9.0), "linewidths": 0.7}
 
 
@@ -266,15 +282,27 @@ def set_length_axis(
     name: str,
     limits: tuple[float, float],
     axis_inches: float,
-    tick_spacing: float = TICK_SPACING_X_INCHES,
+    tick_spacing: float = TICK_SPACING_MIN_X_INCHES,
 ) -> None:
-    """Set label, units and ticks of an axis in metres.
+    """Set label and ticks of an axis in metres.
 
-    Large coordinates are labelled relative to a round number.
+    Parameters
+    ----------
+    axis
+        Axis of matplotlib.
+    name
+        Name of the coordinate.
+    limits
+        Lowest and highest coordinate [m]. Large coordinates are shown as differences from a round
+        number.
+    axis_inches
+        Length of the axis [inches].
+    tick_spacing
+        Least distance between ticks [inches].
     """
     low, high = limits
     offset = 0.0
-    if max(abs(low), abs(high)) > OFFSET_COORDINATE_MIN:
+    if max(abs(low), abs(high)) > OFFSET_LABEL_COORDINATE_MIN:
         rounding_unit = 10.0 ** max(math.ceil(math.log10(high - low)), 0)
         offset = rounding_unit * round((low + high) / 2 / rounding_unit)
     n_ticks = min(max(int(axis_inches / tick_spacing), 1), 8)

@@ -10,8 +10,12 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.datasets import chunk_length, read_attributes_of_kind, read_slices
-from sweep.analysis.selection import matches_any
+from sweep.analysis.datasets import (
+    chunk_aligned_slices,
+    read_attributes_of_kind,
+    stored_chunk_length,
+)
+from sweep.analysis.selection import matches_any_value
 from sweep.model.outputs import (
     BEAMLET_VARIABLES,
     CYCLE_VARIABLES,
@@ -42,35 +46,44 @@ if TYPE_CHECKING:
 WORLD_AXES = ("x", "y", "z")
 """Axes of world coordinates."""
 
-QUANTISED, INTERPOLATED = "quantised", "interpolated"
-"""Ranges and velocities of whole bins, or interpolated between bins."""
+QUANTISED_RANGES, INTERPOLATED_RANGES = "quantised", "interpolated"
+"""Names of the two kinds of ranges and velocities: of whole bins, or interpolated between bins."""
 
-_INTERPOLATED_NAMES = {
+_INTERPOLATED_ARRAY_BY_QUANTITY = {
     f"{name}{error}": f"{name}_interpolated{error}"
     for name in ("range", "radial_velocity")
     for error in ("", "_standard_error")
 }
+"""Names of the stored arrays with interpolated values, by quantity."""
 
 
-def array_name(name: str, ranges: str) -> str:
-    """Return the name of a quantity's array: the interpolated one, if requested and existing."""
-    return _INTERPOLATED_NAMES.get(name, name) if ranges == INTERPOLATED else name
+def quantity_array_name(name: str, ranges: str) -> str:
+    """Return the name of the stored array of a quantity, for a kind of ranges.
+
+    With interpolated ranges it is the array of interpolated values, if the quantity has one.
+    """
+    return (
+        _INTERPOLATED_ARRAY_BY_QUANTITY.get(name, name) if ranges == INTERPOLATED_RANGES else name
+    )
 
 
 CATEGORICAL_QUANTITIES = ("beam", "surface", "flags")
 """Quantities whose values are categories, not amounts."""
 
 SIGNED_QUANTITIES = ("radial_velocity", "beam_radial_velocity", "true_radial_velocity")
-"""Velocities, shown with a scale that distinguishes both signs."""
+"""Quantities with a colour scale that distinguishes both signs: velocities."""
 
 DECIBEL_QUANTITIES = ("snr", "snr_up")
-"""Power ratios, shown in decibels."""
+"""Quantities that are shown in decibels: power ratios."""
 
 LOG_QUANTITIES = ("pfa_up", "pfa_down")
-"""Positive quantities that span orders of magnitude, shown on a logarithmic scale."""
+"""Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
 
-POINT_KINDS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of the flags that tell the kind of a point; each point has exactly one of them."""
+POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
+"""Bits of a point's flags by the kind of point that they stand for.
+
+Each point has exactly one of these bits.
+"""
 
 
 @dataclass(frozen=True)
@@ -78,8 +91,11 @@ class Quantity:
     """Description of a quantity that each shot, or each point, has."""
 
     long_name: str
+    """Name in labels."""
     units: str
+    """Units of the stored values."""
     is_per_point: bool
+    """True if each point has a value, false if each shot has one."""
 
 
 def _list_quantities() -> dict[str, Quantity]:
@@ -110,28 +126,31 @@ QUANTITY_BY_NAME = _list_quantities()
 
 
 def quantity_label(name: str) -> str:
-    """Return the label of a quantity, with the units in which it is shown."""
+    """Return the label of a quantity, with the units in which figures show it."""
     quantity = QUANTITY_BY_NAME[name]
     return labels.axis_label(
         quantity.long_name, "dB" if name in DECIBEL_QUANTITIES else quantity.units
     )
 
 
-def to_shown_units(name: str, values: np.ndarray) -> np.ndarray:
-    """Return values as they are shown: power ratios in dB, flags as indices of the point's kind."""
+def to_displayed_values(name: str, values: np.ndarray) -> np.ndarray:
+    """Convert the values of a quantity to those that figures show.
+
+    Power ratios become decibels, flags become indices in `POINT_KIND_BITS`.
+    """
     values = np.asarray(values)
     if name == "flags":
-        return np.asarray(point_kinds(values.astype(int)), float)
+        return np.asarray(point_kind_indices(values.astype(int)), float)
     if name in DECIBEL_QUANTITIES:
         is_positive = values > 0
         return np.where(is_positive, 10 * np.log10(np.where(is_positive, values, 1.0)), np.nan)
     return values.astype(float)
 
 
-def point_kinds(flags: np.ndarray) -> np.ndarray:
-    """Return the index in `POINT_KINDS` of each point's kind, by its flags; -1 without a point."""
+def point_kind_indices(flags: np.ndarray) -> np.ndarray:
+    """Return the kind of each point as an index in `POINT_KIND_BITS`; -1 if there is no point."""
     kind_indices = np.full(np.shape(flags), -1)
-    for i, bit in enumerate(POINT_KINDS.values()):
+    for i, bit in enumerate(POINT_KIND_BITS.values()):
         kind_indices[(flags & bit) > 0] = i
     return kind_indices
 
@@ -143,11 +162,17 @@ ColumnArrays = dict[str, np.ndarray]
 ValueLimits = tuple[float, ...]
 """Lowest and highest value of a quantity."""
 
-UNLIMITED: ValueLimits = (-np.inf, np.inf)
+UNLIMITED_VALUES: ValueLimits = (-np.inf, np.inf)
+"""Limits that every finite value keeps."""
 
 
-def is_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> np.ndarray:
-    """Return a mask of the rows in which all limited quantities are within limits; nan is not."""
+def within_limits_mask(
+    column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]
+) -> np.ndarray:
+    """Return a mask of the rows of a table whose values are all within the limits, by column.
+
+    A nan is not within limits.
+    """
     masks = [
         (column_arrays[n] >= low) & (column_arrays[n] <= high) for n, (low, high) in limits.items()
     ]
@@ -156,37 +181,43 @@ def is_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) ->
 
 @dataclass(frozen=True)
 class Recording:
-    """Shots and points of one scanner, at one position along the study's axes.
-
-    ``flags_chunk_folder`` is the folder of the chunks of its flags; None in a packed store.
-    """
+    """Shots and points of one scanner, at one position along the study's axes."""
 
     scanner: str
+    """Name of the scanner."""
     dataset: xr.Dataset
+    """Arrays of the scanner at this position."""
     flags_chunk_folder: Location | None = None
+    """Folder with the chunks of the array `flags` at this position; None for a packed store."""
 
     @property
     def n_shots(self) -> int:
         """Number of shots."""
         return int(self.dataset.sizes["shot"])
 
-    def shot_slices(self, time_limits: ValueLimits = UNLIMITED) -> Iterator[slice]:
-        """Yield slices of shots; skip slices that are not computed or outside the time limits."""
-        for shot_slice in read_slices(self.dataset["flags"], "shot"):
-            if is_within({"time": self.read("time", shot_slice)}, {"time": time_limits}).any():
+    def iter_shot_slices(self, time_limits: ValueLimits = UNLIMITED_VALUES) -> Iterator[slice]:
+        """Yield the slices in which shots are read: those with a computed shot within time limits.
+
+        `time_limits` are the earliest and the latest time [s].
+        """
+        for shot_slice in chunk_aligned_slices(self.dataset["flags"], "shot"):
+            if within_limits_mask(
+                {"time": self.read_array("time", shot_slice)}, {"time": time_limits}
+            ).any():
                 yield shot_slice
 
-    def computed_shots(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
-        """Return a mask (k,) of the shots of a slice whose points are computed for a draw.
+    def computed_shot_mask(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
+        """Return a mask (k,) of the k shots of a slice whose points are computed for a draw.
 
-        Geometry is stored with the first axis position and draw. Points that are not computed look
-        like shots without a point, so only the existence of the chunk tells the difference.
+        The geometry of a shot is stored as soon as one draw at one axis position is computed. A
+        shot that is not computed has no points, like one that detects nothing. Only the existence
+        of the stored chunk shows which is the case.
         """
-        has_geometry = np.isfinite(self.read("time", shot_slice))
+        has_geometry = np.isfinite(self.read_array("time", shot_slice))
         if self.flags_chunk_folder is None:
             return has_geometry
         shots_per_chunk, draws_per_chunk = (
-            chunk_length(self.dataset["flags"], dim) for dim in ("shot", "draw")
+            stored_chunk_length(self.dataset["flags"], dim) for dim in ("shot", "draw")
         )
         is_chunk_stored = [
             (
@@ -202,20 +233,23 @@ class Recording:
         )
         return has_geometry & np.array(is_chunk_stored)[chunk_of_shot]
 
-    def read(self, name: str, shot_slice: slice, draw: int | None = None) -> np.ndarray:
-        """Return an array's values over a slice of shots, for one draw if it has draws."""
+    def read_array(self, name: str, shot_slice: slice, draw: int | None = None) -> np.ndarray:
+        """Return the values of a stored array over a slice of shots.
+
+        `draw` is the number of the draw; None for an array without draws.
+        """
         array = self.dataset[name].isel(shot=shot_slice)
         return np.asarray((array if draw is None else array.isel(draw=draw)).values)
 
     def point_columns(
-        self, names: Sequence[str], shot_slice: slice, draw: int = 0, ranges: str = QUANTISED
+        self, names: Sequence[str], shot_slice: slice, draw: int = 0, ranges: str = QUANTISED_RANGES
     ) -> ColumnArrays:
-        """Return quantities of every point of a slice of shots, (m,) each, in order.
+        """Return the named quantities of all m points of a slice of shots and a draw, (m,) each.
 
         Names are those of :data:`QUANTITY_BY_NAME`, ``return_number``, and ``returns`` (number of
-        points of the same shot).
+        points of the same shot). ``ranges`` is ``quantised`` or ``interpolated``.
         """
-        has_point = self.read("flags", shot_slice, draw) > 0
+        has_point = self.read_array("flags", shot_slice, draw) > 0
         shot_index, return_number = np.nonzero(has_point)
         column_arrays: ColumnArrays = {}
         for name in names:
@@ -230,40 +264,41 @@ class Recording:
             elif name == "returns":
                 column_arrays[name] = has_point.sum(axis=1)[shot_index]
             elif QUANTITY_BY_NAME[name].is_per_point:
-                column_arrays[name] = self.read(array_name(name, ranges), shot_slice, draw)[
-                    has_point
-                ]
+                column_arrays[name] = self.read_array(
+                    quantity_array_name(name, ranges), shot_slice, draw
+                )[has_point]
             else:
                 column_arrays[name] = self.shot_values(name, shot_slice)[shot_index]
         return {name: column_arrays[name] for name in names}
 
-    def thinned_rows(
+    def read_thinned_rows(
         self,
         names: Sequence[str],
         rows_max: int,
         *,
         draw: int = 0,
-        ranges: str = QUANTISED,
+        ranges: str = QUANTISED_RANGES,
         time_limits: ValueLimits | None = None,
     ) -> ThinnedRows:
-        """Return quantities of every point, or of every computed shot, thinned to ``rows_max``.
+        """Read the named quantities of all points, thinned to at most ``rows_max`` rows.
 
-        Rows are shots if all quantities belong to shots.
+        If all quantities belong to shots, the rows are the computed shots. ``time_limits`` are the
+        earliest and the latest time [s].
         """
         is_per_point = any(QUANTITY_BY_NAME[name].is_per_point for name in names)
         limits = {"time": time_limits} if time_limits else {}
         thinned = ThinnedRows(rows_max)
-        for shot_slice in self.shot_slices(time_limits or UNLIMITED):
+        for shot_slice in self.iter_shot_slices(time_limits or UNLIMITED_VALUES):
             if is_per_point:
                 names_read = list(dict.fromkeys([*names, "flags", "time"]))
                 column_arrays = self.point_columns(names_read, shot_slice, draw, ranges)
             else:
-                is_computed = self.computed_shots(shot_slice)
+                is_computed = self.computed_shot_mask(shot_slice)
                 names_read = list(dict.fromkeys([*names, "time"]))
                 column_arrays = {
                     name: self.shot_values(name, shot_slice)[is_computed] for name in names_read
                 }
-            thinned.append(select_within(column_arrays, limits))
+            thinned.append(select_rows_within(column_arrays, limits))
         return thinned
 
     def _point_positions(
@@ -274,21 +309,25 @@ class Recording:
         draw: int,
         ranges: str,
     ) -> np.ndarray:
-        """Return world positions of points (m, 3) [m], by quantised or interpolated ranges."""
-        position = self.read("position", shot_slice, draw)[has_point]
-        if ranges == QUANTISED:
-            range_change = self.read("range", shot_slice, draw) - self.read(
+        """Return the world positions of points (m, 3) [m], for quantised or interpolated ranges.
+
+        `has_point` is the mask of the stored points of the slice. `shot_index` (m,) is the shot of
+        each point, from the beginning of the slice.
+        """
+        position = self.read_array("position", shot_slice, draw)[has_point]
+        if ranges == QUANTISED_RANGES:
+            range_change = self.read_array("range", shot_slice, draw) - self.read_array(
                 "range_interpolated", shot_slice, draw
             )
             position = (
                 position
                 + range_change[has_point][:, None]
-                * self.read("beam_direction", shot_slice)[shot_index]
+                * self.read_array("beam_direction", shot_slice)[shot_index]
             )
         return position
 
     def shot_values(self, name: str, shot_slice: slice) -> np.ndarray:
-        """Return a quantity of every shot of a slice, (k,)."""
+        """Return a quantity of the k shots of a slice, (k,)."""
         if name == "shot":
             return np.arange(shot_slice.start, shot_slice.stop)
         if name == "altitude":
@@ -297,27 +336,28 @@ class Recording:
             )
             altitudes = self.dataset["true_altitude"].isel(cycle=slice(cycle[0], cycle[-1] + 1))
             return np.asarray(altitudes.values)[cycle - cycle[0]]
-        return self.read(name, shot_slice)
+        return self.read_array(name, shot_slice)
 
     def aim_points(self, shot_slice: slice) -> np.ndarray:
-        """Return the points where beam axes meet the scene, (k, 3) [m]; nan where they miss it."""
-        beam_range = self.read("beam_range", shot_slice)
+        """Return the points (k, 3) [m] where the beam axes of k shots meet the scene, or nan."""
+        beam_range = self.read_array("beam_range", shot_slice)
         beam_range = np.where(np.isfinite(beam_range), beam_range, np.nan)[:, None]
-        return self.read("platform_position", shot_slice) + beam_range * self.read(
+        return self.read_array("platform_position", shot_slice) + beam_range * self.read_array(
             "beam_direction", shot_slice
         )
 
 
 def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
-    """Return the number of the first shot that has true points of two surfaces in a draw.
+    """Return the number of the first shot that has true points on two surfaces in a draw.
 
-    If there is none, return the first shot with two groups of bins above the threshold, or None.
+    If there is none, the result is the first shot whose spectrum without noise has two groups of
+    bins above the threshold, or None.
     """
     fallback_shot = None
-    for shot_slice in recording.shot_slices():
+    for shot_slice in recording.iter_shot_slices():
         surface_numbers = np.where(
-            (recording.read("flags", shot_slice, draw) & TRUE_FLAG) > 0,
-            recording.read("surface", shot_slice, draw).astype(float), np.nan,
+            (recording.read_array("flags", shot_slice, draw) & TRUE_FLAG) > 0,
+            recording.read_array("surface", shot_slice, draw).astype(float), np.nan,
         )  # fmt: skip
         low = np.where(np.isnan(surface_numbers), np.inf, surface_numbers).min(axis=1)
         high = np.where(np.isnan(surface_numbers), -np.inf, surface_numbers).max(axis=1)
@@ -325,30 +365,37 @@ def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
         if multi_surface_shots.size:
             return shot_slice.start + int(multi_surface_shots[0])
         if fallback_shot is None:
-            multi_group_shots = np.flatnonzero(recording.read("surfaces_seen", shot_slice) >= 2)
+            multi_group_shots = np.flatnonzero(
+                recording.read_array("surfaces_seen", shot_slice) >= 2
+            )
             fallback_shot = (
                 shot_slice.start + int(multi_group_shots[0]) if multi_group_shots.size else None
             )
     return fallback_shot
 
 
-def select_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> ColumnArrays:
-    """Return the rows of a table that are within limits."""
+def select_rows_within(
+    column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]
+) -> ColumnArrays:
+    """Return the rows of a table whose values are all within the limits, by column."""
     if not limits:
         return column_arrays
-    is_inside = is_within(column_arrays, limits)
+    is_inside = within_limits_mask(column_arrays, limits)
     return {name: values[is_inside] for name, values in column_arrays.items()}
 
 
 class ThinnedRows:
-    """Rows of tables in order, thinned by powers of two to a largest number."""
+    """Rows appended part by part, of which every n-th is kept to stay below a largest number.
+
+    The step n is a power of two.
+    """
 
     def __init__(self, rows_max: int) -> None:
         self.rows_max, self.step, self.n_total = rows_max, 1, 0
         self._tables: list[ColumnArrays] = []
 
     def append(self, column_arrays: ColumnArrays) -> None:
-        """Append rows of a table."""
+        """Append the rows of a table, and thin all rows if they are too many."""
         start = -self.n_total % self.step
         self.n_total += len(next(iter(column_arrays.values())))
         self._tables.append(
@@ -359,12 +406,12 @@ class ThinnedRows:
             self._tables = [{n: values[::2].copy() for n, values in self.to_columns().items()}]
 
     def describe_count(self, noun: str, qualifier: str = "") -> str:
-        """Return the number of all rows in words, and the share that is kept."""
+        """Return a text with the number of all appended rows, and with the share that is kept."""
         kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
         return labels.counted(self.n_total, noun) + qualifier + kept_note
 
     def to_columns(self) -> ColumnArrays:
-        """Return the kept rows; empty if none were added."""
+        """Return the kept rows as columns by name; an empty dict if no table was appended."""
         if not self._tables:
             return {}
         return {n: np.concatenate([part[n] for part in self._tables]) for n in self._tables[0]}
@@ -372,16 +419,16 @@ class ThinnedRows:
 
 @dataclass(frozen=True)
 class AxisPosition:
-    """Position along the axes of a study: the index along each axis, and a label.
-
-    ``open_axes`` are axes along which other values match the request too.
-    """
+    """Position along the axes of a study."""
 
     axis_indices: dict[str, int]
+    """Index along each axis, by the axis's name."""
     label: str
+    """Coordinates of the position, as text."""
     open_axes: tuple[str, ...]
+    """Names of the axes along which the request admits several values."""
 
-    def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
+    def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """Return the recording of a scanner at this position."""
         group = tree.children[scanner].to_dataset(inherit=False)
         if PACKED_ATTRIBUTE in tree.attrs:
@@ -395,10 +442,20 @@ class AxisPosition:
 
 
 def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosition:
-    """Return the first position at which coordinates have the requested values.
+    """Return the first position along a study's axes at which coordinates have requested values.
 
-    Values are written as in a spec, one or several for each coordinate. For an axis with a name of
-    its own, the value is the index along it. SpecError lists all unknown coordinates and values.
+    Parameters
+    ----------
+    spec
+        Spec of the study.
+    where
+        One or several values for each coordinate, written as in a spec. For the name of an axis,
+        the values are indices along it.
+
+    Raises
+    ------
+    SpecError
+        A coordinate or a value does not exist; all of them are listed.
     """
     allowed_by_axis = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
     mistakes = []
@@ -419,7 +476,7 @@ def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosi
 
 
 def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
-    """Return the position with the given index along each axis."""
+    """Return the position along a study's axes with the given index along each axis."""
     axis_indices = {
         axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
     }
@@ -429,9 +486,18 @@ def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosit
 def _match_axis_values(
     spec: SceneSpec, name: str, wanted_values: list[object]
 ) -> tuple[str, np.ndarray, str]:
-    """Return the axis of a coordinate, a mask of the requested values, and the available values.
+    """Find requested values of a coordinate along the axes of a study.
 
     Raise QuantityError if no axis has the coordinate.
+
+    Returns
+    -------
+    axis_name : str
+        Name of the axis of the coordinate.
+    is_wanted : numpy.ndarray
+        Mask of the requested values along the axis.
+    available : str
+        Text with the values that exist.
     """
     for axis in spec.axes:
         for axis_parameter in axis.parameters:
@@ -446,7 +512,7 @@ def _match_axis_values(
                 available = f"it has {', '.join(value_texts)}" + (", ..." if axis.size > 8 else "")
                 return (
                     axis.name,
-                    matches_any(np.asarray(axis_parameter.display_values), coordinate_values),
+                    matches_any_value(np.asarray(axis_parameter.display_values), coordinate_values),
                     available,
                 )
         if name == axis.name:
@@ -467,7 +533,7 @@ def _match_axis_values(
 
 
 def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> str:
-    """Return the coordinates of a position in words, for axes with several values."""
+    """Return a text with the coordinates of a position, along axes with several values."""
     return ", ".join(
         labels.format_coordinate_value(
             axis_parameter.coordinate,
@@ -481,10 +547,10 @@ def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> st
 
 
 CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2000
-"""Largest numbers of points, dropouts and path positions in a picture; more are thinned."""
+"""Largest numbers of points, shots without a point, and path positions in a picture."""
 
 BOX_MARGIN_FRACTION = 0.04
-"""Margin around the points, as a fraction of the longest side of their bounding box."""
+"""Margin around the points of a picture, as a fraction of the longest side of their box."""
 
 CoordinateBox = dict[str, tuple[float, float]]
 """Lowest and highest value of x, y and z [m]."""
@@ -492,32 +558,37 @@ CoordinateBox = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of a picture, with the flight path and dropouts.
-
-    Dropouts are the aim points of shots without a point. ``n_outside`` is the number of false
-    points that are left out because they lie outside the ``box`` of the picture [m].
-    """
+    """Points of a picture, with the flight path and dropouts (shots without a point)."""
 
     points: ColumnArrays
+    """Columns of the points: x, y, z, flags, and the requested quantities."""
     path: ColumnArrays
+    """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
+    """Points before the box was applied, with the number of all points."""
     thinned_dropouts: ThinnedRows
+    """Positions of the dropouts, with the number of all dropouts."""
     n_outside: int
+    """Number of false points that are left out because they lie outside the box."""
     box: CoordinateBox
+    """Box of the picture."""
 
     @property
     def dropouts(self) -> ColumnArrays:
-        """Aim points of shots without a point; empty if they were not requested."""
+        """Columns x, y and z of the dropouts: where their beam axes meet the scene [m].
+
+        The columns are empty if dropouts were not requested.
+        """
         return self.thinned_dropouts.to_columns()
 
     @property
     def is_true(self) -> np.ndarray:
-        """Mask of the true points."""
+        """Mask of the true points among the points."""
         return np.asarray((self.points["flags"] & TRUE_FLAG) > 0)
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks on the numbers of points, dropouts and omitted false points."""
+        """Sentences on the numbers of points, dropouts and omitted false points."""
         count_texts = [self.thinned_points.describe_count("point")]
         if self.dropouts:
             count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
@@ -528,7 +599,7 @@ class PointCloud:
         return count_texts
 
 
-def gather_cloud(
+def gather_point_cloud(
     recording: Recording,
     names: Sequence[str],
     *,
@@ -539,7 +610,7 @@ def gather_cloud(
     with_path: bool = False,
     points_max: int = CLOUD_POINTS_MAX,
 ) -> PointCloud | None:
-    """Gather the points of a recording within limits.
+    """Read the points of a recording within limits, for a picture.
 
     Parameters
     ----------
@@ -552,11 +623,11 @@ def gather_cloud(
     draw
         Number of the draw.
     crops
-        Lowest and highest value of quantities; points outside are left out.
+        Lowest and highest value of quantities, by name. Points outside are left out.
     with_dropouts, with_path
-        If true, the aim points of shots without a point, and the flight path, are gathered too.
+        If true, shots without a point are read too, and the flight path.
     points_max
-        Largest number of points; more are thinned.
+        Largest number of points; a larger number is thinned.
 
     Returns
     -------
@@ -571,27 +642,29 @@ def gather_cloud(
         ThinnedRows(CLOUD_DROPOUTS_MAX),
         ThinnedRows(CLOUD_PATH_POINTS_MAX),
     )
-    time_limits = crops.get("time", UNLIMITED)
-    for shot_slice in recording.shot_slices(time_limits):
+    time_limits = crops.get("time", UNLIMITED_VALUES)
+    for shot_slice in recording.iter_shot_slices(time_limits):
         point_columns = recording.point_columns(
             list(dict.fromkeys([*kept_names, *crops])), shot_slice, draw, ranges
         )
-        cropped_columns = select_within(point_columns, crops)
+        cropped_columns = select_rows_within(point_columns, crops)
         thinned_points.append({name: cropped_columns[name] for name in kept_names})
-        time = recording.read("time", shot_slice)
-        is_in_time = is_within({"time": time}, {"time": time_limits})
+        time = recording.read_array("time", shot_slice)
+        is_in_time = within_limits_mask({"time": time}, {"time": time_limits})
         if with_dropouts:
-            has_no_point = ~(recording.read("flags", shot_slice, draw) > 0).any(axis=-1)
-            has_no_point &= recording.computed_shots(shot_slice, draw) & (
+            has_no_point = ~(recording.read_array("flags", shot_slice, draw) > 0).any(axis=-1)
+            has_no_point &= recording.computed_shot_mask(shot_slice, draw) & (
                 is_in_time | ("time" not in crops)
             )
             aim_points = recording.aim_points(shot_slice)[has_no_point]
             aim_points = aim_points[np.isfinite(aim_points[:, 0])]
             thinned_dropouts.append(
-                select_within(dict(zip(WORLD_AXES, aim_points.T, strict=True)), coordinate_crops)
+                select_rows_within(
+                    dict(zip(WORLD_AXES, aim_points.T, strict=True)), coordinate_crops
+                )
             )
         if with_path:
-            positions = recording.read("platform_position", shot_slice)[is_in_time]
+            positions = recording.read_array("platform_position", shot_slice)[is_in_time]
             thinned_path.append(dict(zip(WORLD_AXES, positions.T, strict=True)))
     if not thinned_points.n_total:
         return None
@@ -599,7 +672,7 @@ def gather_cloud(
     box = _bounding_box(
         column_arrays, thinned_dropouts.to_columns(), thinned_path.to_columns(), coordinate_crops
     )
-    is_in_box = is_within(column_arrays, box)
+    is_in_box = within_limits_mask(column_arrays, box)
     return PointCloud(
         points={name: values[is_in_box] for name, values in column_arrays.items()},
         path=thinned_path.to_columns(),
@@ -616,13 +689,16 @@ def _bounding_box(
     path_columns: ColumnArrays,
     coordinate_crops: Mapping[str, ValueLimits],
 ) -> CoordinateBox:
-    """Return the box around true points, dropouts and the path, clipped to the requested limits."""
+    """Return the box of a picture: around true points, dropouts and flight path, with a margin.
+
+    `coordinate_crops` are the limits of x, y and z [m].
+    """
     is_true = (point_columns["flags"] & TRUE_FLAG) > 0
     box: CoordinateBox = {}
     for axis in WORLD_AXES:
         values = point_columns[axis][is_true] if is_true.any() else point_columns[axis]
         value_arrays = [values, *(t[axis] for t in (dropout_columns, path_columns) if t)]
-        crop_low, crop_high = coordinate_crops.get(axis, UNLIMITED)
+        crop_low, crop_high = coordinate_crops.get(axis, UNLIMITED_VALUES)
         low = min(float(v.min()) for v in value_arrays if v.size)
         high = max(float(v.max()) for v in value_arrays if v.size)
         box[axis] = (max(low, crop_low), min(high, crop_high))
@@ -633,7 +709,10 @@ def _bounding_box(
 def read_eyepoints(
     store_path: Location, scanner_dataset: xr.Dataset, shot_indices: np.ndarray
 ) -> Eyepoints:
-    """Read the eyepoints of shots from which a scanner's point cloud was computed."""
+    """Read the eyepoints (geometry) of some shots of a scanner from the store of eyepoints.
+
+    Raise NotAStoreError if the store of eyepoints is missing.
+    """
     eyepoints_store = eyepoint_store_location(store_path, str(scanner_dataset.attrs["geometry_id"]))
     if not eyepoints_store.exists():
         raise NotAStoreError(

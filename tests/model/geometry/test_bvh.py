@@ -7,7 +7,7 @@ import pytest
 
 from sweep.model.geometry import bvh
 from sweep.model.geometry.bvh import LEAF_TRIANGLES_MAX, build_tree, find_nearest_triangles
-from sweep.scenes.rasters import BYTES_PER_CELL
+from sweep.scenes.rasters import TRIANGULATION_BYTES_PER_CELL
 from sweep.scenes.terrain import Terrain
 
 
@@ -183,5 +183,5 @@ def test_a_tree_is_built_in_little_memory(n, monkeypatch):
     peak = tracemalloc.get_traced_memory()[1] / n**2
     tracemalloc.stop()
     of_mesh = sum(array.nbytes for array in (mesh.vertices, mesh.faces, mesh.surface_index)) / n**2
-    assert peak + of_mesh < BYTES_PER_CELL
+    assert peak + of_mesh < TRIANGULATION_BYTES_PER_CELL
     assert sum(array.nbytes for array in tree) / n**2 < 125
