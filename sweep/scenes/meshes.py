@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_shapes
+from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_consistent_mesh
 from sweep.model.geometry.quaternion import axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
 from sweep.scenes.polygons import triangulate
@@ -225,7 +225,7 @@ def clean_mesh(
     """
     positions, face_corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     surfaces = np.full(len(face_corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
-    require_shapes(positions, face_corners, surfaces)
+    require_consistent_mesh(positions, face_corners, surfaces)
     n_vertices, n_faces = len(positions), len(face_corners)
     has_data = np.isfinite(positions)[face_corners].all(axis=(1, 2))
     face_corners, surfaces = face_corners[has_data], surfaces[has_data]
