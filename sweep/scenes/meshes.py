@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_consistent_mesh
-from sweep.model.geometry.quaternion import axis_angle, rotate
+from sweep.model.geometry.quaternion import from_axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
 from sweep.scenes.polygons import triangulate
 from sweep.scenes.scene_files import SceneError, read_companion, require_file, require_memory
@@ -342,7 +342,7 @@ def read_mesh(
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
     is_y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
-    rotation = axis_angle(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
+    rotation = from_axis_angle(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
     return join_facets(parts).transform(
         rotation=rotation, scale=scale * _metres_per_unit(path, unit or file_unit)
     )
