@@ -309,7 +309,7 @@ class Processing(SpecSection):
     shot_detection: str = declare.choice(
         "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
         "range and velocity where the third is missed",
-        waveform.SHOT_DETECTIONS,
+        waveform.SHOT_DETECTION_RULES,
     )
     peaks: str = declare.choice(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
