@@ -315,7 +315,7 @@ def _match_pairs(cost):
 def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
     """Compare a return with the truth: return its flag and the beamlet nearest to its peaks.
 
-    Whether its reading is right is judged elsewhere.
+    The reading of its peaks is not compared here.
 
     Parameters
     ----------
