@@ -75,7 +75,7 @@ def first_value(value) -> float:
 def point_facet(parameters, shots) -> Facet:
     """Facet that the single point of parameters by path sees, and its records."""
     distance = first_value(parameters["target.range"])
-    radius = first_value(beam.sent_and_oscillator_beams(parameters)[0].radius(distance))
+    radius = first_value(beam.transmitted_and_oscillator_beams(parameters)[0].radius(distance))
     return Facet(
         range=distance,
         grazing_angle=first_value(parameters["target.grazing_angle"]),

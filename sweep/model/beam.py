@@ -44,18 +44,31 @@ from sweep.model.constants import SPEED_OF_LIGHT
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
 
-SINGLE_MODE, APERTURE = COUPLINGS = "single_mode", "aperture"
+SINGLE_MODE = "single_mode"
+"""Law of coupling in which a receiver sees a single spatial mode."""
+APERTURE = "aperture"
+"""Law of coupling in which all light in the aperture mixes."""
+COUPLINGS = (SINGLE_MODE, APERTURE)
+"""Names of the laws of coupling."""
 
 COUPLING_PATH = "instrument.telescope.coupling"
 """Path of the law of coupling, one of `COUPLINGS`."""
 APERTURE_DIAMETER_PATH = "instrument.telescope.aperture"
+"""Path of the diameter of the aperture [m]."""
 WAVELENGTH_PATH = "instrument.laser.wavelength"
+"""Path of the wavelength [m]."""
 DIVERGENCE_PATH = "instrument.laser.beam_divergence"
+"""Path of the full far-field 1/e^2 angle of the transmitted beam [rad]."""
 WAIST_PATH = "instrument.laser.beam_waist"
+"""Path of the 1/e^2 radius of the transmitted beam at the telescope [m]."""
 QUALITY_PATH = "instrument.laser.beam_quality"
+"""Path of the beam quality M^2 of the transmitted beam."""
 FOCUS_PATH = "instrument.laser.focus"
+"""Path of the distance at which the beam is focused [m]; 0 for a collimated beam."""
 OSCILLATOR_WAIST_PATH = "instrument.receiver.local_oscillator_waist"
+"""Path of the 1/e^2 radius of the local oscillator's beam at the telescope [m]."""
 ARCHITECTURE_PATH = "instrument.receiver.architecture"
+"""Path of the receiver's architecture, one of `sweep.model.receiver_chain.ARCHITECTURES`."""
 SCAN_RATE_PATH, SEPARATION_PATH, MISALIGNMENT_PATH = (
     f"instrument.telescope.{name}" for name in ("scan_rate", "separation", "misalignment")
 )
@@ -70,14 +83,15 @@ BEAM_DEFAULTS: dict[str, float | str] = {
 }
 """Default values of a beam's parameters, by dotted path.
 
-A divergence or waist of 0 is not given, a focus of 0 is a collimated beam, and a local oscillator's
-waist of 0 is that of the transmitted beam.
+A divergence or a waist of 0 means that it is not stated. A focus of 0 means a collimated beam. A
+local oscillator's waist of 0 means that of the transmitted beam.
 """
 
 FOOTPRINT_ANGLE_MAX = math.pi / 2
 """Upper limit [rad] of the full angle of a footprint."""
 
 Parameters = Mapping[str, Any]
+"""Parameters of points by dotted path, (n,) arrays or scalars."""
 
 
 class GaussianBeam(NamedTuple):
@@ -117,13 +131,17 @@ class GaussianBeam(NamedTuple):
             Beam quality M^2, 1 for a perfect beam.
         focus : array_like
             Distance f of the focus [m]; 0 for a collimated beam.
+
+        Returns
+        -------
+        GaussianBeam
         """
         w, f = np.asarray(waist, float), np.asarray(focus, float)
         curvature = np.where(f > 0, 1 / np.where(f > 0, f, 1.0), 0.0)
         return cls(w, np.asarray(math.pi * w**2 / (np.asarray(quality) * wavelength)), curvature)
 
     def full_angle(self, range: ArrayLike) -> np.ndarray:
-        """Return the full angle 2 w(R) / R at which the beam is seen from the telescope.
+        """Return the full angle 2 w(R) / R that the beam's cross-section subtends at the telescope.
 
         Parameters
         ----------
@@ -148,7 +166,7 @@ class GaussianBeam(NamedTuple):
 
 
 def is_single_mode(parameters: Parameters) -> bool:
-    """Return True if the receiver of points of one category sees a single spatial mode."""
+    """Return True if the receiver sees a single spatial mode, for points of one category."""
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
@@ -158,12 +176,12 @@ def is_single_mode(parameters: Parameters) -> bool:
 def divergence_from_waist(
     waist: ArrayLike, wavelength: ArrayLike, quality: ArrayLike = 1.0
 ) -> np.ndarray:
-    """Return the full far-field angle of a collimated beam from its waist, or the inverse.
+    """Convert the waist of a collimated beam to its full far-field angle, or the reverse.
 
     Parameters
     ----------
     waist : array_like
-        1/e^2 radius w_a [m]; or a full far-field angle [rad].
+        1/e^2 radius w_a [m]; or the full 1/e^2 angle in the far field [rad].
     wavelength : array_like
         Wavelength [m].
     quality : array_like
@@ -172,13 +190,13 @@ def divergence_from_waist(
     Returns
     -------
     ndarray
-        2 M^2 lambda / (pi w_a) [rad]; or the radius [m], as the relation is its own inverse.
+        Angle 2 M^2 lambda / (pi w_a) [rad]; or the radius [m], as the relation is its own inverse.
     """
     return np.asarray(2 * np.asarray(quality) * wavelength / (math.pi * np.asarray(waist)))
 
 
 def far_field_divergence(parameters: Parameters) -> np.ndarray:
-    """Return the full far-field angle [rad] of the transmitted beam, as if it were not focused."""
+    """Return the full far-field angle [rad] that the transmitted beam has without a focus."""
     stated_divergence, waist = (
         np.asarray(parameters[DIVERGENCE_PATH], float),
         np.asarray(parameters[WAIST_PATH], float),
@@ -191,10 +209,11 @@ def far_field_divergence(parameters: Parameters) -> np.ndarray:
     return np.where(waist > 0, divergence_of_waist, stated_divergence)
 
 
-def sent_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, GaussianBeam]:
-    """Return the transmitted beam, and the local oscillator's beam with M^2 = 1.
+def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, GaussianBeam]:
+    """Return the transmitted beam, and the beam of the local oscillator, which has M^2 = 1.
 
-    The local oscillator's waist at the telescope is by default that of the transmitted beam.
+    The oscillator's beam is propagated from the telescope to the target. Its waist is by default
+    that of the transmitted beam.
     """
     waist, oscillator_waist = (
         np.asarray(parameters[WAIST_PATH], float),
@@ -208,21 +227,22 @@ def sent_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBeam, Gau
     )
     waist = np.where(waist > 0, waist, waist_of_divergence)
     common_arguments = {"wavelength": parameters[WAVELENGTH_PATH], "focus": parameters[FOCUS_PATH]}
-    sent_beam = GaussianBeam.from_waist(
+    transmitted_beam = GaussianBeam.from_waist(
         waist=waist, quality=parameters[QUALITY_PATH], **common_arguments
     )
-    return sent_beam, GaussianBeam.from_waist(
+    return transmitted_beam, GaussianBeam.from_waist(
         waist=np.where(oscillator_waist > 0, oscillator_waist, waist), **common_arguments
     )
 
 
 class FootprintAngles(NamedTuple):
-    """Full 1/e^2 angles of the effective footprint, as seen from the instrument [rad]."""
+    """Full 1/e^2 angles of the effective footprint, seen from the instrument [rad]."""
 
     positions: np.ndarray
-    """Full angle of the positions where the effective light meets the target [rad]."""
+    """Full angle over which positions on the target are spread [rad]."""
     directions: np.ndarray
-    """Full angle of the directions of that light [rad], which set its Doppler shifts."""
+    """Full angle over which directions of the light are spread [rad]. They determine Doppler
+    shifts."""
 
 
 def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
@@ -250,10 +270,11 @@ def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> 
         stated_divergence = np.asarray(parameters[DIVERGENCE_PATH], float)
         return FootprintAngles(stated_divergence, stated_divergence)
     distance = np.asarray(parameters["target.range"] if range is None else range, float)
-    sent_beam, oscillator_beam = sent_and_oscillator_beams(parameters)
+    transmitted_beam, oscillator_beam = transmitted_and_oscillator_beams(parameters)
     if is_single_mode(parameters):
         angle_pairs = (
-            (sent_beam.full_angle(r), oscillator_beam.full_angle(r)) for r in (distance, math.inf)
+            (transmitted_beam.full_angle(r), oscillator_beam.full_angle(r))
+            for r in (distance, math.inf)
         )
         return FootprintAngles(
             *(np.minimum(a * b / np.hypot(a, b), FOOTPRINT_ANGLE_MAX) for a, b in angle_pairs)
@@ -261,19 +282,20 @@ def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> 
     has_stated_divergence = (np.asarray(parameters[WAIST_PATH]) == 0) & (
         np.asarray(parameters[FOCUS_PATH]) == 0
     )
-    sent_angles = (
-        np.minimum(sent_beam.full_angle(r), FOOTPRINT_ANGLE_MAX) for r in (distance, math.inf)
+    transmitted_angles = (
+        np.minimum(transmitted_beam.full_angle(r), FOOTPRINT_ANGLE_MAX)
+        for r in (distance, math.inf)
     )
     return FootprintAngles(
         *(
             np.where(has_stated_divergence, parameters[DIVERGENCE_PATH], angle)
-            for angle in sent_angles
+            for angle in transmitted_angles
         )
     )
 
 
 def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
-    """Return the parameters that determine a beam's width at every range."""
+    """Select the parameters that determine a beam's width at every range, by dotted path."""
     paths = (
         WAVELENGTH_PATH,
         DIVERGENCE_PATH,
@@ -286,7 +308,10 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
 
 
 def has_constant_divergence(parameters: Parameters) -> bool:
-    """Return True if every footprint is divergence times range wide, as in [T]."""
+    """Return True if the footprint's width is the divergence times the range, as in [T].
+
+    The points are of one category.
+    """
     return not (
         is_single_mode(parameters)
         or np.any(parameters[WAIST_PATH])
@@ -320,7 +345,7 @@ def range_loss_coefficients(
         return np.asarray(2.0), np.asarray(1.0)
     distance = np.asarray(parameters["target.range"] if range is None else range, float)
     coefficient_sums = [np.asarray(0.0)] * 3
-    for beam in sent_and_oscillator_beams(parameters):
+    for beam in transmitted_and_oscillator_beams(parameters):
         squared_waist, focus_ratio = beam.waist**2, beam.focus_curvature * distance
         quadratic_term = focus_ratio**2 + (distance / beam.rayleigh_range) ** 2
         coefficients = (
@@ -332,29 +357,33 @@ def range_loss_coefficients(
             total + squared_waist * coefficient
             for total, coefficient in zip(coefficient_sums, coefficients, strict=True)
         ]
-    return coefficient_sums[1] / coefficient_sums[0], coefficient_sums[2] / coefficient_sums[0]
+    constant, linear, quadratic = coefficient_sums
+    return linear / constant, quadratic / constant
 
 
 def effective_collecting_area(parameters: Parameters) -> np.ndarray:
-    """Return the area [m^2] that collects, at ``target.range``, as much of a diffuse echo as mixes.
+    """Return the area A [m^2] of an aperture whose light from a diffuse echo, A / R^2, would mix.
 
-    This is the area of the aperture; or for a single mode lambda^2 R^2 times the integral of I_T
-    I_L, reduced by :func:`truncation_efficiency` of both beams.
+    The range R is ``target.range``. The area is that of the real aperture; or for a single mode
+    lambda^2 R^2 times the integral of I_T I_L, reduced by :func:`truncation_efficiency` of both
+    beams.
     """
     diameter = np.asarray(parameters[APERTURE_DIAMETER_PATH])
     if not is_single_mode(parameters):
         return math.pi * (diameter / 2) ** 2
-    sent_beam, oscillator_beam = sent_and_oscillator_beams(parameters)
+    transmitted_beam, oscillator_beam = transmitted_and_oscillator_beams(parameters)
     distance = np.asarray(parameters["target.range"], float)
-    squared_angles = sent_beam.full_angle(distance) ** 2 + oscillator_beam.full_angle(distance) ** 2
+    squared_angles = (
+        transmitted_beam.full_angle(distance) ** 2 + oscillator_beam.full_angle(distance) ** 2
+    )
     area = 8 * np.asarray(parameters[WAVELENGTH_PATH]) ** 2 / (math.pi * squared_angles)
     rim_phase = (
         math.pi
         * (diameter / 2) ** 2
         / parameters[WAVELENGTH_PATH]
-        * (1 / distance - sent_beam.focus_curvature)
+        * (1 / distance - transmitted_beam.focus_curvature)
     )
-    efficiency = truncation_efficiency(2 * sent_beam.waist / diameter, rim_phase)
+    efficiency = truncation_efficiency(2 * transmitted_beam.waist / diameter, rim_phase)
     if np.any(parameters[OSCILLATOR_WAIST_PATH]):
         efficiency = np.sqrt(
             efficiency * truncation_efficiency(2 * oscillator_beam.waist / diameter, rim_phase)
@@ -363,7 +392,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
 
 
 def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diameter and the full angle of view that collect background light.
+    """Return the diameter and the full angle of view with which background light is collected.
 
     Returns
     -------
@@ -374,14 +403,15 @@ def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np
 
     Notes
     -----
-    A single mode has those of the local oscillator's beam, whose area times solid angle is
-    lambda^2.
+    A single mode collects with the diameter and the divergence of the local oscillator's beam. The
+    product of their area and solid angle is lambda^2.
     """
     if not is_single_mode(parameters):
         return np.asarray(parameters[APERTURE_DIAMETER_PATH], float), far_field_divergence(
             parameters
         )
-    oscillator_waist = sent_and_oscillator_beams(parameters)[1].waist
+    _, oscillator_beam = transmitted_and_oscillator_beams(parameters)
+    oscillator_waist = oscillator_beam.waist
     return 2 * oscillator_waist, divergence_from_waist(
         oscillator_waist, parameters[WAVELENGTH_PATH]
     )
@@ -412,27 +442,37 @@ def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Return the fraction, 0..1, of a single mode's echo that remains with its axes apart.
+    """Return the fraction of a single mode's echo that remains if its two axes are apart, 0..1.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters by dotted path.
+    range : array_like
+        Range [m].
 
     Notes
     -----
     exp(-2 d^2 / (w_T^2 + w_L^2)), with the offset d of :func:`axis_offset`.
     """
-    squared_radii = sum(beam.radius(range) ** 2 for beam in sent_and_oscillator_beams(parameters))
+    squared_radii = sum(
+        beam.radius(range) ** 2 for beam in transmitted_and_oscillator_beams(parameters)
+    )
     return np.asarray(np.exp(-2 * axis_offset(parameters, range) ** 2 / squared_radii))
 
 
 _UNTRUNCATED_FILL_MAX = 0.25
-"""Ratio w_a / a of beam radius to aperture radius up to which at most 5e-7 of the echo is cut off.
-"""
+"""Ratio w_a / a of beam radius to aperture radius up to which truncation is neglected. It costs at
+most 5e-7 of the echo there."""
 _TABLE_MIDDLE_PHASE = 4.0
-"""Defocus phase [rad] at the rim that lies in the middle of the table."""
+"""Defocus phase at the rim of the aperture [rad] in the middle of the table's coordinate."""
 _RIM_PHASE_MAX = 60.0
-"""Largest defocus phase [rad] of the table; beyond it the efficiency changes by less than 2 %."""
+"""Largest defocus phase at the rim of the aperture [rad] in the table. Beyond it the efficiency
+changes by less than 2 %."""
 
 
 def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0) -> np.ndarray:
-    """Return the echo of a beam truncated by its aperture, over the echo of the full beam.
+    """Return the ratio of the echo of a beam that its aperture truncates to that of the full beam.
 
     Parameters
     ----------
@@ -476,11 +516,11 @@ def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0)
 
 @lru_cache(maxsize=1)
 def _truncation_table() -> "RectBivariateSpline":
-    """Tabulate :func:`truncation_efficiency` over fill ratio and 1 / (1 + defocus / 4), to 1e-4.
+    """Tabulate :func:`truncation_efficiency` over fill ratio and 1 / (1 + defocus phase / 4).
 
-    In the far field a field exp(-c r^2) of the unit circle, c = (a/w)^2 - i defocus, becomes its
-    Hankel transform. The integral of the fourth power of the untruncated beam is 1 / (32 |c|^2 Re
-    c).
+    Interpolation errs by 1e-4. In the far field a field exp(-c r^2) of the unit circle, c = (a/w)^2
+    - i defocus, becomes its Hankel transform. The integral of the fourth power of the untruncated
+    beam is 1 / (32 |c|^2 Re c).
     """
     from scipy.interpolate import RectBivariateSpline  # slow to import, and rarely needed
 

@@ -48,10 +48,10 @@ from numpy.typing import ArrayLike
 from sweep.model import beam, ground, waveform
 from sweep.model.beamlets import (
     GAUSS_HERMITE_NODES_MAX,
-    UNIFORM_RULE_RADIUS_SIGMA,
+    UNIFORM_QUADRATURE_RADIUS_SIGMA,
     bins_per_velocity,
-    gaussian_rule,
-    plane_moments,
+    gaussian_quadrature,
+    plane_offset_moment_bounds,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.window_response import WindowResponse, window_response
@@ -66,51 +66,61 @@ PATTERN_PATH = "footprint.pattern"
 """Path of the pattern of the beamlets."""
 
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
-"""Smallest and largest ratio of the number of rays to that of the cast before."""
+"""Smallest and largest ratio of a shot's number of rays to that of its last cast."""
 
-_UNSURE_RAYS_MAX = 19
-"""Number of rays up to which the estimated error is no measure: smooth ground then looks far
-rougher than it is."""
+_UNRELIABLE_ERROR_RAYS_MAX = 19
+"""Number of rays up to which the estimated error is unreliable, as smooth ground looks far rougher
+than it is."""
 
 _N_SEGMENTS = 3
-"""Number of segments over which errors of pd are summed."""
+"""Number of segments of a shot, over which errors of pd are summed."""
 
 NODE_COUNTS = np.array([
     2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
     4096,
 ])  # fmt: skip
-"""Possible numbers of nodes; in wide steps, as points with different numbers are computed
-separately."""
+"""Possible numbers of nodes of a quadrature along the slope. They are in wide steps, as points with
+different numbers are computed separately."""
 
-LINE_COUNTS = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
-"""Possible numbers of parallel lines of nodes."""
+NODE_LINE_COUNTS = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
+"""Possible numbers of parallel lines of nodes, across the slope."""
 
-_UNIFORM_RULE_ERROR = 1e-10
-"""Error of evenly spaced nodes due to the Gaussian's tails beyond them."""
-_WINDOW_SAMPLES, _N_LAGS = 1024, 4096
+_UNIFORM_QUADRATURE_ERROR = 1e-10
+"""Error of a quadrature of evenly spaced nodes by the Gaussian's tails beyond them."""
+_WINDOW_SAMPLES = 1024
+"""Number of samples of the windows from which tables of errors are computed."""
+_N_LAGS = 4096
+"""Number of lags of a window's autocorrelation in tables by spread."""
+_N_CURVATURE_LAGS = 512
+"""Number of lags of a window's autocorrelation in tables by curvature."""
 _CURVATURES = np.geomspace(1e-6, 100.0, 97)
-"""Curvatures c of tables [bins of fs/L]."""
-_N_CURVATURE_LAGS, _CURVATURE_PHASES = 512, np.geomspace(1e-6, 1e3, 512)
-"""Phases t c [rad] of tables."""
+"""Curvatures c at which errors are tabulated [bins of fs/L]."""
+_CURVATURE_PHASES = np.geomspace(1e-6, 1e3, 512)
+"""Phases t c at which errors are tabulated [rad]."""
 _CURVATURE_RATIOS = np.geomspace(1e-6, 1e3, 97)
-"""Ratios c / s of tables."""
+"""Ratios c / s of curvature to linear spread at which errors are tabulated."""
 _CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
-"""Standard deviations in Chebyshev's inequality, of which the best bound is taken."""
+"""Distances from the mean [standard deviations] at which Chebyshev's inequality is applied. The
+best of the resulting bounds is used."""
 
 
 class LineSpreadBins(NamedTuple):
-    """Positions of a footprint's lines, s y + c (x^2 + y^2), in bins of fs/L."""
+    """Spread of the positions of a footprint's lines, s y + c (x^2 + y^2) [bins of fs/L].
+
+    x and y are the two coordinates of the beam in its standard deviations, y along the slope.
+    """
 
     deviation: np.ndarray
-    """(n,): largest |s| of the segments, larger where the plane is steeper."""
+    """(n,): largest standard deviation of the positions in any segment."""
     linear: np.ndarray
-    """(rows, n): |s| of each segment, and of the phase that turns from one segment to another."""
+    """(rows, n): |s| of each segment; further rows are that of the phase [cycles] that turns from
+    segment to segment."""
     quadratic: np.ndarray
-    """(rows, n): |c|, as `linear`."""
+    """(rows, n): |c|, in the rows of `linear`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
-        """Standard deviation that smooths the error of lines across the slope, (rows, n).
+        """Standard deviation (rows, n) of the Gaussian that smooths errors across the slope.
 
         |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
         """
@@ -150,7 +160,9 @@ def split_with_beamlet_counts(
                     category_parameters, indices.size
                 )
             else:
-                n_beamlets, pattern = map(np.asarray, finest_beamlets(category_parameters))
+                n_beamlets, pattern = map(
+                    np.asarray, largest_beamlet_count_and_pattern(category_parameters)
+                )
                 beamlets_error = np.asarray(np.nan)  # no estimate for sums of amplitudes
         beamlet_parameters = {
             BEAMLETS_PATH: n_beamlets,
@@ -163,15 +175,18 @@ def split_with_beamlet_counts(
             yield indices[subset], subset_parameters
 
 
-def finest_beamlets(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets of points of one category, and the pattern."""
+def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
+    """Return the largest number of beamlets of points of one category, and its pattern."""
     if beamlets_converge(parameters):
         return ErrorBudget.beamlets_max, "line"
     return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
 
 
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
-    """Return the number of rays of every shot of a flight, if it follows from the tolerance."""
+    """Return the number of rays with which each shot of a flight is cast first.
+
+    It is for flights whose number of rays follows from the tolerance.
+    """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
     tolerance = float(np.asarray(error_budget.tolerance))
@@ -183,7 +198,7 @@ def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) 
 
 
 def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-    """Return the number of rays with which shots are to be cast again.
+    """Choose the number of rays with which each shot is cast again, by its estimated error.
 
     Parameters
     ----------
@@ -207,14 +222,17 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
     if not larger_counts.size:
         return np.zeros(error_ratio.shape, np.int64)
     wanted_counts = n_rays * np.minimum(
-        error_ratio, _RAY_GROWTH_MAX if n_rays > _UNSURE_RAYS_MAX else 1
+        error_ratio, _RAY_GROWTH_MAX if n_rays > _UNRELIABLE_ERROR_RAYS_MAX else 1
     )
     count_index = np.minimum(np.searchsorted(larger_counts, wanted_counts), larger_counts.size - 1)
     return np.where(error_ratio > 1, larger_counts[count_index], 0)
 
 
 def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
-    """Return the part of a study's tolerance that is for skipped effects."""
+    """Return the change of probabilities by skipped effects that a study's tolerance allows.
+
+    `n_beamlets` is the stated number of beamlets, 0 if it follows from the tolerance.
+    """
     counts_beamlets = n_beamlets == 0 and beamlets_converge(parameters)
     return float(
         ErrorBudget.from_parameters(parameters).allowed_effects_error(
@@ -223,14 +241,17 @@ def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
     )
 
 
-def is_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return True where the tolerance alone sets beamlets, lines or leakage; (n,) or scalar."""
+def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
+    """Return True where the number of beamlets, or an error of lines or leakage, is not stated.
+
+    It then follows from the tolerance. The result is (n,) or a scalar.
+    """
     counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
     return counts_beamlets | ErrorBudget.from_parameters(parameters).has_automatic_errors
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if a sufficient number of beamlets exists."""
+    """Return True if the error falls to 0 with more beamlets, for points of one category."""
     return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
         "hexagonal",
         "sunflower",
@@ -269,7 +290,10 @@ def required_beamlets(
 
 
 def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
-    """Return the largest change of pd, over all segments, per relative change of a bin's power."""
+    """Return an upper bound on the change of pd over the relative change of a bin's power, (n,).
+
+    The changes of all segments are summed. See the module's description.
+    """
     b = budget.looks.amplitude_gain_max * budget.threshold_ratio
     a = 0.5 * (b + np.sqrt(b * b + 2))
     slope_max = np.maximum(np.sqrt(a * b / (2 * np.pi)), 1.0)
@@ -277,7 +301,10 @@ def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
 
 
 def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadBins:
-    """Compute the spread of the lines of up, Doppler and down segment [bins of fs/L]."""
+    """Compute the spread of the footprint's lines in all segments of n points [bins of fs/L].
+
+    `beamlets_max` is the largest number of beamlets, which determines how far they reach.
+    """
     parameters = budget.parameters
     grazing_angle, radial_velocity = (
         parameters["target.grazing_angle"],
@@ -292,7 +319,7 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
     )
     bin_width = budget.record.sample_rate / budget.record.window.length
     chirp_rate = budget.waveform.chirp_rate
-    range_moments, velocity_moments = plane_moments(
+    range_moments, velocity_moments = plane_offset_moment_bounds(
         transverse_velocity=transverse_velocity,
         radial_velocity=radial_velocity,
         grazing_angle=grazing_angle,
@@ -394,7 +421,7 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
 def required_nodes(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the nodes for which the largest bin's power is within a tolerance.
+    """Choose the numbers of nodes and of their lines by the error of the largest bin's power.
 
     Parameters
     ----------
@@ -416,24 +443,28 @@ def required_nodes(
     error : ndarray (n,)
         Bound of the relative error; 1 if there is no bound.
     """
-    tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
+    tabulated_spreads, tabulated_errors, largest_bin_powers = _quadrature_errors_by_spread(
+        window_name
+    )
     table_index = np.searchsorted(tabulated_spreads, spread.deviation)  # of the next wider
-    single_line_error = _single_line_error(window_name, spread) / largest_bin_powers[table_index]
+    single_line_error = (
+        _single_node_line_error(window_name, spread) / largest_bin_powers[table_index]
+    )
     counts = NODE_COUNTS[: np.searchsorted(NODE_COUNTS, error_budget.beamlets_max, "right")]
     total_error = tabulated_errors[: counts.size, table_index] + single_line_error
-    count_index, error = _cheapest_row(total_error, counts[:, None], tolerance)
+    count_index, error = _cheapest_within_tolerance(total_error, counts[:, None], tolerance)
     n_lines = np.ones(count_index.shape, np.int64)
     needs_lines = (error > tolerance) & (
-        single_line_error > error_budget.single_line_fraction * tolerance
+        single_line_error > error_budget.single_node_line_fraction * tolerance
     )
     if needs_lines.any():
-        some = LineSpreadBins(*(np.asarray(values)[..., needs_lines] for values in spread))
-        line_count_index, line_counts, line_errors = _choose_lines(
-            window_name, some, tolerance[needs_lines], error_budget.beamlets_max
+        spread_subset = LineSpreadBins(*(np.asarray(values)[..., needs_lines] for values in spread))
+        line_count_index, line_counts, line_errors = _choose_node_lines(
+            window_name, spread_subset, tolerance[needs_lines], error_budget.beamlets_max
         )
         is_better = line_errors < np.minimum(error[needs_lines], 1.0)
-        some = np.flatnonzero(needs_lines)[is_better]
-        count_index[some], n_lines[some], error[some] = (
+        improved = np.flatnonzero(needs_lines)[is_better]
+        count_index[improved], n_lines[improved], error[improved] = (
             line_count_index[is_better],
             line_counts[is_better],
             line_errors[is_better],
@@ -441,10 +472,25 @@ def required_nodes(
     return n_lines, NODE_COUNTS[count_index], np.minimum(error, 1.0)
 
 
-def _cheapest_row(
+def _cheapest_within_tolerance(
     error: np.ndarray, cost: np.ndarray, tolerance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cheapest row of (rows, n) within the tolerance, else of least error; its error."""
+    """Choose, for each of n points, the cheapest of several alternatives within a tolerance.
+
+    Parameters
+    ----------
+    error, cost : ndarray (rows, n)
+        Error and cost of each alternative; costs broadcast.
+    tolerance : ndarray (n,)
+        Tolerated error.
+
+    Returns
+    -------
+    row : ndarray (n,)
+        Chosen alternative; that of least error if none is within the tolerance.
+    error : ndarray (n,)
+        Its error.
+    """
     allowed_cost = np.where(error <= tolerance, cost, np.inf)
     row = np.where(
         np.isfinite(allowed_cost).any(axis=0), allowed_cost.argmin(axis=0), error.argmin(axis=0)
@@ -452,15 +498,26 @@ def _cheapest_row(
     return row, np.take_along_axis(error, row[None], axis=0)[0]
 
 
-def _choose_lines(
+def _choose_node_lines(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose nodes and lines for spreads that need several lines.
+    """Choose the numbers of nodes and lines for n spreads that need several lines of nodes.
 
-    Return the index in NODE_COUNTS, the number of lines, and the error.
+    The parameters are those of :func:`required_nodes`.
+
+    Returns
+    -------
+    count_index : ndarray (n,)
+        Index of the number of nodes in NODE_COUNTS.
+    n_lines : ndarray (n,)
+        Number of lines of nodes.
+    error : ndarray (n,)
+        Bound of the relative error.
     """
-    tabulated_spreads, tabulated_errors, largest_bin_powers = _rule_errors(window_name)
-    errors_along, errors_across = _curvature_errors(window_name)
+    tabulated_spreads, tabulated_errors, largest_bin_powers = _quadrature_errors_by_spread(
+        window_name
+    )
+    errors_along, errors_across = _quadrature_errors_by_curvature(window_name)
     quadratic_max, linear_max = spread.quadratic.max(axis=0), spread.linear.max(axis=0)
     # If curvature alone spreads the lines, only the rules' error for squares counts.
     linear_deviation = spread.deviation * np.minimum(linear_max / quadratic_max, 1.0)
@@ -470,28 +527,29 @@ def _choose_lines(
         tabulated_errors[:, np.searchsorted(tabulated_spreads, linear_deviation)]
         + errors_along[:, curvature_index] / largest_bin_power
     )
-    error_across = np.zeros((LINE_COUNTS.size, quadratic_max.size))
+    error_across = np.zeros((NODE_LINE_COUNTS.size, quadratic_max.size))
     for s, c in zip(spread.smoothing_deviation, spread.quadratic, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
-            smoothed_error = _smoothed_curvature_errors()[:, ratio] * (
+            smoothed_error = _smoothed_errors_by_curvature()[:, ratio] * (
                 _autocorrelation_peak(window_name) / (2 * np.pi * s)
             )
         segment_error = np.fmin(errors_across[:, np.searchsorted(_CURVATURES, c)], smoothed_error)
         error_across = np.maximum(error_across, segment_error / largest_bin_power)
     total_error = error_along[:, None] + error_across
-    cost = NODE_COUNTS[:, None] * LINE_COUNTS
+    cost = NODE_COUNTS[:, None] * NODE_LINE_COUNTS
     total_error = np.where((cost <= beamlets_max)[..., None], total_error, np.inf).reshape(
         -1, quadratic_max.size
     )
-    best, error = _cheapest_row(total_error, cost.reshape(-1, 1), tolerance)
-    return best // LINE_COUNTS.size, LINE_COUNTS[best % LINE_COUNTS.size], error
+    best, error = _cheapest_within_tolerance(total_error, cost.reshape(-1, 1), tolerance)
+    return best // NODE_LINE_COUNTS.size, NODE_LINE_COUNTS[best % NODE_LINE_COUNTS.size], error
 
 
-def _single_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
-    """Return the curvature error of one line of nodes, over a line's power on a bin, (n,).
+def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
+    """Return the error by curvature of a single line of nodes, (n,).
 
-    The factor 2 includes the same error along the slope, of the fewest nodes.
+    It is in units of the power that a spectral line has in a bin on which it is centred. The factor
+    2 includes the equal error along the slope with the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
@@ -505,17 +563,18 @@ def _single_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate the error of each number of nodes by standard deviation.
+def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tabulate the error of each number of nodes by the standard deviation of the lines' positions.
 
     Returns
     -------
     spreads : ndarray (m,)
         Standard deviations [bins of fs/L].
     errors : ndarray (counts, m + 1)
-        Largest error up to each standard deviation, and beyond all, over the largest bin's power.
+        Largest error up to each standard deviation, over the power of the largest bin. The last
+        column is for larger standard deviations.
     largest_bin_powers : ndarray (m + 1,)
-        Power of the largest bin, over that of one line on a bin.
+        Power of the largest bin, over that of one line centred on a bin.
     """
     spreads = np.geomspace(1e-3, 400.0, 96)
     largest_bin_powers = _largest_bin_power(
@@ -525,15 +584,15 @@ def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     weight = _window_autocorrelation(window_name, lag)
     errors = np.empty((NODE_COUNTS.size, spreads.size + 1))
     for row, n_nodes in zip(errors, NODE_COUNTS.tolist(), strict=True):
-        row[:] = np.append(_unbounded_error(spreads, n_nodes), np.inf)
+        row[:] = np.append(_substitute_error(spreads, n_nodes), np.inf)
         for i, spread in enumerate(spreads.tolist()):
             rule_error = (
-                weight * _cosine_rule_error(n_nodes, 2 * np.pi * spread * lag)
+                weight * _quadrature_error_for_cosine(n_nodes, 2 * np.pi * spread * lag)
             ).sum() / largest_bin_powers[i]
             if rule_error > 1:
                 break  # wider spreads have larger errors
             row[i] = rule_error
-        row[-1] = _unbounded_error(1e3, n_nodes)
+        row[-1] = _substitute_error(1e3, n_nodes)
     return (
         spreads,
         np.maximum.accumulate(errors, axis=1),
@@ -541,57 +600,74 @@ def _rule_errors(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def _unbounded_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
-    """Return a substitute, at least 1, for errors without a bound: the distance of nodes [bins]."""
-    return np.maximum(1.0, 2 * UNIFORM_RULE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
+def _substitute_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
+    """Return the distance between nodes [bins], at least 1, as a substitute for unbounded errors.
+
+    It makes more nodes preferable where no error has a bound.
+    """
+    return np.maximum(1.0, 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 
 
 @lru_cache(maxsize=32)
-def _curvature_errors(window_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate errors by curvature, over the power of a line on a bin: along and across the slope.
+def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate the error of each number of nodes and of lines by curvature.
 
-    The first table is by NODE_COUNTS along the slope, the second by LINE_COUNTS across it.
+    Errors are over the power of one line centred on a bin.
+
+    Returns
+    -------
+    along : ndarray (counts, m + 1)
+        Errors of NODE_COUNTS along the slope, at _CURVATURES and beyond the largest.
+    across : ndarray (lines, m + 1)
+        Errors of NODE_LINE_COUNTS across the slope.
     """
     lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
     weight = _window_autocorrelation(window_name, lag)
     phase = 2 * np.pi * lag * _CURVATURES[:, None]
 
     def errors_of_rule(n_nodes: int) -> np.ndarray:
-        """Return the errors of a rule for each curvature, and beyond the largest."""
+        """Return the errors of a quadrature at _CURVATURES, and beyond the largest, (m + 1,)."""
         rule_errors = (
-            weight * np.interp(phase, _CURVATURE_PHASES, _quadratic_phase_error(n_nodes))
+            weight
+            * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
         ).sum(axis=1)
         return np.append(
-            np.where(rule_errors < 1, rule_errors, _unbounded_error(_CURVATURES, n_nodes)), 1e3
+            np.where(rule_errors < 1, rule_errors, _substitute_error(_CURVATURES, n_nodes)), 1e3
         )
 
-    along, across = NODE_COUNTS.tolist(), (2 * LINE_COUNTS).tolist()
+    along, across = NODE_COUNTS.tolist(), (2 * NODE_LINE_COUNTS).tolist()
     return np.array([errors_of_rule(number) for number in along]), np.array(
         [errors_of_rule(number) for number in across]
     )
 
 
 @lru_cache(maxsize=1)
-def _smoothed_curvature_errors() -> np.ndarray:
-    """Tabulate the mean curvature error over a Gaussian of width 1 / ratio, (lines, ratios + 1)."""
+def _smoothed_errors_by_curvature() -> np.ndarray:
+    """Tabulate errors by curvature that a linear spread smooths, (lines, ratios + 1).
+
+    Rows are NODE_LINE_COUNTS, columns are _CURVATURE_RATIOS and beyond. Errors are means over a
+    Gaussian.
+    """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
-    errors = np.full((LINE_COUNTS.size, _CURVATURE_RATIOS.size + 1), np.inf)
-    for row, lines in zip(errors, LINE_COUNTS.tolist(), strict=True):
+    errors = np.full((NODE_LINE_COUNTS.size, _CURVATURE_RATIOS.size + 1), np.inf)
+    for row, lines in zip(errors, NODE_LINE_COUNTS.tolist(), strict=True):
         rule_errors = np.interp(
-            phase * _CURVATURE_RATIOS[:, None], _CURVATURE_PHASES, _quadratic_phase_error(2 * lines)
+            phase * _CURVATURE_RATIOS[:, None],
+            _CURVATURE_PHASES,
+            _quadrature_error_for_quadratic_phase(2 * lines),
         )
         row[:-1] = (weight * rule_errors).sum(axis=1)
     return errors
 
 
 @lru_cache(maxsize=64)
-def _quadratic_phase_error(n_nodes: int) -> np.ndarray:
-    """Return the largest error of a rule's mean of exp(i t x^2) up to each phase t.
+def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
+    """Return the largest error of a quadrature's mean of exp(i t x^2) up to each phase t.
 
-    The exact mean is 1 / sqrt(1 - 2 i t).
+    The phases are _CURVATURE_PHASES. The exact mean is 1 / sqrt(1 - 2 i t).
     """
-    x, w = gaussian_rule(n_nodes)
+    x, w = gaussian_quadrature(n_nodes)
     rule_mean = np.array(
         [(w * np.exp(1j * phase * x**2)).sum() for phase in _CURVATURE_PHASES.tolist()]
     )
@@ -599,9 +675,10 @@ def _quadratic_phase_error(n_nodes: int) -> np.ndarray:
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
-    """Return a lower bound of the largest bin's power, over that of all lines on a bin.
+    """Return a lower bound on the largest bin's power, over that of all lines centred on a bin.
 
-    See :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
+    `deviation` is the standard deviation of the lines' positions [bins of fs/L]. See
+    :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
     wide = (1 - 1 / _CHEBYSHEV_MULTIPLES**2) * lobe_shape.central_energy_min
@@ -614,7 +691,10 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 
 
 def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
-    """Return |r| at lags of either sign [records], as fractions of the signed sum."""
+    """Return the magnitude of a window's autocorrelation at lags [records].
+
+    It is normalised by the sum over the lags, with its sign.
+    """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]
     at_lags = np.interp(lag * _WINDOW_SAMPLES, np.arange(_WINDOW_SAMPLES + 1), r)
@@ -623,19 +703,25 @@ def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _autocorrelation_peak(window_name: str) -> float:
-    """Return the largest density of the autocorrelation over lags [1/record]."""
+    """Return the largest density of a window's autocorrelation over lags [1/record].
+
+    The integral of the density over lags is 1.
+    """
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     return float(_window_autocorrelation(window_name, lag).max()) * _N_LAGS
 
 
-def _cosine_rule_error(n_nodes: int, phase: np.ndarray) -> np.ndarray:
-    """Return the error of a rule's mean of cos(phase x), whose exact value is exp(-phase^2 / 2)."""
+def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:
+    """Return the error of a quadrature's mean of cos(phase x), (phases,).
+
+    The exact mean is exp(-phase^2 / 2).
+    """
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
-        x, w = gaussian_rule(n_nodes)
+        x, w = gaussian_quadrature(n_nodes)
         rule_mean = (w * np.cos(phase[:, None] * x)).sum(axis=1)
         return np.asarray(np.abs(rule_mean - np.exp(-0.5 * phase**2)))
-    step = 2 * UNIFORM_RULE_RADIUS_SIGMA / (n_nodes - 1)
+    step = 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA / (n_nodes - 1)
     excess_phase = phase - 2 * np.pi / step  # evenly spaced nodes alias there
     return np.asarray(
-        np.where(excess_phase < 0, np.exp(-0.5 * excess_phase**2), 1.0) + _UNIFORM_RULE_ERROR
+        np.where(excess_phase < 0, np.exp(-0.5 * excess_phase**2), 1.0) + _UNIFORM_QUADRATURE_ERROR
     )

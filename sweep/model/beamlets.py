@@ -11,10 +11,10 @@ lattice cancels. Off normal incidence its phases step evenly from row to row, an
 vanishes except at grating lobes. A sunflower pattern has no rows. Its sum fades like the random sum
 of rough ground, as [T 4.2] describes (first dips of Pd at some 4 km).
 
-Moments of a plane's lines: let u be the angle of a beamlet along the slope times cot(grazing), and
-d its direction, of length 1 on the axis. Then R_b/R_0 = (1 + d)/(1 + u). The echo relative to that
-on the axis is ((1 + u)/|d|)^m, where m = 2 for isotropic reflectance laws and m = 3 for Lambert's.
-The pattern has exactly the beam's covariance, so u has mean 0 and rms q = (divergence/4)
+Moments of the lines on a plane: let u be the angle of a beamlet along the slope times cot(grazing),
+and d its direction, of length 1 on the axis. Then R_b/R_0 = (1 + d)/(1 + u). The echo relative to
+that on the axis is ((1 + u)/|d|)^m, where m = 2 for isotropic reflectance laws and m = 3 for
+Lambert's. The pattern has exactly the beam's covariance, so u has mean 0 and rms q = (divergence/4)
 cot(grazing). If a beamlet may pass over the horizon, the moments are infinite.
 """
 
@@ -28,16 +28,19 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 BEAMLET_PATTERNS = ("hexagonal", "sunflower", "line", "square")
-"""Names of patterns; ``3 lines`` and the like name a number of parallel lines."""
+"""Names of patterns. ``3 lines``, or another number, is a further name: parallel lines of
+beamlets."""
 
 PATTERN_RADIUS_SIGMA = 3.0
-"""Radius of the pattern before the mapping [standard deviations]; it holds 98.9 % of the power."""
+"""Radius of a pattern before it is mapped to the beam's covariance [standard deviations of the
+beam]. 98.9 % of the power is within it."""
 
 SQUARED_RADIUS_GROWTH = 2.9
-"""Growth of a lattice's squared radius with the logarithm of its number of beamlets, from 19 on.
+"""Growth of a lattice's squared radius with the natural logarithm of its number of beamlets.
 
-A lattice errs by the power outside its radius and by its spacing. A growing radius reduces both as
-beamlets are added: 3.3 standard deviations for 37 beamlets, 3.8 for 109, 4.7 for 2,029.
+It applies from 19 beamlets on. A lattice errs by the power outside its radius and by its spacing. A
+growing radius reduces both as beamlets are added: 3.3 standard deviations for 37 beamlets, 3.8 for
+109, 4.7 for 2,029.
 """
 
 _LATTICE_ROTATION = 0.191
@@ -46,15 +49,15 @@ _LATTICE_ROTATION = 0.191
 
 
 GAUSS_HERMITE_NODES_MAX = 15
-"""Largest number of nodes for which the rule is Gauss-Hermite quadrature."""
+"""Largest number of nodes of a Gauss-Hermite quadrature. More nodes are evenly spaced."""
 
-UNIFORM_RULE_RADIUS_SIGMA = 7.0
-"""Half-width [standard deviations] of rules of more nodes, which are evenly spaced; 3e-12 is
-outside."""
+UNIFORM_QUADRATURE_RADIUS_SIGMA = 7.0
+"""Distance of the outermost of evenly spaced nodes from the middle [standard deviations]. 3e-12 of
+the distribution is outside."""
 
 
 @lru_cache(maxsize=64)
-def gaussian_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def gaussian_quadrature(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights of a quadrature for means over the standard normal distribution.
 
     Parameters
@@ -70,7 +73,9 @@ def gaussian_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
     if n_nodes <= GAUSS_HERMITE_NODES_MAX:
         nodes, weights = np.polynomial.hermite_e.hermegauss(n_nodes)
     else:
-        nodes = np.linspace(-UNIFORM_RULE_RADIUS_SIGMA, UNIFORM_RULE_RADIUS_SIGMA, n_nodes)
+        nodes = np.linspace(
+            -UNIFORM_QUADRATURE_RADIUS_SIGMA, UNIFORM_QUADRATURE_RADIUS_SIGMA, n_nodes
+        )
         weights = np.exp(-0.5 * nodes**2)
     weights /= weights.sum()
     if n_nodes > GAUSS_HERMITE_NODES_MAX:
@@ -80,7 +85,7 @@ def gaussian_rule(n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.ndarray]:
-    """Return directions and weights of a Gaussian beam's beamlets.
+    """Place the beamlets of a Gaussian beam: return their directions and weights.
 
     Parameters
     ----------
@@ -106,7 +111,7 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
     if n_beamlets == 1:
         return np.zeros((2, 1)), np.ones(1)
     if pattern.endswith(("line", "lines", "square")):
-        return _product_rule(pattern, n_beamlets)
+        return _product_quadrature(pattern, n_beamlets)
     if n_beamlets == 2:
         return np.array([[0.0, 0.0], [-1.0, 1.0]]), np.array([0.5, 0.5])
     offsets = _PATTERN_FUNCTIONS[pattern](n_beamlets)
@@ -120,7 +125,10 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
 
 
 def _hexagonal_lattice(n_points: int) -> np.ndarray:
-    """Return the points of a hexagonal lattice nearest to one of its points, (2, n_points)."""
+    """Return a hexagonal lattice's points nearest to one of its points, (2, n_points).
+
+    Coordinates are in standard deviations of the beam.
+    """
     search_radius = 2 + math.ceil(math.sqrt(n_points))
     i, j = np.mgrid[-search_radius : search_radius + 1, -search_radius : search_radius + 1].reshape(
         2, -1
@@ -136,31 +144,40 @@ def _hexagonal_lattice(n_points: int) -> np.ndarray:
 
 
 def lattice_radius(n_beamlets: int) -> float:
-    """Return the radius of a hexagonal lattice before the mapping [standard deviations]."""
+    """Return the radius of a hexagonal lattice before it is mapped to the beam's covariance.
+
+    It is in standard deviations of the beam.
+    """
     return math.sqrt(
         PATTERN_RADIUS_SIGMA**2 + SQUARED_RADIUS_GROWTH * math.log(max(n_beamlets, 19) / 19)
     )
 
 
 def _sunflower_pattern(n_points: int) -> np.ndarray:
-    """Return points of equal areas of a circle, each rotated by the golden angle, (2, n_points)."""
+    """Return the points of a sunflower, (2, n_points) [standard deviations of the beam].
+
+    All points have equal areas of a circle. The golden angle is between successive points.
+    """
     k = np.arange(n_points) + 0.5
     radius, angle = PATTERN_RADIUS_SIGMA * np.sqrt(k / n_points), k * math.pi * (3 - math.sqrt(5))
     return np.array([radius * np.cos(angle), radius * np.sin(angle)])
 
 
-def _product_rule(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions and weights of a product of Gaussian rules along and across the slope."""
+def _product_quadrature(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions and weights, as of `place_beamlets`, of a product of two quadratures.
+
+    One quadrature runs along the slope, the other across it.
+    """
     if pattern == "square":
         nodes_per_side = max(math.isqrt(n_beamlets), 2)
         (x, x_weights), (y, y_weights) = (
-            gaussian_rule(nodes_per_side),
-            gaussian_rule(nodes_per_side),
+            gaussian_quadrature(nodes_per_side),
+            gaussian_quadrature(nodes_per_side),
         )
     else:
         n_lines = 1 if pattern == "line" else int(pattern.split()[0])
-        y, y_weights = gaussian_rule(n_beamlets // n_lines)
-        nodes, weights = gaussian_rule(2 * n_lines)
+        y, y_weights = gaussian_quadrature(n_beamlets // n_lines)
+        nodes, weights = gaussian_quadrature(2 * n_lines)
         x, x_weights = nodes[n_lines:], 2 * weights[n_lines:]
     across, along = (v.ravel() for v in np.meshgrid(x, y))
     return np.array([across, along]), np.outer(y_weights, x_weights).ravel()
@@ -179,7 +196,7 @@ def plane_footprint(
     transverse_velocity: ArrayLike = 0.0,
     direction_angle: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the beamlets of a beam on a flat plane, per unit of range along its axis.
+    """Compute where the beamlets of a beam meet a flat plane, relative to the range on its axis.
 
     Parameters
     ----------
@@ -248,7 +265,7 @@ class OffsetMoments(NamedTuple):
     """Largest magnitude of an offset."""
 
     def scaled_by(self, factor: np.ndarray) -> "OffsetMoments":
-        """Return the moments of offsets times a factor; infinite moments times 0 give 0."""
+        """Return the moments of the offsets times a factor. Infinite moments times 0 give 0."""
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def sum_bound(self, other: "OffsetMoments") -> "OffsetMoments":
@@ -271,7 +288,7 @@ def pattern_radius(n_beamlets: int, pattern: str) -> float:
     return float(np.sqrt((directions**2).sum(axis=0)).max())
 
 
-def plane_moments(
+def plane_offset_moment_bounds(
     *,
     transverse_velocity: ArrayLike,
     radial_velocity: ArrayLike,
@@ -281,7 +298,7 @@ def plane_moments(
     pattern: str,
     direction_angle: ArrayLike | None = None,
 ) -> tuple[OffsetMoments, OffsetMoments]:
-    """Bound the moments of relative ranges and radial velocities of a beam on a plane.
+    """Return upper bounds on the moments of beamlets' offsets in range and velocity on a plane.
 
     Parameters
     ----------
@@ -306,9 +323,9 @@ def plane_moments(
 
     Notes
     -----
-    Both are weighted by echo power. u of the module's description has the rms q; the further terms
-    bound Taylor's remainders. A beamlet x off the axis sees, of a velocity across and along the
-    beam, v_across x / |d| + v_along (1/|d| - 1), with |d|^2 = 1 + x^2.
+    Both are weighted by echo power. u of the module's description has the rms q. Further terms
+    bound the remainders of Taylor series. A beamlet x off the axis sees, of a velocity across and
+    along the beam, v_across x / |d| + v_along (1/|d| - 1), with |d|^2 = 1 + x^2.
     """
     radius, sigma = pattern_radius(n_beamlets, pattern), np.asarray(beam_divergence, float) / 4
     transverse_velocity, radial_velocity = np.abs(transverse_velocity), np.abs(radial_velocity)
@@ -352,7 +369,7 @@ def plane_moments(
     return range_moments, velocity_moments
 
 
-def plane_echo_ratio(
+def plane_echo_ratio_bound(
     law: str,
     *,
     grazing_angle: np.ndarray,
@@ -360,7 +377,7 @@ def plane_echo_ratio(
     n_beamlets: int,
     pattern: str,
 ) -> np.ndarray:
-    """Bound the echo of all beamlets on a plane over that of one line on the axis, (n,).
+    """Return an upper bound on the echo of all beamlets on a plane, over that on the axis, (n,).
 
     Parameters
     ----------
@@ -373,8 +390,9 @@ def plane_echo_ratio(
 
     Notes
     -----
-    u has mean 0 and a known rms, so the ratio differs from 1 in second order: upwards by the slope,
-    and downwards by the beamlets' greater length. The bound takes the second as an increase too.
+    u of the module's description has mean 0 and a known rms, so the ratio differs from 1 in second
+    order. The slope increases it, and the beamlets' greater length reduces it. The bound takes both
+    as increases.
     """
     echo_exponent, sigma = 3 if law == "lambert" else 2, beam_divergence / 4
     range_rms = sigma / np.tan(grazing_angle)
@@ -392,7 +410,7 @@ def plane_echo_ratio(
 def bins_per_velocity(
     *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
 ) -> np.ndarray:
-    """Return the shift of a line in bins for 1 m/s of radial velocity.
+    """Return by how many bins a line shifts for 1 m/s of radial velocity.
 
     Parameters
     ----------

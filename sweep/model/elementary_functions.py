@@ -9,14 +9,14 @@ import math
 
 from sweep.kernel_cache import njit
 
-_TAU = 2.0 * math.pi
-# Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2. For |r| <= 1/8 the truncation error
-# is 5e-17.
+_TWO_PI = 2.0 * math.pi
+# Taylor coefficients of sin(2 pi r) / r, and of cos(2 pi r), in powers of r^2. For |r| <= 1/8 the
+# truncation error is 5e-17.
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7 = (
-    (-1) ** i * _TAU ** (2 * i + 1) / math.factorial(2 * i + 1) for i in range(8)
+    (-1) ** i * _TWO_PI ** (2 * i + 1) / math.factorial(2 * i + 1) for i in range(8)
 )
 _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
-    (-1) ** i * _TAU ** (2 * i) / math.factorial(2 * i) for i in range(1, 9)
+    (-1) ** i * _TWO_PI ** (2 * i) / math.factorial(2 * i) for i in range(1, 9)
 )
 
 
@@ -51,25 +51,25 @@ def exact_product(a, b):
 
 @njit(inline="always")
 def fraction_of_cycle(x):
-    """Return the signed fraction of a number of cycles, in [-1/2, 1/2]."""
+    """Return a phase [cycles] without its whole cycles, in [-1/2, 1/2]."""
     return x - math.floor(x + 0.5)
 
 
 @njit(inline="always")
 def product_cycle_fraction(high, low, x):
-    """Return the signed fraction of (high + low) * x cycles.
+    """Return the phase of (high + low) * x cycles without its whole cycles, in [-1/2, 1/2].
 
     Parameters
     ----------
     high, low : float
-        Factor as two doubles, as of :func:`exact_product`.
+        First factor, as the sum of two doubles, as :func:`exact_product` returns it.
     x : float
         Second factor.
 
     Returns
     -------
     float
-        Fraction of a cycle, to about 1e-16 for products up to 1e15 cycles.
+        Fraction of a cycle, with an error of about 1e-16 for products up to 1e15 cycles.
 
     Notes
     -----
@@ -83,7 +83,7 @@ def product_cycle_fraction(high, low, x):
 
 @njit(inline="always")
 def exact_quotient(numerator, denominator):
-    """Return the quotient numerator / denominator as two doubles (high, low)."""
+    """Return the quotient numerator / denominator as the sum of two doubles, high and low."""
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)
     return high, ((numerator - product) - remainder) / denominator
@@ -101,7 +101,7 @@ def sincos_cycles(x):
     Returns
     -------
     sine, cosine : float
-        Absolute error below 3e-16, besides the error of `x` itself.
+        Values with an absolute error below 3e-16, for the given `x`.
     """
     r = x - math.floor(x + 0.5)
     quadrant = math.floor(4.0 * r + 0.5)

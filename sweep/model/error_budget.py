@@ -47,91 +47,97 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri
 
 AUTOMATIC = -1.0
-"""Value that stands for an error derived from the tolerance."""
+"""Value of an error in :class:`ErrorBudget` that means: derive it from the tolerance."""
 
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Accuracy with which points are computed; the first five are scalars or one a point."""
+    """Tolerance of a study, and its division among the sources of error.
+
+    The first five fields are scalars, or arrays with one value for each point.
+    """
 
     tolerance: ArrayLike = 1e-3
     """Largest error of a probability of detection, of log10 of a probability of false alarm, or of
-    a relative magnitude. Of points with draws it is the largest half-width of the interval. At 0
-    nothing is skipped. A tenth of it rarely doubles the time of a point; where draws decide, it
-    takes a hundred times as many draws."""
+    a relative magnitude. For points with draws it is the largest half-width of the confidence
+    interval. At 0 nothing is skipped. A tenth of the tolerance rarely doubles the time of a point.
+    With draws it takes a hundred times as many."""
 
     confidence: ArrayLike = 0.95
-    """Confidence of the intervals of estimates by draws. Draws grow with the square of the normal
-    quantile: 0.99 takes 1.7 times the draws of 0.95."""
+    """Confidence of the intervals of estimates by draws. The number of draws grows with the square
+    of the normal quantile: 0.99 takes 1.7 times the draws of 0.95."""
 
     line_error: ArrayLike = AUTOMATIC
-    """Error of a bin, in noise sigmas, due to few lines in place of one a beamlet. By default
-    `lines_fraction` of the tolerance. A smaller error slowly increases the number of lines of a
-    segment."""
+    """Error of |X| in a bin, over the noise sigma, because few lines represent all beamlets. By
+    default it is `lines_fraction` of the tolerance. A smaller error slowly increases the number of
+    lines of a segment."""
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Probability of leakage, over all bins far from the lines, that is neglected. By default
-    `leakage_fraction` of the tolerance. With a smaller one more bins are evaluated."""
+    """Probability that leaked signal raises a false peak in bins far from the lines, as far as it
+    is neglected. By default it is `leakage_fraction` of the tolerance. With a smaller value more
+    bins are evaluated."""
 
     leakage_floor: ArrayLike = AUTOMATIC
-    """Leaked signal, in noise sigmas, below which a bin that is evaluated singly counts as noise
-    alone. By default it follows from `leakage_error`. With a lower one more bins are evaluated."""
+    """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. It
+    applies to bins that are evaluated one by one. By default it follows from `leakage_error`. With
+    a lower value more bins are evaluated."""
 
     interval: str = "clopper_pearson"
-    """Interval of a counted share, one of :data:`COUNT_INTERVALS`. The interval of Clopper and
-    Pearson covers at least as often as stated. Wilson's takes fewer draws and covers about as often
-    as stated."""
+    """Kind of confidence interval for a probability that is estimated by counting draws, one of
+    :data:`COUNT_INTERVALS`. The interval of Clopper and Pearson has at least the stated coverage.
+    Wilson's takes fewer draws, and has the stated coverage on average."""
 
     stopping_check_growth: float = 1.25
-    """Ratio of the numbers of draws at successive checks of the half-widths. A ratio nearer 1
-    wastes fewer draws, but checks more often, which costs coverage."""
+    """Ratio of the numbers of draws at successive checks of the half-widths. With a ratio nearer 1
+    fewer draws are wasted, but the more frequent checks reduce the coverage of the intervals."""
 
     effects_fraction: float = 0.8
-    """Fraction of the tolerance for skipped effects, including the number of beamlets. With more of
-    it, more effects are skipped; lines are not affected."""
+    """Fraction of the tolerance for skipped effects and the number of beamlets together. A larger
+    fraction lets more effects be skipped."""
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is taken from `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
+    tolerance. It is a part of `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
     at most points."""
 
     lines_fraction: float = 1.0
-    """Fraction of the tolerance for `line_error`. It is 1, as its bounds are worst cases of lines
-    and bins."""
+    """Fraction of the tolerance for `line_error`. It is 1, as bounds on this error are worst cases
+    over lines and bins."""
 
     leakage_fraction: float = 0.5
     """Fraction of the tolerance for `leakage_error`."""
 
-    single_line_fraction: float = 0.1
-    """Fraction of the beamlets' tolerance by which a single line of nodes may err across the slope
-    before several lines are tried. A smaller one tries several lines at more points, with the same
-    accuracy."""
+    single_node_line_fraction: float = 0.1
+    """Fraction of the beamlets' tolerance that the error of a single line of nodes across the slope
+    may reach before several lines are tried. With a smaller fraction several lines are tried at
+    more points. The accuracy is the same."""
 
     beamlets_max: int = 4096
-    """Largest number of beamlets of a plane's footprint. Points that need more are computed with
-    the number that errs least, and their ``beamlets_error`` states the error."""
+    """Largest number of beamlets of a footprint on a plane. Points that need more are computed with
+    the number of least error, and their ``beamlets_error`` states the error."""
 
     thesis_beamlet_count: int = 109
-    """Number of beamlets of [T 3.3.1], used where no number is enough: the sum of amplitudes over a
-    smooth plane almost cancels."""
+    """Number of beamlets of [T 3.3.1]. It is used where no number is enough, because amplitudes add
+    over a smooth plane and their sum almost cancels."""
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Pairs of a tolerance and the least number of rays of a flight's shot from that tolerance up.
-    No estimate can know of objects that no ray hits: fewer rays miss small objects."""
+    """Pairs of a tolerance and the smallest number of rays of a shot of a flight. A pair applies
+    from its tolerance up to that of the pair before. Estimates of the error cannot include objects
+    that no ray hits, and fewer rays miss more small objects."""
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
-    """Numbers of rays that may be cast for a shot: full shells of the lattice, which alone are
-    symmetric. Symmetry makes results on smooth ground a hundred times more exact. The smallest is
-    the least from which an error can be estimated. Each ray costs some 80 ns."""
+    """Numbers of rays that may be cast for a shot. They are those of full shells of the lattice,
+    which are symmetric. Symmetry makes results on smooth ground a hundred times more exact. The
+    first number is the smallest from which an error can be estimated. Each ray costs some 80 ns."""
 
     rays_tolerance_min: float = 1e-6
-    """Smallest tolerance that has an effect on the number of rays."""
+    """Tolerance below which the number of rays does not increase further."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any], **overrides: Any) -> "ErrorBudget":
-        """Return the budget with the values under ``accuracy.`` in `parameters`, by dotted path.
+        """Return the budget that parameters by dotted path state, under ``accuracy.``.
 
-        `overrides` set other fields.
+        `overrides` are values of further fields, by name.
         """
         names = ("tolerance", "confidence", "line_error", "leakage_error", "leakage_floor")
         stated_values = {name: parameters[f"accuracy.{name}"] for name in names
@@ -139,7 +145,10 @@ class ErrorBudget:
         return cls(**stated_values, **overrides)
 
     def select(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
-        """Return the budget with the tolerance and confidence of selected points of `n_points`."""
+        """Return the budget of selected points: tolerance and confidence have one value for each.
+
+        `point_indices` select from `n_points` points.
+        """
         tolerance, confidence = (
             np.broadcast_to(values, (n_points,))[point_indices]
             for values in (self.tolerance, self.confidence)
@@ -148,12 +157,12 @@ class ErrorBudget:
 
     @property
     def allowed_line_error(self) -> np.ndarray:
-        """Tolerated error of a bin over sigma, due to few lines in place of one a beamlet."""
+        """Tolerated error of |X| in a bin over the noise sigma, because few lines stand for all."""
         return self._stated_or_fraction(self.line_error, self.lines_fraction)
 
     @property
     def allowed_leakage(self) -> np.ndarray:
-        """Probability of leakage that may be neglected."""
+        """Probability of a false peak by leaked signal that may be neglected."""
         return self._stated_or_fraction(self.leakage_error, self.leakage_fraction)
 
     @property
@@ -164,8 +173,8 @@ class ErrorBudget:
     def allowed_effects_error(self, *, counts_beamlets: bool) -> np.ndarray:
         """Return the tolerated change of a probability by all effects that are skipped.
 
-        `counts_beamlets`: True if the number of beamlets follows from the tolerance and takes its
-        part.
+        `counts_beamlets` is True if the number of beamlets follows from the tolerance. Its part of
+        the tolerance is then subtracted.
         """
         beamlets_part = self.beamlets_fraction if counts_beamlets else 0.0
         return (self.effects_fraction - beamlets_part) * np.asarray(self.tolerance, float)
@@ -182,13 +191,13 @@ class ErrorBudget:
         return np.logical_or(*(error == AUTOMATIC for error in errors))
 
     def _stated_or_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
-        """Return the stated error, or where it is :data:`AUTOMATIC` a fraction of the tolerance."""
+        """Return a stated error, with a fraction of the tolerance where it is `AUTOMATIC`."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == AUTOMATIC, allowed, stated)
 
 
 class ConfidenceInterval(NamedTuple):
-    """Ends of intervals, within 0..1, in the shape of their estimates."""
+    """Ends of the confidence intervals of probabilities, 0..1, in the shape of the estimates."""
 
     low: np.ndarray
     """Lower ends."""
@@ -199,7 +208,7 @@ class ConfidenceInterval(NamedTuple):
 def wilson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute Wilson's score interval of the probability of a success, from counts.
+    """Compute Wilson's score interval for the probability of a success, from counts [1]_.
 
     Parameters
     ----------
@@ -226,7 +235,7 @@ def wilson_interval(
 def clopper_pearson_interval(
     *, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute Clopper and Pearson's interval of the probability of a success, from counts.
+    """Compute Clopper and Pearson's interval for the probability of a success, from counts [1]_.
 
     Parameters
     ----------
@@ -237,8 +246,8 @@ def clopper_pearson_interval(
 
     Notes
     -----
-    At either end the observed count, or a more extreme one, has the probability (1 - confidence) /
-    2.
+    If the true probability were at an end of the interval, the observed count, or one still
+    farther from the expectation, would have the probability (1 - confidence) / 2.
 
     References
     ----------
@@ -259,13 +268,13 @@ COUNT_INTERVALS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }
-"""Functions that compute intervals of counted shares, by name."""
+"""Functions that compute confidence intervals of a probability from counts, by name."""
 
 
 def bounded_mean_interval(
     *, mean: ArrayLike, variance: ArrayLike, n_values: ArrayLike, confidence: ArrayLike
 ) -> ConfidenceInterval:
-    """Compute an interval of the expectation of values within 0..1 from their mean.
+    """Compute a confidence interval for the expectation of values within 0..1, from their mean.
 
     Parameters
     ----------
@@ -287,7 +296,10 @@ def bounded_mean_interval(
     variance_term = z * z * n * np.where(n > 1, variance, 0.0)
 
     def half_length(distance_to_end: np.ndarray) -> np.ndarray:
-        """Return the distance d from the mean to an end; q of the equation is `distance_to_end`."""
+        """Return the distance d from the mean to one end of the interval.
+
+        `distance_to_end` is q of the module's equation.
+        """
         linear_term = distance_to_end * z * z / 2
         return (linear_term + np.sqrt(variance_term + linear_term * linear_term)) / n
 
@@ -295,7 +307,7 @@ def bounded_mean_interval(
 
 
 def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np.ndarray:
-    """Return the distance from estimates to the farther ends of their intervals.
+    """Return the half-widths of intervals: the distance from the estimate to the farther end.
 
     Parameters
     ----------

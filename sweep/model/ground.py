@@ -1,4 +1,6 @@
-"""Ground that a beam meets, a flat plane or footprints by ray tracing, as one line or as beamlets.
+"""Ground that beams meet: a flat plane, or footprints by ray tracing.
+
+Either can be represented by one line on the beam's axis, or by beamlets.
 
 Reflectance laws: a surface of bidirectional reflectance f [1/sr] that fills a beam of power P at
 incidence i returns the intensity f P cos(i) [W/sr] along the beam. The illuminated patch is
@@ -66,27 +68,57 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
 
 
 class BeamletTable(NamedTuple):
-    """Positions and echoes of beamlets, in rows that points share."""
+    """Offsets and echoes of the beamlets of n points. Points of equal geometry share a row."""
 
     row_of_point: np.ndarray
     """(n,) int64: the row of each point."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): (R_b - R_0) / R_0."""
+    """(rows, beamlets): range of a beamlet minus that on the axis, over the latter: (R_b - R_0) /
+    R_0."""
     doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): beta_b - beta_0, beta = 2 v_r / c."""
+    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis."""
     relative_echo: np.ndarray
-    """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
+    """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]: power fraction times
+    backscatter, over the range loss from R_0 to R_b."""
 
 
 class BeamGradients(NamedTuple):
-    """Changes across a beam per standard deviation of the beam, (n,) each."""
+    """Changes across a footprint per standard deviation of the beam, (n,) each."""
 
     doppler_ratio: np.ndarray
     """(n,): change of the Doppler ratio 2 v_r / c."""
     relative_range: np.ndarray
-    """(n,): change of the range over that on the axis."""
+    """(n,): relative change of the range."""
     relative_echo: np.ndarray
-    """(n,): change of the echo power over that on the axis."""
+    """(n,): relative change of the echo power."""
+
+
+class _PlaneGeometry(NamedTuple):
+    """Geometry of beams on a plane, (n,) each.
+
+    The last three fields are None if the beam has a constant divergence.
+    """
+
+    grazing_angle: np.ndarray
+    """Angle between beam and plane [rad]."""
+    position_angle: np.ndarray
+    """Full 1/e^2 angle over which positions are spread [rad]."""
+    radial_velocity: np.ndarray
+    """Radial velocity [m/s]; 0 if beamlets have no velocities of their own."""
+    transverse_velocity: np.ndarray
+    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
+    direction_angle: np.ndarray | None = None
+    """Full 1/e^2 angle over which directions of the light are spread [rad]."""
+    linear_range_loss: np.ndarray | None = None
+    """Coefficient b of :func:`sweep.model.beam.range_loss_coefficients`."""
+    quadratic_range_loss: np.ndarray | None = None
+    """Coefficient c of :func:`sweep.model.beam.range_loss_coefficients`."""
+
+    @property
+    def direction_sigma(self) -> np.ndarray:
+        """Standard deviation of the directions of the light on each axis [rad]."""
+        angle = self.position_angle if self.direction_angle is None else self.direction_angle
+        return angle / 4
 
 
 class FlatGround:
@@ -104,7 +136,7 @@ class FlatGround:
     """
 
     off_axis_surface = None
-    """Beamlets off the axis's surface: None, as a plane is a single surface."""
+    """Beamlets on other surfaces than the beam's axis; None, as a plane is a single surface."""
 
     def __init__(
         self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True
@@ -123,22 +155,23 @@ class FlatGround:
         columns = np.broadcast_arrays(
             parameters["target.grazing_angle"], position_angles, *velocities, *single_mode_columns
         )
-        self._geometry_columns, self._n_points = (
-            [np.atleast_1d(column) for column in columns],
-            n_points,
-        )
+        self._geometry = _PlaneGeometry(*(np.atleast_1d(column) for column in columns))
+        self._n_points = n_points
 
     def mean_phasor(self, doppler_cycles: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
-        """Return the mean of a phasor over the beam, (n,) complex.
+        """Return the mean phasor of the echo over the beam, (n,) complex.
 
-        The phasor is exp(2 pi i (doppler_cycles dbeta - delay_cycles dR / R)).
+        The phasor at a position of the beam is exp(2 pi i (doppler_cycles dbeta - delay_cycles dR /
+        R)).
 
         Parameters
         ----------
         doppler_cycles : array_like
-            Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is beta_b - beta_0.
+            Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is the Doppler ratio minus that
+            on the axis.
         delay_cycles : array_like
-            Cycles per unit of relative range, (n,) or scalar; dR / R is (R_b - R_0) / R_0.
+            Cycles per unit of relative range, (n,) or scalar; dR / R is the range minus that on the
+            axis, over the latter.
 
         Notes
         -----
@@ -148,11 +181,7 @@ class FlatGround:
 
             (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
-        _, _, radial_velocity, _, *single_mode_columns = self._geometry_columns
-        gradients = self.gradients
-        direction_sigma = (
-            single_mode_columns[0] if single_mode_columns else self._geometry_columns[1]
-        ) / 4
+        geometry, gradients = self._geometry, self.gradients
         phase_per_speed = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(
             doppler_cycles, float
         )  # for 1 m/s
@@ -164,10 +193,10 @@ class FlatGround:
                 - delay_cycles * gradients.relative_range
             )
         )
-        curvature_phase = phase_per_speed * radial_velocity * direction_sigma**2
+        curvature_phase = phase_per_speed * geometry.radial_velocity * geometry.direction_sigma**2
         curvature_phase = (
             curvature_phase
-            + 2 * np.pi * np.asarray(delay_cycles, float) * (self._geometry_columns[1] / 4) ** 2
+            + 2 * np.pi * np.asarray(delay_cycles, float) * (geometry.position_angle / 4) ** 2
         )
         curvature_factor = 1 / (1 + 1j * curvature_phase)
         mean = (
@@ -179,45 +208,47 @@ class FlatGround:
 
     @property
     def gradients(self) -> "BeamGradients":
-        """Changes per standard deviation of the beam towards the near side, (n,) each."""
-        grazing_angle, position_angles, _, transverse_velocity, *single_mode_columns = (
-            self._geometry_columns
-        )
-        range_gradient = (position_angles / 4) / np.tan(grazing_angle)
-        direction_sigma = (single_mode_columns[0] if single_mode_columns else position_angles) / 4
+        """Changes per standard deviation of the beam, towards the near side of the plane."""
+        geometry = self._geometry
+        range_gradient = (geometry.position_angle / 4) / np.tan(geometry.grazing_angle)
         echo_exponent = 3 if self._reflectance_law == "lambert" else 2
         columns = (
-            2 / SPEED_OF_LIGHT * transverse_velocity * direction_sigma,
+            2 / SPEED_OF_LIGHT * geometry.transverse_velocity * geometry.direction_sigma,
             -range_gradient,
             echo_exponent * range_gradient,
         )
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """Return one line for each point: a row for each distinct grazing angle."""
-        grazing_angles, angle_index = np.unique(self._geometry_columns[0], return_inverse=True)
+        """Return the line on the beam's axis, as one beamlet, for each of `n_points` points.
+
+        The table has a row for each distinct grazing angle.
+        """
+        grazing_angles, angle_index = np.unique(self._geometry.grazing_angle, return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
         zeros = np.zeros_like(relative_echo)
         return BeamletTable(_row_indices(angle_index, n_points), zeros, zeros, relative_echo)
 
     @cached_property
     def beamlets(self) -> BeamletTable:
-        """All beamlets of the footprint: a row for each distinct geometry."""
-        first, geometry_of_point = distinct_rows(self._geometry_columns)
-        geometries = np.stack(self._geometry_columns)[:, first]
+        """All beamlets of the footprints. The table has a row for each distinct geometry."""
+        columns = [column for column in self._geometry if column is not None]
+        first, geometry_of_point = distinct_rows(columns)
+        geometry = _PlaneGeometry(*np.stack(columns)[:, first])
         relative_range_offset, cos_incidence, weights, closing_offset = beamlets.plane_footprint(
-            grazing_angle=geometries[0],
-            beam_divergence=geometries[1],
+            grazing_angle=geometry.grazing_angle,
+            beam_divergence=geometry.position_angle,
             n_beamlets=self._n_beamlets,
             pattern=self._beamlet_pattern,
-            radial_velocity=geometries[2],
-            transverse_velocity=geometries[3],
-            direction_angle=geometries[4] if len(geometries) > 4 else None,
+            radial_velocity=geometry.radial_velocity,
+            transverse_velocity=geometry.transverse_velocity,
+            direction_angle=geometry.direction_angle,
         )
         range_loss = (1 + relative_range_offset) ** 2
-        if len(geometries) > 4:
-            first, second = geometries[5:, :, None]
-            range_loss = 1 + relative_range_offset * (first + relative_range_offset * second)
+        if geometry.linear_range_loss is not None and geometry.quadratic_range_loss is not None:
+            linear = geometry.linear_range_loss[:, None]
+            quadratic = geometry.quadratic_range_loss[:, None]
+            range_loss = 1 + relative_range_offset * (linear + relative_range_offset * quadratic)
         relative_echo = weights * backscatter(self._reflectance_law, cos_incidence) / range_loss
         doppler_ratio_offset = np.where(weights > 0, 2 * closing_offset / SPEED_OF_LIGHT, 0.0)
         return BeamletTable(
@@ -229,14 +260,14 @@ class FlatGround:
 
 
 class RayTracedGround:
-    """Footprints found by ray tracing.
+    """Footprints of beams by ray tracing.
 
     Parameters
     ----------
     beamlet_table : BeamletTable
-        Positions and echoes of the beamlets.
+        Offsets and echoes of the beamlets.
     off_axis_surface : ndarray (rows, beamlets) bool, optional
-        Beamlets that are not on the surface that the axis hits.
+        True for beamlets on other surfaces than the beam's axis.
     """
 
     def __init__(
@@ -245,7 +276,10 @@ class RayTracedGround:
         self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """Return one line for each point, with the total echo of its beamlets."""
+        """Return one line on the beam's axis for each of `n_points` points.
+
+        It has the total echo of the point's beamlets.
+        """
         total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
         zeros = np.zeros_like(total_echo)
         return BeamletTable(self.beamlets.row_of_point, zeros, zeros, total_echo)
@@ -256,16 +290,15 @@ Ground = FlatGround | RayTracedGround
 
 
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
-    """Return True if the beamlets of points of one category add as powers."""
+    """Return True if beamlets add as powers, False if as amplitudes; for points of one category."""
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
 
 
 def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
-    """Return the pattern of the beamlets.
+    """Return the name of the beamlets' pattern, one of `sweep.model.beamlets.BEAMLET_PATTERNS`.
 
-    It is the stated one; by default hexagonal if powers add, else a sunflower, which has no
-    symmetry.
+    If it is not stated, it is hexagonal where powers add, else a sunflower, which has no symmetry.
     """
     stated = str(parameters["footprint.pattern"])
     if stated != "auto":
@@ -274,34 +307,34 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
 
 
 def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
-    """Broadcast row numbers to n points, (n,) int64."""
+    """Broadcast the rows of points, (n,) or one row for all, to n points, (n,) int64."""
     return np.broadcast_to(row_of_point.ravel(), n_points).astype(np.int64)
 
 
 class FootprintExtent(NamedTuple):
-    """Extent of a footprint, and the line on its axis, by point."""
+    """Extent and echo of the footprints of n points, (n,) each."""
 
     axis_echo: np.ndarray
-    """Echo of the line on the axis for a reflectance of 1 [1/sr]."""
+    """Echo, for reflectance 1, of a single line on the beam's axis [1/sr]."""
     total_echo_ratio: np.ndarray | float
-    """Echo of all beamlets over that of the line on the axis."""
+    """Echo of all beamlets over `axis_echo`."""
     range_offsets: OffsetMoments
-    """Moments of (R_b - R_0) / R_0."""
+    """Moments of the beamlets' relative range offsets (R_b - R_0) / R_0."""
     axis_surface_range_offsets: OffsetMoments
-    """Moments of (R_b - R_0) / R_0 of the beamlets on the axis's surface only."""
+    """Moments of the same offsets, of the beamlets on the surface that the axis hits."""
     velocity_offsets: OffsetMoments
-    """Moments of the beamlets' radial velocities minus the axis's [m/s]."""
+    """Moments of the beamlets' radial velocities minus that on the axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
-    """Largest ratio of the beamlets' summed amplitude to that of the line on the axis, in phase or
-    as powers."""
+    """Largest ratio of the beamlets' summed amplitude, in phase or as powers, to the amplitude of
+    the single line."""
     off_axis_fraction: np.ndarray | float = 0.0
-    """Fraction of the echo from surfaces other than the axis's, 0..1."""
+    """Fraction of the echo from other surfaces than that which the axis hits, 0..1."""
     off_axis_range_offset_max: np.ndarray | float = 0.0
-    """Largest |R_b - R_0| / R_0 on surfaces other than the axis's."""
+    """Largest |R_b - R_0| / R_0 on these other surfaces."""
 
 
 def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
-    """Return the extent of footprints found by ray tracing."""
+    """Compute the extent of footprints by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     off_axis_surface = ground.off_axis_surface
     total_echo = relative_echo.sum(axis=1)
@@ -338,7 +371,7 @@ def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
 
 
 def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
-    """Return the moments of values (n, m) with weights (n, m)."""
+    """Return the moments (n,) of values (n, m) with weights (n, m) that sum to 1 in each row."""
     weighted = weights * values
     extreme = np.where(weights > 0, np.abs(values), 0.0).max(axis=1)
     return OffsetMoments(
@@ -347,7 +380,7 @@ def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
 
 
 def distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct rows of a table given by its columns.
+    """Find the distinct rows of a table that is given by its columns.
 
     Parameters
     ----------
@@ -356,10 +389,10 @@ def distinct_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
     Returns
     -------
-    first_rows : ndarray (kinds,)
-        Number of one row of each kind.
-    kind_of_row : ndarray (n,)
-        Kind of each row.
+    first_rows : ndarray (distinct,)
+        Index of one row for each distinct row.
+    distinct_of_row : ndarray (n,)
+        For each row of the table, the index in `first_rows` of the row that equals it.
     """
     order = np.lexsort(columns)
     rows = np.stack(columns)[:, order]

@@ -6,16 +6,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 NO_DOPPLER_NOTE = "nan without a Doppler segment, which direct detection never has"
+"""Comment of outputs of the Doppler segment."""
 NO_ECHO_NOTE = "nan where no light comes back"
-NO_BIN_NOTE = "-inf where the detection occupies every bin, so that none is left to raise an alarm"
+"""Comment of outputs that need an echo."""
+NO_FREE_BIN_NOTE = (
+    "-inf where the detection occupies every bin, so that none is left to raise an alarm"
+)
+"""Comment of logarithms of probabilities of a false alarm."""
 CLOSING_SIGN_NOTE = "positive when closing"
+"""Comment that states the sign of radial velocities."""
 
-XYZ_DIM, SECOND_XYZ_DIM = "xyz", "xyz_again"
+XYZ_DIM = "xyz"
+"""Name of the dimension of the world's axes."""
+SECOND_XYZ_DIM = "xyz_again"
+"""Name of the second dimension of the world's axes in covariances."""
 
 
 @dataclass(frozen=True)
 class OutputVariable:
-    """Output variable of a store.
+    """Name, units and meaning of an output variable of a store.
 
     Missing values are nan for floats, -1 for signed integers, and 0 for flags.
     """
@@ -45,9 +54,20 @@ def _segment_variables(
     separator: str = " ",
     shot_comment: str | None = "",
 ) -> dict[str, OutputVariable]:
-    """Return an output for each segment and one for the shot, each with its own comment.
+    """Return an output variable for each segment and one for the shot, by name.
 
-    `shot_comment` None leaves out the output of the shot.
+    Parameters
+    ----------
+    name_template
+        Name with ``{}`` in the place of ``up``, ``down``, ``doppler`` or ``shot``.
+    quantity_label
+        Quantity in words.
+    comment
+        Comment on all variables.
+    separator
+        Text between this comment and that of a single variable.
+    shot_comment
+        Comment on the variable of the shot; None for no such variable.
     """
     segment_labels = {
         "up": "up-chirp",
@@ -91,9 +111,9 @@ GRID_OUTPUTS: dict[str, OutputVariable] = {
         "the Doppler segment among them, where there is one",
     ),
     "log10_pfa_bin": OutputVariable("1", "log10 of pfa_bin", "finite where pfa_bin underflows"),
-    "log10_pfa_segment": OutputVariable("1", "log10 of pfa_segment", NO_BIN_NOTE),
-    "log10_pfa_both_chirps": OutputVariable("1", "log10 of pfa_both_chirps", NO_BIN_NOTE),
-    "log10_pfa_shot": OutputVariable("1", "log10 of pfa_shot", NO_BIN_NOTE),
+    "log10_pfa_segment": OutputVariable("1", "log10 of pfa_segment", NO_FREE_BIN_NOTE),
+    "log10_pfa_both_chirps": OutputVariable("1", "log10 of pfa_both_chirps", NO_FREE_BIN_NOTE),
+    "log10_pfa_shot": OutputVariable("1", "log10 of pfa_shot", NO_FREE_BIN_NOTE),
     "p_leakage_up": OutputVariable(
         "1",
         "probability that leaked signal raises a further group, up-chirp",
@@ -138,7 +158,7 @@ GRID_OUTPUTS: dict[str, OutputVariable] = {
         f"What is detected then has a wrong range or velocity; {NO_ECHO_NOTE}",
     ),
 }
-"""Outputs of a grid's points, by name; floats, one a point."""
+"""Outputs of the points of a grid, by name; one float for each point."""
 
 STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "p_wrong_range_{}",
@@ -148,8 +168,8 @@ STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     shot_comment="both chirps report a peak, and one of the echo not both; or both do and are "
     "misread",
 )
-"""Additional outputs of studies that report only the strongest peak of a segment; floats, one a
-point."""
+"""Additional outputs of studies that report only the strongest peak of a segment, by name; one
+float for each point."""
 
 NAN_WITHOUT_ECHO_OUTPUTS = tuple(
     name for name, output in GRID_OUTPUTS.items() if NO_ECHO_NOTE in output.comment
@@ -172,7 +192,7 @@ DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     for segment, segment_phrase in {**_SEGMENT_PHRASES, joint_name: "both chirp segments"}.items()
     if (name, segment) != ("false_alarm", "doppler")
 }
-"""Counts of draws with a detection or a false alarm, by name."""
+"""Numbers of draws with a detection or a false alarm, by name."""
 
 STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "pd_{}_error",
@@ -180,10 +200,11 @@ STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "over draws; 0 where nothing random is simulated, nan with a single draw",
     separator="; ",
 )
-"""Standard errors in studies with draws, each named after its output; floats, one a point."""
+"""Standard errors of outputs in studies with draws. The name is that of the output with ``_error``;
+one float for each point."""
 
 PD_OUTPUTS = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
-"""Names of outputs whose accuracy is guaranteed."""
+"""Names of the outputs to which the tolerance of a study applies when draws are made."""
 
 ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
     "n_draws": OutputVariable("1", "number of draws", dtype="int64"),
@@ -199,27 +220,29 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""Accuracy of estimates by draws, for each point."""
+"""Outputs that state the accuracy of estimates by draws, by name; one value for each point."""
 
 RUNNING_SUMS = "running_sums"
+"""Name of the output that holds the sums to which further draws are added."""
 
 RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
     RUNNING_SUMS: OutputVariable(
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""Sums over draws of random effects, to which further draws are added; one row a point."""
+"""Sums over draws of random effects, to which further draws are added; one row for each point."""
 
 IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
-"""(outputs,) bool: outputs of GRID_OUTPUTS that are logarithms."""
+"""(outputs,) bool: True for those of GRID_OUTPUTS that are logarithms."""
 KEEPS_SPREAD = IS_LOGARITHM | np.array(
     [f"{name}_error" in STANDARD_ERROR_OUTPUTS for name in GRID_OUTPUTS]
 )
-"""(outputs,) bool: outputs of GRID_OUTPUTS whose spread over draws enters a result."""
+"""(outputs,) bool: True for those of GRID_OUTPUTS whose sum of squared deviations over draws is
+kept. """
 
 N_RUNNING_SUMS = len(GRID_OUTPUTS) + int(KEEPS_SPREAD.sum()) + int(IS_LOGARITHM.sum())
-"""Length of a row of running sums: besides the means, further draws need counts, spreads and
-logarithms."""
+"""Length of a row of running sums. Besides the means of a store, further draws need numbers of
+values, sums of squared deviations, and the largest logarithms."""
 
 DETECTOR_INDEPENDENT_OUTPUTS = (
     "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",
@@ -232,7 +255,10 @@ _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that 
 def _measurement_variables(
     quantity: str, quantity_label: str, units: str
 ) -> dict[str, OutputVariable]:
-    """Return bias, error of the bias, RMSE and bound of a measured quantity."""
+    """Return the output variables of a measured quantity: bias, its error, RMSE, and bound.
+
+    `quantity` is the beginning of their names, and `quantity_label` the quantity in words.
+    """
     detection_note = "over draws in which every segment has a detection; nan with none"
     bound_note = (
         "Cramer-Rao bound for lone tones of the signal's power in the up- and the down-chirp "
@@ -276,14 +302,14 @@ SPECTRA_OUTPUTS: dict[str, OutputVariable] = {
     **_measurement_variables("range", "range", "m"),
     **_measurement_variables("radial_velocity", f"radial velocity, {CLOSING_SIGN_NOTE}", "m s-1"),
 }
-"""Outputs of studies of full spectra, floats, one a point; ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS
-are stored as well."""
+"""Outputs of studies of full spectra, by name; one float for each point. ACCURACY_OUTPUTS and
+DRAW_COUNT_OUTPUTS are stored as well."""
 
 
 def _with_dims(
     dims: tuple[str, ...], variables: dict[str, OutputVariable]
 ) -> dict[str, OutputVariable]:
-    """Return variables with dimensions put before their own."""
+    """Return output variables with further dimensions before their own."""
     return {
         name: replace(variable, dims=(*dims, *variable.dims))
         for name, variable in variables.items()
@@ -338,7 +364,7 @@ SHOT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Geometry of each shot, common to all draws and all radiometry: the truth of a point cloud."""
+"""True geometry of each shot of a flight, which all draws share, by name."""
 
 CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
     "cycle_time": OutputVariable("s", "start of the measurement cycle"),
@@ -350,7 +376,7 @@ CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
         "at the cycle's start; inf where there is none",
     ),
 })  # fmt: skip
-"""Truth of each measurement cycle."""
+"""True motion of the instrument in each measurement cycle, by name."""
 
 BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "offset": OutputVariable("m", "range less that of the reference beamlet"),
@@ -360,10 +386,11 @@ BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "cos_incidence": OutputVariable("1", "cosine of the incidence angle"),
     "surface": OutputVariable("1", "surface hit", dtype="int16"),
 })  # fmt: skip
-"""Arrays of an eyepoint store by beamlet, besides SHOT_VARIABLES and CYCLE_VARIABLES."""
+"""Arrays of an eyepoint store for each beamlet of each shot, by name. SHOT_VARIABLES and
+CYCLE_VARIABLES are stored as well."""
 
 BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", dims=("beamlet",))
-"""Power fraction of each beamlet in an eyepoint store."""
+"""Output variable of an eyepoint store: the power fraction of each beamlet."""
 
 SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot",),
@@ -398,7 +425,7 @@ SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Probabilities of each shot, before any draw.
+"""Probabilities and other statistics of each shot that do not depend on draws, by name.
 
 They are nan with a detector other than the fixed threshold, or if only the strongest peak of a
 segment is reported. If nothing is hit, false alarms are those of noise alone and all else is nan.
@@ -414,7 +441,7 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
         "overlap leaves of beamlets farther and nearer than the beam's axis",
     ),
 })  # fmt: skip
-"""Effects that were simulated in each shot; none if nothing is hit."""
+"""Effects that were simulated in each shot, by name; none in a shot that hits nothing."""
 
 _NAN_IF_FALSE_NOTE = "nan: a false one"
 
@@ -473,7 +500,7 @@ POINT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Points of a cloud, up to a study's number of returns of each shot and draw."""
+"""Points of a point cloud, by name. Each shot and draw has at most a study's number of returns."""
 
 NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), {
     "velocity": OutputVariable("m s-1", "velocity vector of the instrument", dims=_VECTOR_DIMS),
@@ -487,7 +514,8 @@ NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), 
     "altitude_status": OutputVariable("1", "how the altitude was solved", dtype="int8"),
     "altitude_beams": OutputVariable("1", "beams in the altitude's solution", dtype="int16"),
 })  # fmt: skip
-"""Navigation from each measurement cycle and draw; only if a cycle has three shots or more."""
+"""Velocity and altitude of each measurement cycle and draw, by name. They are stored if a cycle has
+three shots or more."""
 
 GRID_VARIABLE_NAMES = frozenset().union(
     GRID_OUTPUTS,
@@ -499,4 +527,4 @@ GRID_VARIABLE_NAMES = frozenset().union(
     SPECTRA_OUTPUTS,
     EFFECT_VARIABLES,
 )
-"""Names of all variables that the store of a grid may have."""
+"""Names of all output variables that the store of a grid may have."""

@@ -1198,7 +1198,7 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         detection=str(parameters[PROCESSING_PREFIX + "detection"]),
         shot_detection=str(parameters[waveform.SHOT_DETECTION_PATH]),
         reported_peaks=str(parameters[waveform.PEAKS_PATH]),
-        two_beat_assumption=str(parameters[waveform.TWO_BEATS_PATH]),
+        two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
         tnr=budget.tnr,
         leakage_floor=np.asarray(error_budget.leakage_floor, float),
         leakage_tolerance=error_budget.allowed_leakage,

@@ -1,4 +1,4 @@
-"""Receiver: its poles and anti-alias filter, and the noise in the photocurrent and at the ADC."""
+"""Receiver: low-passes, anti-alias filter, and the noise in the photocurrent and at the ADC."""
 
 import math
 from collections.abc import Mapping
@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 
 RECEIVER_PREFIX = "instrument.receiver."
+"""Prefix of the paths of the receiver's parameters."""
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-"""Receiver architectures."""
+"""Names of receiver architectures."""
 
 
 def aperture_area(diameter: np.ndarray) -> np.ndarray:
-    """Return the area [m^2] of a circular aperture of a diameter [m], [T 4.3]."""
+    """Return the area [m^2] of a circular aperture from its diameter [m], [T 4.3]."""
     return math.pi * (np.asarray(diameter) / 2) ** 2
 
 
@@ -27,7 +28,7 @@ def shot_noise_current_variance(
     responsivity: np.ndarray,
     electrical_bandwidth: np.ndarray,
 ) -> np.ndarray:
-    """Compute the current variance of the shot noise of light on the detector.
+    """Compute the variance of the shot-noise current that light makes in the detector.
 
     Parameters
     ----------
@@ -53,19 +54,20 @@ class ReceiverNoise(NamedTuple):
     """Variances of the receiver's noise at the ADC [V^2]."""
 
     variance_per_square_ampere: np.ndarray
-    """Variance [V^2] of 1 A^2 of current variance."""
+    """Variance of the voltage over the variance of a noise current in the detector [V^2/A^2]."""
     shot_noise_variance_per_watt: np.ndarray
-    """Variance [V^2] of the shot noise of 1 W of light."""
+    """Variance of the shot noise over the power of the light on the detector [V^2/W]."""
     variances: dict[str, np.ndarray]
-    """Variance [V^2] of each of the receiver's own sources, by name."""
+    """Variance [V^2] of each noise source of the receiver itself, by name."""
 
 
 ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
-"""Optional parameters of the anti-alias filter; without a filter by default."""
+"""Default values of the anti-alias filter's parameters, by name. A bandwidth of 0 means no
+filter."""
 
 _ALIASES_PER_SIDE = 32
-"""Number of aliases on either side that are summed behind an anti-alias filter. With order 3 and a
-bandwidth of the full sample rate, the rest has 1e-8 of the density."""
+"""Number of aliases on either side over which the noise behind an anti-alias filter is summed. With
+order 3 and a bandwidth of the full sample rate, further aliases have 1e-8 of the density."""
 
 _LOG_ATTENUATION_MAX = 345.0
 """Natural logarithm of the largest attenuation of power by the filter, so that no power becomes 0.
@@ -84,8 +86,8 @@ def receiver_noise(
     receiver : mapping
         Parameters, as of :func:`receiver_parameters`, (n,) or scalars.
     samples_iq : bool
-        True for two receivers that sample I and Q; variances are then stated as those that give a
-        bin of a real record the same noise.
+        True for two receivers that sample I and Q. The variances are then those of a real record
+        whose bins have the same noise.
 
     Returns
     -------
@@ -165,8 +167,8 @@ def quantisation_variance(
     full_scale : array_like
         Largest voltage V to either side [V].
     bits : array_like
-        Effective number of bits, not necessarily an integer, which makes the noise of a real ADC; 0
-        for no rounding.
+        Effective number of bits, not necessarily an integer; 0 for no rounding. It is chosen so
+        that rounding makes all of the noise of the real ADC.
     samples_iq : bool
         True for two ADCs that sample I and Q.
 
@@ -191,7 +193,7 @@ def quantisation_variance(
 
 
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
-    """Return the noise sigma of a bin, per quadrature: sqrt(E_w sigma_x^2 / 2), [T 3.2].
+    """Return the standard deviation of the noise per quadrature of a bin, [T 3.2].
 
     Parameters
     ----------
@@ -203,7 +205,11 @@ def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) ->
     Returns
     -------
     ndarray
-        Sigma of the sum over the record [V].
+        Sigma [V], that of the sum over the record.
+
+    Notes
+    -----
+    sqrt(E_w sigma_x^2 / 2).
     """
     return np.sqrt(window_energy * noise_variance / 2)
 
@@ -221,17 +227,26 @@ def receiver_transfer(
     frequency : ndarray
         Signed frequency [Hz], before the ADC folds it.
     detector_bandwidth, amplifier_bandwidth : ndarray
-        Bandwidths of two single-pole low-passes, each 3 dB down at its bandwidth [Hz].
+        Bandwidths of two single-pole low-passes [Hz], at which each is 3 dB down.
+
+    Returns
+    -------
+    ndarray complex
+        Ratio of voltages, 1 at DC.
+
+    Notes
+    -----
+    1 / ((1 + i f / B_d) (1 + i f / B_a)).
     """
     poles = (1 + 1j * frequency / detector_bandwidth) * (1 + 1j * frequency / amplifier_bandwidth)
     return 1 / poles
 
 
 def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the bandwidth B_e [Hz] that determines the noise: the narrowest of all stages.
+    """Return the noise bandwidth B_e [Hz]: the bandwidth of the narrowest stage of the receiver.
 
-    [T] states one figure for detector and amplifier and uses it as the noise bandwidth, and so does
-    this function. An anti-alias filter counts as another stage.
+    The stages are detector, amplifier and anti-alias filter, if there is one. [T] states one
+    bandwidth for detector and amplifier, and uses it as the noise bandwidth.
     """
     narrowest_pole = np.minimum(receiver["detector_bandwidth"], receiver["amplifier_bandwidth"])
     antialias = antialias_filter_parameters(receiver)
@@ -243,7 +258,7 @@ def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the receiver's parameters by name, without the prefix of their paths."""
+    """Select the receiver's parameters, and name them without the prefix of their paths."""
     return {
         path.removeprefix(RECEIVER_PREFIX): value
         for path, value in parameters.items()
@@ -252,7 +267,7 @@ def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Select the parameters of the anti-alias filter from the receiver's; empty without one."""
+    """Select the anti-alias filter's parameters from the receiver's; none without a filter."""
     filter_parameters = {
         name: np.asarray(receiver.get(name, default))
         for name, default in ANTIALIAS_DEFAULTS.items()
@@ -271,6 +286,11 @@ def antialias_power_transmission(
         Signed frequency [Hz], before the ADC folds it.
     antialias_bandwidth, antialias_order : ndarray
         Bandwidth B [Hz] and order n.
+
+    Returns
+    -------
+    ndarray
+        Ratio of powers, 0..1.
 
     Notes
     -----
@@ -299,11 +319,12 @@ def relative_noise_density(
     Parameters
     ----------
     frequency : ndarray
-        Frequency [Hz], of either sign, folded or not.
+        Frequency [Hz] of either sign, before or after the ADC folds it.
     sample_rate : ndarray
         Sample rate f_s [Hz].
     **filters : ndarray
-        ``detector_bandwidth``, ``amplifier_bandwidth`` and those of an anti-alias filter.
+        ``detector_bandwidth``, ``amplifier_bandwidth`` [Hz], and the parameters of an anti-alias
+        filter if there is one.
 
     Notes
     -----
@@ -355,7 +376,22 @@ def relative_noise_density(
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sum s over the aliases of a single pole, a > 0, and (a / 2) ds/da."""
+    """Sum the power transmission of a single-pole low-pass over its aliases.
+
+    Parameters
+    ----------
+    a : ndarray
+        2 pi B / f_s, with the bandwidth B and the sample rate f_s; above 0.
+    cosine : ndarray
+        cos(2 pi f / f_s) at the frequency f.
+
+    Returns
+    -------
+    alias_sum : ndarray
+        The sum s.
+    derivative : ndarray
+        (a / 2) ds/da.
+    """
     q, one_minus_q = np.exp(-a), -np.expm1(-a)
     denominator = one_minus_q * one_minus_q + 2 * q * (1 - cosine)
     hyperbolic_ratio = one_minus_q * (2 - one_minus_q) / denominator

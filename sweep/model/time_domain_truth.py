@@ -3,7 +3,7 @@
 The beat of each beamlet follows from the exact delay tau(t) (:mod:`sweep.model.waveform`), sample
 by sample. The records are summed, windowed and transformed. Tests compare every fast path with this
 one. It shares link budget, noise and footprint with the fast path, but neither lines nor kernels
-nor bins. A shot takes seconds. Its own accuracy, limited by rounding of f t, is 1e-11 of the peak.
+nor bins. A shot takes seconds. Its error, by rounding of phases, is 1e-11 of the peak.
 
 With the effect of overlap, a beamlet has an echo in samples from its own delay tau(t) until the
 chirp ends.
@@ -18,6 +18,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.effects.segment_motion import split_looks
 from sweep.model.preparation import Shots
+from sweep.model.spectrum.segment_spectra import SEGMENT_FIELDS
 from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
 
 
@@ -30,7 +31,7 @@ def time_domain_spectrum(
     with_acceleration: bool = False,
     laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Compute the noiseless spectrum |X[k]| of one segment of one point.
+    """Compute the magnitudes |X[k]| of the noiseless spectrum of one segment of one point.
 
     Parameters
     ----------
@@ -39,17 +40,18 @@ def time_domain_spectrum(
     point, segment : int
         Indices of the point and of the segment.
     with_range_walk : bool
-        True to keep the terms of the phase in t^2, the frequency drift while the target moves.
+        True to include range walk: the drift of the frequency while the target moves, by the terms
+        of the phase in t^2.
     with_acceleration : bool
-        True to keep the terms of the phase due to the change of its velocity.
+        True to include the drift of the frequency while the target's velocity changes.
     laser_phase : ndarray (L,) or float
-        theta(t) - theta(t - tau) in each sample [rad].
+        Phase noise theta(t) - theta(t - tau) of the laser in each sample [rad].
 
     Returns
     -------
     ndarray (n_bins,)
-        |X| [V] in bins k = 0..N/2, or -N/2..N/2 - 1 of a complex record. With incoherent phases it
-        is the root of the mean of |X|^2 over independent uniform phases of the beamlets.
+        |X| [V] in bins k = 0..N/2, or -N/2..N/2 - 1 of a complex record. If beamlets add as powers,
+        it is the root of the mean of |X|^2 over independent uniform phases of the beamlets.
     """
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
@@ -83,14 +85,29 @@ def time_domain_spectrum(
 
 
 def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = True) -> np.ndarray:
-    """Evaluate each segment's spectrum in the time domain.
+    """Detect echoes in spectra that are computed in the time domain.
 
-    The result is that of :func:`sweep.model.spectrum.segment_spectra.evaluate_segments`.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots of n points.
+    with_range_walk : bool
+        As of :func:`time_domain_spectrum`.
 
-    Leakage is not evaluated. Range walk is the only change of lines within a record that is
-    included.
+    Returns
+    -------
+    ndarray (3, fields, n)
+        Results by segment, field and point, with the fields of
+        :data:`sweep.model.spectrum.segment_spectra.SEGMENT_FIELDS`. Leakage is 0.
+
+    Notes
+    -----
+    Range walk is the only change of frequency within a record that is included.
     """
-    segment_results = np.full((3, 6, shots.size), np.nan)
+    pd_row, miss_row, magnitude_row, frequency_row = map(
+        SEGMENT_FIELDS.index, ("pd", "miss", "magnitude", "frequency")
+    )
+    segment_results = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
     for point in range(shots.size):
         last_bin_and_width = shots.n_bins - 1, float(shots.sample_rate[point]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.has_segment)):
@@ -98,10 +115,8 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
                 time_domain_spectrum(look, point, segment, with_range_walk=with_range_walk)
                 for look in (split_looks(shots) if np.any(shots.line_drift_per_look) else [shots])
             ]
-            magnitude, peak_row = (
-                np.sqrt(np.mean(np.square(look_magnitudes), axis=0)),
-                np.empty((6, 1)),
-            )
+            magnitude = np.sqrt(np.mean(np.square(look_magnitudes), axis=0))
+            detection = np.empty((len(SEGMENT_FIELDS), 1))
             detect_in_spectra(
                 magnitude[None],
                 np.zeros(1, np.int64),
@@ -109,15 +124,17 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
                 shots.detection_rule,
                 shots.bin_threshold_table[:, [point]],
                 shots.speckle_table.select(segment, np.array([point])),
-                peak_row,
+                detection,
             )
-            segment_results[segment, :, point] = peak_row[:, 0]
+            segment_results[segment, :, point] = detection[:, 0]
             if shots.complex_record:
-                segment_results[segment, 3, point] -= float(shots.sample_rate[point]) / 2
+                segment_results[segment, frequency_row, point] -= (
+                    float(shots.sample_rate[point]) / 2
+                )
     if shots.looks.is_noncoherent:
-        peak = np.rint(segment_results[:, 3] / (shots.sample_rate / shots.fft_size))
-        segment_results[:, 0], segment_results[:, 1] = shots.pd_and_miss_in_looks(
-            segment_results[:, 2], peak
+        peak = np.rint(segment_results[:, frequency_row] / (shots.sample_rate / shots.fft_size))
+        segment_results[:, pd_row], segment_results[:, miss_row] = shots.pd_and_miss_in_looks(
+            segment_results[:, magnitude_row], peak
         )
     return segment_results
 
@@ -131,7 +148,7 @@ def analytic_record(
     with_range_walk: bool = True,
     with_acceleration: bool = False,
 ) -> np.ndarray:
-    """Compute the voltage of one beamlet at the ADC as a complex record.
+    """Compute the record of one beamlet's voltage at the ADC, as a complex (analytic) signal.
 
     Parameters
     ----------
@@ -221,7 +238,11 @@ def _start_phase(
     range_offset: float,
     range_decrease: float,
 ) -> float:
-    """Compute the phase -f tau_0 + s S tau_0^2 / 2 at t = 0 [cycles] in exact fractions."""
+    """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
+
+    It is -f tau_0 + s S tau_0^2 / 2, with the delay tau_0 = 2 (R + dR - decrease) / c, the carrier
+    f, the ratio s of the chirp rate to that of the up-chirp, and the rate S of the up-chirp.
+    """
     delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
     phase = -Fraction(carrier) * delay + Fraction(chirp_slope) * Fraction(chirp_rate) * delay**2 / 2
@@ -229,6 +250,6 @@ def _start_phase(
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return the value of one point of a column, which may be a scalar for all points."""
+    """Return a point's value of an array (n,), or of one number that all points share."""
     column = np.asarray(column)
     return column[point] if column.ndim else column

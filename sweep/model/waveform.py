@@ -33,61 +33,79 @@ from sweep.model.constants import SPEED_OF_LIGHT
 
 SEGMENT_NAMES = ("up", "doppler", "down")
 """Names of the segments, in the order of rows of arrays by segment."""
-SEGMENT_ORDER_PATH, SEGMENT_GAP_PATH = "instrument.chirp.segments", "instrument.chirp.gap"
+SEGMENT_ORDER_PATH = "instrument.chirp.segments"
+"""Path of the segments of a shot, one of `SEGMENT_ORDERS`."""
+SEGMENT_GAP_PATH = "instrument.chirp.gap"
+"""Path of the time between two segments [s]."""
 SEGMENT_ORDERS = (
     "up doppler down", "up down", "down up", "down doppler up", "doppler up down",
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
-"""Possible segments of a shot, in the order of time."""
-DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH = (
-    "instrument.chirp.doppler_slope",
-    "instrument.chirp.down_slope",
-)
+"""Possible sets of segments of a shot, each in the order of time."""
+DOPPLER_SLOPE_PATH = "instrument.chirp.doppler_slope"
+"""Path of the chirp rate of the Doppler segment over that of the up-chirp."""
+DOWN_SLOPE_PATH = "instrument.chirp.down_slope"
+"""Path of the chirp rate of the down segment over that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
-BOTH_CHIRPS, ANY_TWO = SHOT_DETECTIONS = ("both_chirps", "any_two")
-TWO_BEATS_PATH = "instrument.processing.two_beats"
+"""Path of the rule by which a shot is detected, one of `SHOT_DETECTION_RULES`."""
+BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_RULES = ("both_chirps", "any_two")
+"""Names of the segments that must be detected for the detection of a shot."""
+TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
+"""Path of the assumption by which two beats without signs are read, one of `TWO_BEAT_ASSUMPTIONS`.
+"""
 PEAKS_PATH = "instrument.processing.peaks"
+"""Path of the selection of peaks that are reported, one of `REPORTED_PEAKS`."""
 ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS = ("all", "strongest")
+"""Names of the selections of peaks that are reported of each segment."""
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
+"""Names of assumptions: the range beat exceeds the Doppler shift, or the Doppler shift exceeds
+it."""
 DEFAULT_CHIRP_SLOPES = (1, 0, -1)
-"""Default chirp rates of up, Doppler and down segment over that of the up-chirp."""
+"""Default ratios of the chirp rates of up, Doppler and down segment to that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
     DOPPLER_SLOPE_PATH: 0.0,
     DOWN_SLOPE_PATH: -1.0,
     SHOT_DETECTION_PATH: BOTH_CHIRPS,
-    TWO_BEATS_PATH: FAR_TARGET,
+    TWO_BEAT_ASSUMPTION_PATH: FAR_TARGET,
     PEAKS_PATH: ALL_PEAKS,
 }
 """Default values of the waveform's parameters, by dotted path."""
 
 SEARCH_PREFIX = "instrument.processing.search."
+"""Prefix of the paths of the search band's parameters."""
 SEARCH_RANGE_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
+"""Paths of the smallest and the largest range in which echoes are searched [m]."""
 SEARCH_VELOCITY_PATHS = SEARCH_PREFIX + "min_radial_velocity", SEARCH_PREFIX + "max_radial_velocity"
+"""Paths of the smallest and the largest radial velocity in which echoes are searched [m/s]."""
 SEARCH_BAND_PATHS = SEARCH_RANGE_PATHS + SEARCH_VELOCITY_PATHS
-"""Paths of the parameters of a search band; all four are given together."""
+"""Paths of all parameters of the search band. Either all four are given or none."""
 
 
 class WaveformSegment(NamedTuple):
-    """One segment of a waveform, in which the frequency rises or falls linearly or is constant."""
+    """One segment of a shot's waveform, whose frequency rises, falls or is constant.
+
+    Arrays are (n,) for n points, or scalars.
+    """
 
     name: str
     """Name, one of :data:`SEGMENT_NAMES`."""
     chirp_slope: float
-    """Chirp rate over the up-chirp's, signed: 1, 0 and -1 by default."""
+    """Ratio of the segment's chirp rate to that of the up-chirp: 1, 0 and -1 by default."""
     chirp_rate: np.ndarray
-    """Signed chirp rate [Hz/s], (n,) or scalar."""
+    """Signed chirp rate [Hz/s]."""
     carrier: np.ndarray
-    """Frequency that the delay turns into phase [Hz], (n,) or scalar."""
+    """Frequency f_seg at the segment's start, by which a delay makes a phase [Hz]."""
     includes_leakage: bool
     """True if leakage in the segment is evaluated."""
     range_decrease: np.ndarray | float
-    """Decrease of the target's range since the shot's start [m], (n,) or scalar."""
+    """Decrease of the target's range from the shot's start to the segment's [m]."""
     doppler_ratio: np.ndarray | float
-    """Doppler ratio 2 v_r / c of the line on the axis, (n,) or scalar."""
+    """Doppler ratio 2 v_r / c of the line on the beam's axis, at the segment's start."""
     start_time: np.ndarray | float
-    """Time since the shot's start [s]; 0 if the target does not move between segments."""
+    """Time from the shot's start to the segment's [s]; 0 if the target's motion between segments is
+    neglected."""
 
     def delay(self, range: np.ndarray | float) -> np.ndarray:
         """Return the delay of the echo at the segment's start [s].
@@ -112,7 +130,7 @@ class WaveformSegment(NamedTuple):
 
 
 class RangeVelocity(NamedTuple):
-    """Range and radial velocity that the peaks of a shot report, (n,) each."""
+    """Range and radial velocity that follow from the peaks of n shots, (n,) each."""
 
     range: np.ndarray
     """Range [m]."""
@@ -124,7 +142,7 @@ def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
     bandwidth: np.ndarray, chirp_slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the frequency f_seg that the delay turns into phase, of up, Doppler and down segment.
+    """Return the frequencies f_seg by which a delay makes a phase, for all three segments.
 
     Parameters
     ----------
@@ -137,7 +155,7 @@ def carrier_frequencies(
     bandwidth : ndarray
         Bandwidth of the up-chirp [Hz].
     chirp_slopes : sequence
-        Chirp rates of the segments over the up-chirp's.
+        Ratios of the segments' chirp rates to that of the up-chirp.
 
     Returns
     -------
@@ -163,16 +181,19 @@ def carrier_frequencies(
 
 
 def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the chirp rates of the segments over the up-chirp's, for points that share them."""
+    """Return the ratios of up, Doppler and down segment's chirp rates to that of the up-chirp.
+
+    The points share them.
+    """
     doppler, down = (
-        float(np.ravel(parameters.get(x, WAVEFORM_DEFAULTS[x]))[0])
-        for x in (DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH)
+        float(np.ravel(parameters.get(path, WAVEFORM_DEFAULTS[path]))[0])
+        for path in (DOPPLER_SLOPE_PATH, DOWN_SLOPE_PATH)
     )
     return 1.0, doppler, down
 
 
 def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the frequencies of :func:`carrier_frequencies` for parameters by dotted path."""
+    """Return the frequencies f_seg [Hz] of :func:`carrier_frequencies`, by dotted path."""
     return carrier_frequencies(
         str(parameters["instrument.receiver.architecture"]),
         wavelength=parameters["instrument.laser.wavelength"],
@@ -199,7 +220,7 @@ def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     segment_order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return the times from the shot's start to the starts of up, Doppler and down segment.
+    """Return the times at which up, Doppler and down segment start, from the shot's start on [s].
 
     Parameters
     ----------
@@ -235,9 +256,9 @@ def beat_frequency(
     Parameters
     ----------
     chirp_slope : float or ndarray
-        Chirp rate of the segment over the up-chirp's, s.
+        Ratio s of the segment's chirp rate to that of the up-chirp.
     carrier : ndarray
-        Frequency f_seg that the delay turns into phase [Hz].
+        Frequency f_seg at the segment's start [Hz].
     chirp_rate : ndarray
         Chirp rate of the up-chirp S = B/T [Hz/s].
     range, radial_velocity : ndarray
@@ -254,14 +275,14 @@ def beat_frequency(
 
 
 SAMPLE_TIME_TOLERANCE = 1e-6
-"""Tolerance, as a fraction of a sample, for a sample at a time limit to count as within it."""
+"""Fraction of a sample by which a sample may lie outside a time limit and still count as within."""
 
 
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the record's length in samples.
+    """Return the length of the record in samples, (n,) int64, for parameters by dotted path.
 
-    It is the FFT size, or the number of samples that the chirp leaves after the acquisition delay,
-    if fewer.
+    It is the FFT size, or the number of samples between the acquisition delay and the chirp's end,
+    if that is smaller.
     """
     time_left = (
         parameters["instrument.chirp.duration"]
@@ -304,50 +325,57 @@ def count_samples_before_echo(
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Return the frequency 0..fs/2 at which a real record shows a signed frequency.
+    """Return the frequency, 0 to half the sample rate, at which a real record shows a frequency.
 
-    `frequency` and `sample_rate` are in the same unit.
+    `frequency`, of either sign, and `sample_rate` are in the same unit.
     """
     return np.abs(frequency - sample_rate * np.rint(frequency / sample_rate))
 
 
 FOLD_PENALTY_BINS = 4.0
-"""Mismatch [bins] that a reading without folds may have before one with a fold is preferred."""
+"""Mismatch [bins] by which a reading without folds may exceed one with a fold and still be
+chosen."""
 
 N_READINGS = 16
-"""Number of readings of unsigned peaks, as of :func:`read_beats`."""
+"""Number of readings of unsigned peaks, as numbered by :func:`beats_of_reading`."""
 
 FAR_READING = 1
-"""Reading without folds in which the half difference is the Doppler frequency: |f_d| < f_r."""
+"""Number of the reading without folds in which the half difference of the peaks is the Doppler
+frequency: |f_d| < f_r."""
 
 FAST_READING = 0
-"""Reading without folds in which the half sum is the Doppler frequency: |f_d| > f_r."""
+"""Number of the reading without folds in which the half sum of the peaks is the Doppler frequency:
+|f_d| > f_r."""
 
 
 SIGNED_READING = 16
-"""Reading of signed peaks u, d of a complex record: 2 f_r = d - u, f_d = u + f_r, each modulo the
-sample rate. Range beats are positive, up to half the sample rate; Doppler shifts have either sign,
-up to half of it."""
+"""Number of the reading of the signed peaks u and d of a complex record: 2 f_r = d - u and f_d = u
++ f_r, each modulo the sample rate. Range beats f_r are positive, up to half the sample rate.
+Doppler shifts f_d have either sign, up to half of it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Largest negative difference of the down and up peaks, 2 f_r with the range beat f_r, as a
-fraction of the sample rate, that is read as negative. Rounding of peaks to bins may make it
-negative."""
+"""Largest magnitude of a negative difference of down and up peak, over the sample rate, that is
+read as negative. Rounding of peaks to bins may make the difference, 2 f_r, negative. Differences
+below this are read modulo the sample rate."""
 
 
-def read_beats(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
-    """Return signed Doppler frequency and range beat (f_d, f_r) by one reading of two peaks.
+def beats_of_reading(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
+    """Convert the peaks of up- and down-chirp to Doppler frequency and range beat, by one reading.
 
     Parameters
     ----------
     reading : int
-        Bits 8, 4 and 2 say that the up, Doppler and down peak is folded; bit 1 exchanges half sum
-        and half difference. Readings are tried in this order. :data:`SIGNED_READING` reads peaks
-        -N/2 .. N/2.
+        Number of the reading. Bits 8, 4 and 2 mean that the up, Doppler and down peak is folded.
+        Bit 1 exchanges half sum and half difference. :data:`SIGNED_READING` is for signed peaks.
     up, down : float or ndarray
         Peaks of up- and down-chirp, in any unit of frequency.
     sample_rate : float or ndarray
         Sample rate in the same unit.
+
+    Returns
+    -------
+    f_d, f_r : float or ndarray
+        Signed Doppler frequency, and range beat, in the same unit.
     """
     if reading == SIGNED_READING:
         rate_fraction = (down - up) / sample_rate
@@ -370,14 +398,19 @@ def read_beats(reading, up, down, sample_rate):  # type: ignore[no-untyped-def] 
 def range_velocity_of_beats(  # type: ignore[no-untyped-def]  # of arrays, or compiled
     f_d, f_r, carrier, bandwidth, duration
 ):
-    """Return range [m] and radial velocity [m/s] of a Doppler frequency and a range beat [Hz].
+    """Convert a Doppler frequency and a range beat to range [m] and radial velocity [m/s].
 
     Parameters
     ----------
     f_d, f_r : float or ndarray
-        Doppler frequency and range beat [Hz].
+        Signed Doppler frequency and range beat [Hz], as of :func:`beats_of_reading`.
     carrier, bandwidth, duration : float or ndarray
         Carrier of the up-chirp [Hz], bandwidth [Hz] and duration [s] of a chirp.
+
+    Returns
+    -------
+    range, radial_velocity : float or ndarray
+        Range [m] and radial velocity [m/s].
     """
     beta = f_d / (carrier + bandwidth / 2.0)
     delay = (f_r - bandwidth * beta / 2.0) / (bandwidth / duration * (1.0 + beta))
@@ -422,12 +455,12 @@ def resolve_range_velocity(
     Notes
     -----
     With a Doppler segment there are two unknowns and three peaks. Every reading predicts the third
-    peak. Each peak is taken as it is or folded at Nyquist, and half sum or half difference is the
-    Doppler frequency. The reading with the best prediction is chosen, a fold counting as
+    peak: each peak is folded at Nyquist or not, and half sum or half difference is the Doppler
+    frequency. The reading with the best prediction is chosen, where a fold counts as
     :data:`FOLD_PENALTY_BINS` bins of mismatch. The velocity has the sign of down - up.
 
-    docs/physics.md, *Folding*, explains the readings. Half sum and half difference belong to the
-    carrier and to the range at mid-chirp, which is corrected here.
+    docs/physics.md, *Folding*, explains the readings. Half sum and half difference are those of the
+    carrier and the range in the middle of the chirp. Range and velocity are corrected for this.
     """
     if has_signs or doppler is None:
         reading = (
@@ -437,14 +470,14 @@ def resolve_range_velocity(
             if two_beat_assumption == FAST_TARGET
             else FAR_READING
         )
-        f_d, f_r = read_beats(reading, up, down, sample_rate)
+        f_d, f_r = beats_of_reading(reading, up, down, sample_rate)
         return RangeVelocity(*range_velocity_of_beats(f_d, f_r, carrier, bandwidth, duration))
     start_carrier_ratio = carrier / (
         carrier + bandwidth / 2
     )  # the Doppler segment's carrier is lower
     least_cost, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())
     for reading in range(N_READINGS):
-        doppler_beat, range_beat = read_beats(reading, up, down, sample_rate)
+        doppler_beat, range_beat = beats_of_reading(reading, up, down, sample_rate)
         unfolded_peak = sample_rate - doppler if reading & 4 else doppler
         n_folds = (reading >> 3 & 1) + (reading >> 2 & 1) + (reading >> 1 & 1)
         cost = abs(abs(doppler_beat) * start_carrier_ratio - unfolded_peak) + n_folds * (
@@ -547,7 +580,18 @@ def fit_range_velocity(
 def _solve_beats(
     beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the Doppler ratio beta and x [s] to signed beats (k, n), by weighted least squares."""
+    """Fit the Doppler ratio beta and x = tau (1 + beta) to signed beats by weighted least squares.
+
+    Parameters
+    ----------
+    beats, weights, carriers, chirp_rates : ndarray (k, n)
+        Signed beats [Hz], and arguments of :func:`fit_range_velocity`.
+
+    Returns
+    -------
+    beta, x : ndarray (n,)
+        Doppler ratio, and x [s].
+    """
     # The determinant of the normal equations as a sum of squares over pairs, without cancellation.
     segment_pairs = [(i, j) for i in range(len(beats)) for j in range(i)]
     pair_weights = [weights[i] * weights[j] for i, j in segment_pairs]
@@ -571,7 +615,7 @@ def _solve_beats(
 def range_velocity_response(
     beats: np.ndarray, *, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of fitted range [m] and radial velocity [m/s] for a change of the beats.
+    """Return by how much the fitted range and radial velocity change with the beats.
 
     Parameters
     ----------
@@ -583,7 +627,7 @@ def range_velocity_response(
     Returns
     -------
     range, radial_velocity : ndarray (n,)
-        0 where the beats do not determine a value.
+        Changes of range [m] and radial velocity [m/s]; 0 where beats do not determine a value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         beta, x = _solve_beats(beats, weights, carriers, chirp_rates)
@@ -596,7 +640,10 @@ def range_velocity_response(
 def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Solve for (beta, x) of unsigned, folded peaks by the assignment of signs that fits best."""
+    """Fit (beta, x) to unsigned peaks, with the signs and folds that fit best, (2, n).
+
+    The parameters are those of :func:`fit_range_velocity` for segments that are all detected.
+    """
     n_peaks = len(peaks)
     least_cost, solutions = np.full(peaks.shape[1:], np.inf), np.full((2, *peaks.shape[1:]), np.nan)
     delay_min = -bin_width / np.abs(chirp_rates).max(axis=0)  # rounding may make a range negative
@@ -629,7 +676,10 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
 def _solve_signed_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Solve for (beta, x) of signed peaks, which are known modulo the sample rate."""
+    """Fit (beta, x) to signed peaks, which are known modulo the sample rate.
+
+    The parameters are those of :func:`fit_range_velocity` for segments that are all detected.
+    """
     point_index = np.arange(peaks.shape[1])
     lowest_segment, highest_segment = chirp_rates.argmin(axis=0), chirp_rates.argmax(axis=0)
     beat_difference = (

@@ -16,25 +16,27 @@ COSINE_SUM_COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "blackmanharris": ("0.35875", "0.48829", "0.14128", "0.01168"),
     "flattop": ("0.21557895", "0.41663158", "0.277263158", "0.083578947", "0.006947368"),
 }
-"""Coefficients c_m of cosine sums, as written in scipy.signal.windows; the alternating signs are
-applied elsewhere."""
+"""Coefficients c_m >= 0 of cosine-sum windows, by name, as written in scipy.signal.windows.
+
+The window is the sum over m of (-1)^m c_m cos(2 pi m n / L).
+"""
 
 WINDOW_NAME_ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
-"""Other names of windows."""
+"""Canonical names of windows by their other names."""
 
 ENVELOPE_SAMPLES_PER_BIN = 16
-"""Number of samples per bin [of fs/L] in the transform of a window without a closed form."""
+"""Number of samples per bin of fs/L in the FFT from which the envelope of a window without a closed
+form follows."""
 
 _CLOSED_FORM_LENGTH_MIN = 64
 """Smallest length [samples] for which the closed form of a cosine sum's transform is used."""
 _WEIGHT_SAMPLES_MAX = 256
-"""Largest number of samples by which :meth:`Window.weights_by_record_position` describes a window.
-"""
+"""Largest number of samples from which :meth:`Window.weights_by_record_position` is computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Window of a given length, with all numbers that the spectrum needs."""
+    """Window of a given name and length, with its sums and the envelope of its transform."""
 
     name: str
     """Canonical name, as of :func:`canonical_window_name`."""
@@ -47,14 +49,14 @@ class Window:
     energy: float
     """Energy E_w = sum w^2."""
     envelope_distances: np.ndarray
-    """(m,): distances from the line at which the envelope is tabulated [bins of fs/L]."""
+    """(m,): distances y from a line at which the envelope is tabulated [bins of fs/L]."""
     sidelobe_envelope: np.ndarray
-    """(m,): max |W(y)| / sum over |y| >= `envelope_distances`."""
+    """(m,): largest |W| / `sum` at and beyond each of `envelope_distances`."""
     n_missing: int = 0
-    """Number of first samples set to 0 by :func:`zero_first_samples`."""
+    """Number of first samples that :func:`zero_first_samples` has set to 0."""
 
     def samples(self) -> np.ndarray:
-        """Return all samples (L,)."""
+        """Return the samples w (L,), of which `n_missing` first ones may be 0."""
         w = window_samples(self.name, self.length)
         if self.n_missing:
             w = w.copy()
@@ -62,19 +64,19 @@ class Window:
         return w
 
     def weights_by_record_position(self, adds_powers: bool) -> tuple[float, ...]:
-        """Return the distribution of |w| over the position in the record.
+        """Return how |w|, or its autocorrelation, is distributed over the record.
 
         Parameters
         ----------
         adds_powers : bool
-            True for the autocorrelation of |w|, whose transform is |W|^2; the position is then the
-            lag over L.
+            False for |w| by the distance t from the record's middle, where 1 is the record's end.
+            True for the autocorrelation of |w|, whose transform is |W|^2, by the lag t over L.
 
         Returns
         -------
         tuple of float
-            Fractions of the sum at positions |t| evenly spaced over 0..1, where 1 is the record's
-            end. Windows other than cosine sums have all of it at the end, an upper bound.
+            Fractions of the sum at |t| evenly spaced over 0..1. For windows other than cosine sums
+            all of it is at t = 1, which gives upper bounds.
         """
         if self.name not in COSINE_SUM_COEFFICIENTS or self.length < _CLOSED_FORM_LENGTH_MIN:
             return 0.0, 1.0
@@ -89,7 +91,11 @@ class Window:
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Return the half-widths pi h up to which J nodes represent all lines, by tolerance."""
+        """Return the largest half-widths pi h of a group of lines that J nodes represent.
+
+        The result is that of :func:`sweep.model.spectrum.lines.node_phase_limits`, for the
+        tolerances of sums of amplitudes, or of powers with `adds_powers`.
+        """
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
             POWER_TOLERANCES,
@@ -101,7 +107,7 @@ class Window:
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
-        """Equivalent noise bandwidth [bins of fs/L]."""
+        """Equivalent noise bandwidth L E_w / sum^2 [bins of fs/L]."""
         return self.length * self.energy / self.sum**2
 
 
@@ -112,13 +118,13 @@ def canonical_window_name(name: str) -> str:
 
 
 def window_samples(name: str, length: int) -> np.ndarray:
-    """Return DFT-even samples of a window, with peak about 1.
+    """Return the DFT-even (periodic) samples of a window, whose largest value is about 1.
 
     Parameters
     ----------
     name : str
-        A cosine sum, or any window of scipy.signal.get_window with its parameters in brackets:
-        ``kaiser(8.6)``.
+        Name of a cosine sum, or of any window of scipy.signal.get_window, with its parameters in
+        brackets: ``kaiser(8.6)``.
     length : int
         Number of samples.
 
@@ -137,20 +143,20 @@ def window_samples(name: str, length: int) -> np.ndarray:
 
     from scipy import signal  # slow to import
 
-    name_and_parameters = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
-    if name_and_parameters:
-        parameters = tuple(float(p) for p in name_and_parameters[2].split(",") if p)
-        return np.asarray(
-            signal.get_window((name_and_parameters[1], *parameters), length, fftbins=True)
-        )
+    match = re.fullmatch(r"([a-z_]+)\(([-+0-9.e,]*)\)", name)
+    if match:
+        base_name, parameter_text = match.groups()
+        parameters = tuple(float(p) for p in parameter_text.split(",") if p)
+        return np.asarray(signal.get_window((base_name, *parameters), length, fftbins=True))
     return np.asarray(signal.get_window(name, length, fftbins=True))
 
 
 def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
-    """Compute the samples of a cosine sum, bit for bit those of scipy.signal."""
+    """Compute the samples (length,) of a cosine-sum window, bit for bit as scipy.signal does."""
     c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
-        c[1] = 1.0 - c[0]
+        constant_term, _ = c
+        c = [constant_term, 1.0 - constant_term]
     if length == 1 or name == "rectangular":
         return np.ones(length)
     phase = np.linspace(-np.pi, np.pi, length + 1)
@@ -162,41 +168,43 @@ def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def get_window(name: str, length: int) -> Window:
-    """Return the window of this name and length, prepared once and cached."""
+    """Return the window of a name and a length [samples]; it is computed once and cached."""
     name = canonical_window_name(name)
     if name in COSINE_SUM_COEFFICIENTS and length >= _CLOSED_FORM_LENGTH_MIN:
         return _cosine_sum_window(name, length)
     return _window_from_samples(name, length)
 
 
-MISSING_STEPS = 32
-"""Number of steps per record in which :func:`zero_first_samples` counts missing samples."""
+ZEROED_STEPS_PER_RECORD = 32
+"""Number of equal parts of a record, to multiples of which :func:`zero_first_samples` rounds."""
 
 
 def zero_first_samples(window: Window, n_missing: int) -> Window:
-    """Return a window whose first samples are 0, rounded to one of :data:`MISSING_STEPS` steps.
+    """Return a window whose first samples are 0, for a record that begins before the echo.
 
     Parameters
     ----------
     window : Window
         Window of the full record.
     n_missing : int
-        Number of first samples that are 0, before rounding.
+        Number of first samples that are 0. It is rounded to a multiple of the record's length over
+        :data:`ZEROED_STEPS_PER_RECORD`, so that few windows are computed.
 
     Returns
     -------
     Window
-        For sums over a window that depend little on the exact number. The envelope is that of the
-        full window.
+        Window with its own sums; the envelope is that of the full window.
     """
-    step = min(round(MISSING_STEPS * n_missing / window.length), MISSING_STEPS - 1)
+    step = min(
+        round(ZEROED_STEPS_PER_RECORD * n_missing / window.length), ZEROED_STEPS_PER_RECORD - 1
+    )
     return _zero_first_steps(window, step) if step else window
 
 
-@lru_cache(maxsize=2 * MISSING_STEPS)
+@lru_cache(maxsize=2 * ZEROED_STEPS_PER_RECORD)
 def _zero_first_steps(window: Window, step: int) -> Window:
-    """Return a window whose first `step` of :data:`MISSING_STEPS` parts are 0."""
-    shortened = replace(window, n_missing=step * window.length // MISSING_STEPS)
+    """Return a window whose first `step` parts, of :data:`ZEROED_STEPS_PER_RECORD`, are 0."""
+    shortened = replace(window, n_missing=step * window.length // ZEROED_STEPS_PER_RECORD)
     w = shortened.samples()
     return replace(shortened, sum=float(w.sum()), energy=float((w**2).sum()))
 
@@ -214,6 +222,7 @@ def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray (n,) complex
+        W(y) = sum_n w[n] exp(-2 pi i y n / L).
     """
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     cycles = np.outer(np.asarray(y, float), n) / window.length
@@ -222,19 +231,19 @@ def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
 
 
 def _cosine_sum_window(name: str, length: int) -> Window:
-    """Prepare a cosine sum's window from closed forms."""
+    """Compute the fields of a cosine-sum window from closed forms."""
     coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])
     envelope_distances, sidelobe_envelope = _cosine_sum_envelope(coefficients, length)
     first_value = math.fsum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
+    constant_term, *cosine_terms = coefficients
     energy = length * (
-        coefficients[0] ** 2
-        + sum(coefficient * coefficient for coefficient in coefficients[1:]) / 2
+        constant_term**2 + sum(coefficient * coefficient for coefficient in cosine_terms) / 2
     )
     return Window(
         name,
         length,
         first_value,
-        length * coefficients[0],
+        length * constant_term,
         energy,
         envelope_distances,
         sidelobe_envelope,
@@ -244,7 +253,20 @@ def _cosine_sum_window(name: str, length: int) -> Window:
 def _cosine_sum_envelope(
     coefficients: tuple[float, ...], length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest |W| / sum at and beyond each distance, from the closed form."""
+    """Compute the envelope of a cosine-sum window's transform from its closed form.
+
+    Parameters
+    ----------
+    coefficients : tuple of float
+        Coefficients c_m.
+    length : int
+        Length [samples].
+
+    Returns
+    -------
+    envelope_distances, sidelobe_envelope : ndarray (m,)
+        Fields of :class:`Window`.
+    """
     near_distances = np.arange(1, min(256, length // 2) * 8) / 8
     far_distances = np.geomspace(256, length / 2, 64) if length > 512 else np.empty(0)
     distances = np.unique(
@@ -252,23 +274,27 @@ def _cosine_sum_envelope(
     )
     distances = distances[distances <= length / 2]
     theta = np.pi * (distances + 1e-9) / length
-    kernel = coefficients[0] / np.tan(theta)
-    for m in range(1, len(coefficients)):
+    constant_term, *cosine_terms = coefficients
+    kernel = constant_term / np.tan(theta)
+    for m, coefficient in enumerate(cosine_terms, 1):
         a = np.pi * m / length
-        kernel += (-1) ** m * coefficients[m] / 2 * (1 / np.tan(theta - a) + 1 / np.tan(theta + a))
+        kernel += (-1) ** m * coefficient / 2 * (1 / np.tan(theta - a) + 1 / np.tan(theta + a))
     first_value = sum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
     magnitude = (
         np.abs(np.sin(np.pi * (distances + 1e-9)))
         * np.hypot(kernel, first_value)
-        / (length * coefficients[0])
+        / (length * constant_term)
     )
-    return _thin_envelope(distances, np.maximum.accumulate(magnitude[::-1])[::-1])
+    return _decimate_envelope(distances, np.maximum.accumulate(magnitude[::-1])[::-1])
 
 
-def _thin_envelope(distances: np.ndarray, envelope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thin the envelope to steps of some 2 % of distance, each value a bound beyond its own.
+def _decimate_envelope(
+    distances: np.ndarray, envelope: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keep values of an envelope at distances some 2 % apart.
 
-    The factor 1.03 covers sidelobes whose peaks lie between samples.
+    `envelope` (m,) is the largest |W| / sum at and beyond each of `distances` (m,). The factor 1.03
+    covers sidelobes whose peaks lie between samples.
     """
     kept_indices = np.unique(
         np.searchsorted(distances, np.geomspace(distances[0], distances[-1], 512)).clip(
@@ -279,14 +305,21 @@ def _thin_envelope(distances: np.ndarray, envelope: np.ndarray) -> tuple[np.ndar
 
 
 def _window_from_samples(name: str, length: int) -> Window:
-    """Prepare any window from its samples and their FFT."""
+    """Compute the fields of any window from its samples and their FFT."""
     w = window_samples(name, length)
     fft_size = ENVELOPE_SAMPLES_PER_BIN * length
     distances = np.arange(fft_size // 2 + 1) / ENVELOPE_SAMPLES_PER_BIN
     spectrum = np.fft.rfft(w, fft_size)
     magnitude = np.abs(spectrum) / w.sum()
-    envelope_distances, sidelobe_envelope = _thin_envelope(
+    envelope_distances, sidelobe_envelope = _decimate_envelope(
         distances[1:], np.maximum.accumulate(magnitude[::-1])[::-1][1:]
     )
-    first_value_and_sums = float(w[0]), float(w.sum()), float((w**2).sum())
-    return Window(name, length, *first_value_and_sums, envelope_distances, sidelobe_envelope)
+    return Window(
+        name,
+        length,
+        float(w[0]),
+        float(w.sum()),
+        float((w**2).sum()),
+        envelope_distances,
+        sidelobe_envelope,
+    )

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_shapes
-from sweep.model.geometry.quaternion import axis_angle, rotate
+from sweep.model.geometry.mesh import Mesh, exact_centre, facet_normals, require_consistent_mesh
+from sweep.model.geometry.quaternion import from_axis_angle, rotate
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygon_file
 from sweep.scenes.polygons import triangulate_polygons
 from sweep.scenes.scene_files import SceneError, read_companion_file, require_file, require_memory
@@ -243,7 +243,7 @@ def clean_mesh(
     """
     positions, face_corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     surfaces = np.full(len(face_corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
-    require_shapes(positions, face_corners, surfaces)
+    require_consistent_mesh(positions, face_corners, surfaces)
     n_vertices, n_faces = len(positions), len(face_corners)
     has_data = np.isfinite(positions)[face_corners].all(axis=(1, 2))
     face_corners, surfaces = face_corners[has_data], surfaces[has_data]
@@ -368,7 +368,7 @@ def read_mesh(
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
     is_y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
-    rotation = axis_angle(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
+    rotation = from_axis_angle(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
     return join_facets(parts).transform(
         rotation=rotation, scale=scale * _metres_per_unit(path, unit or file_unit)
     )

@@ -315,7 +315,7 @@ class Processing(SpecSection):
     shot_detection: str = declare.choice_field(
         "Segments in which a shot is detected: both chirps; or any two of three, which still give "
         "range and velocity if the third is missed",
-        waveform.SHOT_DETECTIONS,
+        waveform.SHOT_DETECTION_RULES,
     )
     peaks: str = declare.choice_field(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "

@@ -16,7 +16,7 @@ from sweep.model.outputs import (
     DRAW_COUNT_OUTPUTS,
     GRID_OUTPUTS,
     NAN_WITHOUT_ECHO_OUTPUTS,
-    NO_BIN_NOTE,
+    NO_FREE_BIN_NOTE,
     STANDARD_ERROR_OUTPUTS,
     STRONGEST_PEAK_OUTPUTS,
 )
@@ -36,7 +36,7 @@ PROBABILITY_ROUNDING = 1e-9
 PROBABILITY_PREFIXES = ("pd_", "miss_", "pfa_", "p_leakage_", "p_wrong_range_")
 FINITE_OUTPUTS = tuple(name for name in GRID_OUTPUTS if not name.endswith("_doppler"))
 OUTPUTS_WITHOUT_BINS = tuple(
-    name for name, output in GRID_OUTPUTS.items() if output.comment == NO_BIN_NOTE
+    name for name, output in GRID_OUTPUTS.items() if output.comment == NO_FREE_BIN_NOTE
 )
 
 

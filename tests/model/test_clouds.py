@@ -416,7 +416,7 @@ def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
         _cloud(seen, p, effects=(*set(DEFAULT_EFFECTS) - {"signal_shot_noise"}, *more))["snr_up"][0]
         for more in (["lag"], [])
     )
-    (waist, _), apart = beam.sent_and_oscillator_beams(p), 2 * rate * far**2 / 299792458.0
+    (waist, _), apart = beam.transmitted_and_oscillator_beams(p), 2 * rate * far**2 / 299792458.0
     expected = np.exp(-2 * apart**2 / (2 * waist.radius(far) ** 2))
     assert 0.1 < expected < 0.95
     assert found / straight == pytest.approx(expected, rel=1e-6)

@@ -33,7 +33,7 @@ from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling import speckle_lines
-from sweep.model.waveform import FAR_READING, range_velocity_of_beats, read_beats
+from sweep.model.waveform import FAR_READING, beats_of_reading, range_velocity_of_beats
 from sweep.model.window import get_window
 
 PROCESSING = "instrument.processing."
@@ -103,7 +103,7 @@ def scatterers_reported(p, draws, seed):
         places[segment] = drawn.bins[segment][best] + delta
     width = float(np.ravel(shots.sample_rate)[0]) / shots.fft_size
     up, down = (places[segment] * width for segment in ("up", "down"))
-    beats = read_beats(FAR_READING, up, down, 200e6)
+    beats = beats_of_reading(FAR_READING, up, down, 200e6)
     carrier = 299792458.0 / p["instrument.laser.wavelength"]
     chirp = (p["instrument.chirp.bandwidth"], p["instrument.chirp.duration"])
     distance, velocity = range_velocity_of_beats(*beats, carrier, *chirp)
@@ -117,11 +117,12 @@ def fan_of(spread, turn, shape="hann"):
     """Lines of one footprint, and the window, of records as long as their FFT."""
     size = 1024
     transform = speckle_lines.transform_table(get_window(shape, size))[1]
-    node, weight = speckle_lines._gaussian_rules()
+    node, weight = speckle_lines._quadrature_tables()
     rule = np.array([[3, 3]])  # of 15 lines along either coordinate
     return speckle_lines.SpeckleLineGrid(
         np.array([spread]), np.array([turn]), rule, np.ones(1, np.int64), node, weight,
-        speckle_lines.RULE_SIZES, transform, float(speckle_lines.TRANSFORM_SAMPLES_PER_BIN), 6.0, 0,
+        speckle_lines.QUADRATURE_NODE_COUNTS, transform,
+        float(speckle_lines.TRANSFORM_SAMPLES_PER_BIN), 6.0, 0,
     )  # fmt: skip
 
 
@@ -139,7 +140,7 @@ def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(s
         middle[segment] = -off
         drawn.append(
             speckle_lines.draw_segment_amplitudes(
-                fan, 0, middle, (0, 1), key=make_point_keys(1)[0], draws=np.arange(number)
+                fan, 0, middle, 0, 1, key=make_point_keys(1)[0], draws=np.arange(number)
             )[:, 0]
         )
     one, other = drawn

@@ -16,7 +16,7 @@ from sweep.model.detection.looks import Looks
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.pointcloud.bin_groups import _list_groups
-from sweep.model.pointcloud.eyepoints import RANGE_MIN, prepare_eyepoint_shots
+from sweep.model.pointcloud.eyepoints import HIT_RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
 from sweep.model.spectrum.search_restriction import _mark_searched_echoes
 from sweep.model.unsupported_shot import UnsupportedShotError
@@ -96,7 +96,7 @@ WALL = clean_mesh(
 FORWARD = np.array([[1.0, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * RANGE_MIN])
+@pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * HIT_RANGE_MIN])
 def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, x):
     far = replace(WALL, origin=WALL.origin + np.array([200.0, 0.0, 0.0]))
     eyes = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
@@ -107,8 +107,10 @@ def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, 
 
 
 def test_a_surface_farther_than_the_least_range_is_hit():
-    eyes = observe_shots(straight_flight((-2 * RANGE_MIN, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
-    np.testing.assert_allclose(eyes.range, 2 * RANGE_MIN)
+    eyes = observe_shots(
+        straight_flight((-2 * HIT_RANGE_MIN, 0.0, 0.0)), bodies=[WALL], beams=FORWARD
+    )
+    np.testing.assert_allclose(eyes.range, 2 * HIT_RANGE_MIN)
     low = observe_shots(straight_flight((0.0, 0.0, 0.1)), beams=DOWNWARD_BEAM)
     np.testing.assert_allclose(low.range, 0.1)
 

@@ -10,7 +10,7 @@ from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.geometry.body_motion import SpinningAttitude
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.geometry.scanner import cone_directions, fixed_beams
-from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion
+from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion_of_eyepoints
 from sweep.model.pointcloud.pairing import TRUE_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
 from sweep.model.sampling import philox
@@ -156,7 +156,7 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
         index=range(4),
         number=109,
     )
-    np.testing.assert_allclose(ego_motion(seen).acceleration, 0, atol=1e-9)
+    np.testing.assert_allclose(ego_motion_of_eyepoints(seen).acceleration, 0, atol=1e-9)
     parameters = scene_parameters(table_4_1, beamlets=109)
     for acceleration, low, high in ((0.0, 50, 1000), (30.0, 0.9, 1.1), (300.0, 0.09, 0.11)):
         priors = MotionPriors(terrain_slope=0.0, target_acceleration=acceleration)
@@ -189,7 +189,7 @@ def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
 def test_known_motion_is_the_true_one_over_level_ground():
     for motion in MOTIONS.values():
         seen = shots(motion)
-        known = ego_motion(seen)
+        known = ego_motion_of_eyepoints(seen)
         np.testing.assert_allclose(known.acceleration, seen.acceleration, rtol=1e-9, atol=1e-9)
         slip = known.slip_at(seen.range)
         np.testing.assert_allclose(slip, seen.radial_velocity - seen.approach_speed, atol=1e-6)
@@ -197,5 +197,5 @@ def test_known_motion_is_the_true_one_over_level_ground():
 
 def test_a_beam_that_looks_ahead_is_taken_to_meet_a_wall_that_faces_it():
     seen = observe_shots(straight_flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
-    known = ego_motion(seen)
+    known = ego_motion_of_eyepoints(seen)
     assert known.slip_at(np.array([1e3])).tolist() == [0.0]

@@ -49,7 +49,7 @@ def _pair(up, doppler, down, tolerance=CONFIRMATION_TOLERANCE_BINS, assumed=wave
 
 
 def _reported(up, down, code):
-    beats = waveform.read_beats(code, up * WIDTH, down * WIDTH, FS)
+    beats = waveform.beats_of_reading(code, up * WIDTH, down * WIDTH, FS)
     return waveform.range_velocity_of_beats(*beats, *OPTICS.values())
 
 

@@ -96,7 +96,7 @@ def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):
     delay, length = 2 * 150.0 / 299792458.0, 8192 / 200e6
     frequencies_apart = 2 * (4e9 / 100e-6) * (5e-6 + length / 2 - delay - 50e-6)
     deviation = (
-        float(beam.sent_and_oscillator_beams(p)[0].radius(150.0))
+        float(beam.transmitted_and_oscillator_beams(p)[0].radius(150.0))
         / np.sqrt(8)
         / np.tan(np.radians(30))
     )

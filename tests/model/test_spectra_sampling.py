@@ -19,8 +19,8 @@ from sweep.model.sampling.noisy_spectra import (
     draw_noise_spectra,
     draw_signal_spectra,
     flag_bins,
-    make_spectrum_view,
     noiseless_signal,
+    prepare_point_spectra,
 )
 from sweep.model.sampling.samplers import PriorDraws, simulate_draws
 from sweep.model.time_domain_truth import time_domain_spectrum
@@ -205,7 +205,7 @@ def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
         DETECTOR_PREFIX + "pfa": 0.02,
     }
     ((_, shots),) = prepare_shots(parameters, EFFECTS)
-    view = make_spectrum_view(shots, 0, parameters, make_point_keys(1)[0], SpectrumMethods())
+    view = prepare_point_spectra(shots, 0, parameters, make_point_keys(1)[0], SpectrumMethods())
     noise = draw_noise_spectra(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(10_000))
     _, flags = flag_bins([noise], view, 0)
     assert flags.shape == (10_000, 64)

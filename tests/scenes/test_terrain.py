@@ -8,7 +8,7 @@ from facet_areas import triangle_areas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.model.geometry.quaternion import axis_angle
+from sweep.model.geometry.quaternion import from_axis_angle
 from sweep.scenes import terrain as ground_
 from sweep.scenes.meshes import Facets, clean_mesh, join_facets
 from sweep.scenes.rasters import read_image_terrain, read_raster_terrain
@@ -118,7 +118,7 @@ def test_a_placed_object_is_scaled_and_turned_about_its_origin():
     corner = Facets.on_one_surface(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30)
     )
-    placed = corner.transform(rotation=axis_angle(2, math.pi / 2), scale=2.0)
+    placed = corner.transform(rotation=from_axis_angle(2, math.pi / 2), scale=2.0)
     corners = [[10, 22, 30], [8, 20, 30], [10, 20, 32]]
     np.testing.assert_allclose(placed.vertices + placed.origin, corners, atol=1e-12)
 

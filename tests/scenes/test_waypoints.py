@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sweep.model.geometry.body_motion import Waypoints
-from sweep.model.geometry.quaternion import axis_angle, from_heading, multiply, rotate
+from sweep.model.geometry.quaternion import from_axis_angle, from_heading, multiply, rotate
 from sweep.scenes.scene_files import SceneError, read_first_waypoint_time, read_waypoints
 
 PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
@@ -51,7 +51,10 @@ def test_angles_left_out_are_zero(table):
 
 
 def test_quaternions_of_a_table_are_taken_as_they_are(table):
-    first, last = axis_angle(2, 0.2), multiply(axis_angle(2, 0.2), axis_angle(0, 1.0))
+    first, last = (
+        from_axis_angle(2, 0.2),
+        multiply(from_axis_angle(2, 0.2), from_axis_angle(0, 1.0)),
+    )
     rows = "\n".join(
         ",".join(str(v) for v in (t, 0, 0, 9, *q)) for t, q in ((0, first), (10, last))
     )

@@ -20,8 +20,8 @@ from sweep.model.beamlets import (
     OffsetMoments,
     bins_per_velocity,
     place_beamlets,
-    plane_echo_ratio,
-    plane_moments,
+    plane_echo_ratio_bound,
+    plane_offset_moment_bounds,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import Looks
@@ -222,7 +222,9 @@ class PlannerInputs:
         self.phase_error_bounds: dict[str, PhaseErrorBound] = {}
         """Bounds of phase errors by name of the effect."""
         n_beamlets = self.shared_integer(beamlet_counts.BEAMLETS_PATH)
-        self.n_beamlets, self.beamlet_pattern = beamlet_counts.finest_beamlets(self.parameters)
+        self.n_beamlets, self.beamlet_pattern = beamlet_counts.largest_beamlet_count_and_pattern(
+            self.parameters
+        )
         if n_beamlets:
             self.n_beamlets, self.beamlet_pattern = (
                 n_beamlets,
@@ -411,13 +413,13 @@ class PlannerInputs:
             "grazing_angle": grazing_angle, "beam_divergence": self.footprint_angles.positions,
             "n_beamlets": self.n_beamlets, "pattern": self.beamlet_pattern,
         }  # fmt: skip
-        range_moments, velocity_moments = plane_moments(
+        range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
             radial_velocity=self.radial_velocity,
             direction_angle=self.footprint_angles.directions,
             **geometry,
         )
-        echo_ratio = plane_echo_ratio(self.option("target.reflectance_law"), **geometry)
+        echo_ratio = plane_echo_ratio_bound(self.option("target.reflectance_law"), **geometry)
         amplitude_gain = 1.0
         if self.adds_field_amplitudes:
             amplitude_gain = float(

@@ -1,8 +1,8 @@
-"""Platform of the instrument: position, velocity and attitude over time.
+"""Motion of bodies: position, velocity, acceleration and attitude over time.
 
-Velocity and acceleration are exact derivatives of the position. Every attitude law returns the
-quaternion (body to world) and its exact derivative, the angular velocity. A moving target is a
-`MovingBody` too. Body frame: x forward, y left, z up.
+A body is the platform of the instrument, or a moving target. Velocity and acceleration are exact
+derivatives of the position. Every attitude law returns the quaternion (body to world) and its exact
+derivative, the angular velocity. In the body's frame x is forward, y left and z up.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ import numpy as np
 from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
 
-_HORIZONTAL_FRACTION_MIN, _HORIZONTAL_SPEED_MIN = 1e-9, 1e-100
-"""Smallest horizontal fraction of the speed, and smallest horizontal speed [m/s], for which a
-heading is defined."""
-
+_HORIZONTAL_FRACTION_MIN = 1e-9
+"""Smallest ratio of horizontal speed to speed for which a heading is defined."""
+_HORIZONTAL_SPEED_MIN = 1e-100
+"""Smallest horizontal speed [m/s] for which a heading is defined."""
 
 FloatSequence = Sequence[float] | np.ndarray
 """Sequence or array of numbers."""
 
 AttitudeAndRate = tuple[np.ndarray, np.ndarray]
-"""Quaternion (n, 4), body to world, and angular velocity (n, 3) [rad/s] in the world frame.
+"""Quaternions (n, 4), body to world, and angular velocities (n, 3) [rad/s] in the world's frame.
 
-An attitude law returns them for times (n,) [s], velocities and accelerations (n, 3) [m/s, m/s^2].
+``attitude_and_rate`` of an attitude law returns them for times (n,) [s] and for the velocities
+[m/s] and accelerations [m/s^2] of the body, (n, 3) each.
 """
 
 
@@ -37,32 +38,32 @@ class NadirAttitude:
     """Level attitude, so that a beam along -z points straight down."""
 
     heading: float | None = 0.0
-    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]. None
-    follows the track over the ground, which is undefined for a vertical motion."""
+    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]. With None
+    the forward axis follows the horizontal velocity, which must not be 0."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         if self.heading is not None:
-            return np.tile(quat.axis_angle(2, self.heading), (len(times), 1)), np.zeros(
+            return np.tile(quat.from_axis_angle(2, self.heading), (len(times), 1)), np.zeros(
                 (len(times), 3)
             )
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
-        return quat.axis_angle(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
+        return quat.from_axis_angle(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True)
 class AlongTrackAttitude:
-    """Attitude with the forward axis along the velocity, and the wings level except for a bank."""
+    """Attitude with the forward axis along the velocity, rolled about it by a constant angle."""
 
     roll: float = 0.0
-    """Constant roll angle, positive with the left side up [rad]."""
+    """Roll angle, positive with the left side up [rad]; at 0 the left axis is horizontal."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
         horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
         pitch = np.arctan2(velocity[:, 2], horizontal_speed)
@@ -81,7 +82,13 @@ class AlongTrackAttitude:
 def _heading_and_rate(
     velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heading [rad] and its rate [rad/s], (n,) each."""
+    """Return the heading of velocities (n, 3) [rad] and its rate [rad/s], (n,) each.
+
+    Raises
+    ------
+    ValueError
+        If a velocity is vertical or 0.
+    """
     vx, vy = velocity[:, 0], velocity[:, 1]
     horizontal_speed = np.hypot(vx, vy)
     speed = np.linalg.norm(velocity, axis=1)
@@ -104,7 +111,7 @@ class FixedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         q = quat.normalise(np.asarray(self.quaternion, float))
         return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
 
@@ -123,7 +130,7 @@ class SpinningAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         angular_velocity = np.asarray(self.angular_velocity, float)
         rotation = quat.from_rotation_vector(
             (times - self.initial_time)[:, None] * angular_velocity
@@ -134,10 +141,10 @@ class SpinningAttitude:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeTrack:
-    """Attitudes at given times, interpolated by the shorter rotation at a constant rate (slerp).
+    """Attitudes at given times, with rotations at a constant rate between them (slerp).
 
-    Before the first and after the last time the attitude is constant. q and -q are the same
-    attitude.
+    Of the two rotations from one attitude to the next, the shorter is taken. Before the first and
+    after the last time the attitude is constant.
     """
 
     times: FloatSequence
@@ -148,7 +155,7 @@ class AttitudeTrack:
     """(n - 1, 3): rotation vectors between successive attitudes [rad]."""
 
     def __post_init__(self) -> None:
-        times, quaternions = checked_rising_times(self.times), np.asarray(self.quaternions, float)
+        times, quaternions = require_rising_times(self.times), np.asarray(self.quaternions, float)
         if quaternions.shape != (len(times), 4):
             raise ValueError(
                 f"a quaternion track needs four numbers a time, not {quaternions.shape}"
@@ -167,7 +174,7 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
         interval_duration = np.diff(times)[interval]
@@ -185,24 +192,23 @@ class AttitudeTrack:
 
 @dataclass(frozen=True, eq=False)
 class MountedAttitude:
-    """Attitude of an instrument that is mounted with a constant rotation on its carrier."""
+    """Attitude of an instrument that is mounted on a vehicle at a constant rotation."""
 
-    carrier: AttitudeLaw
-    """Attitude law of the carrier."""
+    vehicle_attitude: AttitudeLaw
+    """Attitude law of the vehicle."""
     mounting: FloatSequence
-    """(4,): quaternion from the instrument's frame to the carrier's."""
+    """(4,): quaternion from the instrument's frame to the vehicle's."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitude and angular velocity."""
-        q, angular_velocity = self.carrier.attitude_and_rate(times, velocity, acceleration)
+        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        q, angular_velocity = self.vehicle_attitude.attitude_and_rate(times, velocity, acceleration)
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 
 
 _TIME_TOLERANCE = 1e-9
-"""Fraction of the duration by which a time may lie outside the trajectory, to allow for rounding.
-"""
+"""Fraction of a trajectory's duration by which a time may lie outside it, because of rounding."""
 
 
 AttitudeLaw = (
@@ -213,11 +219,11 @@ AttitudeLaw = (
     | AttitudeTrack
     | MountedAttitude
 )
-"""Attitude over time."""
+"""Attitude over time: any class with a method ``attitude_and_rate``."""
 
 
 class Motion(NamedTuple):
-    """Motion of a point, (n, 3) each."""
+    """Motion of a point at n times, (n, 3) each, in the world's frame."""
 
     position: np.ndarray
     """Position [m]."""
@@ -228,7 +234,7 @@ class Motion(NamedTuple):
 
 
 class BodyState(NamedTuple):
-    """Pose and motion of the instrument on a body, in the world frame."""
+    """Pose and motion, at n times, of an instrument on a body, in the world's frame."""
 
     position: np.ndarray
     """(n, 3): position of the instrument [m]."""
@@ -243,7 +249,7 @@ class BodyState(NamedTuple):
 
 
 def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Return the times, clipped to the trajectory within rounding.
+    """Return times (n,) [s], moved into the trajectory if rounding has put them just outside.
 
     Raises
     ------
@@ -295,7 +301,7 @@ def straight_trajectory(
     initial_speed: float,
     final_speed: float | None = None,
 ) -> ConstantAcceleration:
-    """Return a straight trajectory between two points, with a constant rate of change of the speed.
+    """Return a straight trajectory between two points, under constant acceleration.
 
     Parameters
     ----------
@@ -335,14 +341,15 @@ class Waypoints:
     """True for a cubic spline, whose velocity and acceleration are continuous (a line or a parabola
     through two or three points); False for straight lines at constant velocities."""
     _interpolant: Any = field(init=False, repr=False)
-    """Piecewise polynomial of the positions relative to the first."""
+    """Function of the time [s], and of the order of a derivative by time: positions relative to the
+    first one [m]."""
     _origin: np.ndarray = field(init=False, repr=False)
     """(3,): first position [m]."""
 
     def __post_init__(self) -> None:
         from scipy.interpolate import CubicSpline, PPoly  # slow to import
 
-        times, positions = checked_rising_times(self.times), np.asarray(self.positions, float)
+        times, positions = require_rising_times(self.times), np.asarray(self.positions, float)
         if positions.shape != (len(times), 3) or not np.isfinite(positions).all():
             raise ValueError(
                 f"waypoints need three finite coordinates a time, not {positions.shape}"
@@ -380,8 +387,8 @@ class Waypoints:
         )
 
 
-def checked_rising_times(time: FloatSequence) -> np.ndarray:
-    """Return times as an array.
+def require_rising_times(time: FloatSequence) -> np.ndarray:
+    """Convert times (n,) [s] to an array, and require that they ascend.
 
     Raises
     ------
@@ -400,17 +407,17 @@ def checked_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point from `start` to `stop` [s]."""
+"""Motion of a point over time, from `start` to `stop` [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBody:
-    """Body on a trajectory, with an attitude, that carries the instrument."""
+    """Body with a trajectory and an attitude law, which may carry an instrument."""
 
     trajectory: Trajectory
     """Trajectory of the body's reference point."""
     attitude_law: AttitudeLaw
-    """Attitude over time."""
+    """Attitude of the body over time."""
     lever_arm: FloatSequence = (0.0, 0.0, 0.0)
     """(3,): position of the instrument in the body frame [m]."""
 
@@ -430,7 +437,7 @@ class MovingBody:
         Raises
         ------
         ValueError
-            For a time outside the trajectory, or an attitude that the motion leaves undefined.
+            For a time outside the trajectory, or a heading that the velocity leaves undefined.
         """
         motion = self.trajectory.motion(times)
         clipped_times = _clip_to_duration(times, self.start, self.stop)

@@ -1,8 +1,8 @@
-"""Nearest triangles of bundles of rays: an eight-way tree of boxes and its traversal.
+"""Bounding volume hierarchy: the nearest triangles along bundles of rays, by a tree of boxes.
 
-The hit of a ray depends only on the ray and the mesh. The nearest of the triangles hit counts; of
-equally near ones, the first in the mesh. The order of the rays, their grouping and the shape of the
-tree change no bit of it.
+Each node of the tree has up to eight children. The hit of a ray depends only on the ray and the
+mesh: it is the nearest triangle, and the first in the mesh of equally near ones. The order of the
+rays, their grouping and the shape of the tree change no bit of the result.
 
 A triangle counts as hit if the three edge functions of the sheared triangle [1]_ have no opposite
 signs. Each edge function is a difference of two products. The neighbour across the edge computes
@@ -23,16 +23,18 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 
-NODE_WIDTH = 8
-"""Children of a node: one vector of float64 with AVX-512, two with AVX2."""
+CHILDREN_PER_NODE = 8
+"""Number of children of a node. Their boxes fill one vector register of float64 with AVX-512, two
+with AVX2."""
 
 LEAF_TRIANGLES_MAX = 2
-"""Largest number of triangles in a leaf; below NODE_WIDTH, so that start and count share one
-integer."""
+"""Largest number of triangles in a leaf. It is below 8, so that a leaf's first triangle and its
+number of triangles fit one integer (:attr:`BoxTree.children`)."""
 
 _BOX_SLACK = 2.0**-30
-"""Widening of the boxes in units of the largest coordinate. It is far above the sideways rounding
-of a hit (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and below float32."""
+"""Distance by which boxes are widened, over the largest coordinate. It is far above the rounding of
+a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5 times the mesh's
+size), and below the resolution of float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
 """Lower bound of the empty box; its upper bound is minus this."""
@@ -41,39 +43,74 @@ _TRIANGLES_PER_BATCH = 1 << 20
 """Number of triangles whose boxes are computed together."""
 
 _STACK_SIZE = 8 * 16
-"""Entries that the deepest tree can leave on the stack: seven a level."""
+"""Size of the stack of a traversal. The deepest tree needs seven entries a level."""
 
 _DIRECTION_MIN = 1e-200
 """Direction components below this count as possibly zero, so that their reciprocal is finite."""
 
 _ENTRY_SLACK = 1.0 + 1e-14
-"""Factor above the rounding of a box's entry and exit, which is some 5e-16 of them."""
+"""Factor by which the distance of a box's exit is increased, more than its rounding (5e-16)."""
 
 _TIE_SLACK = 1.0 + 1e-12
-"""Factor above the rounding of a hit's distance: a box is skipped only if it cannot hold a tie."""
+"""Factor by which a hit's distance is increased before boxes beyond it are skipped. Rounding then
+skips no box that holds an equally near triangle."""
 
-_BUNDLE_TESTS_MAX, _UNLIMITED_TESTS = np.array([128, 1 << 62])
-"""Number of triangles tested against a full bundle before its rays are traversed one by one, and a
-number that is never reached."""
+_BUNDLE_TESTS_MAX = np.int64(128)
+"""Number of triangles tested against a whole bundle, after which its rays traverse the tree alone.
+"""
+_UNLIMITED_TESTS = np.int64(1 << 62)
+"""Number of triangle tests that is never reached."""
+
+_X, _Y, _Z = range(3)
+"""Indices of the coordinate axes."""
+_LOW_X, _LOW_Y, _LOW_Z, _HIGH_X, _HIGH_Y, _HIGH_Z = range(6)
+"""Rows of a node in :attr:`BoxTree.bounds`."""
+_SHEAR_X, _SHEAR_Y, _RECIPROCAL = range(3)
+"""Rows of :attr:`_Scratch.shears`."""
+(
+    _RECIPROCAL_HIGH, _RECIPROCAL_LOW, _NEAR_TERM_HIGH, _NEAR_TERM_LOW, _FAR_TERM_HIGH,
+    _FAR_TERM_LOW,
+) = range(6)  # fmt: skip
+"""Rows of :attr:`_Scratch.box_test`."""
 
 
 class BoxTree(NamedTuple):
     """Nested boxes over the triangles of one mesh, the root last."""
 
     bounds: np.ndarray
-    """(nodes, 6, 8) float32 [m]: low x, y, z, high x, y, z of each child's box."""
+    """(nodes, 6, 8) float32 [m]: lower bounds x, y, z and upper bounds x, y, z of each child's box.
+    """
     children: np.ndarray
-    """(nodes, 8) int32: index of a node, or -1 - (8 start + count) for triangles of `faces`."""
+    """(nodes, 8) int32: index of a child that is a node. A child that is a leaf has -1 - (8 start +
+    count), with the index `start` of its first triangle in `faces` and their number `count`."""
     faces: np.ndarray
-    """(m, 3) int32: vertices of each triangle, in the order of the leaves."""
-    order: np.ndarray
+    """(m, 3) int32: vertices of each triangle; the triangles are in the order of the leaves."""
+    mesh_face_index: np.ndarray
     """(m,) int32: index in the mesh of each triangle of `faces`."""
     vertices: np.ndarray
     """(n, 3) float64 [m]: the mesh's vertices in the order in which `faces` first uses them."""
 
 
+class _Scratch(NamedTuple):
+    """Arrays that a traversal works in."""
+
+    shears: np.ndarray
+    """(3, b): result of :func:`_prepare_bundle`, by ray."""
+    box_test: np.ndarray
+    """(6, 3): result of :func:`_prepare_bundle`, by coordinate axis."""
+    child_entry: np.ndarray
+    """(8,): distance at which rays may enter each child's box; inf if none can."""
+    node_stack: np.ndarray
+    """(_STACK_SIZE,) int64: nodes and leaves that are still to be visited, as in
+    :attr:`BoxTree.children`."""
+    entry_stack: np.ndarray
+    """(_STACK_SIZE,): distance at which rays may enter each of them."""
+
+
 def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
-    """Build the tree of a mesh: leaves by recursive halving, eight neighbours a node.
+    """Build the tree of a mesh.
+
+    The triangles are halved recursively into leaves. A node's children are eight neighbours.
 
     Parameters
     ----------
@@ -82,16 +119,16 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
     faces : ndarray (m, 3) int
         Vertices of each triangle, m >= 1.
     """
-    leaves = _fill_leaves(_triangle_centres(vertices, faces))
+    leaves = _order_into_leaves(_triangle_centres(vertices, faces))
     bounds, children = _build_nodes(vertices, faces, leaves)
-    order = leaves[leaves < len(faces)]
+    mesh_face_index = leaves[leaves < len(faces)]
     del leaves
-    new_faces, vertex_order = _renumber_by_first_use(faces, order, len(vertices))
-    return BoxTree(bounds, children, new_faces, order, vertices[vertex_order])
+    new_faces, vertex_order = _renumber_by_first_use(faces, mesh_face_index, len(vertices))
+    return BoxTree(bounds, children, new_faces, mesh_face_index, vertices[vertex_order])
 
 
 def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return twice the centres of triangles' boxes, (m, 3) float32; they only order the tree."""
+    """Return twice the centres of triangles' boxes, (m, 3) float32, by which leaves are sorted."""
     centres = np.empty((len(faces), 3), np.float32)
     for begin in range(0, len(faces), _TRIANGLES_PER_BATCH):  # in batches, to save memory
         rows = slice(begin, begin + _TRIANGLES_PER_BATCH)
@@ -101,7 +138,10 @@ def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> np.ndarray:
-    """Return the boxes (low, -high) of leaves, (n, 6) float32."""
+    """Return the box of each leaf, (n, 6) float32 [m]: lower bounds, and upper bounds negated.
+
+    `leaves` is the result of :func:`_order_into_leaves`.
+    """
     slack = _BOX_SLACK * float(max(vertices.max(), -vertices.min()))
     boxes = np.empty((leaves.size // LEAF_TRIANGLES_MAX, 6), np.float32)
     for begin in range(0, leaves.size, _TRIANGLES_PER_BATCH):
@@ -123,7 +163,11 @@ def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> 
 def _build_nodes(
     vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds and children of all nodes, level by level above the leaves, the root last."""
+    """Return :attr:`BoxTree.bounds` and :attr:`BoxTree.children` of all nodes.
+
+    Nodes are in the order of their levels, from those above the leaves to the root. `leaves` is the
+    result of :func:`_order_into_leaves`.
+    """
     boxes = _leaf_boxes(vertices, faces, leaves)
     triangle_count = (
         (leaves < len(faces)).reshape(-1, LEAF_TRIANGLES_MAX).sum(axis=1, dtype=np.int32)
@@ -131,21 +175,21 @@ def _build_nodes(
     child_links = -1 - (
         8 * (np.cumsum(triangle_count, dtype=np.int32) - triangle_count) + triangle_count
     )
-    nodes_per_level = [-(-len(boxes) // NODE_WIDTH)]
+    nodes_per_level = [-(-len(boxes) // CHILDREN_PER_NODE)]
     while nodes_per_level[-1] > 1:
-        nodes_per_level.append(-(-nodes_per_level[-1] // NODE_WIDTH))
-    bounds = np.empty((sum(nodes_per_level), 6, NODE_WIDTH), np.float32)
-    children = np.empty((sum(nodes_per_level), NODE_WIDTH), np.int32)
+        nodes_per_level.append(-(-nodes_per_level[-1] // CHILDREN_PER_NODE))
+    bounds = np.empty((sum(nodes_per_level), 6, CHILDREN_PER_NODE), np.float32)
+    children = np.empty((sum(nodes_per_level), CHILDREN_PER_NODE), np.int32)
     n_nodes_before = 0
     for n_nodes in nodes_per_level:
-        if n_missing_leaves := n_nodes * NODE_WIDTH - len(boxes):  # leaves without triangles
+        if n_missing_leaves := n_nodes * CHILDREN_PER_NODE - len(boxes):  # leaves without triangles
             boxes = np.append(boxes, np.full((n_missing_leaves, 6), _EMPTY_BOX_BOUND), axis=0)
             child_links = np.append(child_links, np.full(n_missing_leaves, -1, np.int32))
-        boxes_by_node = boxes.reshape(n_nodes, NODE_WIDTH, 6)
+        boxes_by_node = boxes.reshape(n_nodes, CHILDREN_PER_NODE, 6)
         level_rows = slice(n_nodes_before, n_nodes_before + n_nodes)
         bounds[level_rows] = boxes_by_node.swapaxes(1, 2)
         np.negative(bounds[level_rows, 3:], out=bounds[level_rows, 3:])
-        children[level_rows] = child_links.reshape(n_nodes, NODE_WIDTH)
+        children[level_rows] = child_links.reshape(n_nodes, CHILDREN_PER_NODE)
         boxes, child_links = (
             boxes_by_node.min(axis=1),
             np.arange(n_nodes_before, n_nodes_before + n_nodes, dtype=np.int32),
@@ -154,10 +198,11 @@ def _build_nodes(
     return bounds, children
 
 
-def _fill_leaves(centres: np.ndarray) -> np.ndarray:
-    """Return the triangles in the order of the leaves, int32, in a power of two of slots.
+def _order_into_leaves(centres: np.ndarray) -> np.ndarray:
+    """Sort triangles into leaves of neighbours; return the number of each slot's triangle, int32.
 
-    An empty slot has the number m of triangles.
+    Leaves of equal size follow each other, and the number of slots is a power of two. An empty slot
+    has the value m, the number of triangles.
     """
     n_triangles, n_slots = len(centres), LEAF_TRIANGLES_MAX
     while n_slots < n_triangles:
@@ -173,9 +218,25 @@ def _fill_leaves(centres: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _renumber_by_first_use(faces, triangle_order, n_vertices):
-    """Return faces in a given order with vertices renumbered by first use, and their old numbers.
+    """Reorder triangles, and renumber vertices by their first use in that order.
 
     The data of a leaf's triangles then lie together in memory.
+
+    Parameters
+    ----------
+    faces : ndarray (m, 3) int
+        Vertices of each triangle.
+    triangle_order : ndarray (m,) int
+        Index of each triangle in the new order.
+    n_vertices : int
+        Number of vertices.
+
+    Returns
+    -------
+    new_faces : ndarray (m, 3) int32
+        New numbers of the vertices of each triangle, in the new order.
+    vertex_order : ndarray (n_vertices,) int32
+        Old number of each vertex; unused vertices come last.
     """
     new_faces = np.empty((triangle_order.size, 3), np.int32)
     new_number, vertex_order = np.full(n_vertices, -1, np.int32), np.empty(n_vertices, np.int32)
@@ -196,7 +257,19 @@ def _renumber_by_first_use(faces, triangle_order, n_vertices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort_into_halves(points, order):
-    """Sort `order` of points (n, 3) so that its halves are separated in space, recursively."""
+    """Sort indices of points so that halves, and halves of halves, are separated in space.
+
+    Parameters
+    ----------
+    points : ndarray (n, 3)
+        Points.
+    order : ndarray (n,) int32
+        Indices of the points; it is sorted in place.
+
+    Notes
+    -----
+    Each part is halved along the axis of its largest extent.
+    """
     part_size = order.size
     while part_size > LEAF_TRIANGLES_MAX:
         for start in range(0, order.size, part_size):
@@ -267,49 +340,68 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
     entered if the interval of the directions may reach it. A leaf's triangles are tested against
     all rays together. If the rays spread too far, each ray traverses the tree alone.
     """
-    scratch = np.empty((3, directions.shape[1])), np.empty((6, 3)), np.empty(NODE_WIDTH)
-    stack_arrays = np.empty(_STACK_SIZE, np.int64), np.empty(_STACK_SIZE)
+    scratch = _Scratch(
+        np.empty((3, directions.shape[1])),
+        np.empty((6, 3)),
+        np.empty(CHILDREN_PER_NODE),
+        np.empty(_STACK_SIZE, np.int64),
+        np.empty(_STACK_SIZE),
+    )
     for i in range(origins.shape[0]):
         origin, bundle_directions = origins[i], directions[i]
-        walk_limits = _BUNDLE_TESTS_MAX, distance_min
-        if not _walk_tree(
+        if not _traverse_tree(
             tree,
             origin,
             bundle_directions,
             distance[i],
             face_index[i],
             scratch,
-            stack_arrays,
-            walk_limits,
+            _BUNDLE_TESTS_MAX,
+            distance_min,
         ):
             for beamlet in range(bundle_directions.shape[0]):
                 ray_slice = slice(beamlet, beamlet + 1)
-                walk_limits = _UNLIMITED_TESTS, distance_min
-                _walk_tree(
+                _traverse_tree(
                     tree,
                     origin,
                     bundle_directions[ray_slice],
                     distance[i, ray_slice],
                     face_index[i, ray_slice],
                     scratch,
-                    stack_arrays,
-                    walk_limits,
+                    _UNLIMITED_TESTS,
+                    distance_min,
                 )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_arrays, walk_limits):
+def _traverse_tree(
+    tree, origin, directions, distance, face_index, scratch, tests_max, distance_min
+):
     """Find the nearest triangles of all rays of a bundle in one traversal; return False if aborted.
 
-    After an abort, the results include all triangles tested so far, so that single rays can
-    continue. `walk_limits` are the number of triangles that may be tested, and the least distance
-    of a hit.
+    Parameters
+    ----------
+    tree : BoxTree
+        Tree of a mesh.
+    origin : ndarray (3,)
+        Origin of the bundle in the tree's frame [m].
+    directions : ndarray (b, 3)
+        Directions of the rays.
+    distance, face_index : ndarray (b,)
+        Nearest known distance and triangle of each ray; they are replaced if a triangle is nearer.
+        After an abort they include all triangles tested so far, so that single rays can continue.
+    scratch : _Scratch
+        Arrays to work in.
+    tests_max : int
+        Number of triangles after which the traversal is aborted.
+    distance_min : float
+        Smallest distance of a hit, in lengths of the direction.
     """
-    bounds, children, tree_faces, triangle_order, vertices = tree
-    shears, planes, child_entry = scratch
-    node_stack, entry_stack = stack_arrays
-    tests_left, distance_min = walk_limits
-    axis = _prepare_bundle(directions, shears, planes)
+    bounds, children, tree_faces, vertices = tree.bounds, tree.children, tree.faces, tree.vertices
+    shears, child_entry = scratch.shears, scratch.child_entry
+    node_stack, entry_stack = scratch.node_stack, scratch.entry_stack
+    tests_left = tests_max
+    axis = _prepare_bundle(directions, shears, scratch.box_test)
     if axis < 0:
         return False
     kx, ky = (axis + 1) % 3, (axis + 2) % 3
@@ -328,10 +420,13 @@ def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_ar
             continue
         if node >= 0:
             _box_entry_distances(
-                bounds, node, origin[0], origin[1], origin[2], planes, farthest_hit, child_entry
-            )
+                bounds, node, origin[_X], origin[_Y], origin[_Z], scratch.box_test, farthest_hit,
+                child_entry,
+            )  # fmt: skip
             stack_base = top
-            for child in range(NODE_WIDTH):  # push the boxes that may be entered, the nearest last
+            for child in range(
+                CHILDREN_PER_NODE
+            ):  # push the boxes that may be entered, the nearest last
                 if child_entry[child] < np.inf:
                     slot = top
                     while slot > stack_base and entry_stack[slot - 1] < child_entry[child]:
@@ -346,11 +441,11 @@ def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_ar
         start, count = (-1 - node) >> 3, (-1 - node) & 7
         for triangle in range(start, start + count):
             p, q, r = tree_faces[triangle, 0], tree_faces[triangle, 1], tree_faces[triangle, 2]
-            _test_triangle(
+            _intersect_triangle(
                 (vertices[p, kx] - ox, vertices[p, ky] - oy, vertices[p, axis] - oz),
                 (vertices[q, kx] - ox, vertices[q, ky] - oy, vertices[q, axis] - oz),
                 (vertices[r, kx] - ox, vertices[r, ky] - oy, vertices[r, axis] - oz),
-                triangle_order[triangle], shears, distance_min, distance, face_index,
+                tree.mesh_face_index[triangle], shears, distance_min, distance, face_index,
             )  # fmt: skip
         is_known = False
         tests_left -= count
@@ -360,43 +455,46 @@ def _walk_tree(tree, origin, directions, distance, face_index, scratch, stack_ar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _prepare_bundle(directions, shears, planes):
-    """Return the axis of the largest component of all directions, -1 if they differ; fill tables.
+def _prepare_bundle(directions, shears, box_test):
+    """Compute the constants of a bundle's tests, and return the axis of its directions.
+
+    The axis is that of the largest component of every direction; -1 if the directions differ in it.
 
     Parameters
     ----------
     directions : ndarray (b, 3)
         Directions of the rays.
     shears : ndarray (3, >= b)
-        Filled with the directions' other two components, in cyclic order, over the largest, and 1
-        over the largest.
-    planes : ndarray (6, 3)
-        Filled with the constants of the box test for each axis, for directions between `low` and
-        `high` along it.
+        The result for triangles: the directions' other two components, in cyclic order, over the
+        largest, and 1 over the largest.
+    box_test : ndarray (6, 3)
+        The result for boxes: constants for each coordinate axis, for all directions between `low`
+        and `high` along it.
 
     Notes
     -----
     The rays o + t d can lie between the box's lower and upper plane only if t high >= lower - o and
     t low <= upper - o. Each condition bounds t from below or from above, by the sign of its factor.
-    The first two rows of `planes` are the reciprocals of the factors. The others are added to make
-    the two bounds idle, from below and from above.
+    The first two rows of `box_test` are the reciprocals 1 / high and 1 / low. The other rows are 0,
+    or infinite. They are added to the two quotients, so that a condition that does not bound t from
+    below (rows 3 and 4), or from above (rows 5 and 6), has no effect there.
     """
     axis = -1
     for beamlet in range(directions.shape[0]):
         x, y, z = (
-            abs(directions[beamlet, 0]),
-            abs(directions[beamlet, 1]),
-            abs(directions[beamlet, 2]),
+            abs(directions[beamlet, _X]),
+            abs(directions[beamlet, _Y]),
+            abs(directions[beamlet, _Z]),
         )
-        largest_component = 0 if x >= y and x >= z else (1 if y >= z else 2)
+        largest_component = _X if x >= y and x >= z else (_Y if y >= z else _Z)
         if beamlet > 0 and largest_component != axis:
             return -1
         axis = largest_component
     for beamlet in range(directions.shape[0]):
         reciprocal = 1.0 / directions[beamlet, axis]
-        shears[0, beamlet] = directions[beamlet, (axis + 1) % 3] * reciprocal
-        shears[1, beamlet] = directions[beamlet, (axis + 2) % 3] * reciprocal
-        shears[2, beamlet] = reciprocal
+        shears[_SHEAR_X, beamlet] = directions[beamlet, (axis + 1) % 3] * reciprocal
+        shears[_SHEAR_Y, beamlet] = directions[beamlet, (axis + 2) % 3] * reciprocal
+        shears[_RECIPROCAL, beamlet] = reciprocal
     for component in range(3):
         low = high = directions[0, component]
         for beamlet in range(1, directions.shape[0]):
@@ -406,48 +504,111 @@ def _prepare_bundle(directions, shears, planes):
             )
         low_nonzero = -_DIRECTION_MIN if abs(low) < _DIRECTION_MIN else low
         high_nonzero = _DIRECTION_MIN if abs(high) < _DIRECTION_MIN else high
-        planes[0, component], planes[1, component] = 1.0 / high_nonzero, 1.0 / low_nonzero
-        planes[2, component] = 0.0 if high_nonzero > 0.0 else -np.inf
-        planes[3, component] = 0.0 if low_nonzero < 0.0 else -np.inf
-        planes[4, component] = 0.0 if high_nonzero < 0.0 else np.inf
-        planes[5, component] = 0.0 if low_nonzero > 0.0 else np.inf
+        box_test[_RECIPROCAL_HIGH, component] = 1.0 / high_nonzero
+        box_test[_RECIPROCAL_LOW, component] = 1.0 / low_nonzero
+        box_test[_NEAR_TERM_HIGH, component] = 0.0 if high_nonzero > 0.0 else -np.inf
+        box_test[_NEAR_TERM_LOW, component] = 0.0 if low_nonzero < 0.0 else -np.inf
+        box_test[_FAR_TERM_HIGH, component] = 0.0 if high_nonzero < 0.0 else np.inf
+        box_test[_FAR_TERM_LOW, component] = 0.0 if low_nonzero > 0.0 else np.inf
     return axis
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _box_entry_distances(bounds, node, ox, oy, oz, planes, distance_max, child_entry):
-    """Compute the smallest distance at which rays may enter each child's box; inf if none can."""
+def _box_entry_distances(bounds, node, ox, oy, oz, box_test, distance_max, child_entry):
+    """Compute the smallest distance at which rays of a bundle may enter each child's box.
+
+    Parameters
+    ----------
+    bounds : ndarray (nodes, 6, 8)
+        Field of :class:`BoxTree`.
+    node : int
+        Node whose children are tested.
+    ox, oy, oz : float
+        Origin of the rays [m].
+    box_test : ndarray (6, 3)
+        Result of :func:`_prepare_bundle`.
+    distance_max : float
+        Boxes at larger distances are not entered.
+    child_entry : ndarray (8,)
+        The result: distances in lengths of the direction, inf for a box that no ray can enter.
+    """
     # Scalars, not an array: the compiler could not exclude that `child_entry` overlaps with it.
-    rx, ry, rz = planes[0, 0], planes[0, 1], planes[0, 2]
-    sx, sy, sz = planes[1, 0], planes[1, 1], planes[1, 2]
-    bx, by, bz = planes[2, 0], planes[2, 1], planes[2, 2]
-    cx, cy, cz = planes[3, 0], planes[3, 1], planes[3, 2]
-    fx, fy, fz = planes[4, 0], planes[4, 1], planes[4, 2]
-    gx, gy, gz = planes[5, 0], planes[5, 1], planes[5, 2]
+    high_x, high_y, high_z = (
+        box_test[_RECIPROCAL_HIGH, _X],
+        box_test[_RECIPROCAL_HIGH, _Y],
+        box_test[_RECIPROCAL_HIGH, _Z],
+    )
+    low_x, low_y, low_z = (
+        box_test[_RECIPROCAL_LOW, _X],
+        box_test[_RECIPROCAL_LOW, _Y],
+        box_test[_RECIPROCAL_LOW, _Z],
+    )
+    near_high_x, near_high_y, near_high_z = (
+        box_test[_NEAR_TERM_HIGH, _X],
+        box_test[_NEAR_TERM_HIGH, _Y],
+        box_test[_NEAR_TERM_HIGH, _Z],
+    )
+    near_low_x, near_low_y, near_low_z = (
+        box_test[_NEAR_TERM_LOW, _X],
+        box_test[_NEAR_TERM_LOW, _Y],
+        box_test[_NEAR_TERM_LOW, _Z],
+    )
+    far_high_x, far_high_y, far_high_z = (
+        box_test[_FAR_TERM_HIGH, _X],
+        box_test[_FAR_TERM_HIGH, _Y],
+        box_test[_FAR_TERM_HIGH, _Z],
+    )
+    far_low_x, far_low_y, far_low_z = (
+        box_test[_FAR_TERM_LOW, _X],
+        box_test[_FAR_TERM_LOW, _Y],
+        box_test[_FAR_TERM_LOW, _Z],
+    )
     for child in range(child_entry.size):  # a constant bound would not be vectorised
-        x0, x1 = (bounds[node, 0, child] - ox) * rx, (bounds[node, 3, child] - ox) * sx
-        y0, y1 = (bounds[node, 1, child] - oy) * ry, (bounds[node, 4, child] - oy) * sy
-        z0, z1 = (bounds[node, 2, child] - oz) * rz, (bounds[node, 5, child] - oz) * sz
-        near_x, far_x = _larger(x0 + bx, x1 + cx), _smaller(x0 + fx, x1 + gx)
-        near_y, far_y = _larger(y0 + by, y1 + cy), _smaller(y0 + fy, y1 + gy)
-        near_z, far_z = _larger(z0 + bz, z1 + cz), _smaller(z0 + fz, z1 + gz)
+        lower_x = (bounds[node, _LOW_X, child] - ox) * high_x
+        upper_x = (bounds[node, _HIGH_X, child] - ox) * low_x
+        lower_y = (bounds[node, _LOW_Y, child] - oy) * high_y
+        upper_y = (bounds[node, _HIGH_Y, child] - oy) * low_y
+        lower_z = (bounds[node, _LOW_Z, child] - oz) * high_z
+        upper_z = (bounds[node, _HIGH_Z, child] - oz) * low_z
+        near_x = _larger(lower_x + near_high_x, upper_x + near_low_x)
+        far_x = _smaller(lower_x + far_high_x, upper_x + far_low_x)
+        near_y = _larger(lower_y + near_high_y, upper_y + near_low_y)
+        far_y = _smaller(lower_y + far_high_y, upper_y + far_low_y)
+        near_z = _larger(lower_z + near_high_z, upper_z + near_low_z)
+        far_z = _smaller(lower_z + far_high_z, upper_z + far_low_z)
         near = _larger(_larger(near_x, near_y), _larger(near_z, 0.0))
         far = _smaller(_smaller(far_x, far_y), far_z) * _ENTRY_SLACK
         child_entry[child] = near if near <= _smaller(far, distance_max) else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _test_triangle(a, b, c, index, shears, distance_min, distance, face_index):
-    """Test one triangle against all rays of a bundle, and keep nearer hits.
+def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_index):
+    """Intersect one triangle with all rays of a bundle, and keep hits that are nearer than before.
 
-    A hit's distance is a weighted mean of the corners' depths, and so lies between them at any
-    incidence.
+    Parameters
+    ----------
+    a, b, c : tuple of float
+        Corners relative to the rays' origin [m], in the axes of the shears: the two across, then
+        the axis of the bundle.
+    index : int
+        Index of the triangle in the mesh.
+    shears : ndarray (3, b)
+        Result of :func:`_prepare_bundle`.
+    distance_min : float
+        Smallest distance of a hit.
+    distance, face_index : ndarray (b,)
+        Nearest distance and triangle of each ray; they are replaced by a nearer hit.
+
+    Notes
+    -----
+    A hit's distance is a weighted mean of the corners' depths along the axis. So it lies between
+    the depths at any incidence.
     """
     ax, ay, az = a
     bx, by, bz = b
     cx, cy, cz = c
     for i in range(distance.size):
-        sx, sy, reciprocal = shears[0, i], shears[1, i], shears[2, i]
+        sx, sy, reciprocal = shears[_SHEAR_X, i], shears[_SHEAR_Y, i], shears[_RECIPROCAL, i]
         pax, pay = ax - sx * az, ay - sy * az
         pbx, pby = bx - sx * bz, by - sy * bz
         pcx, pcy = cx - sx * cz, cy - sy * cz

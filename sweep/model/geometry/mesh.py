@@ -1,9 +1,9 @@
-"""Surfaces, meshes for ray casting, and the planes of their facets in double-double arithmetic.
+"""Triangle meshes for ray casting, their surface materials, and distances of facets along rays.
 
 A wavelength of a micrometre at kilometres of range needs the last bits of float64, and grazing
 incidence amplifies rounding. So a facet's normal, the ray's origin relative to a corner, and their
-products are carried as two float64 each (high + low, by the exact sums and products of Dekker and
-Knuth). The remaining error is the rounding of the range itself, half a unit in its last place.
+products are computed in double-double arithmetic (:mod:`sweep.model.geometry.double_double`). The
+remaining error is the rounding of the range itself, half a unit in its last place.
 """
 
 from __future__ import annotations
@@ -13,22 +13,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sweep.model.geometry.double_double import (
+    DoubleDouble,
+    cross,
+    dot,
+    multiply,
+    quick_two_sum,
+    subtract,
+)
+
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
     """Optical properties of one kind of surface."""
 
     name: str
-    """Name."""
+    """Name of the surface in the spec of the scene."""
     reflectance: float
-    """Reflectance by the definition of its law, 0..1."""
+    """Reflectance, 0..1; `reflectance_law` defines its meaning."""
     reflectance_law: str = "lambert"
     """Reflectance law, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles relative to an origin, so that large coordinates keep their digits.
+    """Triangle mesh. Vertices are relative to an origin, so large coordinates keep their digits.
 
     Raises
     ------
@@ -43,10 +52,11 @@ class Mesh:
     surface_index: np.ndarray
     """(m,) int16: index of each triangle's surface in the scene."""
     origin: np.ndarray
-    """(3,) float64 [m]: position of the vertices' zero in the frame of the scene or the body."""
+    """(3,) float64 [m]: position of the vertices' zero, in the frame of the scene or of the
+    body."""
 
     def __post_init__(self):
-        require_shapes(self.vertices, self.faces, self.surface_index)
+        require_consistent_mesh(self.vertices, self.faces, self.surface_index)
         if len(self.faces) == 0:
             raise ValueError("a mesh needs at least one triangle")
         if not np.isfinite(self.vertices).all():
@@ -80,7 +90,9 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(vertices, faces, np.concatenate([mesh.surface_index for mesh in meshes]), origin)
 
 
-def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.ndarray) -> None:
+def require_consistent_mesh(
+    vertices: np.ndarray, faces: np.ndarray, surface_index: np.ndarray
+) -> None:
     """Check that the arrays of a mesh fit together and that faces refer to existing vertices.
 
     Parameters
@@ -95,7 +107,8 @@ def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface_index: np.nd
     Raises
     ------
     ValueError
-        If they do not.
+        If shapes do not fit, indices are not integers, or a face names a vertex that does not
+        exist.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices are of shape (n, 3), not {vertices.shape}")
@@ -124,87 +137,26 @@ def exact_centre(vertices: np.ndarray) -> np.ndarray:
     return np.where(np.abs(middle) > extent, middle, 0.0)
 
 
-DoubleDouble = tuple[np.ndarray, np.ndarray]
-"""Numbers as sums of two float64, high and low; for vectors the components are along the first
-axis."""
-
-_SPLIT_FACTOR = 2.0**27 + 1
-"""Factor that splits a float64 into two of half as many digits."""
-
 _GRAZING_SINE_MAX = 1e-6
-"""Sine of the angle to a facet below which its plane may lie along the ray within rounding."""
-
-
-def to_double_double(values: np.ndarray) -> DoubleDouble:
-    """Return float64 numbers as double-doubles."""
-    return values, np.zeros_like(values)
-
-
-def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Return a sum and its rounding error."""
-    total = a + b
-    virtual_b = total - a
-    return total, (a - (total - virtual_b)) + (b - virtual_b)
-
-
-def _quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Return a sum and its rounding error, for abs(a) >= abs(b)."""
-    total = a + b
-    return total, b - (total - a)
-
-
-def _split(a: np.ndarray) -> DoubleDouble:
-    """Split numbers into two of half as many digits."""
-    scaled = a * _SPLIT_FACTOR
-    high = scaled - (scaled - a)
-    return high, a - high
-
-
-def multiply(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the product of two double-doubles."""
-    high_product = a[0] * b[0]
-    (ah, al), (bh, bl) = _split(a[0]), _split(b[0])
-    low_product = ((ah * bh - high_product) + ah * bl + al * bh) + al * bl
-    return _quick_two_sum(high_product, low_product + (a[0] * b[1] + a[1] * b[0]))
-
-
-def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the sum of two double-doubles, accurate even if the high parts cancel."""
-    high_sum, high_error = _two_sum(a[0], b[0])
-    low_sum, low_error = _two_sum(a[1], b[1])
-    high_sum, high_error = _quick_two_sum(high_sum, high_error + low_sum)
-    return _quick_two_sum(high_sum, high_error + low_error)
-
-
-def subtract(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the difference of two double-doubles."""
-    return add(a, (-b[0], -b[1]))
-
-
-def dot(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the scalar product of two vectors.
-
-    For a vector (3, 1, n) and a matrix (3, 3, n) it is their product, a vector (3, n).
-    """
-    x, y, z = zip(*multiply(a, b), strict=True)
-    return add(add(x, y), z)
-
-
-def _cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
-    """Return the vector product of two vectors."""
-    (ay, az), (by, bz) = (
-        [(v[0][axes], v[1][axes]) for axes in ([1, 2, 0], [2, 0, 1])] for v in (a, b)
-    )
-    return subtract(multiply(ay, bz), multiply(az, by))
+"""Sine of the angle between a ray and a facet, up to which rounding may make the ray lie in the
+facet's plane."""
 
 
 def facet_normals(corners: np.ndarray) -> DoubleDouble:
-    """Compute normals (3, n) of facets, oriented by their winding, with lengths of twice the areas.
+    """Compute the normals of facets, with lengths of twice the facets' areas.
 
-    `corners` (3, 3, n) are x, y, z of the first, second and third corner.
+    Parameters
+    ----------
+    corners : ndarray (3, 3, n)
+        Corners of n facets [m]: first, second and third corner; x, y, z; facet.
+
+    Returns
+    -------
+    DoubleDouble (3, n)
+        x, y, z of each normal [m^2], oriented by the facet's winding.
     """
-    a, b, c = (to_double_double(corner) for corner in corners)
-    return _cross(subtract(b, a), subtract(c, a))
+    first, second, third = (DoubleDouble.from_float64(corner) for corner in corners)
+    return cross(subtract(second, first), subtract(third, first))
 
 
 def plane_distances(
@@ -219,11 +171,12 @@ def plane_distances(
     Parameters
     ----------
     corners : ndarray (3, 3, n)
-        x, y, z of the facets' first, second and third corner [m].
+        Corners of the facets [m], as of :func:`facet_normals`.
     facet_normal : DoubleDouble (3, n)
-        Normals of the facets.
+        Normals of the facets, as of :func:`facet_normals`.
     plane_height : DoubleDouble (n,)
-        Product of the normals with a corner minus the origin.
+        Scalar product of each normal with the vector from the ray's origin to the facet's first
+        corner.
     ray_origin, ray_direction : DoubleDouble (3, n)
         Origins [m] and directions of the rays.
 
@@ -239,33 +192,31 @@ def plane_distances(
     """
     normal_speed = dot(facet_normal, ray_direction)
     with np.errstate(all="ignore"):  # rays parallel to a plane
-        distance_high = plane_height[0] / normal_speed[0]
-        remainder, distance_low = subtract(
-            plane_height, multiply(to_double_double(distance_high), normal_speed)
+        quotient = plane_height.high / normal_speed.high
+        remainder = subtract(
+            plane_height, multiply(DoubleDouble.from_float64(quotient), normal_speed)
         )
-        distance_high, distance_low = _quick_two_sum(
-            distance_high, (remainder + distance_low) / normal_speed[0]
-        )
-    x, y, z = np.abs(facet_normal[0])
-    grazing_facets = np.flatnonzero(~(np.abs(normal_speed[0]) > _GRAZING_SINE_MAX * (x + y + z)))
+        distance = quick_two_sum(quotient, (remainder.high + remainder.low) / normal_speed.high)
+    x, y, z = np.abs(facet_normal.high)
+    grazing_facets = np.flatnonzero(~(np.abs(normal_speed.high) > _GRAZING_SINE_MAX * (x + y + z)))
     if grazing_facets.size:
-        grazing_origin, grazing_direction = (
-            (ray_origin[0][:, grazing_facets], ray_origin[1][:, grazing_facets]),
-            ray_direction[0][:, grazing_facets],
+        grazing_origin = DoubleDouble(
+            ray_origin.high[:, grazing_facets], ray_origin.low[:, grazing_facets]
         )
-        length = grazing_direction[0] ** 2 + grazing_direction[1] ** 2 + grazing_direction[2] ** 2
+        x, y, z = grazing_direction = ray_direction.high[:, grazing_facets]
+        squared_length = x**2 + y**2 + z**2
         corner_distances = []
         for corner in corners[:, :, grazing_facets]:
-            x, y, z = subtract(to_double_double(corner), grazing_origin)[0] * grazing_direction
-            corner_distances.append((x + y + z) / length)
+            from_origin = subtract(DoubleDouble.from_float64(corner), grazing_origin).high
+            x, y, z = from_origin * grazing_direction
+            corner_distances.append((x + y + z) / squared_length)
         nearest, farthest = np.min(corner_distances, axis=0), np.max(corner_distances, axis=0)
-        outside = ~(
-            (distance_high[grazing_facets] >= nearest) & (distance_high[grazing_facets] <= farthest)
+        grazing_distance = distance.high[grazing_facets]
+        is_outside = ~((grazing_distance >= nearest) & (grazing_distance <= farthest))
+        distance.low[grazing_facets[is_outside]] = 0.0
+        distance.high[grazing_facets] = np.where(
+            is_outside,
+            np.where(grazing_distance < nearest, nearest, farthest),
+            grazing_distance,
         )
-        distance_low[grazing_facets[outside]] = 0.0
-        distance_high[grazing_facets] = np.where(
-            outside,
-            np.where(distance_high[grazing_facets] < nearest, nearest, farthest),
-            distance_high[grazing_facets],
-        )
-    return distance_high, distance_low
+    return distance

@@ -1,6 +1,6 @@
-"""Unit quaternions (w, x, y, z) as rotations from the body to the world frame.
+"""Unit quaternions (w, x, y, z), which are rotations from the body's frame to the world's.
 
-All functions broadcast over leading dimensions. `multiply(p, q)` rotates by q first, then by p.
+All functions broadcast over leading dimensions.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ _SMALL_HALF_ANGLE = 1e-4
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the Hamilton product p q, (..., 4)."""
+    """Return the Hamilton product p q, (..., 4): the rotation by q first, then by p."""
     pw, px, py, pz = np.moveaxis(np.asarray(p, float), -1, 0)
     qw, qx, qy, qz = np.moveaxis(np.asarray(q, float), -1, 0)
     return np.stack(
@@ -27,12 +27,12 @@ def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def conjugate(q: np.ndarray) -> np.ndarray:
-    """Return the inverse of a unit quaternion, (..., 4)."""
+    """Return the conjugate of quaternions, (..., 4): the inverse rotation of a unit quaternion."""
     return np.asarray(q, float) * [1.0, -1.0, -1.0, -1.0]
 
 
 def normalise(q: np.ndarray) -> np.ndarray:
-    """Return the quaternion scaled to length 1, (..., 4).
+    """Scale quaternions (..., 4) to length 1.
 
     Raises
     ------
@@ -47,14 +47,17 @@ def normalise(q: np.ndarray) -> np.ndarray:
 
 
 def rotate(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate vectors (..., 3) by unit quaternions, from body to world."""
+    """Rotate vectors (..., 3) by unit quaternions q (..., 4), from body to world."""
     q, vector = np.asarray(q, float), np.asarray(vector, float)
     doubled_cross = 2 * np.cross(q[..., 1:], vector)
     return np.asarray(vector + q[..., :1] * doubled_cross + np.cross(q[..., 1:], doubled_cross))
 
 
 def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
-    """Return the rotation about `vector` by its length [rad], (..., 4)."""
+    """Convert rotation vectors (..., 3) [rad] to unit quaternions (..., 4).
+
+    A rotation vector points along the axis. Its length is the angle, right-handed.
+    """
     vector = np.asarray(vector, float)
     half_angle = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
     is_small = half_angle < _SMALL_HALF_ANGLE
@@ -64,7 +67,10 @@ def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def to_rotation_vector(q: np.ndarray) -> np.ndarray:
-    """Return the rotation vector [rad] of the shorter rotation, of length 0..pi, (..., 3)."""
+    """Convert unit quaternions (..., 4) to rotation vectors (..., 3) [rad] of length 0..pi.
+
+    Both q and -q give the shorter of the two rotations.
+    """
     q = np.asarray(q, float)
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -76,8 +82,11 @@ def to_rotation_vector(q: np.ndarray) -> np.ndarray:
     )
 
 
-def axis_angle(axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """Return the right-handed rotation by `angle` [rad] about axis 0, 1, 2 (x, y, z), (..., 4)."""
+def from_axis_angle(axis: int, angle: np.ndarray | float) -> np.ndarray:
+    """Return the right-handed rotation by an angle [rad] about one axis, (..., 4).
+
+    `axis` is 0, 1 or 2 for x, y or z.
+    """
     half_angle = 0.5 * np.asarray(angle, float)
     q = np.zeros((*half_angle.shape, 4))
     q[..., 0] = np.cos(half_angle)
@@ -91,16 +100,18 @@ def from_heading(
     pitch: np.ndarray | float = 0.0,
     roll: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Return the attitude of a body (x forward, y left, z up) from angles, (..., 4).
+    """Return the attitude of a body (x forward, y left, z up) from three angles, (..., 4).
 
     Parameters
     ----------
     heading : ndarray or float
         Angle of the forward axis from the world's x, counter-clockwise from above [rad].
     pitch : ndarray or float
-        Angle by which the nose is then raised [rad], a right-handed rotation about -y.
+        Angle by which the nose is raised after that [rad], a right-handed rotation about -y.
     roll : ndarray or float
         Angle by which the left side is raised last [rad], a right-handed rotation about x.
     """
-    heading_and_pitch = multiply(axis_angle(2, heading), axis_angle(1, -np.asarray(pitch, float)))
-    return multiply(heading_and_pitch, axis_angle(0, roll))
+    heading_and_pitch = multiply(
+        from_axis_angle(2, heading), from_axis_angle(1, -np.asarray(pitch, float))
+    )
+    return multiply(heading_and_pitch, from_axis_angle(0, roll))

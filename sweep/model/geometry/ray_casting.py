@@ -1,10 +1,11 @@
 """Ray casting at rigid bodies: the first hit of each ray, its range and incidence.
 
-Coordinates are taken relative to a mesh's own origin exactly. Tests without gaps between neighbours
-find the nearest triangle (:mod:`sweep.model.geometry.bvh`). Its plane is intersected in twice
-float64's precision (:mod:`sweep.model.geometry.mesh`). So a range is the exact one for the given
-numbers, rounded once, which at 2 km is 1e-6 rad of optical phase. Rays are transformed to the frame
-of a moving body, so its mesh is never rebuilt.
+Coordinates are taken relative to a mesh's own origin exactly. The nearest triangle is found by
+tests that leave no gap between neighbouring triangles (:mod:`sweep.model.geometry.bvh`). The
+distance of its plane is computed in twice float64's precision (:mod:`sweep.model.geometry.mesh`).
+So a range is exact for the given numbers, except for one rounding. At 2 km this rounding is 1e-6
+rad of optical phase. Rays are transformed to the frame of a moving body, so its mesh is never
+rebuilt.
 """
 
 from collections.abc import Sequence
@@ -15,14 +16,8 @@ from numpy.typing import ArrayLike
 
 from sweep.model.geometry import quaternion
 from sweep.model.geometry.bvh import build_tree, find_nearest_triangles
-from sweep.model.geometry.mesh import (
-    Mesh,
-    dot,
-    facet_normals,
-    plane_distances,
-    subtract,
-    to_double_double,
-)
+from sweep.model.geometry.double_double import DoubleDouble, dot, subtract
+from sweep.model.geometry.mesh import Mesh, facet_normals, plane_distances
 
 _RAYS_PER_BATCH = 4096
 """Number of rays processed together, so that intermediate results stay in the cache."""
@@ -38,7 +33,7 @@ class Pose(NamedTuple):
 
 
 class BundleHits(NamedTuple):
-    """First hits of the beamlets of each bundle."""
+    """First hits of n bundles of b beamlets."""
 
     range: np.ndarray
     """(n,) float64 [m]: range R_0 of the reference beamlet, inf if all miss."""
@@ -48,7 +43,7 @@ class BundleHits(NamedTuple):
     """(n, 3) float64: unit normal where the reference beamlet hits, towards the origin; nan if all
     miss."""
     range_offset: np.ndarray
-    """(n, b) float64 [m]: R_b - R_0 with all its digits, nan for a miss."""
+    """(n, b) float64 [m]: R_b - R_0, without the rounding of either range; nan for a miss."""
     is_hit: np.ndarray
     """(n, b) bool: True if the beamlet hits a body."""
     cos_incidence: np.ndarray
@@ -76,7 +71,7 @@ class RayCaster:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the bodies' triangles and trees [bytes]."""
+        """Memory that the bodies' triangles and trees take [bytes]."""
         mesh_bytes = sum(
             mesh.vertices.nbytes + mesh.faces.nbytes + mesh.surface_index.nbytes
             for mesh in self.meshes
@@ -103,7 +98,7 @@ class RayCaster:
             Pose of each body; None for a body at rest in the world's frame.
         range_min : float
             Rays pass through everything nearer than this [m]. At 0, a facet on which a ray starts,
-            within rounding, may count as hit or not.
+            within rounding, may or may not count as hit.
 
         Returns
         -------
@@ -117,23 +112,20 @@ class RayCaster:
         is_hit = face_index >= 0
         reference_beamlet = np.where(is_hit.any(axis=1), is_hit.argmax(axis=1), -1)
         n_bundles, hit_bundles = len(origin), np.flatnonzero(reference_beamlet >= 0)
-        range_high, range_low, normal = (
-            np.full(n_bundles, np.inf),
-            np.zeros(n_bundles),
-            np.full((n_bundles, 3), np.nan),
-        )
-        reference_rays = hit_bundles, reference_beamlet[hit_bundles]
-        reference_hits = self._intersect(
+        range_high, range_low = np.full(n_bundles, np.inf), np.zeros(n_bundles)
+        normal = np.full((n_bundles, 3), np.nan)
+        reference_rays = _RayIndices(hit_bundles, reference_beamlet[hit_bundles])
+        reference_hits = self._intersect_facets(
             frames,
             origin,
             direction,
             reference_rays,
-            (face_index[reference_rays], body_index[reference_rays]),
+            _HitFacets(face_index[reference_rays], body_index[reference_rays]),
         )
-        range_high[hit_bundles], range_low[hit_bundles], normal[hit_bundles], cosines = (
-            reference_hits
-        )
-        normal[hit_bundles[cosines > 0]] *= -1.0  # towards the ray's origin
+        range_high[hit_bundles] = reference_hits.range_high
+        range_low[hit_bundles] = reference_hits.range_low
+        normal[hit_bundles] = reference_hits.normal.T
+        normal[hit_bundles[reference_hits.cosine > 0]] *= -1.0  # towards the ray's origin
         # On one facet t_b - t_0 = -t_0 n.delta / (n.d_b), delta = d_b - d_0, without cancellation.
         all_bundles, (range_offset, cos_incidence) = (
             np.arange(n_bundles),
@@ -151,14 +143,18 @@ class RayCaster:
         is_other_facet = face_index != face_index[all_bundles, reference_beamlet][:, None]
         is_other_facet |= body_index != body_index[all_bundles, reference_beamlet][:, None]
         range_offset[is_other_facet] = cos_incidence[is_other_facet] = np.nan
-        other_rays = np.nonzero(is_other_facet & is_hit)
-        reference_hits = self._intersect(
-            frames, origin, direction, other_rays, (face_index[other_rays], body_index[other_rays])
+        other_rays = _RayIndices(*np.nonzero(is_other_facet & is_hit))
+        other_hits = self._intersect_facets(
+            frames,
+            origin,
+            direction,
+            other_rays,
+            _HitFacets(face_index[other_rays], body_index[other_rays]),
         )
-        range_offset[other_rays] = (reference_hits[0] - range_high[other_rays[0]]) + (
-            reference_hits[1] - range_low[other_rays[0]]
+        range_offset[other_rays] = (other_hits.range_high - range_high[other_rays.bundle]) + (
+            other_hits.range_low - range_low[other_rays.bundle]
         )
-        cos_incidence[other_rays] = reference_hits[3]
+        cos_incidence[other_rays] = other_hits.cosine
         surface_index = np.full(face_index.shape, -1, dtype=np.int16)
         for body_number, mesh in enumerate(self.meshes):
             is_body = body_index == body_number
@@ -176,42 +172,58 @@ class RayCaster:
         )
 
     def _first_hits(self, frames, origins, directions, range_min):
-        """Return the triangle and the body that each beamlet hits first, (n, b) each."""
+        """Return the triangle and body that each beamlet hits first, (n, b) each; -1 for none."""
         shape = directions.shape[:2]
         distance, face_index = np.full(shape, np.inf), np.full(shape, -1)
         body_index = np.full(shape, -1, np.int16)
         for body_number, frame in enumerate(frames):
-            found_face = np.full(shape, -1)
+            nearer_face = np.full(shape, -1)
             rays = frame.to_mesh_rounded(origins, directions)
-            find_nearest_triangles(self._trees[body_number], *rays, distance, found_face, range_min)
-            is_nearer = found_face >= 0
-            face_index[is_nearer], body_index[is_nearer] = found_face[is_nearer], body_number
+            find_nearest_triangles(
+                self._trees[body_number], *rays, distance, nearer_face, range_min
+            )
+            is_nearer = nearer_face >= 0
+            face_index[is_nearer], body_index[is_nearer] = nearer_face[is_nearer], body_number
         return face_index, body_index
 
-    def _intersect(self, frames, origins, directions, ray_indices, facets):
-        """Return ranges, high and low [m], normals (m, 3), and cosines between rays and normals.
+    def _intersect_facets(self, frames, origins, directions, rays, facets):
+        """Intersect m rays with the planes of the facets that they hit.
 
-        `ray_indices` are bundle and beamlet of each ray, ((m,), (m,)); `facets` are its triangle
-        and body.
+        Parameters
+        ----------
+        frames : list of _MeshFrame
+            Frame of each body.
+        origins, directions : ndarray (n, 3), (n, b, 3)
+            All bundles of rays, in the world's frame.
+        rays : _RayIndices
+            The m rays.
+        facets : _HitFacets
+            The facet that each of these rays hits.
+
+        Returns
+        -------
+        _FacetIntersections
         """
-        results = np.empty((6, len(ray_indices[0])))
+        intersections = _FacetIntersections.empty(rays.bundle.size)
         for body_number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
-            hit_places = np.flatnonzero(facets[1] == body_number)
-            for batch_start in range(0, len(hit_places), _RAYS_PER_BATCH):
-                batch = hit_places[batch_start : batch_start + _RAYS_PER_BATCH]
-                bundle, beamlet = ray_indices[0][batch], ray_indices[1][batch]
-                results[:, batch] = _intersect_mesh(
+            rays_of_body = np.flatnonzero(facets.body_index == body_number)
+            for batch_start in range(0, len(rays_of_body), _RAYS_PER_BATCH):
+                batch = rays_of_body[batch_start : batch_start + _RAYS_PER_BATCH]
+                bundle, beamlet = rays.bundle[batch], rays.beamlet[batch]
+                batch_intersections = _intersect_mesh(
                     mesh,
                     frame,
                     bundle,
                     origins[bundle],
                     directions[bundle, beamlet],
-                    facets[0][batch],
+                    facets.face_index[batch],
                 )
-        return results[0], results[1], results[2:5].T, results[5]
+                for values, batch_values in zip(intersections, batch_intersections, strict=True):
+                    values[..., batch] = batch_values
+        return intersections
 
     def _mesh_frames(self, poses, n_bundles):
-        """Return the frame of each body for its pose."""
+        """Return the :class:`_MeshFrame` of each body at its pose; None is a body at rest."""
         poses = [None] * len(self.meshes) if poses is None else poses
         return [
             _MeshFrame(
@@ -221,8 +233,44 @@ class RayCaster:
         ]
 
 
+class _RayIndices(NamedTuple):
+    """Indices of m rays in arrays (bundles, beamlets); a valid index of such an array."""
+
+    bundle: np.ndarray
+    """(m,) int64: bundle of each ray."""
+    beamlet: np.ndarray
+    """(m,) int64: beamlet of each ray."""
+
+
+class _HitFacets(NamedTuple):
+    """Facets that m rays hit."""
+
+    face_index: np.ndarray
+    """(m,) int64: triangle in the body's mesh."""
+    body_index: np.ndarray
+    """(m,) int16: body."""
+
+
+class _FacetIntersections(NamedTuple):
+    """Intersections of m rays with the planes of facets."""
+
+    range_high: np.ndarray
+    """(m,): range, rounded to float64 [m]."""
+    range_low: np.ndarray
+    """(m,): remainder of that rounding [m]."""
+    normal: np.ndarray
+    """(3, m): unit normal of the facet in the world's frame, oriented by its winding."""
+    cosine: np.ndarray
+    """(m,): scalar product of the ray's direction and the normal, -1..1."""
+
+    @classmethod
+    def empty(cls, n_rays: int) -> "_FacetIntersections":
+        """Return uninitialised arrays for `n_rays` rays."""
+        return cls(np.empty(n_rays), np.empty(n_rays), np.empty((3, n_rays)), np.empty(n_rays))
+
+
 class _MeshFrame(NamedTuple):
-    """Frame of a mesh, for n rays or bundles."""
+    """Transformation from the world's frame to a mesh's own, for n bundles of rays."""
 
     mesh_origin: np.ndarray
     """(3,): the mesh's own origin in the body's frame [m]."""
@@ -232,37 +280,48 @@ class _MeshFrame(NamedTuple):
     """(n, 3): position of the body [m]; None if the body's frame is the world's."""
 
     def to_mesh_origins(self, origins, ray_rows):
-        """Return origins (m, 3) in the mesh's frame as double-doubles (3, m).
+        """Transform origins of m rays to the mesh's frame.
 
-        `ray_rows` (m,) are the rows of the rays in rotation and position.
+        Parameters
+        ----------
+        origins : ndarray (m, 3)
+            Origins in the world's frame [m].
+        ray_rows : ndarray (m,) int
+            Row of each ray in `rotation` and `position`.
+
+        Returns
+        -------
+        DoubleDouble (3, m)
         """
-        world_origin, mesh_origin = (
-            to_double_double(origins.T),
-            to_double_double(self.mesh_origin[:, None]),
-        )
+        world_origin = DoubleDouble.from_float64(origins.T)
+        mesh_origin = DoubleDouble.from_float64(self.mesh_origin[:, None])
         if self.rotation is None:
             return subtract(world_origin, mesh_origin)
-        from_body = subtract(world_origin, to_double_double(self.position[ray_rows].T))
-        return subtract(self._rotate_back(from_body, ray_rows), mesh_origin)
+        from_body = subtract(world_origin, DoubleDouble.from_float64(self.position[ray_rows].T))
+        return subtract(self._rotate_to_body(from_body, ray_rows), mesh_origin)
 
     def to_mesh_directions(self, directions, ray_rows):
-        """Return directions (m, 3) in the mesh's frame as double-doubles (3, m)."""
-        world_direction = to_double_double(directions.T)
+        """Transform directions (m, 3) to the mesh's frame, DoubleDouble (3, m).
+
+        `ray_rows` are as in :meth:`to_mesh_origins`.
+        """
+        world_direction = DoubleDouble.from_float64(directions.T)
         return (
             world_direction
             if self.rotation is None
-            else self._rotate_back(world_direction, ray_rows)
+            else self._rotate_to_body(world_direction, ray_rows)
         )
 
-    def _rotate_back(self, vector, ray_rows):
-        """Rotate vectors from the world's frame to the body's."""
+    def _rotate_to_body(self, vector, ray_rows):
+        """Rotate vectors (3, m) of double-doubles from the world's frame to the body's."""
         rotations = self.rotation[ray_rows].transpose(1, 2, 0)
-        return dot((vector[0][:, None], vector[1][:, None]), to_double_double(rotations))
+        vector_column = DoubleDouble(vector.high[:, None], vector.low[:, None])
+        return dot(vector_column, DoubleDouble.from_float64(rotations))
 
     def to_mesh_rounded(self, origins, directions):
-        """Return origins (n, 3) and directions (n, b, 3) in the mesh's frame, as float64."""
+        """Transform origins (n, 3) and directions (n, b, 3) to the mesh's frame, as float64."""
         n_bundles, n_beamlets = directions.shape[:2]
-        mesh_origins = self.to_mesh_origins(origins, np.arange(n_bundles))[0].T
+        mesh_origins = self.to_mesh_origins(origins, np.arange(n_bundles)).high.T
         if self.rotation is not None:
             flat_directions, ray_rows = (
                 directions.reshape(-1, 3),
@@ -273,7 +332,7 @@ class _MeshFrame(NamedTuple):
                 for batch_start in range(0, n_bundles * n_beamlets, _RAYS_PER_BATCH)
             ]
             rotated = [
-                self.to_mesh_directions(flat_directions[batch], ray_rows[batch])[0].T
+                self.to_mesh_directions(flat_directions[batch], ray_rows[batch]).high.T
                 for batch in batches
             ]
             directions = np.concatenate([*rotated, np.empty((0, 3))]).reshape(directions.shape)
@@ -282,40 +341,57 @@ class _MeshFrame(NamedTuple):
         return np.ascontiguousarray(mesh_origins), directions
 
     def to_world(self, vector, ray_rows):
-        """Return vectors (3, m) in the world's frame."""
+        """Rotate vectors (3, m) from the body's frame to the world's."""
         if self.rotation is None:
             return vector
-        x, y, z = self.rotation[ray_rows].transpose(2, 1, 0)
-        return x * vector[0] + y * vector[1] + z * vector[2]
+        x_axis, y_axis, z_axis = self.rotation[ray_rows].transpose(2, 1, 0)
+        x, y, z = vector
+        return x_axis * x + y_axis * y + z_axis * z
 
 
 def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
-    """Return the results of `RayCaster._intersect` for rays that hit one body, as rows (6, m)."""
+    """Intersect m rays with the planes of facets of one mesh.
+
+    Parameters
+    ----------
+    mesh, frame : Mesh, _MeshFrame
+        Mesh, and its frame.
+    bundle : ndarray (m,) int
+        Bundle of each ray.
+    origins, directions : ndarray (m, 3)
+        Rays in the world's frame.
+    face_index : ndarray (m,) int
+        Facet of each ray.
+
+    Returns
+    -------
+    _FacetIntersections
+    """
     starts_facet = np.ones(len(bundle), bool)  # successive rays may hit the same facet
     starts_facet[1:] = (np.diff(bundle) != 0) | (np.diff(face_index) != 0)
     first_ray, facet_of_ray = np.flatnonzero(starts_facet), np.cumsum(starts_facet) - 1
     corners = mesh.vertices[mesh.faces[face_index[first_ray]]].transpose(1, 2, 0)
+    first_corner, _, _ = corners
     ray_origin = frame.to_mesh_origins(origins[first_ray], bundle[first_ray])
     normal = facet_normals(corners)
-    plane_height = dot(normal, subtract(to_double_double(corners[0]), ray_origin))
-    length = np.sqrt(
-        normal[0][0] * normal[0][0] + normal[0][1] * normal[0][1] + normal[0][2] * normal[0][2]
-    )
-    unit_normal = frame.to_world(normal[0] / length, bundle[first_ray])[:, facet_of_ray]
+    plane_height = dot(normal, subtract(DoubleDouble.from_float64(first_corner), ray_origin))
+    x, y, z = normal.high
+    length = np.sqrt(x * x + y * y + z * z)
+    unit_normal = frame.to_world(normal.high / length, bundle[first_ray])[:, facet_of_ray]
     normal, plane_height, ray_origin = (
-        tuple(component[..., facet_of_ray] for component in pair)
-        for pair in (normal, plane_height, ray_origin)
+        DoubleDouble(values.high[..., facet_of_ray], values.low[..., facet_of_ray])
+        for values in (normal, plane_height, ray_origin)
     )
     ray_direction = frame.to_mesh_directions(directions, bundle)
-    distance_high, distance_low = plane_distances(
+    distance = plane_distances(
         corners[..., facet_of_ray], normal, plane_height, ray_origin, ray_direction
     )
     x, y, z = unit_normal * directions.T
-    return np.concatenate([[distance_high, distance_low], unit_normal, [x + y + z]])
+    return _FacetIntersections(distance.high, distance.low, unit_normal, x + y + z)
 
 
 def _pose_matrices(pose, n_bundles):
-    """Return the rotation matrices (n, 3, 3) and positions (n, 3) of a pose."""
+    """Return rotation matrices (n, 3, 3), body to world, and positions (n, 3) [m] of a pose."""
     attitude = np.atleast_2d(quaternion.normalise(pose.attitude))
     position = np.atleast_2d(np.asarray(pose.position, dtype=np.float64))
     columns = quaternion.rotate(attitude[:, None], np.eye(3))

@@ -16,12 +16,13 @@ import numpy as np
 
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
 
-JITTER_DOMAIN = "sweep.jitter"
-"""Domain of the random key, so that no other use of the same seed shares its numbers."""
+JITTER_KEY_DOMAIN = "sweep.jitter"
+"""Text in the hash of the random key of pointing jitter, so that it differs from other keys of the
+same seed."""
 
 
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
-    """Return directions evenly spaced on a cone around nadir, (n_beams, 3).
+    """Return unit vectors, evenly spaced on a cone around nadir, in the body frame, (n_beams, 3).
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
     half_angle : float
         Angle from nadir [rad].
     azimuth : float
-        Azimuth of the first beam, from forward towards the left [rad].
+        Angle of the first beam about the vertical, from forward towards the left [rad].
     """
     azimuths = azimuth + 2 * math.pi * np.arange(n_beams) / n_beams
     horizontal = math.sin(half_angle)
@@ -39,7 +40,7 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
 
 
 def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
-    """Return the directions of a two-axis beam steerer, (..., 3).
+    """Return the unit vectors of the beams of a two-axis steerer, in the body frame, (..., 3).
 
     Parameters
     ----------
@@ -48,9 +49,8 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
     Notes
     -----
-    The angle of an axis is that of the beam's projection on the plane of that axis and nadir: ``tan
-    = x / -z``. A grid of angles thus draws straight lines on level ground. Both axes at 22.5 deg
-    make 30.4 deg from nadir.
+    The direction is proportional to (tan angle_x, tan angle_y, -1). A grid of angles thus draws
+    straight lines on level ground. With both angles at 22.5 deg the beam is 30.4 deg from nadir.
     """
     x, y = np.broadcast_arrays(np.tan(angle_x), np.tan(angle_y))
     vector = np.stack([x, y, np.full(x.shape, -1.0)], axis=-1)
@@ -58,15 +58,21 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
 
 def corner_directions(angle: float) -> np.ndarray:
-    """Return the four directions with both axes at +-`angle` [rad], counter-clockwise, (4, 3)."""
+    """Return the four beams of :func:`steered_directions` with both angles at +-`angle` [rad].
+
+    Returns
+    -------
+    ndarray (4, 3)
+        Unit vectors, counter-clockwise seen from above.
+    """
     return steered_directions(angle * np.array([1, -1, -1, 1]), angle * np.array([1, 1, -1, -1]))
 
 
 def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
-    """Return the angles of an axis of n stacked steering elements [rad], ascending, (2^n,).
+    """Return all angles that a stack of n steering elements reaches [rad], ascending, (2^n,).
 
-    Each element deflects the beam to either side by its angle, and the angles add: 15 and 7.5 deg
-    make -22.5, -7.5, 7.5 and 22.5 deg.
+    Each element deflects the beam to one side or the other by its angle [rad], and deflections add.
+    Elements of 15 and 7.5 deg reach -22.5, -7.5, 7.5 and 22.5 deg.
     """
     angles = np.array([0.0])
     for element_angle in element_angles:
@@ -75,18 +81,25 @@ def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
 
 
 def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return all directions of a steerer with two axes of `stacked_angles`, sorted into squares.
+    """Return all directions of a two-axis steerer of stacked elements, sorted into squares.
 
-    A square consists of one pair of angles and its quarter turns about nadir. The widest square
-    comes first and the narrowest last, each counter-clockwise. For the two elements of [T Fig. 5.2]
-    these are the corners at 22.5 deg, the two oblique squares, and the corners at 7.5 deg.
+    Parameters
+    ----------
+    element_angles : sequence of float
+        Angles of the n elements of each axis [rad], as of :func:`stacked_angles`.
 
     Returns
     -------
     directions : ndarray (4^n, 3)
         Unit vectors, square by square.
     patterns : ndarray (4^n / 4, 4) int64
-        Beams of each square.
+        Indices of the four directions of each square.
+
+    Notes
+    -----
+    A square consists of one pair of angles and its quarter turns about nadir. The widest square
+    comes first and the narrowest last, each counter-clockwise. For the two elements of [T Fig. 5.2]
+    these are the corners at 22.5 deg, the two oblique squares, and the corners at 7.5 deg.
 
     Raises
     ------
@@ -105,7 +118,7 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
 
 
 class ScanShots(NamedTuple):
-    """Shots of a scanner."""
+    """Times and directions of n shots of a scanner."""
 
     time: np.ndarray
     """(n,): start of each measurement, from the first one of the scan [s]."""
@@ -121,20 +134,24 @@ class ScanShots(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BeamCycle:
-    """Beams at fixed angles, fired in a cycle of patterns."""
+    """Beams at fixed angles, fired in a repeated sequence of patterns."""
 
     directions: Sequence[Sequence[float]] | np.ndarray
-    """(b, 3): directions of the beams in the body frame; they are normalised."""
+    """(b, 3): directions of the beams in the body frame, of any length above 0."""
     patterns: Sequence[Sequence[int]] | np.ndarray
-    """(p, k): beams of each measurement cycle in the order of firing; cycles use the patterns in
-    turn."""
+    """(p, k): p patterns. Each measurement cycle fires the k beams of one pattern in their order,
+    and the next cycle those of the next pattern."""
     rate: float
-    """Measurement cycles per second [Hz], > 0."""
+    """Number of measurement cycles per second [Hz], > 0."""
     interval: float | None = None
     """Time from one beam of a cycle to the next [s]. 0 fires all at once (several telescopes); None
     spaces them evenly over the cycle (one steered beam)."""
-    _checked: tuple[np.ndarray, np.ndarray, float] = field(init=False, repr=False)
-    """Normalised directions, patterns as an array, and interval [s]."""
+    _unit_directions: np.ndarray = field(init=False, repr=False)
+    """(b, 3): unit vectors along `directions`."""
+    _pattern_table: np.ndarray = field(init=False, repr=False)
+    """(p, k) int64: `patterns` as an array."""
+    _shot_interval: float = field(init=False, repr=False)
+    """`interval` [s], or what follows for None."""
 
     def __post_init__(self) -> None:
         directions, patterns = np.asarray(self.directions, float), np.asarray(self.patterns)
@@ -158,37 +175,37 @@ class BeamCycle:
             raise ValueError(
                 f"{shots_per_cycle} beams {interval:g} s apart do not fit in 1/{self.rate:g} s"
             )
-        object.__setattr__(
-            self, "_checked", (directions / length, patterns.astype(np.int64), interval)
-        )
+        object.__setattr__(self, "_unit_directions", directions / length)
+        object.__setattr__(self, "_pattern_table", patterns.astype(np.int64))
+        object.__setattr__(self, "_shot_interval", interval)
 
     @property
     def n_beams(self) -> int:
         """Number of distinct beams."""
-        return len(self._checked[0])
+        return len(self._unit_directions)
 
     @property
     def beams_per_cycle(self) -> int:
         """Number of shots of a measurement cycle."""
-        return int(self._checked[1].shape[1])
+        return int(self._pattern_table.shape[1])
 
     def count_shots(self, duration: float) -> int:
         """Return the number of shots that begin within a duration [s], including its end."""
-        return _count_begun_shots(duration, self.rate, self.beams_per_cycle, self._checked[2])
+        return _count_begun_shots(duration, self.rate, self.beams_per_cycle, self._shot_interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
         """Return the shots of given numbers (n,), counted from 0."""
-        directions, patterns, interval = self._checked
+        patterns = self._pattern_table
         cycle_number, shot_in_cycle = np.divmod(
             np.asarray(shot_numbers, np.int64), self.beams_per_cycle
         )
         beam_number = patterns[cycle_number % len(patterns), shot_in_cycle]
         zero_rate = np.zeros((beam_number.size, 3))
         return ScanShots(
-            cycle_number / self.rate + shot_in_cycle * interval,
+            cycle_number / self.rate + shot_in_cycle * self._shot_interval,
             beam_number,
             cycle_number,
-            directions[beam_number],
+            self._unit_directions[beam_number],
             zero_rate,
         )
 
@@ -196,7 +213,10 @@ class BeamCycle:
 def _count_begun_shots(
     duration: float, cycle_rate: float, shots_per_cycle: int, interval: float
 ) -> int:
-    """Count the shots, `shots_per_cycle` a cycle, that begin within a duration [s] from time 0."""
+    """Count the shots that begin within a duration [s] from time 0.
+
+    Cycles have a rate [Hz] and a number of shots, which are `interval` [s] apart.
+    """
     if duration < 0:
         return 0
     # A number just below an integer counts as that integer, because times are rounded products.
@@ -213,7 +233,7 @@ def _count_begun_shots(
 def fixed_beams(
     directions: Sequence[Sequence[float]] | np.ndarray, *, rate: float, interval: float | None = 0.0
 ) -> BeamCycle:
-    """Return a cycle of beams that all fire in every measurement cycle.
+    """Return a scan pattern of beams at fixed angles that all fire in every measurement cycle.
 
     Parameters
     ----------
@@ -236,14 +256,16 @@ def raster_scan(
     rate: float,
     both_ways: bool = True,
 ) -> BeamCycle:
-    """Return a grid of directions, scanned row by row, from right to left and from aft forward.
+    """Return a scan pattern of a grid of directions, one frame in each measurement cycle.
+
+    Rows are scanned from aft forward, and each row from right to left.
 
     Parameters
     ----------
     columns, rows : int
-        Number of directions across (y) and along (x), at least 1 each.
+        Number of directions across the track (y) and along it (x), at least 1 each.
     half_angles : tuple of float
-        Largest angles from nadir across and along [rad].
+        Largest angles from nadir across and along the track [rad].
     rate : float
         Frames per second [Hz].
     both_ways : bool
@@ -260,18 +282,18 @@ def raster_scan(
 
 @dataclass(frozen=True)
 class LineScan:
-    """Parallel beams along the track, swept together from side to side."""
+    """Fan of beams along the track that a mirror sweeps together from side to side."""
 
     half_angle: float
     """Largest angle of the sweep from nadir to each side [rad], 0 <= . < pi/2."""
     line_rate: float
-    """Lines per second [Hz]; a sweep in one direction is a line."""
+    """Number of lines per second [Hz]; a sweep in one direction is a line."""
     rate: float
-    """Measurements per second of each beam [Hz]."""
+    """Number of measurements per second of each beam [Hz]."""
     along: tuple[float, ...] = (0.0,)
     """Fixed angle of each beam from nadir towards forward [rad]."""
     wave: str = "triangle"
-    """``triangle`` at a constant rate, or ``sine`` for a resonant mirror."""
+    """Sweep angle over time: ``triangle`` for a constant rate, ``sine`` for a resonant mirror."""
     interval: float = 0.0
     """Time from one beam of a measurement to the next [s]; 0 fires all at once."""
 
@@ -297,7 +319,7 @@ class LineScan:
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
         """Return the shots of given numbers (n,), counted from 0.
 
-        A cycle is one measurement of all beams.
+        A measurement cycle is one shot of each beam.
         """
         cycle_number, beam_number = np.divmod(np.asarray(shot_numbers, np.int64), self.n_beams)
         time = cycle_number / self.rate + beam_number * self.interval
@@ -326,14 +348,17 @@ class LineScan:
         )
 
     def sweep_angle(self, times: np.ndarray) -> np.ndarray:
-        """Return the sweep angle from nadir towards the left [rad]; it starts at the right."""
+        """Return the sweep angle at times [s], from nadir towards the left [rad].
+
+        The first sweep starts at the right.
+        """
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":
             return np.asarray(-self.half_angle * np.cos(math.pi * lines_scanned))
         return np.asarray(self.half_angle * (1 - 2 * np.abs(1 - lines_scanned % 2)))
 
     def sweep_rate(self, times: np.ndarray) -> np.ndarray:
-        """Return the rate of the sweep angle [rad/s]; at a turning point, the rate after it."""
+        """Return the rate of the sweep angle at times [s], in rad/s; at an end, that after it."""
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":
             return np.asarray(
@@ -344,7 +369,7 @@ class LineScan:
 
 
 ScanPattern = BeamCycle | LineScan
-"""A scan pattern."""
+"""Times and directions of a scanner's shots, by their number."""
 
 
 def beamlet_rays(
@@ -363,8 +388,8 @@ def beamlet_rays(
     axis : ndarray (n, 3)
         Directions of the beams in the body frame.
     tangent_across, tangent_along : ndarray (b,)
-        Tangents of angles off the axis towards the two vectors of :func:`transverse_axes`, in units
-        of `sigma`.
+        Tangents of the beamlets' angles off the axis, over `sigma`, towards the first and second
+        vector of :func:`transverse_axes`.
     sigma : float or ndarray (n, 1)
         Standard deviation of the beam on each axis [rad].
     """
@@ -385,10 +410,11 @@ def beamlet_rays(
 
 
 def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors across directions (n, 3): (first, second, direction) is right-handed.
+    """Return two unit vectors across each direction, (n, 3) each.
 
-    For a beam near -z the first vector lies near x. They are smooth functions of the direction
-    except near x and -x, where no beam of a downward-looking instrument points.
+    First, second and `direction` (n, 3) form a right-handed system. For a beam near -z the first
+    vector lies near x. Both are smooth functions of the direction except near x and -x, where no
+    beam of a downward-looking instrument points.
     """
     second = np.cross(direction, [1.0, 0.0, 0.0])
     length = _vector_length(second)
@@ -399,16 +425,16 @@ def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vector_length(vectors: np.ndarray) -> np.ndarray:
-    """Return the length of vectors, (..., 1)."""
+    """Return the lengths (..., 1) of vectors (..., 3)."""
     x, y, z = vectors[..., :1], vectors[..., 1:2], vectors[..., 2:]
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 class PointingJitter(NamedTuple):
-    """Random rotations of the beams, shot by shot: three independent normal angles about body axes.
+    """Random pointing errors: each shot's beams rotate about the three body axes by normal angles.
 
-    A beam in any direction is deflected by two angles across it, each of that standard deviation.
-    The third angle rotates its footprint.
+    The three angles are independent. Two of their combinations deflect a beam across its direction,
+    each with the standard deviation `sigma`. The third rotates the footprint about the beam.
     """
 
     sigma: float
@@ -417,7 +443,7 @@ class PointingJitter(NamedTuple):
     """Seed of the study, >= 0."""
 
     def perturb_attitude(self, attitude: np.ndarray, shot_numbers: np.ndarray) -> np.ndarray:
-        """Rotate the attitudes of shots at random.
+        """Rotate attitudes by the pointing errors of their shots.
 
         Parameters
         ----------
@@ -430,6 +456,7 @@ class PointingJitter(NamedTuple):
         Returns
         -------
         ndarray (n, 4)
+            Rotated quaternions.
         """
         from sweep.model.sampling.philox import (
             STREAM_POINTING_JITTER,
@@ -438,7 +465,7 @@ class PointingJitter(NamedTuple):
             uniforms,
         )
 
-        study_key = point_keys(np.empty((1, 0)), domain=JITTER_DOMAIN, seed=self.seed)
+        study_key = point_keys(np.empty((1, 0)), domain=JITTER_KEY_DOMAIN, seed=self.seed)
         keys = np.broadcast_to(
             study_key, (len(shot_numbers), 2)
         )  # the shot's number replaces that of a draw

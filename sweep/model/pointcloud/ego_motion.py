@@ -1,10 +1,10 @@
 """Motion of the instrument within a shot, as far as it is known, and the remaining errors.
 
-The beats of a shot give range and radial velocity some milliseconds after its start, with an error
-while the closing speed grows. Let the segments start at t_i, with optical frequencies f_i and chirp
-rates r_i. The middle of each record is t_c after its segment's start. The beam meets scatterers
-that close at v and accelerate at a, and ground whose range along the beam falls at u. To first
-order the beats are
+The beats of a shot give range and radial velocity some milliseconds after its start. They are wrong
+if the closing speed grows meanwhile. Let the segments start at t_i, with optical frequencies f_i
+and chirp rates r_i. The middle of each record is t_c after its segment's start. The beam meets
+scatterers that close at v and accelerate at a, and ground whose range along the beam falls at u. To
+first order the beats are
 
     f_i (2/c) (v + a (t_i + t_c)) - r_i (2/c) (R - u t_i - (v + u) t_c - a (t_i^2 + ...) / 2)
 
@@ -19,9 +19,9 @@ V.d'.
 
 **Known motion.** Inertial sensors and the scanner give the instrument its velocity V, its
 acceleration V' and the rate d' at which the beam d turns. So it knows a = V'.d + V.d' for ground at
-rest. It assumes that the ground is level (:func:`ego_motion`). A beam that points down then meets
-the ground at a range that falls by u = (V + R d').z / d.z. A beam that does not point down is
-assumed to meet a surface that faces it, along which nothing slides. Range and velocity are
+rest. It assumes that the ground is level (:func:`ego_motion_of_beams`). A beam that points down
+then meets the ground at a range that falls by u = (V + R d').z / d.z. A beam that does not point
+down is assumed to meet a surface that faces it, along which nothing slides. Range and velocity are
 corrected for both u and a.
 
 **Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor the
@@ -52,27 +52,29 @@ import numpy as np
 if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
-DESCENT_SINE_MIN = 0.05
-"""Smallest sine of the depression angle at which a beam is assumed to meet level ground."""
+DEPRESSION_SINE_MIN = 0.05
+"""Smallest sine of the angle below the horizontal at which a beam is assumed to meet level ground.
+"""
 
 
 class MotionPriors(NamedTuple):
-    """Standard deviations of the motion along its beams that an instrument does not know."""
+    """Standard deviations of slope and motion of surfaces, which an instrument does not know."""
 
     terrain_slope: float = 0.2
-    """Slope of the surface that a beam meets, relative to level ground or to a surface that faces
-    the beam."""
+    """Standard deviation of the slope of the surface that a beam meets, relative to level ground or
+    to a surface that faces the beam."""
     target_speed: float = 0.0
-    """Each component of the velocity [m/s] of the surface that a beam meets."""
+    """Standard deviation of each component of that surface's velocity [m/s]."""
     target_acceleration: float = 0.0
-    """Acceleration, along the beam, of the surface that a beam meets [m/s^2]."""
+    """Standard deviation of that surface's acceleration along the beam [m/s^2]."""
 
 
 class EgoMotion(NamedTuple):
     """Motion along n beams as the instrument knows it; arrays are (n,) unless noted."""
 
     closing_speed: np.ndarray
-    """Closing speed of ground at rest [m/s]."""
+    """Speed [m/s] at which ground at rest approaches along the beam: the instrument's velocity on
+    the beam."""
     acceleration: np.ndarray
     """Rate of change of the closing speed [m/s^2]."""
     slip: np.ndarray
@@ -93,19 +95,21 @@ class EgoMotion(NamedTuple):
     """Prior standard deviations of unknown motion."""
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the slip at ranges (n, ...) [m]: closing speed minus range decrease [m/s]."""
+        """Return the slip [m/s] at ranges (n, ...) [m], for level ground at rest."""
         slip, per_range = (
             _align_with_ranges(v, distance) for v in (self.slip, self.slip_per_range)
         )
         return np.asarray(slip + per_range * distance)
 
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the known speed [m/s] at which ranges (n, ...) [m] fall: closing less slip."""
+        """Return the speed [m/s] at which ranges (n, ...) [m] to level ground at rest fall."""
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m] by the priors.
+        """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m], by the priors.
 
+        Notes
+        -----
         sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 + slope^2)).
         """
         slope_deviation, speed_deviation, _ = self.priors
@@ -128,12 +132,18 @@ class EgoMotion(NamedTuple):
 
     @property
     def acceleration_standard_error(self) -> np.ndarray:
-        """Standard deviation of the acceleration [m/s^2], (n,)."""
+        """Standard deviation of the closing speed's rate of change by the priors [m/s^2], (n,)."""
         return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
 
 
-def ego_motion(eyepoints: Eyepoints, priors: MotionPriors = MotionPriors()) -> EgoMotion:  # noqa: B008  # a tuple
-    """Return the known motion along the commanded beams of n shots over level ground."""
+def ego_motion_of_eyepoints(
+    eyepoints: Eyepoints,
+    priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
+) -> EgoMotion:
+    """Return the motion along the commanded beams of n shots, as an instrument knows it.
+
+    The ground is assumed to be level and at rest.
+    """
     return ego_motion_of_beams(
         eyepoints.direction, eyepoints.velocity, eyepoints.direction_rate,
         eyepoints.platform_acceleration, priors,
@@ -147,7 +157,7 @@ def ego_motion_of_beams(
     acceleration: np.ndarray,
     priors: MotionPriors,
 ) -> EgoMotion:
-    """Return the known motion along n beams of a moving instrument over level ground.
+    """Return the motion along n beams of a moving instrument, as it knows it over level ground.
 
     Parameters
     ----------
@@ -166,11 +176,14 @@ def ego_motion_of_beams(
     """
     closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
     closing_speed = _row_dot(velocity, direction)
-    meets_ground = direction[:, 2] < -DESCENT_SINE_MIN
+    meets_ground = direction[:, 2] < -DEPRESSION_SINE_MIN
     direction_z = np.where(meets_ground, direction[:, 2], -1.0)
 
     def slip_gradient(vector: np.ndarray) -> np.ndarray:
-        """Return the derivative (n, 3) of the slip by the surface's gradient, for a part of W."""
+        """Return the derivative (n, 3) of the slip by the surface's gradient.
+
+        `vector` (n, 3) takes the place of W. The derivative is linear in it.
+        """
         over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
         over_ground /= direction_z[:, None] ** 2
         for_facing_surface = vector - _row_dot(vector, direction)[:, None] * direction

@@ -1,4 +1,4 @@
-"""Floor of errors: errors of an instrument that do not depend on the strength of the echo.
+"""Error floor: errors of an instrument that do not depend on the strength of the echo.
 
 There are five errors, normal with a mean of 0. Let u be a beam's direction, R and v_r the reported
 range and radial velocity, v the instrument's velocity, and v_perp its component across the beam:
@@ -39,10 +39,11 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 KEY_DOMAIN = "sweep.error_floor"
-"""Domain of the random keys of errors that are common to shots."""
+"""Text in the hash of the random keys of errors that several shots share."""
 
 INSTRUMENT_KEY_NUMBER = -1.0
-"""Number that replaces a beam number in the key of errors common to all beams."""
+"""Number that takes the place of a beam's number in the random key of errors common to all
+beams."""
 
 
 class ErrorFloor(NamedTuple):
@@ -65,11 +66,14 @@ class ErrorFloor(NamedTuple):
 
     @property
     def velocity_scale_error(self) -> float:
-        """Relative standard deviation common to all velocities."""
+        """Relative standard deviation of the error that scales all velocities of a draw."""
         return float(np.hypot(self.clock, self.wavelength))
 
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
-        """Return the standard error of radial velocities [m/s] at a speed across the beam [m/s].
+        """Return the standard errors of radial velocities [m/s] by the error floor.
+
+        `radial_velocity` and `speed_across` are the instrument's velocity along and across the beam
+        [m/s].
 
         >>> ErrorFloor(pointing=1e-3, vibration=0.03).velocity_error(0.0, 40.0).round(12).item()
         0.05
@@ -92,10 +96,10 @@ def apply_error_floor(
     seed: int,
     first_draw: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Return points with the instrument's errors in values, positions and standard errors.
+    """Add an instrument's errors to points, and to their standard errors.
 
-    Range, radial velocity and their standard errors change, both by whole bins and interpolated,
-    and the compensated velocity and position. The truth does not change.
+    Ranges and radial velocities change, both those by whole bins and those interpolated, and with
+    them standard errors, compensated velocities and positions. The truth does not change.
 
     Parameters
     ----------
@@ -111,12 +115,18 @@ def apply_error_floor(
         Seed of the study, for errors that shots share.
     first_draw
         Number of the first draw in `points`.
+
+    Returns
+    -------
+    dict of str to ndarray
+        `points` with changed arrays.
     """
     n, draws = points["flags"].shape[:2]
     draw_numbers = np.arange(first_draw, first_draw + draws)
-    clock, wavelength = _draw_beam_normals(np.array([INSTRUMENT_KEY_NUMBER]), draw_numbers, seed)[
-        0
-    ].T
+    (instrument_normals,) = _draw_beam_normals(
+        np.array([INSTRUMENT_KEY_NUMBER]), draw_numbers, seed
+    )
+    clock, wavelength = instrument_normals.T
     beam_numbers, beam_index = np.unique(eyepoints.beam, return_inverse=True)
     pointing_errors = (
         error_floor.pointing
@@ -165,7 +175,7 @@ def apply_error_floor(
 
 
 def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
-    """Return two standard normal numbers for each beam in each draw, (beams, draws, 2)."""
+    """Draw two standard normal numbers for each beam and draw, (beams, draws, 2)."""
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0
     )
@@ -181,7 +191,9 @@ def _scalar_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors (n, 3) across each direction (n, 3), which rotate steadily with it.
+    """Return two unit vectors across each direction (n, 3), which are continuous functions of it.
+
+    The three vectors are orthogonal. The result is a pair of arrays (n, 3).
 
     References
     ----------

@@ -30,18 +30,17 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 TARGET_HEIGHT_PATH = "atmosphere.target_height"
 """Path of the height of the target above the zero of atmospheric profiles [m]."""
 SOLAR_IRRADIANCE_PATH = "target.solar_irradiance"
-"""Path of the spectral irradiance of the sun on the target."""
+"""Path of the spectral irradiance of the sun on the target [W/m^3]."""
 
-RANGE_MIN = 1e-3
+HIT_RANGE_MIN = 1e-3
 """Range [m] below which rays pass through surfaces.
 
-A beam neither focuses nor falls off over so short a distance. An instrument in the plane of a wall,
-or standing on the ground, would otherwise see it at range 0, with an infinite echo.
+An instrument that stands on the ground, or in the plane of a wall, would otherwise see the surface
+at range 0, with an infinite echo.
 """
 
 _GRAZING_SINE_MIN = 0.01
-"""Lower bound on the sine of the grazing angle for the speed at which a range along a plane falls.
-"""
+"""Smallest sine of the grazing angle with which the speed is computed at which a range falls."""
 
 
 class Eyepoints(NamedTuple):
@@ -127,7 +126,7 @@ def observe_eyepoints(
     bodies_rotate: bool = True,
     footprint_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
 ) -> Eyepoints:
-    """Return the eyepoints of n shots of a flight, by ray casting.
+    """Compute the eyepoints of n shots of a flight by ray casting.
 
     Shots depend only on their number, so any part of a flight can be computed alone.
 
@@ -142,19 +141,20 @@ def observe_eyepoints(
     caster
         Ray caster of the scene.
     beam_divergence
-        Full width of the beam without `footprint_angles` [rad, between 1/e^2 points].
+        Full 1/e^2 angle of the beam [rad], if `footprint_angles` is None.
     n_beamlets, pattern
         Number and pattern of beamlets (:func:`sweep.model.beamlets.place_beamlets`).
     body_motions
         Motion of each of the caster's bodies; None for a body at rest.
     jitter
-        Random pointing of the light of each shot, unknown to the instrument: position, velocity and
-        `direction` of the result stay those commanded.
+        Random pointing of the light of each shot. The instrument does not know it, so position,
+        velocity and `direction` of the result stay those commanded.
     bodies_rotate
-        False if surfaces of rotating bodies have no velocity by the rotation.
+        False to neglect the velocity of surfaces by the rotation of their body.
     footprint_angles
-        Function of the range (n,) of the beam's axis, infinite if the axis hits nothing. It returns
-        the footprint (:func:`sweep.model.beam.footprint_angles`).
+        Function that returns the angles of the footprint, as
+        :func:`sweep.model.beam.footprint_angles`. Its argument is the range (n,) of the beam's axis
+        [m], infinite if the axis hits nothing.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def observe_eyepoints(
 
     Notes
     -----
-    Rays pass through surfaces nearer than `RANGE_MIN`.
+    Rays pass through surfaces nearer than `HIT_RANGE_MIN`.
     """
     shot_numbers = np.asarray(shot_numbers)
     shots = scanner.shots(shot_numbers)
@@ -184,17 +184,17 @@ def observe_eyepoints(
             state.position,
             make_rays(zero_angle, zero_angle, 1.0),
             poses=poses or None,
-            range_min=RANGE_MIN,
+            range_min=HIT_RANGE_MIN,
         )
         ray_directions, light_directions = (
             make_rays(across, along, np.reshape(full_angle, (-1, 1)) / 4)
             for full_angle in footprint_angles(axis_bundle.range)
         )
     bundle = caster.cast_bundles(
-        state.position, ray_directions, poses=poses or None, range_min=RANGE_MIN
+        state.position, ray_directions, poses=poses or None, range_min=HIT_RANGE_MIN
     )
     radial_velocity = _radial_velocities(
-        state, (ray_directions, light_directions), bundle, body_states, bodies_rotate
+        state, ray_directions, light_directions, bundle, body_states, bodies_rotate
     )
     rows = np.arange(len(time))
     reference_velocity = radial_velocity[rows, np.maximum(bundle.reference_beamlet, 0)]
@@ -234,7 +234,7 @@ def _require_finite(
     bundle: BundleHits,
     velocity: np.ndarray,
 ) -> None:
-    """Raise an error for shots with non-finite geometry, on which loops over spectra never end."""
+    """Raise UnsupportedShotError for geometry that is not finite: loops over bins would not end."""
     is_hit = bundle.is_hit
     for label, is_wrong in (
         ("position", ~np.isfinite(state.position).all(axis=1)),
@@ -255,20 +255,35 @@ def _require_finite(
 
 def _radial_velocities(
     state: BodyState,
-    rays_and_light: tuple[np.ndarray, np.ndarray],
+    ray_directions: np.ndarray,
+    light_directions: np.ndarray,
     bundle: BundleHits,
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> np.ndarray:
-    """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b).
+    """Compute the radial velocities of beamlets [m/s], (n, b); nan for a beamlet that misses.
 
-    The speed is nan for a beamlet that misses. Rays give the points that are hit, and the
-    directions of light there may differ from those of the rays. A surface on a rotating body at X
-    moves with V + omega x (P - X) at the point P that is hit. Rotation of the instrument about
-    itself does not shift the light's frequency. Rotation with a lever arm does, through the
-    instrument's velocity.
+    Parameters
+    ----------
+    state
+        Position and motion of the instrument in n shots.
+    ray_directions
+        (n, b, 3): directions of the rays, which determine the points that are hit.
+    light_directions
+        (n, b, 3): directions of the light, along which velocities are seen.
+    bundle
+        Hits of the rays.
+    body_states
+        Position and motion of each body; None for a body at rest.
+    bodies_rotate
+        False to neglect the velocity of surfaces by the rotation of their body.
+
+    Notes
+    -----
+    A surface on a body at X, of velocity V and angular velocity omega, moves with V + omega x (P -
+    X) at the point P that is hit. Rotation of the instrument about itself does not shift the
+    light's frequency. Rotation with a lever arm does, through the instrument's velocity.
     """
-    ray_directions, light_directions = rays_and_light
     closing_speed = light_directions[..., 0] * state.velocity[:, :1]
     for k in (2, 1):  # fixed order of addition, for equal bits
         closing_speed += light_directions[..., k] * state.velocity[:, k, None]
@@ -304,13 +319,30 @@ def _reference_beam_motion(
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute closing acceleration, approach speed and turn rate of reference beamlets, (n,) each.
+    """Compute the motion along the reference beamlets of n shots.
 
+    Parameters
+    ----------
+    state, ray_directions, bundle, body_states, bodies_rotate
+        Arguments of :func:`_radial_velocities`.
+    scanner_rate
+        (n, 3): rate of change of the beam's direction by the scanner [1/s], in the world's frame.
+
+    Returns
+    -------
+    acceleration : ndarray (n,)
+        Rate at which the radial velocity grows [m/s^2]; nan if nothing is hit.
+    approach_speed : ndarray (n,)
+        Speed at which the range falls [m/s]; nan if nothing is hit.
+    turn_rate : ndarray (n,)
+        Rate at which the direction turns [rad/s].
+
+    Notes
+    -----
     V is the velocity of the instrument relative to the body that is hit. The body rotates with w
     and is extended to the instrument. The beam d has the closing speed V.d, which grows by V'.d +
     V.d'. It meets the surface, a plane with normal n, at a range that falls by (V + R (d' - w x
-    d)).n / d.n. Bodies are assumed to rotate at steady rates. ``scanner_rate`` (n, 3) is the
-    scanner's part of d'.
+    d)).n / d.n. Bodies are assumed to rotate at steady rates.
     """
     rows, reference = np.arange(len(ray_directions)), np.maximum(bundle.reference_beamlet, 0)
     ray, body = ray_directions[rows, reference], bundle.body_index[rows, reference]
@@ -329,24 +361,28 @@ def _reference_beam_motion(
         velocity = np.where(
             is_on_body, relative_velocity - np.cross(angular_velocity, lever_arm), velocity
         )
-        grows = (
+        relative_acceleration = (
             state.acceleration
             - body_state.acceleration
             - np.cross(angular_velocity, relative_velocity)
         )
-        acceleration = np.where(is_on_body, grows, acceleration)
+        acceleration = np.where(is_on_body, relative_acceleration, acceleration)
         relative_direction_rate = np.where(
             is_on_body, direction_rate - np.cross(angular_velocity, ray), relative_direction_rate
         )
     reference_range = np.where(bundle.reference_beamlet >= 0, bundle.range, np.nan)
-    grows = _row_dot(acceleration, ray) + _row_dot(velocity, direction_rate)
+    closing_acceleration = _row_dot(acceleration, ray) + _row_dot(velocity, direction_rate)
     incidence_cosine = np.minimum(_row_dot(bundle.normal, ray), -_GRAZING_SINE_MIN)
     approach_speed = (
         _row_dot(velocity + reference_range[:, None] * relative_direction_rate, bundle.normal)
         / incidence_cosine
     )
     turn_rate = np.sqrt(_row_dot(direction_rate, direction_rate))
-    return np.where(bundle.reference_beamlet >= 0, grows, np.nan), approach_speed, turn_rate
+    return (
+        np.where(bundle.reference_beamlet >= 0, closing_acceleration, np.nan),
+        approach_speed,
+        turn_rate,
+    )
 
 
 def _row_dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -360,7 +396,7 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare the shots of eyepoints of which each hits a surface.
+    """Prepare the shots of eyepoints, each of which hits a surface.
 
     Parameters
     ----------
@@ -381,9 +417,10 @@ def prepare_eyepoint_shots(
 def parameters_and_ground_of_eyepoints(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
 ) -> tuple[Parameters, RayTracedGround]:
-    """Return parameters of shots, and their footprints; a beamlet that misses returns no light.
+    """Convert eyepoints to the parameters and footprints from which shots are prepared.
 
-    Range, velocity, reflectance and reflectance law follow from the eyepoints and the surfaces.
+    Range, velocities, reflectance and reflectance law follow from the eyepoints and the surfaces. A
+    beamlet that misses returns no light.
 
     Parameters
     ----------
@@ -393,6 +430,13 @@ def parameters_and_ground_of_eyepoints(
         Other parameters by dotted path, scalars.
     surfaces
         Materials by the surface numbers of `eyepoints`.
+
+    Returns
+    -------
+    parameters : mapping
+        Parameters by dotted path, (n,) or scalars.
+    ground : RayTracedGround
+        Footprints of the n shots.
     """
     surface = eyepoints.surface
     is_hit = surface >= 0

@@ -56,7 +56,7 @@ from scipy.special import chdtri, stdtrit
 
 from sweep.model.outputs import NAVIGATION_VARIABLES
 from sweep.model.pointcloud.ego_motion import (
-    DESCENT_SINE_MIN,
+    DEPRESSION_SINE_MIN,
     EgoMotion,
     MotionPriors,
     ego_motion_of_beams,
@@ -65,27 +65,28 @@ from sweep.model.pointcloud.error_floor import NO_ERROR_FLOOR, ErrorFloor
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 
 BEAMS_PER_BATCH = 1 << 14
-"""Largest number of beams in a batch, so that intermediate arrays fit the cache."""
+"""Largest number of beams, over all draws, that are solved together, so that intermediate arrays
+fit the cache."""
 
 GRAZING_SINE_MIN = 0.05
-"""Lower bound on the sine of the grazing angle in the weights, about 3 deg."""
+"""Sine of the smallest grazing angle that the weights of points take into account, about 3 deg."""
 
 _CONDITION_NUMBER_MAX = 1e6
-"""Condition number above which beams count as coplanar; below it covariances show weak geometries.
-"""
+"""Condition number of the equations above which the beams of a cycle count as coplanar. Below it,
+covariances show how weak a geometry is."""
 
 _INTERPOLATION_ERROR_MIN = 1e-6
-"""Smallest error of an interpolated position, over that of a position by whole bins."""
+"""Smallest standard error of an interpolated value, over that of the value by whole bins."""
 
 _ONE_SIGMA_PROBABILITY = 0.8413447460685429
-"""Probability that a normal error is below one standard deviation."""
+"""Probability that a normal number is below one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
-"""Relative rounding error of numbers that are subtracted from each other."""
+"""Relative rounding error of squared standard errors, of which a part is subtracted."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
-"""Probability of larger residuals below which the covariance follows from the residuals, and not
-from the stated errors."""
+"""Probability that true errors make larger residuals. If it is below this limit, the covariance
+follows from the residuals, and not from the stated errors."""
 
 STATUS_SOLVED = 0
 """The solution uses all valid beams."""
@@ -97,14 +98,25 @@ STATUS_UNDETERMINED = 3
 """No solution: beams are too few, or nearly coplanar."""
 
 ArraysByName = Mapping[str, np.ndarray]
-"""Arrays by the name of their variable."""
+"""Arrays by the name of their output variable."""
 
-FitResult = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""First four fields of a :class:`NavigationSolution` of n cycles."""
+
+class FittedCycles(NamedTuple):
+    """Velocities or altitudes fitted to n cycles: the first fields of a `NavigationSolution`."""
+
+    value: np.ndarray
+    """(n, 3) or (n,): velocity [m/s] or altitude [m]."""
+    covariance: np.ndarray
+    """(n, 3, 3) or (n,): covariance of the velocity's error [m^2/s^2], or variance of the
+    altitude's error [m^2]."""
+    chi_square: np.ndarray
+    """(n,): weighted sum of squared residuals; nan without a solution."""
+    degrees_of_freedom: np.ndarray
+    """(n,) int64: number of observations minus that of unknowns; 0 without a solution."""
 
 
 class NavigationSolution(NamedTuple):
-    """Velocities in the frame of the directions, or altitudes; nan without a solution."""
+    """Velocities or altitudes of cycles, in the frame of the directions; nan without a solution."""
 
     value: np.ndarray
     """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above the
@@ -124,7 +136,7 @@ class NavigationSolution(NamedTuple):
 
     @property
     def is_available(self) -> np.ndarray:
-        """(...,) bool: True if there is a solution."""
+        """True for cycles that have a solution, (...,) bool."""
         return self.status <= STATUS_EXCLUDED
 
 
@@ -158,7 +170,8 @@ def solve_velocity(
         direction, radial_velocity, standard_error
     )
 
-    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FitResult:
+    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
+        """Fit velocities to selected cycles (k,) by selected beams (k, b)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             design = np.where(is_used[..., None], u[cycles] / error[cycles, :, None], 0.0)
             residual = np.where(is_used, closing_speed[cycles] / error[cycles], 0.0)
@@ -177,9 +190,13 @@ def solve_velocity(
         chi_square = np.where(is_solved, sum(residual.T**2), np.nan)
         degrees_of_freedom = np.where(is_solved, is_used.sum(axis=1) - 3, 0)
         scale = _covariance_scale(chi_square, degrees_of_freedom, degrees_of_freedom)
-        return value, covariance * scale[:, None, None], chi_square, degrees_of_freedom
+        return FittedCycles(
+            value, covariance * scale[:, None, None], chi_square, degrees_of_freedom
+        )
 
-    return _solve_screened(fit_cycles, np.isfinite(closing_speed), test_level, leading_shape)
+    return _solve_without_false_beams(
+        fit_cycles, np.isfinite(closing_speed), test_level, leading_shape
+    )
 
 
 def solve_altitude(
@@ -224,7 +241,8 @@ def solve_altitude(
         direction, range, standard_error, offset
     )
 
-    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FitResult:
+    def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
+        """Fit altitudes to selected cycles (k,) by selected beams (k, b)."""
         is_used_by_beam = np.ascontiguousarray(is_used.T)
         plane_arguments = (
             np.where(is_used_by_beam, ground_points[..., cycles], 0.0),
@@ -244,14 +262,15 @@ def solve_altitude(
             chi_square, degrees_of_freedom, n_used - 1 - plane.n_fitted_slopes
         )
         off_plane_variance = n_used * np.where(scale > 1, plane.point_variance, 0.0)
-        return (
+        return FittedCycles(
             plane.height,
             scale * (plane.variance + off_plane_variance),
             chi_square,
             degrees_of_freedom,
         )
 
-    return _solve_screened(fit_cycles, np.isfinite(ground_points[0]).T, test_level, leading_shape)
+    is_valid = np.isfinite(ground_points).all(axis=0).T
+    return _solve_without_false_beams(fit_cycles, is_valid, test_level, leading_shape)
 
 
 def ground_gradient(
@@ -293,10 +312,24 @@ def _ground_points(
     direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
     offset: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
-    """Return ground points and directions (3, b, n), range errors (b, n), and the leading shape.
+    """Return the points of the ground that beams measure, with beams first and cycles last.
 
-    n is the product of the leading shape. Beams come first and cycles last, because NumPy is fast
-    along the last axis.
+    Parameters
+    ----------
+    direction, distance, standard_error, offset
+        As `direction`, `range`, `standard_error` and `offset` of :func:`solve_altitude`.
+
+    Returns
+    -------
+    ground_points : ndarray (3, b, n)
+        Ground points [m]. n is the product of the leading dimensions. Cycles come last, because
+        NumPy is fast along the last axis.
+    directions : ndarray (3, b, n)
+        Directions of the beams.
+    errors : ndarray (b, n)
+        Standard errors of the ranges [m].
+    leading_shape : tuple of int
+        Leading dimensions of the arguments.
     """
     u, distance, error, leading_shape = _flatten_cycles(direction, distance, standard_error)
     ground_points = u * distance[..., None]
@@ -312,12 +345,22 @@ def _ground_points(
 def _covariance_scale(
     chi_square: np.ndarray, degrees_of_freedom: np.ndarray, residual_degrees: np.ndarray
 ) -> np.ndarray:
-    """Return the factor on the covariance of solutions whose residuals exceed the stated errors.
+    """Return the factor (n,) that scales covariances where residuals contradict the stated errors.
 
     If true errors make such residuals with :data:`_CONTRADICTION_PROBABILITY` or less, the
     residuals determine the size of the errors. The factor is then chi-square over the residuals'
-    degrees of freedom, at least one, times a factor of Student's t. The error over a deviation so
-    estimated follows Student's t, and the scaled deviation covers its central 68 %.
+    degrees of freedom (at least 1), times the square of Student's t at one standard deviation. The
+    error over a deviation so estimated follows Student's t, and the scaled deviation covers its
+    central 68 %. Other solutions have the factor 1.
+
+    Parameters
+    ----------
+    chi_square
+        (n,): weighted sum of squared residuals.
+    degrees_of_freedom
+        (n,): expectation of `chi_square` for true errors.
+    residual_degrees
+        (n,): effective number of degrees of freedom of the residuals.
     """
     n_residual_degrees = np.maximum(residual_degrees, 1)
     scale = (
@@ -327,7 +370,10 @@ def _covariance_scale(
 
 
 def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
-    """Return True for solutions whose residuals contradict the stated errors."""
+    """Return True for solutions whose residuals contradict the stated errors, (...,) bool.
+
+    `chi_square` is then larger than true errors make it with `_CONTRADICTION_PROBABILITY`.
+    """
     return (degrees_of_freedom > 0) & (
         chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
     )
@@ -356,12 +402,25 @@ def _fit_plane(
 ) -> _GroundPlane:  # fmt: skip
     """Fit planes to n cycles' ground points by weighted least squares.
 
+    Parameters
+    ----------
+    ground_points, directions, errors
+        Results of :func:`_ground_points`.
+    is_used
+        (b, n) bool: beams whose points determine the plane.
+    gradient
+        (2, n): estimate of the plane's gradient, on which the weights depend.
+    slope, relief
+        As in :func:`solve_altitude`.
+
+    Notes
+    -----
     The plane is z = -altitude + gradient . (x, y) with the platform at the origin. An error of
-    range moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``. So the
-    weights need a gradient beforehand. Points and directions are (3, b, n), gradients (2, n).
+    range moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``.
     """
     n_beams, n_cycles = is_used.shape
-    incidence_sine = gradient[0] * directions[0] + gradient[1] * directions[1] - directions[2]
+    (gradient_x, gradient_y), (u_x, u_y, u_z) = gradient, directions
+    incidence_sine = gradient_x * u_x + gradient_y * u_y - u_z
     height_errors = errors * np.maximum(incidence_sine, GRAZING_SINE_MIN)
     weights = np.where(is_used, 1.0 / np.hypot(height_errors, relief), 0.0)
     weight_sum = np.asarray(
@@ -370,13 +429,15 @@ def _fit_plane(
     weight_fractions = weights**2 / np.where(weight_sum > 0, weight_sum, 1.0)
     centroid = np.asarray(sum((ground_points * weight_fractions).swapaxes(0, 1)))
     weighted_offsets = weights * (ground_points - centroid[:, None])
+    *weighted_xy, weighted_z = weighted_offsets
+    centroid_x, centroid_y, centroid_z = centroid
     residual = np.zeros((n_cycles, n_beams + 2))
-    residual[:, :n_beams] = weighted_offsets[2].T
-    height, variance, gradient = -centroid[2], 1.0 / weight_sum, np.zeros((2, n_cycles))
+    residual[:, :n_beams] = weighted_z.T
+    height, variance, gradient = -centroid_z, 1.0 / weight_sum, np.zeros((2, n_cycles))
     n_fitted_slopes = np.zeros(n_cycles)
     if slope > 0:
         design = np.zeros((n_cycles, n_beams + 2, 2))
-        design[:, :n_beams] = weighted_offsets[:2].T
+        design[:, :n_beams] = np.array(weighted_xy).T
         design[:, n_beams, 0] = design[:, n_beams + 1, 1] = 1.0 / slope
         right_vectors, squared_singular_values, coordinates = _least_squares(design, residual)
         right_vectors, squared_singular_values, coordinates = (
@@ -385,7 +446,8 @@ def _fit_plane(
             coordinates.T,
         )  # cycles last
         for k in range(2):
-            centroid_along = centroid[0] * right_vectors[k, 0] + centroid[1] * right_vectors[k, 1]
+            vector_x, vector_y = right_vectors[k]
+            centroid_along = centroid_x * vector_x + centroid_y * vector_y
             height = height + centroid_along * coordinates[k]
             variance = variance + centroid_along**2 / squared_singular_values[k]
             gradient = gradient + right_vectors[k] * coordinates[k]
@@ -397,9 +459,19 @@ def _fit_plane(
 def _flatten_cycles(
     direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Return directions (n, b, 3), values and errors (n, b), and the leading shape.
+    """Broadcast measurements of beams, and join their leading dimensions to one, of n cycles.
 
-    n is the product of the leading shape.
+    Parameters
+    ----------
+    direction
+        (..., b, 3): unit vectors of the beams.
+    value, standard_error
+        (..., b): measured values and their standard errors.
+
+    Returns
+    -------
+    tuple
+        Directions (n, b, 3), values (n, b), errors (n, b), and the leading dimensions.
     """
     u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
     leading_shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape)
@@ -442,31 +514,33 @@ def _least_squares(
     return right_vectors.mT, singular_values**2, coordinates
 
 
-def _solve_screened(
-    fit_cycles: Callable[[np.ndarray, np.ndarray], FitResult],
+def _solve_without_false_beams(
+    fit_cycles: Callable[[np.ndarray, np.ndarray], FittedCycles],
     is_valid: np.ndarray,
     test_level: float | None,
     leading_shape: tuple[int, ...],
 ) -> NavigationSolution:
-    """Solve n cycles of b beams, without a beam that contradicts the others.
+    """Fit n cycles of b beams, and exclude a beam that contradicts the others.
 
+    Parameters
+    ----------
+    fit_cycles
+        Function of the indices (k,) of cycles, and of a mask (k, b) of the beams to use. It returns
+        the fit of these cycles.
+    is_valid
+        (n, b) bool: beams with a return.
+    test_level
+        Level of the test for a false beam; None for no test.
+    leading_shape
+        Leading dimensions of the result; their product is n.
+
+    Notes
+    -----
     A cycle is suspect if its chi-square is larger than true beams make it with probability
     `test_level`. Each beam is then excluded in turn. If exactly one such fit passes the same test,
     that beam is false and that fit is the solution. Otherwise the solution is withheld. With one
     degree of freedom every exclusion leaves an exact fit: a contradiction is noticed, but the false
     beam is never identified.
-
-    Parameters
-    ----------
-    fit_cycles
-        Function of the cycles' indices (k,) and a mask of beams (k, b); its chi-square is nan
-        without a solution.
-    is_valid
-        (n, b) bool: beams with a return.
-    test_level
-        Level of the test; None for no test.
-    leading_shape
-        Shape of the result, of n elements.
     """
     is_used, n_beams = is_valid.copy(), is_valid.shape[1]
     fitted = fit_cycles(np.arange(len(is_valid)), is_used)
@@ -477,10 +551,10 @@ def _solve_screened(
         suspect_cycles = np.flatnonzero(chi_square > chi_square_max[degrees_of_freedom])
         passes_without = np.zeros((suspect_cycles.size, n_beams), bool)
         for beam in range(n_beams):
-            _, _, trial_chi_square, trial_degrees = fit_cycles(
+            trial = fit_cycles(
                 suspect_cycles, is_used[suspect_cycles] & (np.arange(n_beams) != beam)
             )
-            passes_without[:, beam] = trial_chi_square <= chi_square_max[trial_degrees]
+            passes_without[:, beam] = trial.chi_square <= chi_square_max[trial.degrees_of_freedom]
         has_one_false = passes_without.sum(axis=1) == 1
         status[suspect_cycles] = np.where(has_one_false, STATUS_EXCLUDED, STATUS_WITHHELD)
         corrected_cycles = suspect_cycles[has_one_false]
@@ -519,7 +593,7 @@ def solve_navigation(
     shots_per_cycle
         Number of shots in a cycle.
     ground_slope, relief
-        Slope and relief of the ground, as in :func:`solve_altitude`.
+        Standard deviations of slope and relief of the ground, as in :func:`solve_altitude`.
     test_level
         Level of the test for one false beam; None or 0 for no test.
     pointing_jitter
@@ -543,12 +617,18 @@ def solve_navigation(
     for first in range(0, cycles, step):
         cycle_slice = slice(first, min(first + step, cycles))
         shot_slice = slice(cycle_slice.start * shots_per_cycle, cycle_slice.stop * shots_per_cycle)
-        poses = Poses(*(shot_arrays[name][shot_slice] for name in _POSE_VARIABLES))
+        beam_motion = BeamMotion(
+            *(shot_arrays[name][shot_slice] for name in _BEAM_MOTION_VARIABLES)
+        )
         known_motion = ego_motion_of_beams(
-            poses.direction, poses.velocity, poses.direction_rate, poses.acceleration, motion_priors
+            beam_motion.direction,
+            beam_motion.velocity,
+            beam_motion.direction_rate,
+            beam_motion.acceleration,
+            motion_priors,
         )
         solutions = _solve_cycles(
-            poses.by_cycle(shots_per_cycle),
+            beam_motion.by_cycle(shots_per_cycle),
             _select_beams(point_arrays, shot_slice, shots_per_cycle, error_floor, known_motion),
             {"test_level": test_level or None},
             {"slope": ground_slope, "relief": relief},
@@ -564,15 +644,15 @@ def solve_navigation(
     return results
 
 
-_POSE_VARIABLES = (
+_BEAM_MOTION_VARIABLES = (
     "platform_position", "platform_velocity", "beam_direction", "beam_turning",
     "platform_acceleration",
 )  # fmt: skip
-"""Names of variables in the order of the fields of :class:`Poses`."""
+"""Names of variables in the order of the fields of :class:`BeamMotion`."""
 
 
-class Poses(NamedTuple):
-    """Known motion of shots' beams, (..., 3) each, in the world's axes."""
+class BeamMotion(NamedTuple):
+    """Motion of the instrument and of its beam in each shot, (..., 3) each, in the world's axes."""
 
     position: np.ndarray
     """Position of the instrument [m]."""
@@ -585,9 +665,9 @@ class Poses(NamedTuple):
     acceleration: np.ndarray
     """Acceleration of the instrument [m/s^2]."""
 
-    def by_cycle(self, beams_per_cycle: int) -> "Poses":
-        """Return the poses of n shots by cycle, (n / beams, beams, 3) each."""
-        return Poses(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
+    def by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
+        """Arrange the motion of n shots by cycles, (cycles, beams, 3) each."""
+        return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
 
 def _select_beams(
@@ -597,12 +677,30 @@ def _select_beams(
     error_floor: ErrorFloor,
     known_motion: EgoMotion,
 ) -> dict[str, np.ndarray]:
-    """Return values and errors of one trusted point for each shot and draw, (cycles, draws, beams).
+    """Select the first trusted point of each shot and draw.
 
-    Values are nan for shots without a trusted point. Errors exclude those common to all beams and
-    that by an unknown slip, which is ``radial_velocity_slip_error`` for the velocity. ``delay`` is
-    the time from the shot's start to that of the range [s], and ``range_then`` the range at that
-    time. ``position`` is included if pointing has an error.
+    Parameters
+    ----------
+    point_arrays
+        Arrays of :data:`sweep.model.outputs.POINT_VARIABLES` by name.
+    shot_slice
+        Shots of whole cycles that are selected.
+    shots_per_cycle
+        Number of shots in a cycle.
+    error_floor
+        Standard deviations of the instrument's other errors.
+    known_motion
+        Motion along the beams of these shots, as the instrument knows it.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Arrays (cycles, draws, beams), nan for a shot without a trusted point: ``range`` and
+        ``radial_velocity`` with their ``_standard_error``, without errors common to all beams or by
+        an unknown slip; ``radial_velocity_slip_error``, the error by an unknown slip [m/s];
+        ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats [s];
+        ``range_then``, the range at that time [m]. If pointing has an error, ``position``
+        (cycles, draws, beams, 3) [m].
     """
     flags = point_arrays["flags"][shot_slice]
     values_by_name: dict[str, np.ndarray] = {}
@@ -654,11 +752,30 @@ def _select_beams(
 
 
 def _solve_cycles(
-    poses: Poses, beams: dict[str, np.ndarray], test_arguments: dict, ground_arguments: dict,
-    pointing_jitter: float, error_floor: ErrorFloor,
+    beam_motion: BeamMotion, beams: dict[str, np.ndarray], test_arguments: dict,
+    ground_arguments: dict, pointing_jitter: float, error_floor: ErrorFloor,
 ) -> list[tuple[str, str, NavigationSolution]]:  # fmt: skip
-    """Return velocities and altitudes of cycles and draws, each with names of value and spread."""
-    positions, velocities, direction, direction_rates, _ = poses
+    """Solve for velocity and altitude of cycles in all draws.
+
+    Parameters
+    ----------
+    beam_motion
+        Motion of the instrument and its beams, (cycles, beams, 3).
+    beams
+        Measurements, as of :func:`_select_beams`.
+    test_arguments, ground_arguments
+        Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
+    pointing_jitter
+        Standard deviation of each angle of the pointing [rad].
+    error_floor
+        Standard deviations of the instrument's other errors.
+
+    Returns
+    -------
+    list of tuple
+        Name of the quantity, name of its spread (``covariance`` or ``variance``), and solution.
+    """
+    positions, velocities, direction, direction_rates, _ = beam_motion
     velocity_offset = np.einsum(
         "cbi,cbi->cb", direction, velocities - velocities.mean(axis=1, keepdims=True)
     )
@@ -680,7 +797,7 @@ def _solve_cycles(
     altitude_solution = solve_altitude(**ground_points, **test_arguments)
     is_used = altitude_solution.is_used & altitude_solution.is_available[..., None]
     gradient = ground_gradient(**ground_points, is_used=is_used)
-    missing_slip = _slip_of_ground_gradient(poses, beams["range"], gradient)
+    missing_slip = _slip_of_ground_gradient(beam_motion, beams["range"], gradient)
     unknown_slip = beams["radial_velocity_slip_error"]
     if ground_arguments["relief"] == 0:
         is_plane = altitude_solution.is_available & ~_residuals_contradict(
@@ -717,21 +834,37 @@ def _solve_cycles(
     ]
 
 
-def _slip_of_ground_gradient(poses: Poses, ranges: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+def _slip_of_ground_gradient(
+    beam_motion: BeamMotion, ranges: np.ndarray, gradient: np.ndarray
+) -> np.ndarray:
     """Return the slip over a plane minus that over level ground [m/s], (cycles, draws, beams).
 
-    `ranges` are (cycles, draws, beams), gradients (cycles, draws, 2). With W = V + R d' and the
-    normal n of the plane the result is W.z / d.z - W.n / d.n. It is 0 for beams that do not point
-    down at both.
+    Parameters
+    ----------
+    beam_motion
+        Motion of the instrument and its beams, (cycles, beams, 3).
+    ranges
+        (cycles, draws, beams): ranges R [m].
+    gradient
+        (cycles, draws, 2): gradient of the plane along x and y.
+
+    Notes
+    -----
+    With W = V + R d' and the normal n of the plane the result is W.z / d.z - W.n / d.n. It is 0 for
+    beams that do not point down at both planes.
     """
-    _, velocity, direction, direction_rates, _ = poses
-    d = [direction[:, None, :, k] for k in range(3)]
-    w = [velocity[:, None, :, k] + ranges * direction_rates[:, None, :, k] for k in range(3)]
-    x, y = gradient[..., :1], gradient[..., 1:]
-    plane_sine = d[2] - x * d[0] - y * d[1]
-    points_down = (d[2] < -DESCENT_SINE_MIN) & (plane_sine < -DESCENT_SINE_MIN)
-    slip = w[2] / np.where(points_down, d[2], -1.0)
-    slip = slip - (w[2] - x * w[0] - y * w[1]) / np.where(points_down, plane_sine, -1.0)
+    _, velocity, direction, direction_rates, _ = beam_motion
+    d_x, d_y, d_z = (direction[:, None, :, k] for k in range(3))
+    w_x, w_y, w_z = (
+        velocity[:, None, :, k] + ranges * direction_rates[:, None, :, k] for k in range(3)
+    )
+    gradient_x, gradient_y = gradient[..., :1], gradient[..., 1:]
+    plane_sine = d_z - gradient_x * d_x - gradient_y * d_y
+    points_down = (d_z < -DEPRESSION_SINE_MIN) & (plane_sine < -DEPRESSION_SINE_MIN)
+    slip = w_z / np.where(points_down, d_z, -1.0)
+    slip = slip - (w_z - gradient_x * w_x - gradient_y * w_y) / np.where(
+        points_down, plane_sine, -1.0
+    )
     return np.where(points_down, slip, 0.0)
 
 
@@ -743,10 +876,28 @@ def _add_pointing_errors(
     pointing_jitter: float,
     pointing: float,
 ) -> dict[str, np.ndarray]:
-    """Return standard errors (cycles, draws, beams) that include the errors of pointing.
+    """Return standard errors of range and radial velocity that include the errors of pointing.
 
-    Jitter is added to both errors. ``pointing`` is added to the range only, because the velocity's
-    error already includes it.
+    Parameters
+    ----------
+    direction
+        (cycles, beams, 3): unit vectors of the beams.
+    offset
+        (cycles, 1, beams, 3): position of the instrument relative to that at the first shot [m].
+    beams
+        Measurements, as of :func:`_select_beams`.
+    ground_arguments
+        Arguments ``slope`` and ``relief`` of :func:`ground_gradient`.
+    pointing_jitter
+        Standard deviation of each angle of the pointing by jitter [rad]. It adds to both errors.
+    pointing
+        Standard deviation of a beam's known direction [rad]. It adds to the error of the range. The
+        error of the velocity already includes it.
+
+    Returns
+    -------
+    dict of str to ndarray
+        ``radial_velocity_standard_error`` and ``range_standard_error``, (cycles, draws, beams).
     """
     closing_speed, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first_velocity = solve_velocity(
@@ -764,8 +915,8 @@ def _add_pointing_errors(
         **ground_arguments,
     )
     x, y = gradient[..., :1], gradient[..., 1:]
-    d = [direction[:, None, :, k] for k in range(3)]
-    plane_sine = d[2] - x * d[0] - y * d[1]  # d.n for the normal n = (-x, -y, 1)
+    d_x, d_y, d_z = (direction[:, None, :, k] for k in range(3))
+    plane_sine = d_z - x * d_x - y * d_y  # d.n for the normal n = (-x, -y, 1)
     incidence_tangent = np.sqrt(np.maximum(1 + x**2 + y**2 - plane_sine**2, 0.0)) / np.maximum(
         -plane_sine, GRAZING_SINE_MIN
     )

@@ -4,8 +4,8 @@ Each surface in a footprint makes a peak in all three segments, but peaks do not
 belong together. A pair of an up and a down peak has 16 readings: each of the three peaks is folded
 at Nyquist or not, and the Doppler frequency is the half sum or the half difference. Each reading
 predicts a Doppler peak. A pair is *confirmed* by a peak within the tolerance of that prediction. Up
-and down peaks are paired one to one such that the number of confirmed pairs is largest. Among equal
-numbers the sum of mismatches is smallest, where a fold counts as
+and down peaks are paired one to one such that the number of confirmed pairs is largest. Of several
+such pairings, that with the smallest sum of mismatches is chosen, where a fold counts as
 :data:`sweep.model.waveform.FOLD_PENALTY_BINS` bins. A Doppler peak may confirm several pairs, as
 surfaces with a common velocity share a Doppler peak.
 
@@ -15,7 +15,7 @@ prediction that a false peak comes as near only once in a hundred cases. Otherwi
 reading of two beats without a Doppler segment. If that reading is wrong, range and velocity are
 exchanged. [T] leaves the choice open (docs/physics.md, *Folding*).
 
-An up or down peak in which two surfaces coincide serves one return only.
+If the lines of two surfaces make one up or down peak, it is part of one return only.
 
 An instrument that accelerates has another closing speed in each segment. With the default slopes
 this cancels in the half sum, as the Doppler segment is in the middle. With other slopes it does not
@@ -33,6 +33,7 @@ strongest up peak is paired with the strongest down peak, and so on. The reading
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,15 +60,18 @@ CHANCE_MATCH_PROBABILITY = 0.01
 _UNPAIRED_COST = 1e9
 """Cost of an up peak without a down peak: larger than any sum of mismatches."""
 
-TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG, MISREAD_FLAG, SIDELOBE_FLAG, UNCONFIRMED_FLAG = (
-    1,
-    2,
-    4,
-    8,
-    16,
-    32,
-)
-"""Bits of a return's flags, described at :data:`FLAG_BITS`."""
+TRUE_FLAG = 1
+"""Bit of a return whose range and velocity are those of a beamlet (:data:`FLAG_BITS`)."""
+FALSE_ALARM_FLAG = 2
+"""Bit of a return with a false peak (:data:`FLAG_BITS`)."""
+MISPAIRED_FLAG = 4
+"""Bit of a return whose peaks belong to different beamlets (:data:`FLAG_BITS`)."""
+MISREAD_FLAG = 8
+"""Bit of a return whose peaks were read as another range or velocity (:data:`FLAG_BITS`)."""
+SIDELOBE_FLAG = 16
+"""Bit of a return with a peak that contains no beamlet's line (:data:`FLAG_BITS`)."""
+UNCONFIRMED_FLAG = 32
+"""Bit of a return that no Doppler peak confirms (:data:`FLAG_BITS`)."""
 FLAG_BITS = {
     "true": TRUE_FLAG,
     "false_alarm": FALSE_ALARM_FLAG,
@@ -76,7 +80,9 @@ FLAG_BITS = {
     "sidelobe": SIDELOBE_FLAG,
     "unconfirmed": UNCONFIRMED_FLAG,
 }
-"""Bits of a return's flags. Exactly one of the first five is set, which require the truth.
+"""Bits of a return's flags, by name.
+
+Exactly one of the first five bits is set. They follow from a comparison with the truth.
 
 - true: all its peaks contain lines of one beamlet, whose range and velocity it reports to within
   the width of the peaks;
@@ -88,9 +94,25 @@ FLAG_BITS = {
 """
 
 
-FALSE_PEAK, NO_PEAK = -1, -2
-"""Values in place of the number of a peak's group: for a false peak; and for no Doppler peak or
-segment."""
+FALSE_PEAK = -1
+"""Value in the place of the number of a peak's group, for a false peak."""
+NO_PEAK = -2
+"""Value in the place of the number of a peak's group, if there is no Doppler peak or no segment."""
+
+UP_COLUMN, DOPPLER_COLUMN, DOWN_COLUMN, READING_COLUMN = range(4)
+"""Columns of the pairs that :func:`pair_peaks` returns: index of the up peak, of the Doppler peak
+(-1 if the pair is unconfirmed) and of the down peak; and reading."""
+
+
+class ConfirmingPeak(NamedTuple):
+    """Doppler peak and reading that fit an up and a down peak best."""
+
+    cost: float
+    """Mismatch of the Doppler beat plus penalties for folds [bins]; inf if no peak fits."""
+    doppler_index: int
+    """Index of the Doppler peak; -1 if no peak fits."""
+    reading: int
+    """Reading of the peaks; -1 if no peak fits."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -110,27 +132,31 @@ def pair_peaks(
     Parameters
     ----------
     up, doppler, down
-        Positions of the peaks [bins], strongest first; signed if `down_beat_sign` is not 0.
+        Positions of the peaks of each segment [bins], strongest first; signed if `down_beat_sign`
+        is not 0.
     doppler_prediction, fft_size, down_beat_sign, tolerance
         Arguments of :func:`find_confirming_peak`.
     two_beat_reading
         Reading of pairs that no Doppler peak confirms.
     pairs
-        (>= min(ups, downs), 4) int64; the result. Columns are the index of the up peak, of the
-        Doppler peak (-1 if unconfirmed) and of the down peak, and the reading. Confirmed pairs come
-        first, in the order of the up peaks.
+        (>= min(ups, downs), 4) int64; the result, with the columns UP_COLUMN to READING_COLUMN.
+        Confirmed pairs come first, in the order of the up peaks.
     """
     if up.size == 1 and down.size == 1:  # fast path for the most frequent case
-        mismatch, doppler_index, reading = find_confirming_peak(
+        confirming_peak = find_confirming_peak(
             up[0], doppler, down[0], doppler_prediction, fft_size, down_beat_sign, tolerance
         )
-        if math.isfinite(mismatch):
-            pairs[0, 0], pairs[0, 1], pairs[0, 2], pairs[0, 3] = 0, doppler_index, 0, reading
+        if math.isfinite(confirming_peak.cost):
+            pairs[0, UP_COLUMN], pairs[0, DOWN_COLUMN] = 0, 0
+            pairs[0, DOPPLER_COLUMN] = confirming_peak.doppler_index
+            pairs[0, READING_COLUMN] = confirming_peak.reading
             return 1, 1
-    cost, confirmed_by = np.empty((up.size, down.size)), np.empty((up.size, down.size, 2), np.int64)
+    cost = np.empty((up.size, down.size))
+    doppler_of_pair = np.empty((up.size, down.size), np.int64)
+    reading_of_pair = np.empty((up.size, down.size), np.int64)
     for i in range(up.size):
         for j in range(down.size):
-            cost[i, j], confirmed_by[i, j, 0], confirmed_by[i, j, 1] = find_confirming_peak(
+            cost[i, j], doppler_of_pair[i, j], reading_of_pair[i, j] = find_confirming_peak(
                 up[i], doppler, down[j], doppler_prediction, fft_size, down_beat_sign, tolerance
             )
     down_of_up, is_down_used = _match_pairs(cost)
@@ -138,8 +164,9 @@ def pair_peaks(
     for i in range(up.size):
         j = down_of_up[i]
         if j >= 0:
-            pairs[n_pairs, 0], pairs[n_pairs, 2] = i, j
-            pairs[n_pairs, 1], pairs[n_pairs, 3] = confirmed_by[i, j, 0], confirmed_by[i, j, 1]
+            pairs[n_pairs, UP_COLUMN], pairs[n_pairs, DOWN_COLUMN] = i, j
+            pairs[n_pairs, DOPPLER_COLUMN] = doppler_of_pair[i, j]
+            pairs[n_pairs, READING_COLUMN] = reading_of_pair[i, j]
             n_pairs += 1
     n_confirmed, j = n_pairs, 0
     for i in range(up.size):
@@ -148,7 +175,7 @@ def pair_peaks(
         if down_of_up[i] < 0 and j < down.size:
             n_readings = 1 if down_beat_sign else N_READINGS
             chance_tolerance = CHANCE_MATCH_PROBABILITY * fft_size / (4.0 * n_readings)
-            _, _, reading = find_confirming_peak(
+            reading = find_confirming_peak(
                 up[i],
                 doppler,
                 down[j],
@@ -156,9 +183,10 @@ def pair_peaks(
                 fft_size,
                 down_beat_sign,
                 chance_tolerance,
-            )
-            pairs[n_pairs, 0], pairs[n_pairs, 1], pairs[n_pairs, 2] = i, -1, j
-            pairs[n_pairs, 3] = reading if reading >= 0 else two_beat_reading
+            ).reading
+            pairs[n_pairs, UP_COLUMN], pairs[n_pairs, DOWN_COLUMN] = i, j
+            pairs[n_pairs, DOPPLER_COLUMN] = -1
+            pairs[n_pairs, READING_COLUMN] = reading if reading >= 0 else two_beat_reading
             n_pairs, j = n_pairs + 1, j + 1
     return n_confirmed, n_pairs
 
@@ -176,8 +204,9 @@ def find_confirming_peak(
     doppler
         (k,): positions of the Doppler peaks [bins].
     doppler_prediction
-        (3,): coefficients of the up and down beat in the Doppler beat, and the change of that by
-        the instrument's motion between the segments [bins], which is added to the tolerance.
+        (3,): coefficient of the up beat, and of the down beat, in the predicted Doppler beat; and
+        the change of the Doppler beat by the instrument's motion between the segments [bins], which
+        is added to the tolerance.
     fft_size
         FFT size N.
     down_beat_sign
@@ -188,12 +217,12 @@ def find_confirming_peak(
 
     Returns
     -------
-    tuple
-        Mismatch plus penalties for folds [bins], index of the Doppler peak, and reading; inf, -1,
-        -1 if no peak is within the tolerance.
+    ConfirmingPeak
+        The peak of least cost within the tolerance.
     """
     least_cost, doppler_index, best_reading = np.inf, -1, -1
-    tolerance += doppler_prediction[2]
+    up_coefficient, down_coefficient, motion_change = doppler_prediction
+    tolerance += motion_change
     for k in range(doppler.size):
         for reading in range(
             SIGNED_READING if down_beat_sign else 0,
@@ -207,9 +236,7 @@ def find_confirming_peak(
                     * fft_size
                 )
                 mismatch = (
-                    doppler_prediction[0] * up
-                    + doppler_prediction[1] * (up + beat_difference)
-                    - doppler[k]
+                    up_coefficient * up + down_coefficient * (up + beat_difference) - doppler[k]
                 )
                 mismatch = abs(mismatch - fft_size * math.floor(mismatch / fft_size + 0.5))
             else:
@@ -217,23 +244,38 @@ def find_confirming_peak(
                 doppler_beat = fft_size - doppler[k] if reading & 4 else doppler[k]
                 down_beat = fft_size - down if reading & 2 else down
                 predicted_beat = (
-                    doppler_prediction[0] * (-up_beat if reading & 1 else up_beat)
-                    + doppler_prediction[1] * down_beat
+                    up_coefficient * (-up_beat if reading & 1 else up_beat)
+                    + down_coefficient * down_beat
                 )
                 mismatch = abs(abs(predicted_beat) - doppler_beat)
             n_folds = (reading >> 3 & 1) + (reading >> 2 & 1) + (reading >> 1 & 1)
             cost = mismatch + n_folds * FOLD_PENALTY_BINS
             if cost < least_cost and mismatch <= tolerance:
                 least_cost, doppler_index, best_reading = cost, k, reading
-    return least_cost, doppler_index, best_reading
+    return ConfirmingPeak(least_cost, doppler_index, best_reading)
 
 
 @njit(cache=True, error_model="numpy")
 def _match_pairs(cost):
-    """Return the down peak of each up peak, or -1, and the mask of down peaks that are used.
+    """Find the one-to-one pairing with the most pairs, and of such pairings that of least cost.
 
-    The solution has the most pairs, and among those the least cost. It is found by a depth-first
-    search over pairs of finite cost, which stops where it cannot be better than the best so far.
+    Parameters
+    ----------
+    cost
+        (ups, downs): cost of each pair of an up and a down peak; inf for a pair that is not
+        allowed.
+
+    Returns
+    -------
+    best_down
+        (ups,) int64: index of the down peak of each up peak, -1 for none.
+    is_down_used
+        (downs,) bool: True for down peaks that are paired.
+
+    Notes
+    -----
+    A depth-first search over pairs of finite cost, which leaves a branch as soon as it cannot be
+    better than the best solution so far.
     """
     n_up, n_down = cost.shape
     best_down, current_down = np.full(n_up, -1), np.full(n_up, -1)
@@ -271,24 +313,28 @@ def _match_pairs(cost):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
-    """Return the flag of a return, apart from its reading, and its nearest beamlet.
+    """Compare a return with the truth: return its flag and the beamlet nearest to its peaks.
+
+    The reading of its peaks is not compared here.
 
     Parameters
     ----------
     groups, positions
-        (3,): group and position [bins] of the peak in each segment.
+        (3,): number of the group and position [bins] of the peak in each segment.
     group_bins, line_positions, beamlet_amplitude
         Fields of :class:`sweep.model.pointcloud.returns.DrawInputs` for one point. Beamlets of
         amplitude 0 do not count.
 
     Returns
     -------
-    tuple
-        TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG; and the beamlet nearest to the
-        peaks, of those whose lines are in all of them, or -1.
+    flag
+        TRUE_FLAG, FALSE_ALARM_FLAG, MISPAIRED_FLAG or SIDELOBE_FLAG.
+    beamlet
+        Beamlet nearest to the peaks, of those whose lines are in all peaks; -1 for none.
     """
-    if groups[0] == FALSE_PEAK or groups[1] == FALSE_PEAK or groups[2] == FALSE_PEAK:
-        return FALSE_ALARM_FLAG, -1
+    for s in range(3):
+        if groups[s] == FALSE_PEAK:
+            return FALSE_ALARM_FLAG, -1
     nearest_beamlet, least_distance, held_segments = -1, np.inf, 0
     for beamlet in range(beamlet_amplitude.size):
         if not beamlet_amplitude[beamlet] > 0.0:

@@ -1,16 +1,17 @@
-"""Point clouds: the reports of an instrument for a flight's eyepoints, by shot and draw.
+"""Point clouds: the points that an instrument reports for a flight's eyepoints, by shot and draw.
 
 Every point has a position in the world, standard errors and the truth: surface, range and radial
 velocity of the beamlet that it measures, and flags
 (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`).
 
-A shot that hits nothing has noise alone in its record. Its false alarms are the largest of all bins
-that are counted, drawn like those of any other shot, from the same addresses. A shot has one state
-of the air: all its draws, and its probabilities, have the scintillation of the shot's key. Results
-of a shot do not depend on the shots and draws that are computed with it.
+A shot that hits nothing has noise alone in its record. Its false alarms are drawn as those of any
+other shot, with the same random numbers. The air does not change from draw to draw: all draws of a
+shot, and its probabilities, have the same scintillation, which follows from the shot's random key.
+Results of a shot do not depend on the shots and draws that are computed with it.
 """
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.ground import BeamletTable
 from sweep.model.outputs import POINT_VARIABLES, SHOT_STATISTIC_VARIABLES
 from sweep.model.pointcloud.bin_groups import BinGroups, list_bin_groups
-from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion
+from sweep.model.pointcloud.ego_motion import MotionPriors, ego_motion_of_eyepoints
 from sweep.model.pointcloud.eyepoints import Eyepoints, parameters_and_ground_of_eyepoints
 from sweep.model.pointcloud.leaked_peaks import (
     LeakageBins,
@@ -42,10 +43,10 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import STRONGEST_PEAK
 
 VALUES_PER_BATCH = 1 << 20
-"""Largest number of values, in addition to the result, that a batch of shots needs in memory."""
+"""Largest number of values in memory, besides the results, for shots that are computed together."""
 
 _EMPTY_SHOT_RANGE = 1.0
-"""Range [m] assumed for a shot that hits nothing. It returns no light."""
+"""Range [m] that stands in for that of a shot that hits nothing, which returns no light."""
 
 
 def simulate_cloud(
@@ -64,7 +65,7 @@ def simulate_cloud(
     estimates_ray_error: bool = False,
     motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
-    """Compute statistics and points of n shots, with or without a target.
+    """Simulate n shots of a flight: their probabilities, and the points that are reported.
 
     Parameters
     ----------
@@ -77,9 +78,9 @@ def simulate_cloud(
     keys
         (n, 2) uint64: random key of each shot.
     first_draw, draws
-        Number of the first draw, and number of draws.
+        Number of the first draw, and count of draws.
     method
-        ``probabilities``, ``noise`` or ``spectra``.
+        Method of drawing: ``probabilities``, ``noise`` or ``spectra``.
     methods
         Detectors and estimators for ``spectra``.
     returns_max
@@ -115,8 +116,8 @@ def simulate_cloud(
         part_flags = None if effect_flags is None else effect_flags[shot_slice]
         effect_arguments = effects, part_flags, keys[shot_slice]
         try:
-            shots, beamlet_table, bin_groups, known_leakage_bins = _prepare_bin_groups(
-                part_eyepoints, parameters, surfaces, returns_max, effect_arguments
+            shots, beamlet_table, bin_groups, known_leakage_bins = _prepare_batch(
+                part_eyepoints, parameters, surfaces, returns_max, *effect_arguments
             )
         except UnsupportedShotError as error:
             if error.point_index is None:
@@ -142,7 +143,7 @@ def simulate_cloud(
                 keys=keys[shot_slice],
                 parameters=parameters,
                 methods=methods,
-                motion=ego_motion(part_eyepoints, motion_priors),
+                motion=ego_motion_of_eyepoints(part_eyepoints, motion_priors),
                 **draw_arguments,
             )
         else:
@@ -151,7 +152,7 @@ def simulate_cloud(
                 bin_groups,
                 keys=keys[shot_slice],
                 method=method,
-                motion=ego_motion(part_eyepoints, motion_priors),
+                motion=ego_motion_of_eyepoints(part_eyepoints, motion_priors),
                 known_leakage_bins=known_leakage_bins,
                 **draw_arguments,
             )
@@ -173,19 +174,34 @@ def simulate_cloud(
     return results
 
 
-def _prepare_bin_groups(
+class _PreparedBatch(NamedTuple):
+    """Prepared shots of a batch, and their spectra without noise."""
+
+    shots: Shots
+    """Prepared shots, with all effects."""
+    beamlet_table: BeamletTable
+    """Footprints of the shots."""
+    bin_groups: BinGroups
+    """Groups of adjacent bins above the threshold; none for a shot without a target."""
+    leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None
+    """Indices of shots, and the bins in which leaked signal may raise false peaks; None if they
+    were not listed, or are too many to keep."""
+
+
+def _prepare_batch(
     eyepoints: Eyepoints,
     parameters: Parameters,
     surfaces: Sequence[SurfaceMaterial],
     groups_max: int,
-    effect_arguments: tuple[Collection[str], np.ndarray | None, np.ndarray],
-) -> tuple[Shots, BeamletTable, BinGroups, list[tuple[np.ndarray, LeakageBins]] | None]:
-    """Return prepared shots, footprints, groups in the spectra, and bins of leaked signal.
+    effects: Collection[str],
+    effect_flags: np.ndarray | None,
+    keys: np.ndarray,
+) -> _PreparedBatch:
+    """Prepare a batch of shots, and find the echoes and the leaked signal in their spectra.
 
-    Shots without a target have no groups. Bins of leaked signal are None if they were not listed or
-    are many. `effect_arguments` are names of effects, flags of each shot, and the shots' keys.
+    The arguments are those of :func:`simulate_cloud`; `groups_max` is its `returns_max`.
     """
-    (effects, effect_flags, keys), has_target = effect_arguments, eyepoints.has_target
+    has_target = eyepoints.has_target
     placed_eyepoints = eyepoints._replace(
         range=np.where(has_target, eyepoints.range, _EMPTY_SHOT_RANGE),
         radial_velocity=np.where(has_target, eyepoints.radial_velocity, 0.0),
@@ -217,8 +233,8 @@ def _prepare_bin_groups(
         )
     if not has_target.all():
         without_target = ~has_target
-        for bin_array in bin_groups[:3]:
-            bin_array[without_target] = -1
+        for bins in (bin_groups.strongest_bin, bin_groups.first_bin, bin_groups.last_bin):
+            bins[without_target] = -1
         bin_groups.neighbour_magnitudes[without_target] = bin_groups.pd[without_target] = np.nan
         bin_groups.n_exempt[without_target] = bin_groups.leakage[without_target] = 0.0
     if leaks_in_speckle and not finds_groups_with_leakage:
@@ -231,11 +247,14 @@ def _prepare_bin_groups(
             bin_groups.leakage[indices] = leakage_bins.mean_leakage()
             if known_leakage_bins is not None:
                 known_leakage_bins.append((indices, leakage_bins))
-    return shots, ground.beamlets, bin_groups, known_leakage_bins
+    return _PreparedBatch(shots, ground.beamlets, bin_groups, known_leakage_bins)
 
 
 def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, np.ndarray]:
-    """Return probabilities of shots that do not depend on draws, (n,) by name."""
+    """Return the statistics (n,) of shots that do not depend on draws, by name.
+
+    The names are those of :data:`sweep.model.outputs.SHOT_STATISTIC_VARIABLES`.
+    """
     pd_up, pd_doppler, pd_down = bin_groups.pd[:, :, 0].T
     pd_both = shots.joint_detection_probability(
         pd_up, pd_down, (bin_groups.magnitude[:, 0, 0], bin_groups.magnitude[:, 2, 0])
@@ -264,7 +283,11 @@ def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, n
 def _cloud_points(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
-    """Return points and their truth by name, (n, draws, returns[, 3])."""
+    """Return points and their truth, (n, draws, returns[, 3]) by name of POINT_VARIABLES.
+
+    `n_lines` is the number of lines of a shot in `shot_returns`: 1 if the effect of the footprint
+    is skipped, else that of the beamlets.
+    """
     has_beamlet = shot_returns.beamlet >= 0
     shot = np.arange(len(has_beamlet))[:, None, None]
     shot_and_beamlet = shot, np.maximum(shot_returns.beamlet, 0)

@@ -1,4 +1,4 @@
-"""Error of too few rays: the change of probabilities and peaks that more rays might make.
+"""Error by too few rays: the change of probabilities and peaks that more rays might make.
 
 If powers add, the power of the detected bin is a mean over the beam, P = sum_b w_b g_b. Here g_b is
 the power of the bin if all light went to beamlet b. A hexagonal lattice of whole shells is exact
@@ -44,54 +44,61 @@ from sweep.model.window import window_samples
 _CHIRP_SIGNS = 1.0, 0.0, -1.0
 """Signs of the chirp rates of the up, Doppler and down segment."""
 
-_LOBE_REACH_BINS, _LOBE_STEPS_PER_BIN, _WINDOW_SAMPLES = 4, 1024, 1024
-"""Table of a line's power: largest distance [bins of fs/L], steps per bin, samples of the window.
-"""
+_LOBE_REACH_BINS = 4
+"""Largest distance from a line in the table of its power [bins of fs/L]."""
+_LOBE_STEPS_PER_BIN = 1024
+"""Number of steps per bin in that table."""
+_WINDOW_SAMPLES = 1024
+"""Number of samples of the window from which that table is computed."""
 
 _NEIGHBOUR_DISTANCE_RATIO = 1.3
-"""Largest distance of neighbours over that of the nearest; second neighbours are at 1.7."""
+"""Distance up to which beamlets of a lattice are neighbours, over that of the nearest. The second
+nearest are at 1.7."""
 
 _QUARTIC_RAYS_MIN = 37
-"""Smallest number of rays for polynomials of degree 4, which then leave enough residuals."""
+"""Smallest number of rays for which polynomials of degree 4 leave enough residuals."""
 
-_NO_CHANGE_SIGMA = 15.0
-"""Distance from the threshold [standard deviations] beyond which no probability changes: e^-112."""
+_UNAFFECTED_DISTANCE_SIGMA = 15.0
+"""Distance of a magnitude from the threshold [standard deviations of the noise] beyond which no
+probability changes (e^-112)."""
 
 _PROBABILITY_CHANGE_MIN = 1e-9
 """Change of a probability below which the error of a shot is not computed."""
 
 
 class FoldedLattice(NamedTuple):
-    """Lattice of whole shells, folded about its centre: h positions, each with the opposite one."""
+    """Hexagonal lattice as h pairs of opposite beamlets; the central one forms a pair by itself."""
 
     beamlet: np.ndarray
-    """(h,) int64: index of the beamlet."""
+    """(h,) int64: index of the first beamlet of each pair."""
     opposite_beamlet: np.ndarray
-    """(h,) int64: index of the opposite beamlet; for the central one its own."""
+    """(h,) int64: index of the second beamlet of each pair."""
     inverse_weight: np.ndarray
-    """(h,): 1 over the power fraction of both beamlets."""
+    """(h,): 1 over the power fraction of both beamlets of a pair together."""
     polynomials: np.ndarray
-    """(k, h): even polynomials of the positions, orthonormal under the power fractions."""
+    """(k, h): even polynomials of the positions, orthonormal under the power fractions of pairs."""
     weighted_polynomials: np.ndarray
-    """(k, h): polynomials times the power fractions."""
+    """(k, h): polynomials times the power fractions of pairs."""
     density_change: np.ndarray
-    """(h,): relative change (u_b - w_b) / w_b from the weights to the beam's powers about the
-    beamlets."""
-    neighbour_pairs: np.ndarray
-    """(m, 2) int64: indices of neighbouring positions."""
-    pair_weight: np.ndarray
-    """(m,): sum of the products of the beamlets' power fractions, times h / (h - k) for the
+    """(h,): relative change (u_b - w_b) / w_b from a beamlet's weight w_b to the beam's power u_b
+    about it."""
+    first_neighbour: np.ndarray
+    """(m,) int64: first of two pairs of beamlets that are neighbours."""
+    second_neighbour: np.ndarray
+    """(m,) int64: second of two pairs of beamlets that are neighbours."""
+    neighbour_weight: np.ndarray
+    """(m,): sum of the products of the neighbours' power fractions, times h / (h - k) for the
     roughness that k polynomials remove."""
 
 
 def estimate_ray_error(
     shots: Shots, beamlet_table: BeamletTable, peak_bins: np.ndarray, magnitude: np.ndarray
 ) -> np.ndarray:
-    """Return the change that more rays may make, (n,), 0..1.
+    """Estimate how much more rays may change the results of shots, (n,), 0..1.
 
-    It is the larger of two errors. The first is that of the probabilities of detection, summed over
-    the segments. The second is that of a peak's magnitude, relative to the larger of the magnitude
-    and sigma.
+    The estimate is the larger of two errors. The first is that of the probabilities of detection,
+    summed over the segments. The second is that of a peak's magnitude, relative to the larger of
+    the magnitude and sigma.
 
     Parameters
     ----------
@@ -136,18 +143,26 @@ def estimate_ray_error(
 
 
 def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Return an upper bound on the change of Q_1(a, b) by a relative change of a^2.
+    """Return an upper bound on the change of Marcum's Q_1(a, b) by a relative change of a^2.
 
-    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), at the a in this range that is nearest to
-    b.
+    `a` is the magnitude, and `b` the threshold, over the standard deviation of the noise per
+    quadrature.
+
+    Notes
+    -----
+    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), with the value in the exponent, of those
+    that a takes, that is nearest to b.
     """
     distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
     bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
-    return np.where(distance > _NO_CHANGE_SIGMA, 0.0, np.minimum(bound, 1.0))
+    return np.where(distance > _UNAFFECTED_DISTANCE_SIGMA, 0.0, np.minimum(bound, 1.0))
 
 
 def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Return the change of a by a relative change of a^2: relative to a, or absolute if a < 1."""
+    """Return the change of a by a relative change of a^2, over the larger of a and 1.
+
+    `a` is a magnitude over the standard deviation of the noise per quadrature.
+    """
     return np.asarray(0.5 * relative * np.minimum(a, 1.0))
 
 
@@ -158,7 +173,24 @@ def _bin_powers(
     indices: np.ndarray,
     bins: np.ndarray,
 ) -> np.ndarray:
-    """Return powers (m, b) of beamlets' lines in a bin of m shots, up to a common factor."""
+    """Return the power (m, b) that each beamlet's line has in one bin of m shots.
+
+    Parameters
+    ----------
+    shots, beamlet_table
+        Prepared shots, and their footprints.
+    segment_index
+        The segment: 0 up, 1 Doppler, 2 down.
+    indices
+        (m,): indices of the shots.
+    bins
+        (m,): bin of each shot.
+
+    Returns
+    -------
+    ndarray (m, b)
+        Powers, up to a factor that is common to the beamlets of a shot.
+    """
     segment = shots.waveform_segments[segment_index]
     columns = (
         shots.range - segment.range_decrease,
@@ -226,8 +258,9 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
     offsets, weights = place_beamlets(n_beamlets)
     positions = offsets.T
     tree = cKDTree(positions)
-    neighbour_distance = _NEIGHBOUR_DISTANCE_RATIO * tree.query(positions[0], 2)[0][1]
-    opposite = tree.query(-positions)[1]
+    (_, nearest_distance), _ = tree.query(positions[0], 2)  # the first is the position itself
+    neighbour_distance = _NEIGHBOUR_DISTANCE_RATIO * nearest_distance
+    _, opposite = tree.query(-positions)
     representatives = np.flatnonzero(np.arange(n_beamlets) <= opposite)
     folded_index = np.empty(n_beamlets, np.int64)
     folded_index[representatives] = folded_index[opposite[representatives]] = np.arange(
@@ -238,18 +271,20 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
     )
     neighbours = tree.query_pairs(neighbour_distance, output_type="ndarray")
     neighbours = neighbours[np.lexsort(neighbours.T)]  # independent of the tree's order
-    folded_pairs = np.sort(folded_index[neighbours], axis=1)
-    pair_keys, key_index = np.unique(
-        folded_pairs[:, 0] * n_beamlets + folded_pairs[:, 1], return_inverse=True
+    first_beamlet, second_beamlet = neighbours.T
+    first_folded, second_folded = np.sort(folded_index[neighbours], axis=1).T
+    neighbour_keys, key_index = np.unique(
+        first_folded * n_beamlets + second_folded, return_inverse=True
     )
-    pairs = np.stack([pair_keys // n_beamlets, pair_keys % n_beamlets], axis=1)
-    pair_weights: np.ndarray = np.bincount(
-        key_index.ravel(), weights[neighbours[:, 0]] * weights[neighbours[:, 1]]
+    neighbour_weights: np.ndarray = np.bincount(
+        key_index.ravel(), weights[first_beamlet] * weights[second_beamlet]
     )
     polynomials = _even_polynomials(
         offsets[:, representatives], folded_weights, 4 if n_beamlets >= _QUARTIC_RAYS_MIN else 2
     )
-    pair_weights = pair_weights * (representatives.size / (representatives.size - len(polynomials)))
+    neighbour_weights = neighbour_weights * (
+        representatives.size / (representatives.size - len(polynomials))
+    )
     density_change = _density_change(offsets, weights)[representatives] / weights[representatives]
     return FoldedLattice(
         representatives,
@@ -258,17 +293,24 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
         polynomials,
         folded_weights * polynomials,
         density_change,
-        pairs,
-        pair_weights,
+        neighbour_keys // n_beamlets,
+        neighbour_keys % n_beamlets,
+        neighbour_weights,
     )
 
 
 def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the beam's power in each beamlet's cell minus its weight, (beamlets,); the sum is 0.
+    """Return the beam's power in each beamlet's cell minus the beamlet's weight, (beamlets,).
 
-    ``offsets`` (2, beamlets) are in standard deviations of the beam; ``weight`` (beamlets,) sums to
-    1. The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius share the
-    power outside of all cells.
+    The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius share the power
+    outside of all cells, so that the sum of the result is 0.
+
+    Parameters
+    ----------
+    offsets
+        (2, beamlets): positions of the beamlets [standard deviations of the beam].
+    weight
+        (beamlets,): power fractions of the beamlets; they sum to 1.
     """
     squared_radius = (offsets**2).sum(axis=0)
     # Weights are exp(-r^2 / 2) at the radius r before the lattice is stretched.
@@ -282,7 +324,17 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> np.ndarray:
-    """Return even polynomials up to a degree, orthonormal under the weights, (k, h)."""
+    """Return the values (k, h) of even polynomials at positions, orthonormal under the weights.
+
+    Parameters
+    ----------
+    offsets
+        (2, h): positions.
+    weights
+        (h,): weight of each position.
+    degree
+        Largest degree of the polynomials.
+    """
     x, y = offsets
     powers = [(total - k, k) for total in range(0, degree + 1, 2) for k in range(total + 1)]
     root = np.sqrt(weights)
@@ -292,7 +344,10 @@ def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> 
 
 @lru_cache(maxsize=32)
 def _main_lobe_table(window_name: str) -> np.ndarray:
-    """Return |W(y)|^2 over its peak's at even steps of y >= 0, for any length of the window."""
+    """Return |W(y) / W(0)|^2 at y = 0, 1, 2 .. steps, for windows of any length.
+
+    A bin of fs/L has `_LOBE_STEPS_PER_BIN` steps.
+    """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     transform = np.abs(
         np.fft.rfft(w, _WINDOW_SAMPLES * _LOBE_STEPS_PER_BIN)[
@@ -305,17 +360,22 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_power_errors(powers, lattice, relative_errors):
-    """Compute relative errors (m,), at most 1, of sums of powers (m, b): see the module."""
-    (
-        beamlet,
-        opposite_beamlet,
-        inverse_weight,
-        polynomials,
-        weighted_polynomials,
-        density_change,
-        neighbour_pairs,
-        pair_weight,
-    ) = lattice
+    """Compute the relative errors of the powers of m bins, as the module's description derives.
+
+    Parameters
+    ----------
+    powers
+        (m, b): power of each beamlet's line in the bins.
+    lattice
+        Lattice of the beamlets (:class:`FoldedLattice`).
+    relative_errors
+        (m,): the result, at most 1.
+    """
+    beamlet, opposite_beamlet = lattice.beamlet, lattice.opposite_beamlet
+    inverse_weight, density_change = lattice.inverse_weight, lattice.density_change
+    polynomials, weighted_polynomials = lattice.polynomials, lattice.weighted_polynomials
+    first_neighbour, second_neighbour = lattice.first_neighbour, lattice.second_neighbour
+    neighbour_weight = lattice.neighbour_weight
     residual = np.empty(beamlet.size)
     for i in range(relative_errors.size):
         total_power = bias = 0.0
@@ -333,9 +393,9 @@ def _fill_power_errors(powers, lattice, relative_errors):
             for f in range(beamlet.size):
                 residual[f] -= projection * polynomials[j, f]
         roughness = 0.0
-        for k in range(pair_weight.size):
-            difference = residual[neighbour_pairs[k, 0]] - residual[neighbour_pairs[k, 1]]
-            roughness += pair_weight[k] * difference * difference
+        for k in range(neighbour_weight.size):
+            difference = residual[first_neighbour[k]] - residual[second_neighbour[k]]
+            roughness += neighbour_weight[k] * difference * difference
         relative_errors[i] = (
             min((math.sqrt(roughness) + abs(bias)) / total_power, 1.0) if total_power > 0.0 else 1.0
         )

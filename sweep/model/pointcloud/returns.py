@@ -109,10 +109,10 @@ from sweep.model.sampling.draws import (
     threshold_and_line_noise_ratios,
 )
 from sweep.model.sampling.speckle_lines import (
-    CHIRP_PAIRS,
+    CHIRP_PAIRS_WITH_SELF,
     FACTORED_BINS_MAX,
     LOOK_DRAW_STRIDE,
-    SEGMENT_PAIRS_AND_SELF,
+    SEGMENT_PAIRS_WITH_SELF,
     SpeckleLineGrid,
     SpecklePeaks,
     draw_bin_amplitudes,
@@ -876,9 +876,9 @@ def _wander_covariance(
         offset, folding_signs(shots)[point], relative_power, signal_power / mean_power
     )
     segment_pairs = (
-        CHIRP_PAIRS
+        CHIRP_PAIRS_WITH_SELF
         if shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
-        else SEGMENT_PAIRS_AND_SELF
+        else SEGMENT_PAIRS_WITH_SELF
     )
     covariance[point, draw, return_number] = position_error_moments(
         line_gradients.select(point), speckle_peaks, shots, segment_pairs
@@ -1062,7 +1062,7 @@ def _measure_by_reading(
         f_d, f_r = (
             np.where(has_reading, new, old)
             for new, old in zip(
-                waveform.read_beats(reading, up, down, sample_rate), (f_d, f_r), strict=True
+                waveform.beats_of_reading(reading, up, down, sample_rate), (f_d, f_r), strict=True
             )
         )
     measured_range, measured_velocity = waveform.range_velocity_of_beats(

@@ -1,16 +1,16 @@
 """Returns of a flight's shots from full spectra, by a detector and an estimator, draw by draw.
 
 Spectra are those of :mod:`sweep.model.sampling.noisy_spectra`, as for grids. A shot is a point,
-with the echoes of all surfaces in its footprint. Adjacent flagged bins make a peak, whose position
-the estimator gives. The strongest peaks are paired, judged and measured as all peaks of flights are
-(:mod:`sweep.model.pointcloud.returns`).
+with the echoes of all surfaces in its footprint. Adjacent flagged bins make a peak, and the
+estimator gives its position. The strongest peaks are paired, compared with the truth and measured
+as all peaks of flights are (:mod:`sweep.model.pointcloud.returns`).
 
-A peak belongs to an echo if it shares a bin with the echo. The bins of an echo reach from the first
-to the last of half its largest magnitude, plus a main lobe's half-width on either side. With
+A peak belongs to an echo if it shares a bin with the echo. The bins of an echo begin with the first
+of half its largest magnitude and end with the last, plus half a main lobe on either side. With
 ``peak_bin`` only the strongest bin counts. An echo has one peak, the strongest. All other peaks are
-false, without a limit on their number. Peaks are omitted if they contain a bin of signal at or
-above a fixed threshold, or a neighbour of such a bin. Closed forms exempt such bins from false
-alarms, too.
+false, however many there are. A false peak is omitted if it contains a bin in which the signal
+alone reaches a fixed threshold, or a neighbour of such a bin. Closed forms exempt such bins from
+false alarms, too.
 
 Each draw is processed alone, so that a user's function returns the same values however draws are
 grouped.
@@ -21,6 +21,7 @@ instrument has no better knowledge. Those of ``peak_bin`` include its rounding.
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,15 +43,15 @@ from sweep.model.pointcloud.returns import (
 )
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.noisy_spectra import (
+    PointSpectra,
     SegmentSignal,
     SpectrumMethods,
-    SpectrumView,
+    centre_bins,
+    centring_shift,
     estimate_positions,
     flag_bins,
     iter_look_spectra,
-    make_spectrum_view,
-    unroll_bins,
-    unrolling_shift,
+    prepare_point_spectra,
     zero_frequency_index,
 )
 from sweep.model.waveform import STRONGEST_PEAK
@@ -83,9 +84,9 @@ def draw_spectra_returns(
     methods
         Detectors and estimators by name.
     first_draw, draws
-        Number of the first draw, and number of draws.
+        Number of the first draw, and count of draws.
     motion
-        Known motion of the instrument; None to correct nothing.
+        Known motion of the instrument; with None, range and velocity are not corrected for motion.
     """
     method_parameters, groups_max = (
         {**SPECTRUM_METHOD_DEFAULTS, **parameters},
@@ -110,7 +111,7 @@ def draw_spectra_returns(
         math.sqrt(1 / 12) if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN else 0.0
     )
     for point in range(shots.size):
-        spectrum_view = make_spectrum_view(
+        point_spectra = prepare_point_spectra(
             shots,
             point,
             method_parameters,
@@ -121,21 +122,21 @@ def draw_spectra_returns(
         )
         noise_sigma, _, line_noise_ratio = inputs.noise_and_threshold[point]
         echo_bounds = [
-            _echo_bin_bounds(spectrum_view, s, signal)
-            for s, signal in enumerate(spectrum_view.signals)
+            _echo_bin_bounds(point_spectra, s, signal)
+            for s, signal in enumerate(point_spectra.signals)
         ]
         for d in range(draws):
             n_peaks = np.zeros(3, np.int64)
-            for s, signal in enumerate(spectrum_view.signals):
+            for s, signal in enumerate(point_spectra.signals):
                 if signal is None:
                     continue
-                spectra = list(iter_look_spectra(spectrum_view, s, np.array([first_draw + d])))
+                spectra = list(iter_look_spectra(point_spectra, s, np.array([first_draw + d])))
                 power, bins, echo_of_peak = list_flagged_peaks(
-                    spectra, signal, echo_bounds[s], spectrum_view, peaks_max
+                    spectra, signal, echo_bounds[s], point_spectra, peaks_max
                 )
                 repeated_spectra = [np.repeat(spectrum, bins.size, axis=0) for spectrum in spectra]
                 positions = (
-                    estimate_positions(repeated_spectra, bins, spectrum_view)
+                    estimate_positions(repeated_spectra, bins, point_spectra)
                     if bins.size
                     else np.empty(0)
                 )
@@ -178,44 +179,63 @@ def draw_spectra_returns(
     return measure_returns(shots, inputs, drawn_peaks, motion, from_three_bins=False)
 
 
-def _echo_bin_bounds(view: SpectrumView, segment: int, signal: SegmentSignal | None) -> np.ndarray:
-    """Return the first and last bin (echoes, 2) of each echo in a segment.
+class EchoBounds(NamedTuple):
+    """Bins of k echoes in a segment, as numbered after :func:`centre_bins`."""
 
-    Bins are those after :func:`unroll_bins`, with the strongest echo in the middle of a complex
-    record's bins.
-    """
-    echo_indices = view.echo_indices(segment)
+    first_bin: np.ndarray
+    """(k,) int64: first bin of each echo."""
+    last_bin: np.ndarray
+    """(k,) int64: last bin of each echo."""
+
+
+class FlaggedPeaks(NamedTuple):
+    """Peaks of flagged bins in one draw of a segment, strongest first."""
+
+    power: np.ndarray
+    """(bins,): |X|^2 of all bins of the draw [V^2]."""
+    strongest_bin: np.ndarray
+    """(peaks,) int64: index of the strongest bin of each peak."""
+    echo_number: list[int]
+    """(peaks,): number of each peak's echo; FALSE_PEAK for none."""
+
+
+def _echo_bin_bounds(
+    point_spectra: PointSpectra, segment: int, signal: SegmentSignal | None
+) -> EchoBounds:
+    """Return the bins of each echo of a point in a segment; no echoes without a signal."""
+    echo_indices = point_spectra.echo_indices(segment)
     if signal is None or not echo_indices.size:
-        return np.empty((0, 2), np.int64)
-    shots, setting = view.shots, view.setting
-    shift = unrolling_shift(shots, signal.strongest_bin)
+        return EchoBounds(np.empty(0, np.int64), np.empty(0, np.int64))
+    shots, settings = point_spectra.shots, point_spectra.settings
+    shift = centring_shift(shots, signal.strongest_bin)
     if shots.complex_record:
         echo_indices = (echo_indices + shift - 1) % shots.fft_size + 1
     if shots.detection != "any_bin":
-        return np.stack([echo_indices, echo_indices], axis=1)
+        return EchoBounds(echo_indices, echo_indices)
     if echo_indices.size == 1:
-        return np.array([[signal.first_bin + shift, signal.last_bin + shift]])
-    magnitude = unroll_bins(shots, np.abs(signal.spectrum), signal.strongest_bin)
+        return EchoBounds(np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift]))
+    magnitude = centre_bins(shots, np.abs(signal.spectrum), signal.strongest_bin)
     lobe_half_width = math.ceil(
-        main_lobe_half_width(setting.window) * setting.fft_size / setting.window.length
+        main_lobe_half_width(settings.window) * settings.fft_size / settings.window.length
     )
-    bounds = []
+    first_bins, last_bins = [], []
     for echo_index in echo_indices:
         low_bins = np.flatnonzero(magnitude < 0.5 * magnitude[echo_index])
         next_low = int(np.searchsorted(low_bins, echo_index))
         first = low_bins[next_low - 1] + 1 if next_low else 0
         last = low_bins[next_low] - 1 if next_low < low_bins.size else magnitude.size - 1
-        bounds.append((first - lobe_half_width, last + lobe_half_width))
-    return np.array(bounds)
+        first_bins.append(first - lobe_half_width)
+        last_bins.append(last + lobe_half_width)
+    return EchoBounds(np.array(first_bins), np.array(last_bins))
 
 
 def list_flagged_peaks(
     spectra: Sequence[np.ndarray],
     signal: SegmentSignal,
-    echo_bounds: np.ndarray,
-    view: SpectrumView,
+    echo_bounds: EchoBounds,
+    point_spectra: PointSpectra,
     peaks_max: int,
-) -> tuple[np.ndarray, np.ndarray, list[int]]:
+) -> FlaggedPeaks:
     """List the peaks of flagged bins in one draw of a segment, strongest first.
 
     Parameters
@@ -225,43 +245,39 @@ def list_flagged_peaks(
     signal
         Signal of the segment without noise.
     echo_bounds
-        Result of :func:`_echo_bin_bounds`.
-    view
-        View of the shot.
+        Bins of the echoes.
+    point_spectra
+        Spectra of the shot.
     peaks_max
         Largest number of peaks.
-
-    Returns
-    -------
-    tuple
-        Power (bins,) of the draw; strongest bin (peaks,) of each peak; and number of its echo, or
-        FALSE_PEAK.
     """
-    (all_power,), (flags,) = flag_bins(spectra, view, signal.segment)
-    shots, shift = view.shots, unrolling_shift(view.shots, signal.strongest_bin)
+    (all_power,), (flags,) = flag_bins(spectra, point_spectra, signal.segment)
+    shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
     power, flags = (
-        unroll_bins(shots, values, signal.strongest_bin) for values in (all_power, flags)
+        centre_bins(shots, values, signal.strongest_bin) for values in (all_power, flags)
     )
     end_index = power.size - 1
-    if view.shots.real_fft_size and signal.last_bin >= signal.first_bin:  # an echo on DC or Nyquist
-        # Groups exclude these bins: if one is flagged, flag its inner neighbour instead.
+    if shots.real_fft_size and signal.last_bin >= signal.first_bin:
+        # Groups exclude DC and Nyquist: flag the inner neighbour of an echo's bin flagged there.
         for end, inner_bin in ((0, 1), (end_index, end_index - 1)):
             if flags[end] and end in (signal.first_bin, signal.last_bin):
                 flags[inner_bin] = True
-                echo_bounds = np.where(echo_bounds == end, inner_bin, echo_bounds)
+                echo_bounds = EchoBounds(
+                    *(np.where(bins == end, inner_bin, bins) for bins in echo_bounds)
+                )
     flags[[0, -1]] = False
     assert signal.is_exempt is not None
-    is_exempt = unroll_bins(shots, signal.is_exempt, signal.strongest_bin)
+    is_exempt = centre_bins(shots, signal.is_exempt, signal.strongest_bin)
     edges = np.diff(flags.astype(np.int8))
     starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
-    bins: list[int] = []
+    strongest_bins: list[int] = []
     echo_of_peak: list[int] = []
-    first_searched = view.shots.first_searched_bin
+    first_searched = point_spectra.shots.first_searched_bin
     group_power = [power[start:end].max() for start, end in zip(starts, ends, strict=True)]
     for group_index in np.argsort(-np.array(group_power), kind="stable"):
         start, end = int(starts[group_index]), int(ends[group_index])
-        touched_echoes = np.flatnonzero((echo_bounds[:, 0] < end) & (start <= echo_bounds[:, 1]))
-        echo_number = int(touched_echoes[0]) if touched_echoes.size else FALSE_PEAK
+        touches_echo = (echo_bounds.first_bin < end) & (start <= echo_bounds.last_bin)
+        echo_number = int(touches_echo.argmax()) if touches_echo.any() else FALSE_PEAK
         if echo_number == FALSE_PEAK and (
             start > end_index - first_searched or end <= first_searched
         ):
@@ -270,8 +286,8 @@ def list_flagged_peaks(
             continue
         if echo_number != FALSE_PEAK and echo_number in echo_of_peak:
             continue
-        bins.append((start + int(power[start:end].argmax()) - shift) % all_power.size)
+        strongest_bins.append((start + int(power[start:end].argmax()) - shift) % all_power.size)
         echo_of_peak.append(echo_number)
-        if len(bins) == peaks_max:
+        if len(strongest_bins) == peaks_max:
             break
-    return all_power, np.array(bins, np.int64), echo_of_peak
+    return FlaggedPeaks(all_power, np.array(strongest_bins, np.int64), echo_of_peak)

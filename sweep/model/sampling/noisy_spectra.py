@@ -78,7 +78,7 @@ from sweep.model.evaluation import fit_peaks
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.philox import (
     STREAM_LASER_PHASE,
-    STREAM_RECORD,
+    STREAM_RECORD_NOISE,
     to_normals_by_row,
     uniforms,
 )
@@ -98,15 +98,17 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import full_segment_spectrum
 from sweep.model.window import zero_first_samples
 
-AVERAGED_VALUES = (
+AVERAGED_VALUE_NAMES = (
     "pfa_bin",
     "false_alarms",
-    "range",
-    "radial_velocity",
-    "range_2",
-    "radial_velocity_2",
+    "range_error",
+    "radial_velocity_error",
+    "squared_range_bound",
+    "squared_radial_velocity_bound",
 )
-"""Names of values that are averaged over draws; the last two are squares of bounds."""
+"""Names of values that are averaged over draws: the fraction of bins with a false alarm, the number
+of false alarms, measured minus true range [m] and radial velocity [m/s], and the squares of their
+bounds."""
 
 
 class SpectrumMethods(NamedTuple):
@@ -119,49 +121,75 @@ class SpectrumMethods(NamedTuple):
 
 
 class SegmentSignal(NamedTuple):
-    """Spectrum of a segment without noise, with the bins and the frequency of its echo."""
+    """Spectrum of a segment of a point without noise, with the bins and the frequency of its echo.
+
+    Bins are stated by their index in the spectrum.
+    """
 
     spectrum: np.ndarray
-    """Spectrum without noise [V], complex: (N/2 + 1,), or (N,) for a complex record."""
+    """Complex spectrum [V]: (N/2 + 1,), or (N,) for a complex record."""
     strongest_bin: int
-    """Index of the largest bin. DC and Nyquist are excluded if noise is taken as circular in all
-    bins of a real record."""
+    """Index of the largest bin. DC and Nyquist are excluded if the noise of a real record counts as
+    circular in all bins."""
     first_bin: int
-    """Index of the first bin that the signal occupies. The occupied bins reach from the first to
-    the last of half the largest magnitude, plus a main lobe's half-width on either side."""
+    """First bin that the signal occupies. The occupied bins begin with the first bin of half the
+    largest magnitude and end with the last, plus half a main lobe on either side."""
     last_bin: int
-    """Index of the last bin that the signal occupies; below ``first_bin`` if there is no echo, or
-    its largest bin is not searched."""
+    """Last bin that the signal occupies. It is below ``first_bin`` if there is no echo, or if its
+    largest bin is not searched."""
     frequency: float
-    """Position [bins] of a lone tone with the magnitudes about the largest bin, with its sign."""
+    """Signed frequency [bins] of a lone tone with the same magnitudes about the largest bin."""
     cnr: float
-    """Power of the signal over that of the noise in the record, before the FFT."""
+    """Carrier-to-noise ratio: power of the signal over that of the noise in the record, before the
+    FFT."""
     segment: int
-    """0 up, 1 Doppler, 2 down."""
+    """The segment: 0 up, 1 Doppler, 2 down."""
     nearest_echo: np.ndarray | None = None
-    """(bins,) int64: number of the echo nearest to each bin; None if there is one echo."""
-    echo_peaks: tuple[np.ndarray, np.ndarray] | None = None
-    """Index of the strongest bin of each of several echoes, and index (fractional) of a lone tone
-    about it; None if there is one echo."""
+    """(bins,) int64: number of the echo nearest to each bin; None with a single echo."""
+    echo_peaks: "EchoPeaks | None" = None
+    """Peaks of the echoes; None with a single echo."""
     echo_half_width: int = 0
-    """Bins on either side of the strongest bin that each of several echoes occupies."""
+    """Number of bins on either side of its strongest bin that each of several echoes occupies."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Records of the speckle of each echo. Empty if lines spread over more than a bin or the echo
-    has no samples; None before :func:`add_footprint_records`."""
+    """Record of each echo in speckle. Empty if lines spread over more than a bin or the echo has no
+    samples; None before :func:`add_footprint_records`."""
     record_scalings: tuple[np.ndarray, ...] = ()
-    """(bins,) complex for each echo: factors that turn the transform of a drawn record into factors
-    on ``spectrum``."""
+    """(bins,) complex for each echo. The transform of a drawn record times these scalings gives the
+    factors of speckle on the bins of ``spectrum``."""
     is_exempt: np.ndarray | None = None
-    """(bins,) bool: bins that raise no false alarm. These are ``first_bin`` to ``last_bin``, and
-    bins at or above the threshold with their neighbours
+    """(bins,) bool: True for bins that raise no false alarm. These are ``first_bin`` to
+    ``last_bin``, and bins at or above the threshold with their neighbours
     (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`)."""
+
+
+class EchoPeaks(NamedTuple):
+    """Peaks of k echoes in a segment."""
+
+    strongest_bin: np.ndarray
+    """(k,) int64: index of the strongest bin."""
+    tone_position: np.ndarray
+    """(k,): position of a lone tone with the same magnitudes about that bin, as a fractional index.
+    """
+
+
+class EchoWindow(NamedTuple):
+    """Bins of an echo whose speckle is drawn, by their index in the spectrum."""
+
+    strongest_bin: int
+    """Strongest bin of the echo."""
+    position: float
+    """Middle of the echo, as a fractional index."""
+    first_bin: int
+    """First bin of the window."""
+    last_bin: int
+    """Last bin of the window."""
 
 
 def noiseless_signal(
     shots: Shots, point: int, segment: int, echo_bins: Sequence[int] | np.ndarray = (),
     fixed_threshold: float = math.inf,
 ) -> SegmentSignal:  # fmt: skip
-    """Return the spectrum of a segment of a point without noise.
+    """Return the spectrum of a segment of a point without noise, and where its echoes are.
 
     Parameters
     ----------
@@ -170,14 +198,14 @@ def noiseless_signal(
     point
         Index of the point.
     segment
-        0 up, 1 Doppler, 2 down.
+        The segment: 0 up, 1 Doppler, 2 down.
     echo_bins
         Indices of the strongest bins of the echoes, if several surfaces return one.
     fixed_threshold
-        Fixed threshold [V] of the detector, if it has one; bins that reach it raise no false alarm.
+        Threshold [V] of the detector, if it is fixed; bins that reach it raise no false alarm.
     """
     magnitude = full_segment_spectrum(shots, point, segment)
-    if (laser_timing := _laser_timing(shots, point))[
+    if (phase_noise_arguments := _phase_noise_arguments(shots, point))[
         "line_width"
     ] > 0:  # magnitude before the phase walk, which draws apply
         echo_window = shots.window
@@ -185,9 +213,9 @@ def noiseless_signal(
             echo_window = zero_first_samples(
                 echo_window, int(shots.n_samples_before_echo[0, point])
             )
-        line_power_fraction = apparent_line_and_pedestal(
-            window=echo_window, looks=shots.looks.n_coherent, **laser_timing
-        )[0][0]
+        (line_power_fraction, *_), *_ = apparent_line_and_pedestal(
+            window=echo_window, looks=shots.looks.n_coherent, **phase_noise_arguments
+        )
         magnitude = magnitude / math.sqrt(line_power_fraction)
     window, last_index = shots.window, magnitude.size - 1
     margin = 0 if shots.real_fft_size or shots.complex_record else 1  # omits DC and Nyquist
@@ -206,10 +234,10 @@ def noiseless_signal(
             is_exempt=no_bins,
         )
     peak_position = _tone_position(shots, magnitude, strongest_bin)
-    shift = unrolling_shift(shots, strongest_bin)
+    shift = centring_shift(shots, strongest_bin)
     bins_above_half = (
         np.flatnonzero(
-            unroll_bins(shots, magnitude, strongest_bin) >= 0.5 * magnitude[strongest_bin]
+            centre_bins(shots, magnitude, strongest_bin) >= 0.5 * magnitude[strongest_bin]
         )
         - shift
     )
@@ -250,7 +278,7 @@ def noiseless_signal(
         if shots.complex_record:
             bin_offset -= shots.fft_size * np.rint(bin_offset / shots.fft_size).astype(np.int64)
         nearest_echo = np.abs(bin_offset).argmin(axis=1)
-        echo_peaks = (
+        echo_peaks = EchoPeaks(
             np.asarray(echo_bins),
             np.array(
                 [
@@ -279,7 +307,7 @@ def noiseless_signal(
         echo_peaks=echo_peaks,
         echo_half_width=lobe_half_width,
         is_exempt=_exempt_bin_mask(
-            shots, magnitude, strongest_bin, (first_bin, last_bin), fixed_threshold
+            shots, magnitude, strongest_bin, first_bin, last_bin, fixed_threshold
         ),
     )
 
@@ -288,58 +316,79 @@ def _exempt_bin_mask(
     shots: Shots,
     magnitude: np.ndarray,
     strongest_bin: int,
-    echo_bins: tuple[int, int],
+    first_bin: int,
+    last_bin: int,
     fixed_threshold: float,
 ) -> np.ndarray:
-    """Return the mask (bins,) bool of bins that raise no false alarm.
+    """Return :attr:`SegmentSignal.is_exempt` of a segment.
 
-    Without a searched echo no bin is exempt. `echo_bins` are the first and last bin that the signal
-    occupies.
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    magnitude
+        (bins,): |X| without noise [V].
+    strongest_bin, first_bin, last_bin
+        Strongest bin, and the bins that the signal occupies. If `last_bin` is below `first_bin`, no
+        bin is exempt.
+    fixed_threshold
+        Threshold [V] of the detector, if it is fixed.
     """
-    first_bin, last_bin = echo_bins
     is_exempt = np.zeros(magnitude.size, bool)
     if last_bin < first_bin:
         return is_exempt
-    unrolled_magnitude = unroll_bins(shots, magnitude, strongest_bin)
-    is_marked = np.zeros(unrolled_magnitude.size, bool)
+    centred_magnitude = centre_bins(shots, magnitude, strongest_bin)
+    is_marked = np.zeros(centred_magnitude.size, bool)
     mark_exempt_bins(
-        unrolled_magnitude,
-        unrolled_magnitude.size,
+        centred_magnitude,
+        centred_magnitude.size,
         fixed_threshold,
         is_marked,
         shots.detection_rule.lobe_half_width,
     )
     if shots.complex_record:
-        is_marked = np.roll(is_marked[1:-1], 1 - unrolling_shift(shots, strongest_bin))
+        is_marked = np.roll(is_marked[1:-1], 1 - centring_shift(shots, strongest_bin))
     is_exempt[np.arange(first_bin, last_bin + 1) % is_exempt.size] = True
     return is_exempt | is_marked
 
 
 def zero_frequency_index(shots: Shots) -> int:
-    """Return the index of the bin at frequency 0 in a spectrum."""
+    """Return the index of the bin of frequency 0 in a spectrum of shots."""
     return int(shots.bin_indices(np.zeros((), int)))
 
 
-def unrolling_shift(shots: Shots, middle_index: int) -> int:
-    """Return the number of bins by which :func:`unroll_bins` moves a bin."""
+def centring_shift(shots: Shots, middle_index: int) -> int:
+    """Return the number of bins by which :func:`centre_bins` moves a bin upwards."""
     return 1 + shots.fft_size // 2 - middle_index if shots.complex_record else 0
 
 
-def unroll_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
-    """Return values of bins (..., bins) rotated so that a given bin is far from either end.
+def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarray:
+    """Rotate the bins of a complex record's spectrum until a given bin is in the middle.
 
-    Values of a complex record are rotated until index ``middle_index`` is in the middle. A 0 is
-    added at either end, as if for DC and Nyquist of a real record. Values of a real record are
-    returned unchanged.
+    Bins about it are then adjacent, although the first bin of the spectrum follows its last. A 0 is
+    added at either end, in the place of DC and Nyquist of a real record. The bins of a real record
+    are returned unchanged.
+
+    Parameters
+    ----------
+    shots
+        Prepared shots.
+    values
+        (..., bins): any values of the bins of a spectrum.
+    middle_index
+        Index of the bin that is moved to the middle.
     """
     if not shots.complex_record:
         return values
-    values = np.roll(values, unrolling_shift(shots, middle_index) - 1, axis=-1)
+    values = np.roll(values, centring_shift(shots, middle_index) - 1, axis=-1)
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)])
 
 
 def _tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
-    """Return the position, as a fractional index, of a lone tone with a given largest bin."""
+    """Interpolate the position of a peak, as a fractional index, as if it were a lone tone.
+
+    ``magnitude`` (bins,) is |X|, and ``peak_index`` its largest bin.
+    """
     last_index = magnitude.size - 1
     if shots.complex_record:
         below, above = magnitude[peak_index - 1], magnitude[(peak_index + 1) % magnitude.size]
@@ -354,9 +403,9 @@ def _tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> floa
 
 
 def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray:
-    """Return phase factors (bins,) of a lone tone at a position, by index; 1 if the tone vanishes.
+    """Return the phase factors X / |X| (bins,) of a lone tone's spectrum; 1 where X is 0.
 
-    The tone begins with sample ``first_sample`` of the record.
+    The tone is at a position, as a fractional index, and begins with sample ``first_sample``.
     """
     fft_size = shots.fft_size
     cycles = (position - zero_frequency_index(shots)) / fft_size
@@ -370,14 +419,18 @@ def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray
 
 
 def record_spectrum(shots: Shots, record: np.ndarray) -> np.ndarray:
-    """Return the spectrum (bins,) of a windowed record (L,), padded to the FFT size."""
+    """Transform a windowed record (L,), padded to the FFT size, to a complex spectrum (bins,)."""
     if shots.complex_record:
         return np.asarray(fft.fftshift(fft.fft(record, shots.fft_size)))
     return np.asarray(fft.rfft(record, shots.fft_size))
 
 
-def _laser_timing(shots: Shots, point: int) -> dict[str, np.ndarray]:
-    """Return the laser's line width [Hz], the echo's delay [s] and the record's duration [s]."""
+def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
+    """Return the quantities of a point on which its phase noise depends, by name.
+
+    They are the ``line_width`` of the laser [Hz], the ``delay`` of the echo [s] and the
+    ``duration`` of the record [s].
+    """
     return {
         "line_width": _value_at(shots.lorentzian_line_width, point),
         "delay": 2 * _value_at(shots.range, point) / SPEED_OF_LIGHT,
@@ -394,9 +447,9 @@ def draw_signal_spectra(
     key: np.ndarray,
     draws: np.ndarray,
 ) -> np.ndarray:
-    """Return complex spectra (m, bins) of the signal in m draws, without noise [V].
+    """Draw complex spectra (m, bins) of the signal [V] with the laser's phase noise, without noise.
 
-    Without a phase walk all draws are equal, and there is one row.
+    If the laser has no line width, all draws are equal, and there is one row.
 
     Parameters
     ----------
@@ -409,14 +462,14 @@ def draw_signal_spectra(
     draws
         (m,) int64: numbers of the draws.
     """
-    laser_timing, sample_rate = (
-        _laser_timing(shots, point),
+    phase_noise_arguments, sample_rate = (
+        _phase_noise_arguments(shots, point),
         float(_value_at(shots.sample_rate, point)),
     )
-    if not laser_timing["line_width"] > 0:
+    if not phase_noise_arguments["line_width"] > 0:
         return signal.spectrum[None]
     record_length, fft_size = shots.window.length, shots.fft_size
-    delay_samples = float(laser_timing["delay"]) * sample_rate
+    delay_samples = float(phase_noise_arguments["delay"]) * sample_rate
     analytic_spectrum = np.zeros(fft_size, complex)  # spectrum of the analytic record
     if shots.complex_record:
         analytic_spectrum = fft.ifftshift(signal.spectrum)
@@ -425,7 +478,7 @@ def draw_signal_spectra(
         analytic_spectrum[[0, fft_size // 2]] /= 2
     record = fft.ifft(analytic_spectrum)[:record_length]
     phase_variance_per_sample, spectra = (
-        2 * math.pi * float(laser_timing["line_width"]) / sample_rate,
+        2 * math.pi * float(phase_noise_arguments["line_width"]) / sample_rate,
         [],
     )
     for draw in draws:
@@ -450,7 +503,7 @@ def draw_signal_spectra(
 def draw_noise_spectra(
     shots: Shots, point: int, segment: int, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Return complex noise (m, bins) of a segment in m draws [V].
+    """Draw complex spectra (m, bins) of a segment's noise alone [V].
 
     Parameters
     ----------
@@ -461,7 +514,7 @@ def draw_noise_spectra(
     draws
         (m,) int64: numbers of the draws.
     """
-    record_length, stream = shots.window.length, STREAM_RECORD[segment]
+    record_length, stream = shots.window.length, STREAM_RECORD_NOISE[segment]
     keys = np.broadcast_to(key, (draws.size, 2))
     n_numbers = 2 * record_length if shots.complex_record else record_length + record_length % 2
     record = to_normals_by_row(uniforms(keys, draws, stream, n_numbers))
@@ -486,10 +539,10 @@ def draw_bin_speckle(
     draws: np.ndarray,
     line_grid: SpeckleLineGrid | None = None,
 ) -> np.ndarray:
-    """Return complex factors (m, bins) of speckle on the bins of a segment; 1 without speckle.
+    """Draw the complex factors (m, bins) by which speckle multiplies the bins of a segment.
 
-    The bins that an echo occupies have the factors of the lines of its footprint. Its other bins
-    have the factor of its strongest bin.
+    The bins that an echo occupies have factors that the lines of its footprint make. Its other bins
+    have the factor of its strongest bin. Without speckle all factors are 1, as one row of one bin.
 
     Parameters
     ----------
@@ -516,19 +569,21 @@ def draw_bin_speckle(
     is_real_bin = np.zeros(n_bins, bool)  # the real part alone has all of the power
     is_real_bin[[0, -1]] = shots.real_fft_size > 0
     echo_windows = [
-        (signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin)
+        EchoWindow(
+            signal.strongest_bin, signal.frequency + zero_index, signal.first_bin, signal.last_bin
+        )
     ]
     if signal.nearest_echo is not None and signal.echo_peaks is not None:
         echo_windows = [
-            (
-                int(own),
+            EchoWindow(
+                int(echo_bin),
                 position,
-                int(own) - signal.echo_half_width,
-                int(own) + signal.echo_half_width,
+                int(echo_bin) - signal.echo_half_width,
+                int(echo_bin) + signal.echo_half_width,
             )
-            if (own - signal.first_bin) % n_bins > signal.last_bin - signal.first_bin
-            else (int(own), position, signal.first_bin, signal.last_bin)
-            for own, position in zip(*signal.echo_peaks, strict=True)
+            if (echo_bin - signal.first_bin) % n_bins > signal.last_bin - signal.first_bin
+            else EchoWindow(int(echo_bin), position, signal.first_bin, signal.last_bin)
+            for echo_bin, position in zip(*signal.echo_peaks, strict=True)
         ]
     for echo_number, (strongest_bin, position, first_bin, last_bin) in enumerate(echo_windows):
         first_bin, last_bin = min(first_bin, strongest_bin - 1), max(last_bin, strongest_bin + 1)
@@ -538,13 +593,16 @@ def draw_bin_speckle(
             line_grid,
             point,
             positions,
-            (first_bin, last_bin - first_bin + 1),
+            first_bin,
+            last_bin - first_bin + 1,
             key=key,
             draws=draws,
-            group=echo_number,
+            echo_number=echo_number,
         )
-        own = slice(None) if signal.nearest_echo is None else signal.nearest_echo == echo_number
-        factors[:, own] = amplitudes[:, strongest_bin - first_bin, None]
+        bins_of_echo = (
+            slice(None) if signal.nearest_echo is None else signal.nearest_echo == echo_number
+        )
+        factors[:, bins_of_echo] = amplitudes[:, strongest_bin - first_bin, None]
         bins = np.arange(first_bin, last_bin + 1)
         has_speckle = (amplitudes != 0).any(axis=0)
         if not shots.complex_record:
@@ -576,7 +634,10 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return the signal of a point with the records of its echoes' speckle."""
+    """Return a signal with the fields that draws of its speckle need.
+
+    These are :attr:`SegmentSignal.footprint_records` and :attr:`SegmentSignal.record_scalings`.
+    """
     if shots.line_gradients is None:
         return signal
     segment, zero_index = signal.segment, zero_frequency_index(shots)
@@ -595,7 +656,7 @@ def add_footprint_records(
     strongest_bins = np.full((1, 3), signal.strongest_bin - zero_index)
     positions = [float(mean_line_positions(shots, np.array([point]), strongest_bins)[0, segment])]
     if signal.echo_peaks is not None:
-        positions = [float(position) - zero_index for position in signal.echo_peaks[1]]
+        positions = [float(position) - zero_index for position in signal.echo_peaks.tone_position]
     records = tuple(
         FootprintRecord.from_line_grid(
             line_grid, point, segment, position, shots.window, first_sample, shots.fft_size
@@ -618,7 +679,7 @@ def add_footprint_records(
 def _draw_speckle_from_records(
     shots: Shots, signal: SegmentSignal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Draw factors (m, bins) of speckle from the records of a footprint's lines."""
+    """Draw the factors (m, bins) of :func:`draw_bin_speckle` from the records of the echoes."""
     assert signal.footprint_records is not None
     factors = np.empty((draws.size, signal.spectrum.size), complex)
     for echo_number, record in enumerate(signal.footprint_records):
@@ -634,22 +695,26 @@ def _draw_speckle_from_records(
 
 
 def iter_look_spectra(
-    view: "SpectrumView", segment: int, draws: np.ndarray
+    point_spectra: "PointSpectra", segment: int, draws: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield complex spectra (m, bins) of a segment in m draws, with noise [V], look by look.
+    """Draw and yield complex spectra (m, bins) of a segment with noise [V], look by look.
 
-    For looks that are added in amplitude it yields their mean alone.
+    If looks are added in amplitude, only their mean is yielded. ``draws`` (m,) int64 are the
+    numbers of the draws.
     """
-    looks, look_sum = view.shots.looks, np.zeros(1, complex)
-    for look, shots in enumerate(view.look_shots):
+    looks, look_sum = point_spectra.shots.looks, np.zeros(1, complex)
+    for look, shots in enumerate(point_spectra.look_shots):
         look_draws = draws + look * LOOK_DRAW_STRIDE
-        draw_arguments = {"key": view.key, "draws": look_draws}
-        signal = view.get_signal_in_look(segment, look)
-        factors = _draw_look_speckle(view, shots, segment, look, draws, signal)
+        draw_arguments = {"key": point_spectra.key, "draws": look_draws}
+        signal = point_spectra.get_signal_in_look(segment, look)
+        factors = _draw_look_speckle(point_spectra, shots, segment, look, draws, signal)
         spectra = (
-            draw_signal_spectra(shots, view.point, segment, signal, **draw_arguments) * factors
+            draw_signal_spectra(shots, point_spectra.point, segment, signal, **draw_arguments)
+            * factors
         )
-        spectra = spectra + draw_noise_spectra(shots, view.point, segment, **draw_arguments)
+        spectra = spectra + draw_noise_spectra(
+            shots, point_spectra.point, segment, **draw_arguments
+        )
         if looks.n_coherent == 1:
             yield spectra
         else:
@@ -659,27 +724,30 @@ def iter_look_spectra(
 
 
 def _draw_look_speckle(
-    view: "SpectrumView",
+    point_spectra: "PointSpectra",
     shots: Shots,
     segment: int,
     look: int,
     draws: np.ndarray,
     signal: SegmentSignal,
 ) -> np.ndarray:
-    """Return factors (m, bins) of speckle on the bins of a look.
+    """Draw the factors (m, bins) by which speckle multiplies the bins of one look.
 
-    Speckle is common to all looks, independent, or a mixture. Speckle that changes from look to
-    look is a sum of independent realisations.
+    The speckle of successive looks is equal, independent or correlated. Correlated speckle is a sum
+    of independent realisations, with other coefficients in each look.
     """
-    draw_arguments: dict[str, Any] = {"key": view.key, "line_grid": view.line_grid}
+    draw_arguments: dict[str, Any] = {
+        "key": point_spectra.key,
+        "line_grid": point_spectra.line_grid,
+    }
     if shots.look_speckle is None:
         look_draws = (
             draws + look * LOOK_DRAW_STRIDE if shots.looks.has_independent_speckle else draws
         )
         return draw_bin_speckle(
-            shots, view.point, segment, signal, draws=look_draws, **draw_arguments
+            shots, point_spectra.point, segment, signal, draws=look_draws, **draw_arguments
         )
-    root_row = shots.look_speckle.covariance_root(segment, view.point)[look]
+    root_row = shots.look_speckle.covariance_root(segment, point_spectra.point)[look]
     # The mean power of each look is already in its signal.
     root_row = root_row / np.sqrt((np.abs(root_row) ** 2).sum())
     return np.asarray(
@@ -687,7 +755,7 @@ def _draw_look_speckle(
             coefficient
             * draw_bin_speckle(
                 shots,
-                view.point,
+                point_spectra.point,
                 segment,
                 signal,
                 draws=draws + term * LOOK_DRAW_STRIDE,
@@ -698,8 +766,8 @@ def _draw_look_speckle(
     )
 
 
-class SpectrumView(NamedTuple):
-    """Point of prepared shots, with the detector and the estimator of its spectra."""
+class PointSpectra(NamedTuple):
+    """Noiseless signals of a point, with the detector and estimator that process its draws."""
 
     shots: Shots
     """Prepared shots."""
@@ -710,21 +778,23 @@ class SpectrumView(NamedTuple):
     signals: tuple[SegmentSignal | None, ...]
     """Signal of each segment; None for a segment that does not exist."""
     look_shots: list[Shots]
-    """Prepared shots at the time of each look."""
-    setting: SpectrumSettings
+    """Prepared shots as they are at the time of each look."""
+    settings: SpectrumSettings
     """Settings of the spectra and of the detector."""
     detect: Detector
-    """Detector: a function of power |X|^2 (m, bins) that returns flags."""
+    """Detector: a function of powers |X|^2 (m, bins) and the settings that returns flags (m, bins).
+    """
     estimate: Estimator
-    """Estimator: a function of spectra (m, bins) and peak bins (m,) that returns positions (m,)."""
+    """Estimator of frequency: a function of spectra (m, bins), peak bins (m,) and the settings that
+    returns positions (m,)."""
     signal_cache: dict[tuple[int, int], SegmentSignal]
-    """Computed signals of looks at which the target has moved, by segment and look."""
+    """Signals that were computed for looks at which the target has moved, by segment and look."""
     echo_bins: np.ndarray | None = None
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
     line_grid: SpeckleLineGrid | None = None
     """Speckle lines of the footprints of all shots."""
     fixed_threshold: float = math.inf
-    """Fixed threshold of the detector [V]; infinite for other detectors."""
+    """Threshold of the detector [V] if it is fixed; infinite for other detectors."""
 
     def get_signal_in_look(self, segment: int, look: int) -> SegmentSignal:
         """Return the signal of a segment at the time of a look."""
@@ -752,25 +822,26 @@ class SegmentDetections(NamedTuple):
     """Detections, false alarms and frequency of a segment in m draws, (m,) each."""
 
     is_detected: np.ndarray
-    """bool: True if the detector flags a bin of the echo."""
+    """(m,) bool: True if the detector flags a bin of the echo."""
     n_false_groups: np.ndarray
-    """int64: number of groups of flagged bins outside the signal."""
+    """(m,) int64: number of groups of flagged bins outside the signal."""
     n_false_bins: np.ndarray
-    """int64: number of bins in these groups."""
+    """(m,) int64: number of bins in these groups."""
     frequency: np.ndarray
-    """Estimated frequency [bins], signed for a complex record."""
+    """(m,): estimated frequency [bins], signed for a complex record."""
     peak_offset: np.ndarray
-    """Estimated position relative to the strongest bin [bins]."""
+    """(m,): estimated position relative to the largest bin of the detected group [bins]."""
     peak_power: np.ndarray
-    """|X|^2 [V^2] of the bin that is strongest without noise; at least the smaller of the peak's
-    power and the squared threshold."""
+    """(m,): |X|^2 [V^2] that errors by speckle are computed with. It is that of the bin which is
+    strongest without noise, but no less than the smaller of the peak's power and the squared
+    threshold."""
 
 
-def make_spectrum_view(
+def prepare_point_spectra(
     shots: Shots, point: int, parameters: Parameters, key: np.ndarray, methods: SpectrumMethods,
     echo_bins: np.ndarray | None = None, line_grid: SpeckleLineGrid | None = None,
-) -> SpectrumView:  # fmt: skip
-    """Return the view of one point of prepared shots.
+) -> PointSpectra:  # fmt: skip
+    """Return the point_spectra of one point of prepared shots.
 
     Parameters
     ----------
@@ -793,7 +864,7 @@ def make_spectrum_view(
         int(parameters[DETECTOR_PREFIX + "training"]),
         int(parameters[DETECTOR_PREFIX + "rank"]),
     )
-    setting = SpectrumSettings(
+    settings = SpectrumSettings(
         fft_size=shots.fft_size,
         sample_rate=float(shots.sample_rate[point]),
         window=shots.window,
@@ -808,19 +879,19 @@ def make_spectrum_view(
         complex_record=shots.complex_record,
     )
     line_grid = speckle_line_grid(shots) if line_grid is None else line_grid
-    view = SpectrumView(
+    point_spectra = PointSpectra(
         shots,
         point,
         key,
         (),
         split_looks(shots),
-        setting,
+        settings,
         methods.detectors[str(parameters[DETECTOR_PREFIX + "kind"])],
         methods.estimators[str(parameters[ESTIMATOR_PREFIX + "kind"])],
         {},
         echo_bins,
         line_grid,
-        setting.threshold
+        settings.threshold
         if str(parameters[DETECTOR_PREFIX + "kind"]) == FIXED_THRESHOLD
         else math.inf,
     )
@@ -828,41 +899,69 @@ def make_spectrum_view(
         add_footprint_records(
             shots,
             point,
-            noiseless_signal(shots, point, s, view.echo_indices(s), view.fixed_threshold),
+            noiseless_signal(
+                shots, point, s, point_spectra.echo_indices(s), point_spectra.fixed_threshold
+            ),
             line_grid,
         )
         if exists
         else None
         for s, exists in enumerate(shots.has_segment)
     )
-    return view._replace(signals=signals)
+    return point_spectra._replace(signals=signals)
 
 
 def flag_bins(
-    spectra: Sequence[np.ndarray], view: SpectrumView, segment: int
+    spectra: Sequence[np.ndarray], point_spectra: PointSpectra, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean power of a segment's looks, and the mask of flagged bins, (m, bins) each."""
+    """Detect in the looks of a segment.
+
+    Parameters
+    ----------
+    spectra
+        Complex spectra (m, bins) of each look [V].
+    point_spectra
+        Point to which the spectra belong.
+    segment
+        The segment: 0 up, 1 Doppler, 2 down.
+
+    Returns
+    -------
+    power : ndarray (m, bins)
+        Mean of |X|^2 over the looks [V^2].
+    is_flagged : ndarray (m, bins) bool
+        True for bins that the detector flags and that are searched.
+    """
     powers = [spectrum.real**2 + spectrum.imag**2 for spectrum in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
-    if view.shots.looks.combine == COMBINE_BINARY:
-        votes = sum(np.array(view.detect(spectrum, view.setting), np.int64) for spectrum in powers)
-        flags = np.asarray(votes >= view.shots.looks.votes)
+    if point_spectra.shots.looks.combine == COMBINE_BINARY:
+        votes = sum(
+            np.array(point_spectra.detect(spectrum, point_spectra.settings), np.int64)
+            for spectrum in powers
+        )
+        flags = np.asarray(votes >= point_spectra.shots.looks.votes)
     else:
-        flags = np.array(view.detect(power, view.setting), bool)
-    bins = np.arange(flags.shape[1]) - zero_frequency_index(view.shots)
-    return power, flags & is_searched(view.shots, segment, view.point, bins)
+        flags = np.array(point_spectra.detect(power, point_spectra.settings), bool)
+    bins = np.arange(flags.shape[1]) - zero_frequency_index(point_spectra.shots)
+    return power, flags & is_searched(point_spectra.shots, segment, point_spectra.point, bins)
 
 
 def estimate_positions(
-    spectra: Sequence[np.ndarray], peak_bins: np.ndarray, view: SpectrumView
+    spectra: Sequence[np.ndarray], peak_bins: np.ndarray, point_spectra: PointSpectra
 ) -> np.ndarray:
-    """Return positions (m,) of peaks as fractional indices: the mean of the looks' estimates."""
-    positions = [view.estimate(spectrum, peak_bins, view.setting) for spectrum in spectra]
+    """Estimate the positions (m,) of peaks, as fractional indices: the mean over the looks.
+
+    ``spectra`` are the complex spectra (m, bins) of each look [V], and ``peak_bins`` (m,) the
+    indices of the peaks.
+    """
+    positions = [
+        point_spectra.estimate(spectrum, peak_bins, point_spectra.settings) for spectrum in spectra
+    ]
     return positions[0] if len(positions) == 1 else np.asarray(np.mean(positions, axis=0))
 
 
 def detect_and_estimate(
-    spectra: Sequence[np.ndarray], signal: SegmentSignal, view: SpectrumView
+    spectra: Sequence[np.ndarray], signal: SegmentSignal, point_spectra: PointSpectra
 ) -> SegmentDetections:
     """Detect an echo and estimate its frequency in each draw of a segment.
 
@@ -872,12 +971,12 @@ def detect_and_estimate(
         Complex spectra (m, bins) of each look [V].
     signal
         Signal of the segment without noise.
-    view
-        View of the point.
+    point_spectra
+        Point to which the spectra belong.
     """
-    power, flags = flag_bins(spectra, view, signal.segment)
-    shots, shift = view.shots, unrolling_shift(view.shots, signal.strongest_bin)
-    power, flags = (unroll_bins(shots, values, signal.strongest_bin) for values in (power, flags))
+    power, flags = flag_bins(spectra, point_spectra, signal.segment)
+    shots, shift = point_spectra.shots, centring_shift(point_spectra.shots, signal.strongest_bin)
+    power, flags = (centre_bins(shots, values, signal.strongest_bin) for values in (power, flags))
     strongest_index, first_index, last_index = (
         k + shift for k in (signal.strongest_bin, signal.first_bin, signal.last_bin)
     )
@@ -888,10 +987,10 @@ def detect_and_estimate(
         if not shots.real_fft_size:
             first_detecting, end_detecting = max(first_detecting, 1), min(end_detecting, end_index)
     signed_peak = signal.strongest_bin - zero_frequency_index(shots)
-    own = flags[:, first_detecting:end_detecting] & is_searched(
-        shots, signal.segment, view.point, signed_peak
+    flags_of_echo = flags[:, first_detecting:end_detecting] & is_searched(
+        shots, signal.segment, point_spectra.point, signed_peak
     )
-    detecting_power = np.where(own, power[:, first_detecting:end_detecting], -1.0)
+    detecting_power = np.where(flags_of_echo, power[:, first_detecting:end_detecting], -1.0)
     detected_index, is_detected = (
         first_detecting + detecting_power.argmax(axis=1),
         detecting_power.max(axis=1) >= 0,
@@ -902,7 +1001,7 @@ def detect_and_estimate(
     start, end = start + 1, np.nonzero(flag_edges < 0)[1] + 1
     assert signal.is_exempt is not None
     n_exempt_below = np.cumsum(
-        np.pad(unroll_bins(shots, signal.is_exempt, signal.strongest_bin), (1, 0))
+        np.pad(centre_bins(shots, signal.is_exempt, signal.strongest_bin), (1, 0))
     )
     is_false = n_exempt_below[start] == n_exempt_below[end]  # groups without exempt bins
     is_false &= (start <= end_index - shots.first_searched_bin) & (end > shots.first_searched_bin)
@@ -910,64 +1009,74 @@ def detect_and_estimate(
         np.bincount(draw_of_group[is_false], weights, len(power)).astype(np.int64)
         for weights in (None, (end - start)[is_false])
     )
-    own = (
+    is_echo = (
         is_detected[draw_of_group]
         & (start <= detected_index[draw_of_group])
         & (detected_index[draw_of_group] < end)
     )
     search_first, search_end = np.ones((len(power), 1)), np.full((len(power), 1), end_index)
-    search_first[draw_of_group[own], 0], search_end[draw_of_group[own], 0] = start[own], end[own]
+    search_first[draw_of_group[is_echo], 0] = start[is_echo]
+    search_end[draw_of_group[is_echo], 0] = end[is_echo]
     peak_index = np.where((search_first <= bins) & (bins < search_end), power, -1.0).argmax(axis=1)
     # The largest of several bins would be brighter than the bin of a wandering peak.
-    capped_power = np.minimum(power[np.arange(len(power)), peak_index], view.setting.threshold**2)
+    capped_power = np.minimum(
+        power[np.arange(len(power)), peak_index], point_spectra.settings.threshold**2
+    )
     peak_power = np.maximum(power[:, strongest_index], capped_power)
     peak_bin = (peak_index - shift) % shots.fft_size if shots.complex_record else peak_index
-    peak_place = estimate_positions(spectra, peak_bin, view)
+    peak_place = estimate_positions(spectra, peak_bin, point_spectra)
     frequency = peak_place - zero_frequency_index(shots)
     return SegmentDetections(
         is_detected, n_false_groups, n_false_bins, frequency, peak_place - peak_bin, peak_power
     )
 
 
-def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_detections(
+    point_spectra: PointSpectra, draws: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Count detections and false alarms in draws, and return values to be averaged over the draws.
 
     Parameters
     ----------
-    view
-        View of the point.
+    point_spectra
+        Spectra of the point.
     draws
         (m,) int64: numbers of the draws.
 
     Returns
     -------
-    tuple of ndarray
-        Counts (names, m) in the order of :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`, and values
-        (names, m) in the order of AVERAGED_VALUES; nan for a draw without a value.
+    counts : ndarray (names, m) int64
+        1 for a draw with the event, else 0, in the order of
+        :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`.
+    values : ndarray (names, m)
+        Values in the order of :data:`AVERAGED_VALUE_NAMES`; nan for a draw without a value.
     """
     zeros = np.zeros(draws.size, np.int64)
     detections = [SegmentDetections(zeros > 0, zeros, zeros, *np.zeros((3, draws.size)))] * 3
     n_searched = 0
-    for s, signal in enumerate(view.signals):
+    for s, signal in enumerate(point_spectra.signals):
         if signal is not None:
             detections[s] = detect_and_estimate(
-                list(iter_look_spectra(view, s, draws)), signal, view
+                list(iter_look_spectra(point_spectra, s, draws)), signal, point_spectra
             )
-            bins = np.arange(view.shots.n_bins)
+            bins = np.arange(point_spectra.shots.n_bins)
             in_band = is_searched(
-                view.shots, s, view.point, bins - zero_frequency_index(view.shots)
+                point_spectra.shots,
+                s,
+                point_spectra.point,
+                bins - zero_frequency_index(point_spectra.shots),
             )
             n_exempt = in_band[signal.is_exempt].sum()
-            first_bin = 0 if view.shots.complex_record else view.shots.first_searched_bin
+            first_bin = (
+                0 if point_spectra.shots.complex_record else point_spectra.shots.first_searched_bin
+            )
             n_searched += int(in_band[first_bin : bins.size - first_bin].sum() - n_exempt)
     up, doppler, down = detections
-    is_detected, has_alarm = (
-        np.array([f.is_detected for f in detections]),
-        (up.n_false_groups > 0, down.n_false_groups > 0),
-    )
+    is_detected = np.array([f.is_detected for f in detections])
+    alarm_up, alarm_down = up.n_false_groups > 0, down.n_false_groups > 0
     shot_detected = up.is_detected & down.is_detected
-    is_resolved = shot_detected & (doppler.is_detected | (view.signals[1] is None))
-    if view.shots.any_two:
+    is_resolved = shot_detected & (doppler.is_detected | (point_spectra.signals[1] is None))
+    if point_spectra.shots.any_two:
         shot_detected = is_resolved = is_detected.sum(axis=0) >= 2
     counts = np.array(
         [
@@ -975,8 +1084,9 @@ def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray,
             down.is_detected,
             doppler.is_detected,
             shot_detected,
-            *has_alarm,
-            has_alarm[0] & has_alarm[1],
+            alarm_up,
+            alarm_down,
+            alarm_up & alarm_down,
         ],
         np.int64,
     )
@@ -984,42 +1094,51 @@ def count_detections(view: SpectrumView, draws: np.ndarray) -> tuple[np.ndarray,
         sum(f.n_false_bins for f in detections),
         sum(f.n_false_groups for f in detections),
     )
-    squared_bounds = np.square(_bounds_by_draw(view, is_detected)) + _wander_variances(
-        view, detections, is_detected
+    squared_bounds = np.square(_bounds_by_draw(point_spectra, is_detected)) + _wander_variances(
+        point_spectra, detections, is_detected
     )
-    if view.shots.any_two:  # bounds depend on the detected segments
+    if point_spectra.shots.any_two:  # bounds depend on the detected segments
         squared_bounds = np.where(is_resolved, squared_bounds, np.nan)
     errors = [
         np.where(is_resolved, error, np.nan)
-        for error in _measurement_errors(view, detections, is_detected)
+        for error in _measurement_errors(point_spectra, detections, is_detected)
     ]
     return counts, np.array(
         [n_false_bins / max(n_searched, 1), n_false_groups, *errors, *squared_bounds]
     )
 
 
-def _bounds_by_draw(view: SpectrumView, is_detected: np.ndarray) -> np.ndarray:
-    """Return bounds of range and velocity in draws, (2, m), by the detected segments (3, m)."""
+def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
+    """Return the bounds of range [m] and radial velocity [m/s] in each draw, (2, m).
+
+    They depend on the segments that are detected in the draw, `is_detected` (3, m).
+    """
     bounds = np.empty((2, is_detected.shape[1]))
-    bounds[...] = np.reshape(measurement_bound(view), (2, 1))
-    if view.shots.any_two:
+    bounds[...] = np.reshape(measurement_bound(point_spectra), (2, 1))
+    if point_spectra.shots.any_two:
         for is_missing in np.eye(3, dtype=bool):
             has_pattern = (is_detected == ~is_missing[:, None]).all(axis=0)
-            bounds[:, has_pattern] = np.reshape(measurement_bound(view, ~is_missing), (2, 1))
+            bounds[:, has_pattern] = np.reshape(
+                measurement_bound(point_spectra, ~is_missing), (2, 1)
+            )
     return bounds
 
 
 def _wander_variances(
-    view: SpectrumView, detections: Sequence[SegmentDetections], is_detected: np.ndarray
+    point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return mean square errors of range and velocity by speckle in draws, (2, m)."""
-    shots, point, n_draws = view.shots, view.point, is_detected.shape[1]
+    """Return the mean square errors of range [m^2] and velocity [m^2/s^2] by speckle, (2, m).
+
+    `detections` are those of each segment, and `is_detected` (3, m) says which count.
+    """
+    shots, point, n_draws = point_spectra.shots, point_spectra.point, is_detected.shape[1]
     if shots.line_gradients is None:
         return np.zeros((2, n_draws))
     point_indices = np.full(n_draws, point)
     line_noise_sigma = float(np.broadcast_to(shots.line_noise_sigma, shots.size)[point])
     signal = np.array([
-        np.nan if s is None else np.abs(s.spectrum[s.strongest_bin]) ** 2 for s in view.signals
+        np.nan if s is None else np.abs(s.spectrum[s.strongest_bin]) ** 2
+        for s in point_spectra.signals
     ])  # fmt: skip
     mean_power = signal + 2 * line_noise_sigma**2
     power = (
@@ -1039,14 +1158,14 @@ def _wander_variances(
 
 
 def measurement_bound(
-    view: SpectrumView, is_used: Sequence[bool] | np.ndarray | None = None
+    point_spectra: PointSpectra, is_used: Sequence[bool] | np.ndarray | None = None
 ) -> RangeVelocityDeviation:
-    """Return the bound on the deviations of range and radial velocity from selected beats.
+    """Return the smallest standard deviations of range and radial velocity from selected beats.
 
     Parameters
     ----------
-    view
-        View of the point.
+    point_spectra
+        Spectra of the point.
     is_used
         True for each segment whose beat is used; by default up and down, or all if the segments'
         chirp slopes differ from the default.
@@ -1056,17 +1175,17 @@ def measurement_bound(
     The bound on a beat's variance is the Cramer-Rao bound in white noise plus the variance by the
     laser's phase noise. Looks count as independent measurements.
     """
-    shots, point = view.shots, view.point
-    sample_rate, root_n_looks, laser_timing = (
+    shots, point = point_spectra.shots, point_spectra.point
+    sample_rate, root_n_looks, phase_noise_arguments = (
         float(shots.sample_rate[point]),
         math.sqrt(shots.looks.number),
-        _laser_timing(shots, point),
+        _phase_noise_arguments(shots, point),
     )
-    record_lengths = np.full(len(view.signals), shots.window.length)
+    record_lengths = np.full(len(point_spectra.signals), shots.window.length)
     if shots.n_samples_before_echo is not None:
         record_lengths = np.maximum(record_lengths - shots.n_samples_before_echo[:, point], 2)
-        laser_timing["duration"] = record_lengths[0] / np.asarray(sample_rate)
-    laser_deviation = phase_noise_deviation(**laser_timing)
+        phase_noise_arguments["duration"] = record_lengths[0] / np.asarray(sample_rate)
+    laser_deviation = phase_noise_deviation(**phase_noise_arguments)
     cnr_factor = 2 if shots.complex_record else 1  # two samples (I, Q) for the noise of one
     if is_used is None:
         is_used = (True, shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES, True)
@@ -1081,7 +1200,7 @@ def measurement_bound(
         )
         / root_n_looks
         for s, exists, record_length in zip(
-            view.signals, is_used, record_lengths.tolist(), strict=True
+            point_spectra.signals, is_used, record_lengths.tolist(), strict=True
         )
     )
     return range_velocity_deviation(
@@ -1092,20 +1211,21 @@ def measurement_bound(
 
 
 def _measurement_errors(
-    view: SpectrumView, detections: Sequence[SegmentDetections], is_detected: np.ndarray
+    point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return measured minus true range [m] and radial velocity [m/s], (m,) each.
+    """Return measured minus true range [m] and radial velocity [m/s] in each draw, (m,) each.
 
-    `is_detected` (3, m) are the segments that are detected in each draw.
+    `detections` are those of each segment, and `is_detected` (3, m) says which count.
     """
-    shots, point = view.shots, view.point
-    bin_width = view.setting.sample_rate / view.setting.fft_size
+    shots, point = point_spectra.shots, point_spectra.point
+    bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
+    up_carrier, _, _ = shots.carriers
     up, doppler, down = (segment.frequency * bin_width for segment in detections)
     measured = waveform.resolve_range_velocity(
         up=up,
         doppler=doppler if shots.has_segment[1] else None,
         down=down,
-        carrier=_carriers_at(shots, point)[0],
+        carrier=_value_at(up_carrier, point),
         bandwidth=_value_at(shots.chirp_bandwidth, point),
         duration=_value_at(shots.chirp_duration, point),
         sample_rate=shots.sample_rate[point],
@@ -1122,7 +1242,7 @@ def _measurement_errors(
         shots.any_two & ~is_detected.all(axis=0)
     )
     if np.any(uses_fit):
-        cnr = np.array([[0.0 if s is None else s.cnr] for s in view.signals])
+        cnr = np.array([[0.0 if s is None else s.cnr] for s in point_spectra.signals])
         fitted_values = fit_peaks(
             shots, np.array([up, doppler, down]), is_detected * cnr, np.array([point])
         )
@@ -1138,6 +1258,6 @@ def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return the value of a point in a column, which may be one number for all points."""
+    """Return a point's value of an array (n,), or of one number that all points share."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

@@ -1,90 +1,131 @@
-"""Random numbers by address: Philox4x64-10 [Salmon et al., SC 2011], compiled.
+"""Random numbers by address: the counter-based generator Philox4x64-10 [1]_, compiled.
 
-A random number is a function of the point (the key), the number of the draw, the physical cause
-(the stream) and an index in the stream. It does not depend on the order of work, the size of blocks
-or the number of workers. The 256-bit counter is
+A random number is a function of its address: the random key of a point, the number of a draw, the
+physical cause (the stream), and an index in the stream. It does not depend on the order of work,
+the size of blocks or the number of workers. The generator turns a 256-bit counter into a block of
+four 64-bit words. The four words of the counter are
 
-    word 0: block of four outputs    word 1: 0    word 2: draw    word 3: stream
+    word 0: number of the block    word 1: 0    word 2: number of the draw    word 3: stream
 
-The words are those of ``numpy.random.Philox`` for this key and counter, bit for bit.
+The results are those of ``numpy.random.Philox`` for this key and counter, bit for bit.
+
+References
+----------
+.. [1] Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3, SC 2011.
 """
 
 import hashlib
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from sweep.kernel_cache import multiply_high, njit
 
-# Streams, one per physical cause; causes that act in each segment have three: up, Doppler, down.
-# Every stored draw depends on these numbers: add numbers, never change any.
+# Streams, one for each physical cause. Causes that act in every segment have three: up, Doppler,
+# down. Every stored draw depends on these numbers: add numbers, never change any.
 STREAM_DETECTION = (1, 3, 2)
-"""Streams of detections, by comparison with a probability; by segment."""
+"""Streams of the numbers that are compared with probabilities of detection, by segment."""
 STREAM_FALSE_ALARM = (4, 6, 5)
-"""Streams of false alarms of noise, compared with a probability, and of their bins; by segment."""
+"""Streams of the numbers that are compared with probabilities of a false alarm by noise, and of the
+bins of such alarms, by segment."""
 STREAM_NOISE = (7, 9, 8)
-"""Streams of the noise of the bins of an echo and of leaked signal; by segment."""
+"""Streams of the noise in the bins of an echo, and in bins of leaked signal, by segment."""
 STREAM_NOISE_MAXIMUM = (10, 12, 11)
-"""Streams of the largest magnitude in bins of noise alone, and of its bin; by segment."""
+"""Streams of the largest magnitude in bins of noise alone, and of its bin, by segment."""
 STREAM_FOOTPRINT_PHASE = 13
-"""Stream of phases of beamlets."""
+"""Stream of the phases of beamlets."""
 STREAM_SPECKLE = 14
-"""Stream of amplitudes of developed speckle."""
+"""Stream of the complex amplitudes of developed speckle."""
 STREAM_POINTING_JITTER = 16
 """Stream of the pointing jitter of the beam."""
 STREAM_SCINTILLATION = 17
 """Stream of scintillation by turbulence."""
-STREAM_RECORD = (18, 20, 19)
-"""Streams of the noise of the samples of a record; by segment."""
+STREAM_RECORD_NOISE = (18, 20, 19)
+"""Streams of the noise in the samples of a record, by segment."""
 STREAM_LASER_PHASE = (21, 23, 22)
-"""Streams of the random walk of the laser's phase; by segment."""
+"""Streams of the random walk of the laser's phase, by segment."""
 STREAM_ERROR_FLOOR = 24
-"""Stream of errors of the instrument that do not depend on the echo."""
+"""Stream of an instrument's errors that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
-"""Streams of false peaks by leaked signal; by segment."""
+"""Streams of false peaks by leaked signal, by segment."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
-_M0, _M1 = (np.uint64(m) for m in _MULTIPLIERS)
-_LOW0, _LOW1 = (np.uint64(m & 0xFFFFFFFF) for m in _MULTIPLIERS)
-_HIGH0, _HIGH1 = (np.uint64(m >> 32) for m in _MULTIPLIERS)
+_MULTIPLIER_0, _MULTIPLIER_1 = (np.uint64(m) for m in _MULTIPLIERS)
+_MULTIPLIER_0_LOW, _MULTIPLIER_1_LOW = (np.uint64(m & 0xFFFFFFFF) for m in _MULTIPLIERS)
+_MULTIPLIER_0_HIGH, _MULTIPLIER_1_HIGH = (np.uint64(m >> 32) for m in _MULTIPLIERS)
 _WEYL_0 = np.uint64(0x9E3779B97F4A7C15)
 _WEYL_1 = np.uint64(0xBB67AE8584CAA73B)
-_HALF_WORD = np.uint64(0xFFFFFFFF)
-
-FIRST_BLOCK_NUMBER, DRAW_INCREMENTS, BLOCK_INCREMENTS = np.int64(0), (1, 0), (0, 1)
-"""Arguments of :func:`fill_words` as constants: numba compiles anew for each literal in a call."""
+_LOW_HALF_MASK = np.uint64(0xFFFFFFFF)
 
 _SHIFT_32, _SHIFT_12 = np.uint64(32), np.uint64(12)
 
 
+class DrawAddress(NamedTuple):
+    """Address of the random numbers of one draw of a point, for compiled code."""
+
+    key_0: np.uint64
+    """First word of the point's random key (:func:`point_keys`)."""
+    key_1: np.uint64
+    """Second word of the key."""
+    draw: np.int64
+    """Number of the draw."""
+
+
+class CounterIncrements(NamedTuple):
+    """Differences between the counters of successive columns in :func:`fill_words`."""
+
+    draw: int
+    """Difference of the numbers of the draws."""
+    block: int
+    """Difference of the numbers of the blocks."""
+
+
+# Arguments of `fill_words` as constants, because numba compiles anew for each literal in a call.
+FIRST_BLOCK_NUMBER = np.int64(0)
+"""Number of the first block of a stream."""
+DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
+"""Increments for the same block in successive draws."""
+BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
+"""Increments for successive blocks of one draw."""
+
+
 @njit(cache=True)
-def _round(x0, x1, x2, x3, key0, key1):
-    """Return the counter after one of the ten rounds of Philox.
+def _philox_round(x0, x1, x2, x3, key0, key1):
+    """Return the four words of a counter after one of the ten rounds of Philox.
 
     High words of 128-bit products are computed from 32-bit halves, because vector registers lack
     such a product. The processor then computes several counters at once.
     """
-    low, high = x0 & _HALF_WORD, x0 >> _SHIFT_32
-    middle = _LOW0 * high + (_LOW0 * low >> _SHIFT_32)
+    low, high = x0 & _LOW_HALF_MASK, x0 >> _SHIFT_32
+    middle = _MULTIPLIER_0_LOW * high + (_MULTIPLIER_0_LOW * low >> _SHIFT_32)
     product0 = (
-        _HIGH0 * high + (middle >> _SHIFT_32) + (_HIGH0 * low + (middle & _HALF_WORD) >> _SHIFT_32)
+        _MULTIPLIER_0_HIGH * high
+        + (middle >> _SHIFT_32)
+        + (_MULTIPLIER_0_HIGH * low + (middle & _LOW_HALF_MASK) >> _SHIFT_32)
     )
-    low, high = x2 & _HALF_WORD, x2 >> _SHIFT_32
-    middle = _LOW1 * high + (_LOW1 * low >> _SHIFT_32)
+    low, high = x2 & _LOW_HALF_MASK, x2 >> _SHIFT_32
+    middle = _MULTIPLIER_1_LOW * high + (_MULTIPLIER_1_LOW * low >> _SHIFT_32)
     product1 = (
-        _HIGH1 * high + (middle >> _SHIFT_32) + (_HIGH1 * low + (middle & _HALF_WORD) >> _SHIFT_32)
+        _MULTIPLIER_1_HIGH * high
+        + (middle >> _SHIFT_32)
+        + (_MULTIPLIER_1_HIGH * low + (middle & _LOW_HALF_MASK) >> _SHIFT_32)
     )
-    return product1 ^ x1 ^ key0, _M1 * x2, product0 ^ x3 ^ key1, _M0 * x0
+    return product1 ^ x1 ^ key0, _MULTIPLIER_1 * x2, product0 ^ x3 ^ key1, _MULTIPLIER_0 * x0
 
 
 @njit(cache=True)
 def four_words(key0, key1, draw, stream, block):
-    """Return the four random words (uint64) of indices 4 `block` to 4 `block` + 3 of a stream."""
+    """Return the four random words (uint64) of a block, which is number `block` of its stream.
+
+    `key0` and `key1` are the random key of a point, and `draw` is the number of the draw.
+    """
     k0, k1 = np.uint64(key0), np.uint64(key1)
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
     for _ in range(10):
         x0, x1, x2, x3 = (
-            multiply_high(_M1, x2) ^ x1 ^ k0, _M1 * x2, multiply_high(_M0, x0) ^ x3 ^ k1, _M0 * x0,
+            multiply_high(_MULTIPLIER_1, x2) ^ x1 ^ k0, _MULTIPLIER_1 * x2,
+            multiply_high(_MULTIPLIER_0, x0) ^ x3 ^ k1, _MULTIPLIER_0 * x0,
         )  # fmt: skip
         k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
     return x0, x1, x2, x3
@@ -97,13 +138,13 @@ def fill_words(address, stream, block, increments, count, words):
     Parameters
     ----------
     address
-        Key (two uint64) and draw of the first column.
+        Key of the point, and draw of the first column (:class:`DrawAddress`).
     stream
-        Stream.
+        Stream of the physical cause.
     block
         Block of the first column.
     increments
-        Increments of draw and block from one column to the next.
+        Increments of draw and block from one column to the next (:class:`CounterIncrements`).
     count
         Number of columns to fill.
     words
@@ -114,33 +155,33 @@ def fill_words(address, stream, block, increments, count, words):
     All columns pass one round before any passes the next, which the processor vectorises: about six
     times as fast.
     """
-    k0, k1, draw = np.uint64(address[0]), np.uint64(address[1]), np.uint64(address[2])
+    key_0, key_1, first_draw = address
+    k0, k1, draw = np.uint64(key_0), np.uint64(key_1), np.uint64(first_draw)
     x0, x1, x2, x3 = words[0], words[1], words[2], words[3]
     for i in range(count):
-        x0[i], x1[i] = np.uint64(block) + np.uint64(increments[1] * i), 0
-        x2[i], x3[i] = draw + np.uint64(increments[0] * i), stream
+        x0[i], x1[i] = np.uint64(block) + np.uint64(increments.block * i), 0
+        x2[i], x3[i] = draw + np.uint64(increments.draw * i), stream
     for _ in range(10):
         for i in range(count):
-            x0[i], x1[i], x2[i], x3[i] = _round(x0[i], x1[i], x2[i], x3[i], k0, k1)
+            x0[i], x1[i], x2[i], x3[i] = _philox_round(x0[i], x1[i], x2[i], x3[i], k0, k1)
         k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
 
 
 @njit(cache=True)
 def to_uniform(word):
-    """Return a uniform number in (0, 1) from a word: the centre of one of 2^52 equal cells.
+    """Convert a random word to a uniform number in (0, 1).
 
-    Only the upper 52 bits are used, because with 53 the last centre would round to 1. So 0 and 1
-    are impossible. u and 1 - u are both exact and equally likely.
+    The number is the centre of one of 2^52 equal cells, so that it is never 0 or 1. Only the upper
+    52 bits of the word are used, because with 53 the last centre would round to 1.
     """
     return (np.float64(word >> _SHIFT_12) + 0.5) * 2.0**-52
 
 
 @njit(cache=True)
 def to_normals(word0, word1):
-    """Return two independent standard normal numbers from two words, by the Box-Muller transform.
+    """Convert two random words to two independent standard normal numbers, by Box and Muller.
 
-    Sigma times the pair is one bin's noise, real and imaginary part (sigma per quadrature). The
-    magnitude of the pair is at most sqrt(2 ln 2^53) = 8.57.
+    The root of the sum of their squares is at most sqrt(2 ln 2^53) = 8.57.
     """
     radius, angle = math.sqrt(-2.0 * math.log(to_uniform(word0))), 2.0 * math.pi * to_uniform(word1)
     return radius * math.cos(angle), radius * math.sin(angle)
@@ -148,22 +189,25 @@ def to_normals(word0, word1):
 
 @njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
-    """Return uniform number `index` of a stream in a draw, 2^-53 .. 1 - 2^-53.
+    """Return one uniform number, 2^-53 .. 1 - 2^-53: number `index` of a stream in a draw.
 
-    So comparison with a uniform number cannot realise a probability below 1.1e-16.
+    A comparison with it cannot realise a probability below 2^-53 = 1.1e-16.
     """
     return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
 
 
 @njit(cache=True)
 def normal_pair(key0, key1, draw, stream, index):
-    """Return pair `index` of normal numbers, made from uniforms ``2 index`` and ``2 index + 1``."""
+    """Return two standard normal numbers, pair number `index` of a stream in a draw.
+
+    They are made from the uniform numbers ``2 index`` and ``2 index + 1``.
+    """
     words = four_words(key0, key1, draw, stream, index >> 1)
     return to_normals(words[2], words[3]) if index & 1 else to_normals(words[0], words[1])
 
 
 def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np.ndarray:
-    """Return the first ``count`` uniform numbers of a stream in each of m draws, (m, count).
+    """Return the first uniform numbers of a stream in each of m draws, (m, count).
 
     Parameters
     ----------
@@ -172,7 +216,7 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
     draws
         (m,) int64: number of the draw of each row.
     stream
-        Stream.
+        Stream of the physical cause.
     count
         Number of uniform numbers in a row.
     """
@@ -183,10 +227,13 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
 
 @njit(cache=True, nogil=True)
 def _fill_uniforms(keys, draws, stream, out):
-    """Fill rows of `out` with the uniform numbers of a stream, in blocks of four."""
+    """Fill the rows of `out` (m, count) with the uniform numbers of a stream; see :func:`uniforms`.
+
+    The count is a multiple of 4.
+    """
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):
-        address = keys[i, 0], keys[i, 1], draws[i]
+        address = DrawAddress(keys[i, 0], keys[i, 1], draws[i])
         fill_words(address, stream, FIRST_BLOCK_NUMBER, BLOCK_INCREMENTS, words.shape[1], words)
         for block in range(words.shape[1]):
             for lane in range(4):
@@ -194,9 +241,9 @@ def _fill_uniforms(keys, draws, stream, out):
 
 
 def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
-    """Return independent standard normal numbers, (m, k) with even k, from as many uniform numbers.
+    """Convert uniform numbers (m, k), with even k, to as many independent standard normal numbers.
 
-    Each pair is that of `normal_pair`, up to the last bit.
+    Columns 2 i and 2 i + 1 give pair i, which is that of :func:`normal_pair` up to the last bit.
     """
     # Contiguous copies, so that bits do not depend on the number of rows.
     first, second = (np.ascontiguousarray(uniform_numbers[:, lane::2]) for lane in range(2))
@@ -207,22 +254,22 @@ def to_normals_by_row(uniform_numbers: np.ndarray) -> np.ndarray:
 
 
 def point_keys(parameter_rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:
-    """Return the Philox keys (n, 2) of points, which follow from their parameters alone.
+    """Return the random keys (n, 2) uint64 of points, which follow from their parameters alone.
 
     Parameters
     ----------
     parameter_rows
         (n, m): parameters of each point, without nan.
     domain
-        Meaning of the rows, such as names and order of the columns, so that equal numbers of
-        different meaning give different keys.
+        Text that states the meaning of the rows, such as names and order of the columns, so that
+        equal numbers of different meaning give different keys.
     seed
-        Seed, not negative.
+        Seed of the study, not negative.
 
     Notes
     -----
-    A key is the BLAKE2b-128 hash of domain, seed and row. Equal rows have equal keys and different
-    rows different ones, wherever a point is in a grid.
+    A key is the BLAKE2b-128 hash of domain, seed and row. Points of equal parameters have equal
+    keys, wherever they are in a grid, and points of different parameters have different keys.
     """
     table = np.asarray(parameter_rows, dtype="<f8")
     if table.ndim != 2:

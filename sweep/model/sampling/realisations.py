@@ -1,14 +1,14 @@
 """Simulation of random effects by draws: each draw is a shot, and results are means over draws.
 
-All combinations of points and draws are laid out in a row and cut into batches that fit the memory.
-Each batch is prepared as any other points are. Random effects change its parameters before all
-other effects, and its shots after them. The probabilities of each draw over its noise are closed
+All combinations of points and draws form one sequence, which is cut into batches that fit the
+memory. A batch is prepared as any points are. Random effects change its parameters before all other
+effects, and its shots after them. The probabilities of each draw over its noise are closed
 forms (docs/draws.md). Their mean over the draws converges far faster than the fraction of
 detections would.
 
 Every random number is addressed by point, draw and cause (:mod:`sweep.model.sampling.philox`), and
-sums run over a point's draws in their order. So neither the cut into batches nor other points or
-effects change a single bit.
+sums run over a point's draws in their order. So neither the division into batches nor other points
+or effects change a single bit.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from sweep.model.preparation import Parameters, Shots
 DRAWS_PER_BATCH = 4096
 """Largest number of draws that are prepared at once, over all points."""
 BEAMLETS_PER_BATCH = 1 << 19
-"""Largest number of beamlets in the draws that are prepared at once, about 100 bytes each."""
+"""Largest number of beamlets in the draws that are prepared at once. Each takes some 100 bytes."""
 
 
 class RealisedShots(NamedTuple):
@@ -49,7 +49,7 @@ class RealisedShots(NamedTuple):
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Return the effects, of those with the given names, that are simulated by draws."""
+    """Return those of the named effects that are simulated by draws."""
     return tuple(effect for effect in select_effects(effects) if effect.is_random)
 
 
@@ -106,7 +106,10 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """Return prepared shots of one draw of each point of a category, with all effects."""
+    """Return prepared shots, with all effects, for one draw of each of m points of a category.
+
+    `draw_keys` are the random keys and the numbers of the draws.
+    """
     n_points, random = draw_keys.draw_numbers.size, random_effects(effects)
     for effect in random:
         if effect.perturb_parameters is not None:
@@ -122,7 +125,7 @@ def _realise_batch(
 
 
 def zero_standard_errors(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return standard errors of points without random effects: 0, but nan if the output is nan."""
+    """Return standard errors by name if nothing is random: 0, or nan where the output is nan."""
     return {name: 0.0 * outputs[name.removesuffix("_error")] for name in STANDARD_ERROR_OUTPUTS}
 
 
@@ -196,12 +199,16 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return the sums, besides the means, that further draws change: (n, N_RUNNING_SUMS)."""
+        """Return what further draws need in addition to the means, (n, N_RUNNING_SUMS)."""
         arrays = self.n_values, self.squared_deviations[KEEPS_SPREAD], self.mean[IS_LOGARITHM]
         return np.concatenate(arrays).T
 
     def resume(self, results: Mapping[str, np.ndarray]) -> None:
-        """Resume from earlier `results` with `running_sums`; zeros for points without draws."""
+        """Continue from earlier results.
+
+        `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
+        RUNNING_SUMS. Points without draws have zeros there.
+        """
         split_rows = np.cumsum([len(self.names), KEEPS_SPREAD.sum()])
         n_values, squared_deviations, largest_logarithms = np.split(
             results[RUNNING_SUMS].T, split_rows

@@ -44,11 +44,11 @@ from sweep.model.outputs import (
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.draws import DrawRanges, count_by_probability, count_in_noise
 from sweep.model.sampling.noisy_spectra import (
-    AVERAGED_VALUES,
+    AVERAGED_VALUE_NAMES,
+    PointSpectra,
     SpectrumMethods,
-    SpectrumView,
     count_detections,
-    make_spectrum_view,
+    prepare_point_spectra,
 )
 from sweep.model.sampling.realisations import (
     DRAWS_PER_BATCH,
@@ -59,40 +59,44 @@ from sweep.model.sampling.realisations import (
 )
 
 NOISE_DRAWS_PER_STEP = 1 << 16
-"""Number of draws of a point in one step if nothing but noise is random."""
+"""Number of draws of a point that are made at once if nothing but noise is random."""
 RANDOM_EFFECT_DRAWS_PER_STEP_MIN = 16
-"""Smallest number of draws of a point in one step if random effects are simulated."""
+"""Smallest number of draws of a point that are made at once if random effects are simulated."""
 
 SPECTRUM_SAMPLES_PER_STEP = 1 << 18
-"""Largest number of samples of full spectra in one step."""
+"""Largest number of samples of full spectra that are processed at once."""
 
 FFT_SIZE_PATH = "instrument.processing.fft_size"
 """Path of the FFT size."""
 
 SPECTRA_METHOD = "spectra"
-"""Method of drawing that makes full spectra; the others are ``probabilities`` and ``noise``."""
+"""Name of the method of drawing that makes full spectra. The others are ``probabilities`` and
+``noise``."""
 
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
 ]
-"""Rows of the counts with the detections that PD_OUTPUTS are estimated from."""
+"""Rows in `DRAW_COUNT_OUTPUTS` of the numbers of detections, in the order of `PD_OUTPUTS`."""
 
 
 class PriorDraws(NamedTuple):
-    """Earlier draws of n points. Further draws give the same bits as one run of all draws."""
+    """Results of earlier draws of n points, to which further draws are added.
+
+    Earlier and further draws give the same bits as one run of all draws.
+    """
 
     n_draws: np.ndarray
     """(n,) int64: number of draws of each point."""
     counts: np.ndarray
-    """(names, n, batches) int64: counts in the batches of the result, in the order of
+    """(names, n, batches) int64: counts of events in each batch, in the order of
     DRAW_COUNT_OUTPUTS."""
     means: Mapping[str, np.ndarray]
-    """(n,) by the names of outputs, and RUNNING_SUMS; used for points with random effects or full
-    spectra."""
+    """Means (n,) by the names of outputs, and RUNNING_SUMS (n, columns). They are used for points
+    with random effects or full spectra."""
 
 
 class Sampler(ABC):
-    """Sums over the draws of n points so far, to which further draws can be added.
+    """Draws of n points so far, as counts and sums to which further draws can be added.
 
     Parameters
     ----------
@@ -123,10 +127,10 @@ class Sampler(ABC):
 
     @abstractmethod
     def draws_per_step(self, n_points: int) -> int:
-        """Return the number of draws of each of `n_points` points in a step of a few seconds."""
+        """Return how many draws of each of `n_points` points are made at once, in a few seconds."""
 
     def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
-        """Add `n_draws` draws to points that have equal numbers of draws."""
+        """Add `n_draws` draws to selected points, all of which have as many draws so far."""
         first_draw = self.batch_edges[0] + self.n_draws[point_indices[0]]
         counts = np.zeros(
             (len(DRAW_COUNT_OUTPUTS), point_indices.size, self.batch_edges.size - 1), np.int64
@@ -139,21 +143,28 @@ class Sampler(ABC):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Add draws `first_draw` to `end_draw` - 1 to the counts (names, points, batches)."""
+        """Make draws `first_draw` to `end_draw` - 1 and add their events to the counts.
+
+        `counts` (names, points, batches) int64 has the order of DRAW_COUNT_OUTPUTS.
+        """
 
     @abstractmethod
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return half-widths of pd at the confidence of `error_budget`, (4, points).
+        """Return the half-widths of the confidence intervals of pd, (4, points).
 
-        Rows are in the order of PD_OUTPUTS; nan for a segment that does not exist.
+        Rows are in the order of PD_OUTPUTS; nan for a segment that does not exist. `error_budget`
+        states the confidence.
         """
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, errors and half-widths, (n,) each, and the sums for further draws."""
+        """Return outputs, their standard errors and half-widths, (n,) by name.
+
+        The running sums that further draws need are included, (n, columns).
+        """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
-        """Return the parameters of selected points."""
+        """Return the parameters of selected points by dotted path."""
         return {
             path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
             for path, v in self.parameters.items()
@@ -173,7 +184,7 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return the excess (points,) of the largest half-width over the tolerance, at least 0."""
+        """Return each point's largest half-width minus the tolerance, at least 0, (points,)."""
         widths = self.half_widths(point_indices, error_budget)
         excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
@@ -190,15 +201,15 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Return False: continue until all draws are made."""
+    """Return False. It is a `should_stop` with which all draws are made."""
     return False
 
 
 def stopping_checks(batch_size: int, draws_max: int) -> Iterator[int]:
-    """Yield the numbers of draws, rising to `draws_max`, at which half-widths are tested.
+    """Yield the numbers of draws at which half-widths are tested, in rising order.
 
-    Tests come after each of the first batches, later each time the number of draws has grown by a
-    quarter, rounded to whole batches.
+    The first numbers are one batch apart. Later numbers grow by a quarter, rounded to whole
+    batches. The last is `draws_max`.
     """
     n_batches = 1
     while n_batches * batch_size < draws_max:
@@ -249,8 +260,8 @@ def simulate_draws(
     prior_draws
         Earlier draws from `first_draw` on, for the same tolerance or a looser one.
     should_stop
-        Function that is called between steps. If it returns True, the result holds the draws so
-        far, at least those of one step. It can be continued by another call with `prior_draws`.
+        Function that is called between steps. If it returns True, no more draws are made. The
+        result then holds at least those of one step, and can be the `prior_draws` of another call.
 
     Returns
     -------
@@ -258,7 +269,7 @@ def simulate_draws(
         By names of :mod:`sweep.model.outputs`: (n,) those of GRID_OUTPUTS and
         STANDARD_ERROR_OUTPUTS, or of SPECTRA_OUTPUTS, and of ACCURACY_OUTPUTS; those of
         DRAW_COUNT_OUTPUTS, (n, batches) with `batch_sizes`, else (n,). With random effects or full
-        spectra there is RUNNING_SUMS (n, columns), and outputs are means over the draws.
+        spectra outputs are means over the draws, and RUNNING_SUMS (n, columns) is included.
     """
     batch_edges = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     sampler_arguments: dict[str, Any] = {
@@ -290,7 +301,7 @@ def draw_until_accurate(
     error_budget: ErrorBudget | None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> None:
-    """Draw points until each meets the tolerance, the last check is passed, or a stop is due.
+    """Add draws to points until each meets the tolerance, or has the last number of draws.
 
     Parameters
     ----------
@@ -304,7 +315,7 @@ def draw_until_accurate(
     error_budget
         Tolerance and confidence; None to draw up to the last of `check_draws` without a test.
     should_stop
-        Function that is called between steps and returns True to stop.
+        Function that is called between steps and returns True to stop earlier.
     """
     has_drawn = False
     for check_at in check_draws:
@@ -329,7 +340,7 @@ def draw_until_accurate(
 
 
 class DetectionSampler(Sampler):
-    """Sampler that compares draws with probabilities, or makes them in noise (``noise``)."""
+    """Sampler of detections, by comparing random numbers with probabilities or by drawing noise."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -355,7 +366,7 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Implement :meth:`Sampler.count_draws`; draws of random effects also change the means."""
+        """Implement :meth:`Sampler.count_draws`, and add draws of random effects to the means."""
         point_parameters, keys = self.select_parameters(point_indices), self.keys[point_indices]
         if self._running_means is not None:
             for members, draw_numbers, shots in iter_realisations(
@@ -410,7 +421,7 @@ class DetectionSampler(Sampler):
 
 
 class SpectraSampler(Sampler):
-    """Sampler whose draws are full spectra, processed by named detectors and estimators."""
+    """Sampler whose draws are full spectra, processed by a detector and an estimator."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, methods: SpectrumMethods,
@@ -424,7 +435,7 @@ class SpectraSampler(Sampler):
         )
         self._methods, n_points = methods, self.n_draws.size
         self._value_means, self._statistic_means = (
-            RunningMeans(n_points, AVERAGED_VALUES),
+            RunningMeans(n_points, AVERAGED_VALUE_NAMES),
             RunningMeans(n_points),
         )
         self._shot_of_point: dict[int, tuple[Shots, int]] = {}
@@ -436,17 +447,17 @@ class SpectraSampler(Sampler):
                 self._shot_of_point |= {int(p): (shots, i) for i, p in enumerate(indices)}
         if prior_draws is not None:
             value_sums, statistic_sums = np.split(
-                prior_draws.means[RUNNING_SUMS].T, [3 * len(AVERAGED_VALUES)]
+                prior_draws.means[RUNNING_SUMS].T, [3 * len(AVERAGED_VALUE_NAMES)]
             )
             self._value_means.restore_state(value_sums)
             if not self._shot_of_point:
                 self._statistic_means.restore_state(statistic_sums)
 
     def draws_per_step(self, n_points: int) -> int:
-        """Return the number of draws of each of ``n_points`` points in one step.
+        """Implement :meth:`Sampler.draws_per_step`.
 
-        It is a multiple of the draws that are processed together, so that a detector gets the same
-        draws together however the draws are cut into steps.
+        The result is a multiple of the number of draws that a detector processes together. So a
+        detector gets the same draws together, however draws are divided into steps.
         """
         fft_sizes = np.unique(self.parameters[FFT_SIZE_PATH])
         return max(1, 4 // n_points) * math.lcm(
@@ -458,25 +469,27 @@ class SpectraSampler(Sampler):
     ) -> None:
         """Implement :meth:`Sampler.count_draws`, and add measured values to the running means."""
         for column, point in enumerate(point_indices):
-            for view, draws in self._iter_views(int(point), int(first_draw), int(end_draw)):
+            for point_spectra, draws in self._iter_point_spectra(
+                int(point), int(first_draw), int(end_draw)
+            ):
                 batch_index = np.searchsorted(self.batch_edges, draws, "right") - 1
-                draw_counts, values = count_detections(view, draws)
+                draw_counts, values = count_detections(point_spectra, draws)
                 np.add.at(counts[:, column].T, batch_index, draw_counts.T)
-                values_by_name = dict(zip(AVERAGED_VALUES, values, strict=True))
+                values_by_name = dict(zip(AVERAGED_VALUE_NAMES, values, strict=True))
                 self._value_means.add(np.full(draws.size, point), values_by_name)
 
-    def _iter_views(
+    def _iter_point_spectra(
         self, point: int, first_draw: int, end_draw: int
-    ) -> Iterator[tuple[SpectrumView, np.ndarray]]:
-        """Yield views of a point, each with the numbers of its draws."""
+    ) -> Iterator[tuple[PointSpectra, np.ndarray]]:
+        """Yield the spectra of a point, prepared, with the numbers of the draws that share them."""
         point_parameters = self.select_parameters(point)
         if self._shot_of_point:
-            view = make_spectrum_view(
+            point_spectra = prepare_point_spectra(
                 *self._shot_of_point[point], point_parameters, self.keys[point], self._methods
             )
-            step = max(1, SPECTRUM_SAMPLES_PER_STEP // view.setting.fft_size)
+            step = max(1, SPECTRUM_SAMPLES_PER_STEP // point_spectra.settings.fft_size)
             for start in range(first_draw, end_draw, step):
-                yield view, np.arange(start, min(start + step, end_draw))
+                yield point_spectra, np.arange(start, min(start + step, end_draw))
             return
         for realised in iter_realisations(
             point_parameters,
@@ -489,13 +502,16 @@ class SpectraSampler(Sampler):
                 np.full(realised.draw_numbers.size, point), shot_statistics(realised.shots)
             )
             for i, draw_number in enumerate(realised.draw_numbers):
-                view = make_spectrum_view(
+                point_spectra = prepare_point_spectra(
                     realised.shots, i, point_parameters, self.keys[point], self._methods
                 )
-                yield view, np.array([draw_number])
+                yield point_spectra, np.array([draw_number])
 
-    def _nan_where_missing(self) -> np.ndarray:
-        """Return 0, but nan for segments that do not exist, (4, n), in the order of PD_OUTPUTS."""
+    def _nan_for_missing_segments(self) -> np.ndarray:
+        """Return nan for outputs of segments that do not exist, else 0, (4, n).
+
+        Rows are in the order of PD_OUTPUTS.
+        """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(
             self.parameters.get(
@@ -513,14 +529,14 @@ class SpectraSampler(Sampler):
         """Implement :meth:`Sampler.half_widths`."""
         return (
             self.count_half_widths(point_indices, error_budget)
-            + self._nan_where_missing()[:, point_indices]
+            + self._nan_for_missing_segments()[:, point_indices]
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
         """Implement :meth:`Sampler.results`."""
         values, statistics = self._value_means, self._statistic_means.results()
         n, mean, squared_deviations, error = (
-            dict(zip(AVERAGED_VALUES, part, strict=True))
+            dict(zip(AVERAGED_VALUE_NAMES, part, strict=True))
             for part in (
                 values.n_values,
                 values.mean,
@@ -529,19 +545,22 @@ class SpectraSampler(Sampler):
             )
         )
         outputs = {name: statistics[name] for name in DETECTOR_INDEPENDENT_OUTPUTS}
-        detected_fractions = self.n_detected() / self.n_draws + self._nan_where_missing()
+        detected_fractions = self.n_detected() / self.n_draws + self._nan_for_missing_segments()
         outputs |= dict(zip(PD_OUTPUTS, detected_fractions, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             for name in ("pfa_bin", "false_alarms"):
                 outputs |= {name: mean[name], f"{name}_error": error[name]}
             for name in ("range", "radial_velocity"):
-                zero_or_nan = np.where(n[name] > 0, 0.0, np.nan)
+                error_name, bound_name = f"{name}_error", f"squared_{name}_bound"
+                bias, squared_bound = mean[error_name], mean[bound_name]
+                zero_or_nan = np.where(n[error_name] > 0, 0.0, np.nan)
+                mean_squared_deviation = squared_deviations[error_name] / n[error_name]
                 outputs |= {
-                    f"{name}_bias": mean[name] + zero_or_nan,
-                    f"{name}_bias_error": error[name] + zero_or_nan,
-                    f"{name}_rmse": np.sqrt(mean[name] ** 2 + squared_deviations[name] / n[name]),
-                    f"{name}_bound": np.sqrt(mean[f"{name}_2"])
-                    + np.where(n[f"{name}_2"] > 0, 0.0, np.nan),
+                    f"{name}_bias": bias + zero_or_nan,
+                    f"{name}_bias_error": error[error_name] + zero_or_nan,
+                    f"{name}_rmse": np.sqrt(bias**2 + mean_squared_deviation),
+                    f"{name}_bound": np.sqrt(squared_bound)
+                    + np.where(n[bound_name] > 0, 0.0, np.nan),
                 }
         running_sums = np.concatenate([values.state(), self._statistic_means.state()]).T
         return outputs | self.accuracy_outputs(error_budget) | {RUNNING_SUMS: running_sums}

@@ -1,19 +1,19 @@
-"""Developed speckle of a footprint in draws: complex amplitudes of bins in the segments of a shot.
+"""Developed speckle in draws: random complex amplitudes of the bins of an echo, in all segments.
 
-The footprint is a grid of lines over the two coordinates of a Gaussian beam, in its standard
-deviations. A line at (y, x) has the weight a^2 of a Gaussian rule and a circular complex Gaussian
-amplitude z, common to all segments of a shot. In segment s it is b_s . (y, x) bins off the middle
-of the echo. Its phase is t_s . (y, x) relative to the first segment, by equation (1) of
-:mod:`sweep.model.detection.speckle_correlation`. The amplitude of bin k is
+The footprint is represented by a grid of lines over the two coordinates y and x of a Gaussian beam,
+in its standard deviations. The line at (y, x) has the weight a^2 of a Gaussian quadrature, and a
+circular complex Gaussian amplitude z, common to all segments of a shot. In segment s it is b_s .
+(y, x) bins off the middle of the echo. Its phase is t_s . (y, x) relative to the first segment, by
+equation (1) of :mod:`sweep.model.detection.speckle_correlation`. The amplitude of bin k is
 
     A_s,k = sum a z e^(i t_s . (y, x)) G(k - middle_s - b_s . (y, x))                            (1)
 
 with the window's transform G. Near DC and Nyquist of a real record the conjugate amplitudes of the
 lines' images are added (:mod:`sweep.model.detection.pseudo_variance`): at DC the sum is real. Sums
 of Gaussian numbers are Gaussian, so bins of all segments are jointly circular Gaussian. Their
-covariances are Gaussian means, which the rule integrates. So the peak bins of two segments have the
-correlation mu of that module. Amplitudes are returned over their root mean squares, and callers
-multiply them by the magnitudes of the noiseless spectrum.
+covariances are means over the beam, which the quadrature computes. So the peak bins of two segments
+have the correlation mu of that module. Amplitudes are returned over their root mean squares, and
+callers multiply them by the magnitudes of the noiseless spectrum.
 
 Positions of peaks wander with speckle. If the footprint spreads over less than a bin, (1) is to
 first order in b the bin of a lone tone. This tone is off the middle by
@@ -46,7 +46,7 @@ import numpy as np
 from scipy import special
 
 from sweep.kernel_cache import njit
-from sweep.model.beamlets import gaussian_rule
+from sweep.model.beamlets import gaussian_quadrature
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.speckle_correlation import (
     TRANSFORM_REACH_BINS,
@@ -67,51 +67,64 @@ from sweep.model.window import Window, window_samples
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
-RULE_SIZES = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Numbers of nodes of the Gaussian rules, which are the numbers of lines along one coordinate of
-the beam."""
+QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
+"""Possible numbers of nodes of a Gaussian quadrature, which are the numbers of lines along one
+coordinate of the beam."""
 
-_RULE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
-"""Largest phase per standard deviation of the beam [rad] that each rule of RULE_SIZES integrates to
-1e-3."""
+_QUADRATURE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
+"""Largest phase per standard deviation of the beam [rad] that each number of nodes integrates with
+an error of 1e-3."""
 
 _LINE_WEIGHT_MIN = 1e-6
 """Power fraction below which a line is omitted."""
 
-GROUP_NUMBER_STRIDE = 1 << 24
-"""Number of random numbers reserved for a group; those of group g begin at (1 + g) times this."""
+ECHO_NUMBER_STRIDE = 1 << 24
+"""Count of random numbers that are reserved for an echo; those of echo g begin at (1 + g) times it.
+"""
 
 LOOK_DRAW_STRIDE = np.int64(1 << 48)
-"""Offset in the draw number between successive looks, which makes their random numbers distinct."""
+"""Offset that is added to the number of the draw for each further look, whose random numbers
+differ. """
+
+_FIRST, _SECOND = 0, 1
+"""Indices of the beam's coordinates y and x, as rotated by :func:`_rotate_to_steepest`."""
 
 
 class SpeckleLineGrid(NamedTuple):
-    """Grid of speckle lines of n points, for compiled code."""
+    """Lines that represent the footprints of n points in developed speckle, for compiled code.
+
+    Arrays by segment have the rows 0 up, 1 Doppler, 2 down. Arrays by coordinate have the columns y
+    and x of the beam.
+    """
 
     line_shift: np.ndarray
-    """(n, 3, 2): line shift per standard deviation of the beam [bins], positive towards higher
-    bins."""
+    """(n, 3, 2): shift of a line per standard deviation of the beam [bins], by segment and
+    coordinate; positive towards higher bins."""
     phase: np.ndarray
-    """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
-    rule_index: np.ndarray
-    """(n, 2) int64: index into :data:`RULE_SIZES` for each coordinate."""
+    """(n, 3, 2): phase of a line per standard deviation of the beam [rad], by segment and
+    coordinate, relative to the up segment."""
+    quadrature_index: np.ndarray
+    """(n, 2) int64: index of the quadrature of each coordinate in :data:`QUADRATURE_NODE_COUNTS`.
+    """
     peak_search_bins: np.ndarray
-    """(n,) int64: bins on either side of the strongest bin in which the peak is searched."""
+    """(n,) int64: number of bins on either side of the strongest bin in which the peak is searched.
+    """
     node: np.ndarray
-    """(rules, nodes): nodes of the Gaussian rules [standard deviations], padded with 0."""
+    """(quadratures, nodes): nodes of each quadrature [standard deviations of the beam], padded with
+    0."""
     weight: np.ndarray
-    """(rules, nodes): weights of the Gaussian rules; those of a rule sum to 1."""
-    nodes_in_rule: np.ndarray
-    """(rules,) int64: number of nodes of each rule."""
-    transform: np.ndarray
-    """(m,): window transform G at 0, 1/steps, 2/steps .. bins."""
+    """(quadratures, nodes): weights of the nodes, whose sum is 1 for each quadrature."""
+    n_nodes: np.ndarray
+    """(quadratures,) int64: number of nodes of each quadrature."""
+    window_transform: np.ndarray
+    """(m,): window transform G, sampled at 0, 1, 2 .. over ``samples_per_bin``."""
     samples_per_bin: float
-    """Samples of ``transform`` per bin of fs/N."""
+    """Number of samples of ``window_transform`` per bin of fs/N."""
     transform_reach_bins: float
     """Distance from a line up to which bins receive its light [bins of fs/N]."""
     nyquist_bin: int
-    """N/2 of a real record whose bins near DC and Nyquist contain the conjugate images of lines,
-    else 0."""
+    """N/2 if bins near DC and Nyquist contain the conjugate images of lines, as those of a real
+    record do; else 0."""
 
     @classmethod
     def empty(cls) -> "SpeckleLineGrid":
@@ -133,31 +146,31 @@ class SpeckleLineGrid(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
-        """Return the grid of the points with the given indices."""
+        """Return the lines of selected points, by their indices."""
         if not self.line_shift.shape[0]:
             return self
         return self._replace(
             line_shift=self.line_shift[points],
             phase=self.phase[points],
-            rule_index=self.rule_index[points],
+            quadrature_index=self.quadrature_index[points],
             peak_search_bins=self.peak_search_bins[points],
         )
 
 
 @lru_cache(maxsize=1)
-def _gaussian_rules() -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of the Gaussian rules, (rules, nodes), padded with zeros."""
-    node, weight = np.zeros((2, RULE_SIZES.size, RULE_SIZES[-1]))
-    for row, n_nodes in enumerate(RULE_SIZES.tolist()):
-        node[row, :n_nodes], weight[row, :n_nodes] = gaussian_rule(n_nodes)
+def _quadrature_tables() -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of all quadratures, (quadratures, nodes) each, padded with zeros."""
+    node, weight = np.zeros((2, QUADRATURE_NODE_COUNTS.size, QUADRATURE_NODE_COUNTS[-1]))
+    for row, n_nodes in enumerate(QUADRATURE_NODE_COUNTS.tolist()):
+        node[row, :n_nodes], weight[row, :n_nodes] = gaussian_quadrature(n_nodes)
     return node, weight
 
 
 def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
-    """Return the speckle lines of shots; without points if the shots have no developed speckle."""
+    """Return the speckle lines of shots; without developed speckle those of no points."""
     gradients = shots.line_gradients
-    transform = transform_table(shots.window)[1]
-    node, weight = _gaussian_rules()
+    _, window_transform = transform_table(shots.window)
+    node, weight = _quadrature_tables()
     n_points = 0 if gradients is None else shots.size
     line_shift, phase = np.zeros((2, n_points, 3, 2)) if gradients is None else gradients
     padding_factor = shots.fft_size / shots.window.length
@@ -165,7 +178,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     # The product of two bins' transforms turns by at most 2 pi for each bin of fs/L.
     phase_max = np.abs(phase[:, :, None] - phase[:, None]).max(axis=(1, 2))
     phase_max = phase_max + np.pi * np.abs(line_shift).max(axis=1) / padding_factor
-    rule_index = np.searchsorted(_RULE_PHASE_MAX, phase_max)
+    quadrature_index = np.searchsorted(_QUADRATURE_PHASE_MAX, phase_max)
     line_shift_max = np.sqrt((line_shift**2).sum(axis=-1)).max(axis=1)
     peak_search_bins = np.ones(n_points, np.int64)
     if shots.detection == "any_bin":
@@ -174,12 +187,12 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     return SpeckleLineGrid(
         np.ascontiguousarray(line_shift * folding_signs(shots)[..., None][:n_points]),
         np.ascontiguousarray(phase),
-        rule_index.astype(np.int64),
+        quadrature_index.astype(np.int64),
         peak_search_bins,
         node,
         weight,
-        RULE_SIZES,
-        transform,
+        QUADRATURE_NODE_COUNTS,
+        window_transform,
         TRANSFORM_SAMPLES_PER_BIN / padding_factor,
         TRANSFORM_REACH_BINS * padding_factor,
         shots.real_fft_size // 2,
@@ -189,10 +202,22 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
 def _rotate_to_steepest(
     line_shift: np.ndarray, phase: np.ndarray, padding_factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate the beam's coordinates until shifts and phases grow most along the first.
+    """Rotate the beam's coordinates so that shifts and phases grow most along the first.
 
-    The beam is round, so the probability law is unchanged. Few lines are then needed along the
-    second coordinate.
+    The beam is round, so the joint distribution of the amplitudes is unchanged. Few lines are then
+    needed along the second coordinate.
+
+    Parameters
+    ----------
+    line_shift, phase
+        (n, 3, 2): fields of :class:`SpeckleLineGrid`, in any coordinates.
+    padding_factor
+        FFT size over the window's length.
+
+    Returns
+    -------
+    tuple of ndarray
+        ``line_shift`` and ``phase`` in the rotated coordinates.
     """
     phase_slopes = np.concatenate(
         [phase - phase[:, :1], line_shift * (np.pi / padding_factor)], axis=1
@@ -202,7 +227,7 @@ def _rotate_to_steepest(
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
 
     def rotate(vectors: np.ndarray) -> np.ndarray:
-        """Rotate vectors (n, 3, 2) by each point's angle."""
+        """Rotate vectors (n, 3, 2) by the angle of their point."""
         first, second = vectors[..., 0], vectors[..., 1]
         return np.stack([cosine * first + sine * second, cosine * second - sine * first], axis=-1)
 
@@ -210,7 +235,7 @@ def _rotate_to_steepest(
 
 
 def folding_signs(shots: "Shots") -> np.ndarray:
-    """Return the sign of d(bin) / d(beat) after folding, by segment: -1 or 1, (n, 3)."""
+    """Return -1 for segments whose bin falls as the beat rises, by folding, else 1, (n, 3)."""
     signs = np.ones((shots.size, 3))
     if shots.complex_record:
         return signs
@@ -226,23 +251,28 @@ def folding_signs(shots: "Shots") -> np.ndarray:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def interpolate_transform(distance, grid):
-    """Interpolate the window transform G at a distance from the line [bins of fs/N]."""
+    """Interpolate the window transform G at a distance from the line [bins of fs/N].
+
+    `grid` is a :class:`SpeckleLineGrid`.
+    """
     table_position = abs(distance) * grid.samples_per_bin
     k = int(table_position)
-    if k >= grid.transform.size - 1:
+    if k >= grid.window_transform.size - 1:
         return 0.0
-    return grid.transform[k] + (table_position - k) * (grid.transform[k + 1] - grid.transform[k])
+    return grid.window_transform[k] + (table_position - k) * (
+        grid.window_transform[k + 1] - grid.window_transform[k]
+    )
 
 
 @njit(cache=True, error_model="numpy")
 def nearest_image_position(position, nyquist_bin):
-    """Return the position [bins] of the nearest image of a line, about DC or Nyquist."""
+    """Return the position [bins] of a line's image at DC or Nyquist, whichever is nearer."""
     return -position if position < 0.5 * nyquist_bin else 2.0 * nyquist_bin - position
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
-    """Compute mean powers of bins by lines of total power 1, and return True if there are images.
+    """Compute the mean powers of bins in speckle, for an echo whose lines have the total power 1.
 
     Parameters
     ----------
@@ -251,27 +281,38 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
     echo_centre
         (3,): middle of the echo in each segment [bins]; nan for a segment without an echo.
     first_bin
-        (3,): first of the bins in each segment.
+        (3,): number of the first bin in each segment; the others follow it.
     mean_power
-        (3, bins): set to the mean powers.
+        (3, bins): the result, mean powers.
     pseudo_variance
-        (3, bins): set to the pseudo-variances over the mean powers, which images of lines cause
+        (3, bins): the second result, pseudo-variances over mean powers, which images of lines cause
         near DC and Nyquist (:mod:`sweep.model.detection.pseudo_variance`).
+
+    Returns
+    -------
+    bool
+        True if images of lines reach any of the bins.
     """
     mean_power[:] = 0.0
     pseudo_variance[:] = 0.0
     has_images = False
-    rule_first, rule_second = grid.rule_index[point]
+    first_quadrature, second_quadrature = grid.quadrature_index[point]
     for s in range(3):
         if np.isnan(echo_centre[s]):
             continue
-        for a in range(grid.nodes_in_rule[rule_first]):
-            for c in range(grid.nodes_in_rule[rule_second]):
-                weight = grid.weight[rule_first, a] * grid.weight[rule_second, c]
+        for a in range(grid.n_nodes[first_quadrature]):
+            for c in range(grid.n_nodes[second_quadrature]):
+                weight = grid.weight[first_quadrature, a] * grid.weight[second_quadrature, c]
                 if weight < _LINE_WEIGHT_MIN:
                     continue
-                position = echo_centre[s] + grid.line_shift[point, s, 0] * grid.node[rule_first, a]
-                position += grid.line_shift[point, s, 1] * grid.node[rule_second, c] - first_bin[s]
+                position = (
+                    echo_centre[s]
+                    + grid.line_shift[point, s, _FIRST] * grid.node[first_quadrature, a]
+                )
+                position += (
+                    grid.line_shift[point, s, _SECOND] * grid.node[second_quadrature, c]
+                    - first_bin[s]
+                )
                 begin = max(0, math.ceil(position - grid.transform_reach_bins))
                 for k in range(
                     begin,
@@ -305,17 +346,15 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_amplitudes(
-    address, group, grid, point, echo_centre, first_bin, mean_power, amplitudes
+    address, echo_number, grid, point, echo_centre, first_bin, mean_power, amplitudes
 ):
-    """Draw complex speckle amplitudes of bins, of mean power 1, into ``amplitudes`` (3, bins).
-
-    Amplitudes are those of the transform about the record's middle.
+    """Draw the complex amplitudes of bins in speckle, of mean power 1, line by line.
 
     Parameters
     ----------
     address
-        Key of the point (two uint64) and number of the draw.
-    group
+        Key of the point and number of the draw (:class:`sweep.model.sampling.philox.DrawAddress`).
+    echo_number
         Number of the echo; each echo has its own random numbers.
     grid, point
         Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
@@ -328,34 +367,34 @@ def draw_bin_amplitudes(
 
     Notes
     -----
-    Amplitudes are equation (1) of the module over the root of ``mean_power``. All segments have the
-    same amplitudes z. Bins that no line reaches are 0.
+    Amplitudes are equation (1) of the module over the root of ``mean_power``. Their phases refer to
+    the middle of the record. All segments have the same amplitudes z. Bins that no line reaches are
+    0.
     """
     amplitudes[:] = 0.0
-    rule_first, rule_second = grid.rule_index[point]
-    quadrature_deviation, random_number = math.sqrt(0.5), GROUP_NUMBER_STRIDE * (1 + group)
-    for a in range(grid.nodes_in_rule[rule_first]):
-        for c in range(grid.nodes_in_rule[rule_second]):
-            weight = grid.weight[rule_first, a] * grid.weight[rule_second, c]
+    key_0, key_1, draw = address
+    first_quadrature, second_quadrature = grid.quadrature_index[point]
+    quadrature_deviation, random_number = math.sqrt(0.5), ECHO_NUMBER_STRIDE * (1 + echo_number)
+    for a in range(grid.n_nodes[first_quadrature]):
+        for c in range(grid.n_nodes[second_quadrature]):
+            weight = grid.weight[first_quadrature, a] * grid.weight[second_quadrature, c]
             if weight < _LINE_WEIGHT_MIN:
                 continue
-            re, im = philox.normal_pair(
-                address[0], address[1], address[2], philox.STREAM_SPECKLE, random_number
-            )
+            re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_SPECKLE, random_number)
             random_number += 1
             line_amplitude = complex(re, im) * (quadrature_deviation * math.sqrt(weight))
-            y, x = grid.node[rule_first, a], grid.node[rule_second, c]
+            y, x = grid.node[first_quadrature, a], grid.node[second_quadrature, c]
             for s in range(3):
                 if np.isnan(echo_centre[s]):
                     continue
-                phase = grid.phase[point, s, 0] * y + grid.phase[point, s, 1] * x
+                phase = grid.phase[point, s, _FIRST] * y + grid.phase[point, s, _SECOND] * x
                 phased_amplitude = line_amplitude
                 if phase != 0.0:
                     phased_amplitude = line_amplitude * complex(math.cos(phase), math.sin(phase))
                 position = (
                     echo_centre[s]
-                    + grid.line_shift[point, s, 0] * y
-                    + grid.line_shift[point, s, 1] * x
+                    + grid.line_shift[point, s, _FIRST] * y
+                    + grid.line_shift[point, s, _SECOND] * x
                     - first_bin[s]
                 )
                 begin = max(0, math.ceil(position - grid.transform_reach_bins))
@@ -387,16 +426,19 @@ def draw_bin_amplitudes(
 
 
 FACTORED_BINS_MAX = 48
-"""Largest number of bins, over all segments, whose covariance is factored. For more bins, lines are
-drawn."""
+"""Largest number of bins, over all segments, whose amplitudes are drawn by a factor of their
+covariance. Those of more bins are drawn line by line."""
 
 _RESIDUAL_POWER_MAX = 1e-8
-"""Fraction of a bin's mean power that a factor may omit."""
+"""Fraction of a bin's mean power that a factor of the covariance may omit."""
 
 
 @njit(cache=True, error_model="numpy")
 def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, factor):
-    """Factor the covariance of the bins of :func:`draw_bin_amplitudes`, and return its rank.
+    """Factor the covariance of the amplitudes of bins in speckle, and return its rank.
+
+    Draws by the factor (:func:`draw_factored_amplitudes`) have the distribution of those by
+    :func:`draw_bin_amplitudes`, and take fewer random numbers.
 
     Parameters
     ----------
@@ -406,8 +448,13 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
         Middle of the echo, first bin and mean powers, as in :func:`draw_bin_amplitudes`.
     factor
         (rows, 3, bins) complex, with one row for each bin of all segments; the result. The
-        amplitudes of the bins are sums of its first rows, up to the rank, times independent
-        circular Gaussian numbers of mean power 2.
+        amplitudes of the bins are the sum over its first rows, up to the rank, of the row times a
+        circular Gaussian number of mean power 2.
+
+    Returns
+    -------
+    int
+        Rank: the number of rows that are used.
 
     Notes
     -----
@@ -415,21 +462,21 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
     three random numbers determine the amplitudes of nine bins. The factor follows from Cholesky's
     factorisation with pivots, until no bin lacks more than 1e-8 of its mean power.
     """
-    rule_first, rule_second = grid.rule_index[point]
+    first_quadrature, second_quadrature = grid.quadrature_index[point]
     n_segments, n_bins = mean_power.shape
-    line_weights = np.empty(grid.nodes_in_rule[rule_first] * grid.nodes_in_rule[rule_second])
+    line_weights = np.empty(grid.n_nodes[first_quadrature] * grid.n_nodes[second_quadrature])
     line_amplitudes = np.zeros((n_segments, n_bins, line_weights.size), np.complex128)
     n_lines = 0
-    for a in range(grid.nodes_in_rule[rule_first]):
-        for c in range(grid.nodes_in_rule[rule_second]):
-            line_weight = grid.weight[rule_first, a] * grid.weight[rule_second, c]
+    for a in range(grid.n_nodes[first_quadrature]):
+        for c in range(grid.n_nodes[second_quadrature]):
+            line_weight = grid.weight[first_quadrature, a] * grid.weight[second_quadrature, c]
             if line_weight < _LINE_WEIGHT_MIN:
                 continue
-            y, x = grid.node[rule_first, a], grid.node[rule_second, c]
+            y, x = grid.node[first_quadrature, a], grid.node[second_quadrature, c]
             for s in range(n_segments):
                 if np.isnan(echo_centre[s]):
                     continue
-                phase = grid.phase[point, s, 0] * y + grid.phase[point, s, 1] * x
+                phase = grid.phase[point, s, _FIRST] * y + grid.phase[point, s, _SECOND] * x
                 phased_amplitude = complex(math.sqrt(line_weight), 0.0)
                 if phase != 0.0:
                     phased_amplitude = phased_amplitude.real * complex(
@@ -437,8 +484,8 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
                     )
                 position = (
                     echo_centre[s]
-                    + grid.line_shift[point, s, 0] * y
-                    + grid.line_shift[point, s, 1] * x
+                    + grid.line_shift[point, s, _FIRST] * y
+                    + grid.line_shift[point, s, _SECOND] * x
                     - first_bin[s]
                 )
                 for k in range(n_bins):
@@ -450,14 +497,15 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
             n_lines += 1
     residual = np.where(mean_power > 0.0, 1.0, 0.0)
     for rank in range(factor.shape[0]):
-        pivot, residual_max = (0, 0), _RESIDUAL_POWER_MAX
+        pivot_segment, pivot_bin, residual_max = 0, 0, _RESIDUAL_POWER_MAX
         for s in range(n_segments):
             for k in range(n_bins):
                 if residual[s, k] > residual_max:
-                    pivot, residual_max = (s, k), residual[s, k]
+                    pivot_segment, pivot_bin, residual_max = s, k, residual[s, k]
         if residual_max == _RESIDUAL_POWER_MAX:
             return rank
-        pivot_amplitudes, scale = line_amplitudes[pivot[0], pivot[1]], 1.0 / math.sqrt(residual_max)
+        pivot_amplitudes = line_amplitudes[pivot_segment, pivot_bin]
+        scale = 1.0 / math.sqrt(residual_max)
         for s in range(n_segments):
             for k in range(n_bins):
                 if not residual[s, k] > 0.0:
@@ -467,35 +515,44 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
                 for line in range(n_lines):
                     covariance += line_amplitudes[s, k, line] * pivot_amplitudes[line].conjugate()
                 for r in range(rank):
-                    covariance -= factor[r, s, k] * factor[r, pivot[0], pivot[1]].conjugate() * 2.0
+                    covariance -= (
+                        factor[r, s, k] * factor[r, pivot_segment, pivot_bin].conjugate() * 2.0
+                    )
                 factor[rank, s, k] = covariance * (scale * math.sqrt(0.5))
         for s in range(n_segments):
             for k in range(n_bins):
                 residual[s, k] -= 2.0 * abs(factor[rank, s, k]) ** 2
-        residual[pivot] = 0.0
+        residual[pivot_segment, pivot_bin] = 0.0
     return factor.shape[0]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_factored_amplitudes(address, group, factor, rank, amplitudes):
-    """Draw amplitudes of bins into ``amplitudes`` (3, bins) from a factor of their covariance.
+def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
+    """Draw the complex amplitudes of bins in speckle by a factor of their covariance.
 
-    ``factor`` and ``rank`` are the results of :func:`factor_bin_covariance`. ``address`` and
-    ``group`` are as in :func:`draw_bin_amplitudes`.
+    Parameters
+    ----------
+    address, echo_number
+        Address of the draw and number of the echo, as in :func:`draw_bin_amplitudes`.
+    factor, rank
+        Results of :func:`factor_bin_covariance`.
+    amplitudes
+        (3, bins) complex; the result, of mean power 1.
     """
     amplitudes[:] = 0.0
-    first_number = GROUP_NUMBER_STRIDE * (1 + group)
+    key_0, key_1, draw = address
+    first_number = ECHO_NUMBER_STRIDE * (1 + echo_number)
     for pair in range(0, rank, 2):
-        words = philox.four_words(
-            address[0], address[1], address[2], philox.STREAM_SPECKLE, (first_number + pair) >> 1
+        word_0, word_1, word_2, word_3 = philox.four_words(
+            key_0, key_1, draw, philox.STREAM_SPECKLE, (first_number + pair) >> 1
         )
-        first_of_pair = complex(*philox.to_normals(words[0], words[1]))
+        first_of_pair = complex(*philox.to_normals(word_0, word_1))
         if pair + 1 == rank:
             for s in range(amplitudes.shape[0]):
                 for k in range(amplitudes.shape[1]):
                     amplitudes[s, k] += first_of_pair * factor[pair, s, k]
             return
-        second_of_pair = complex(*philox.to_normals(words[2], words[3]))
+        second_of_pair = complex(*philox.to_normals(word_2, word_3))
         for s in range(amplitudes.shape[0]):
             for k in range(amplitudes.shape[1]):
                 amplitudes[s, k] = (
@@ -507,13 +564,14 @@ def draw_segment_amplitudes(
     grid: SpeckleLineGrid,
     point: int,
     echo_centre: np.ndarray,
-    first_and_count: tuple[int, int],
+    first_bin: int,
+    n_bins: int,
     *,
     key: np.ndarray,
     draws: np.ndarray,
-    group: int = 0,
+    echo_number: int = 0,
 ) -> np.ndarray:
-    """Draw speckle amplitudes of mean power 1 in adjacent bins of one segment of a point.
+    """Draw the complex amplitudes of adjacent bins in speckle, of mean power 1, in one segment.
 
     Parameters
     ----------
@@ -521,13 +579,13 @@ def draw_segment_amplitudes(
         Speckle lines (:class:`SpeckleLineGrid`), and the index of the point.
     echo_centre
         (3,): middle of the echo in the segment that is drawn [bins], nan in the other two.
-    first_and_count
-        First bin, and number of bins.
+    first_bin, n_bins
+        Number of the first bin, and count of bins.
     key
         (2,) uint64: random key of the point.
     draws
         (m,) int64: numbers of the draws.
-    group
+    echo_number
         Number of the echo.
 
     Returns
@@ -536,21 +594,19 @@ def draw_segment_amplitudes(
         (m, bins) complex.
     """
     (segment,) = np.flatnonzero(np.isfinite(echo_centre))
-    first_bin = np.full(3, first_and_count[0])
-    mean_power = np.empty((3, first_and_count[1]))
-    mean_bin_powers(
-        grid, point, echo_centre, first_bin, mean_power, np.empty((3, first_and_count[1]))
-    )
-    bin_amplitudes = np.zeros((3, first_and_count[1]), complex)
-    drawn_amplitudes = np.empty((draws.size, first_and_count[1]), complex)
+    first_bins = np.full(3, first_bin)
+    mean_power = np.empty((3, n_bins))
+    mean_bin_powers(grid, point, echo_centre, first_bins, mean_power, np.empty((3, n_bins)))
+    bin_amplitudes = np.zeros((3, n_bins), complex)
+    drawn_amplitudes = np.empty((draws.size, n_bins), complex)
     for row, draw in enumerate(draws):
         draw_bin_amplitudes(
-            (key[0], key[1], draw),
-            group,
+            philox.DrawAddress(key[0], key[1], draw),
+            echo_number,
             grid,
             point,
             echo_centre,
-            first_bin,
+            first_bins,
             mean_power,
             bin_amplitudes,
         )
@@ -559,25 +615,29 @@ def draw_segment_amplitudes(
 
 
 RECORD_LINE_DEVIATION_MAX_BINS = 1.0
-"""Largest standard deviation of a footprint's lines [bins of fs/L] for which
-:class:`FootprintRecord` is used."""
+"""Largest standard deviation of the positions of a footprint's lines [bins of fs/L] for which draws
+use a :class:`FootprintRecord`."""
 
 
 class FootprintRecord(NamedTuple):
-    """Windowed record of a footprint's speckle lines: a lone tone at their middle times a series.
+    """Windowed record of an echo in speckle, from which its samples are drawn.
 
-    The series is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) /
-    N)``, in Chebyshev polynomials of the sample number n.
+    The record is that of a lone tone at the middle of the echo, times a factor that varies slowly
+    from sample to sample. The factor is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b .
+    (y, x) (n - middle) / N)``, represented by a series of Chebyshev polynomials in the sample
+    number n.
     """
 
     series_coefficients: np.ndarray
-    """(lines, k) complex: coefficients of the series by line, for an amplitude z of 1."""
+    """(lines, k) complex: coefficients of each line's part of the series, for an amplitude z of 1.
+    """
     series_positions: np.ndarray
-    """(L,): argument of the series at each sample, -1..1 over the samples that contain the echo."""
+    """(L,): argument of the polynomials at each sample, -1..1 over the samples that contain the
+    echo."""
     windowed_tone: np.ndarray
     """(L,) complex: windowed record of the lone tone, of amplitude 1."""
     mean_bin_power: np.ndarray
-    """(N,): mean power of the transform of the record by bin."""
+    """(N,): mean power of each bin of the record's transform."""
 
     @classmethod
     def from_line_grid(
@@ -601,7 +661,7 @@ class FootprintRecord(NamedTuple):
         tone_position
             Frequency of the lone tone [bins].
         window, first_sample
-            Window of the record, and the number of samples before the echo.
+            Window of the record, and the first of its samples that contain the echo.
         fft_size
             FFT size N.
 
@@ -610,15 +670,13 @@ class FootprintRecord(NamedTuple):
         The mean powers of the bins are the transform of a product over lags. Its factors are the
         window's autocorrelation and the mean phasor of the lines.
         """
-        line_offsets, line_phases, line_weights = _line_offsets_phases_and_weights(
-            line_grid, point, segment
-        )
+        line_offsets, line_phases, line_weights = _line_table(line_grid, point, segment)
         length = window.length
         half_length = max(0.5 * (length - 1 - first_sample), 0.5)
         radians_per_sample = 2 * np.pi * line_offsets / fft_size
         record_middle = 0.5 * length + float(centroid_delay(window)[first_sample])
         series_nodes, series_matrix = _chebyshev_nodes_and_matrix(
-            _chebyshev_degree(np.abs(radians_per_sample).max() * half_length)
+            _n_chebyshev_coefficients(np.abs(radians_per_sample).max() * half_length)
         )
         series_coefficients = np.exp(
             1j
@@ -636,7 +694,7 @@ class FootprintRecord(NamedTuple):
         )
         windowed_tone[:first_sample] = 0.0
         series_nodes, series_matrix = _chebyshev_nodes_and_matrix(
-            _chebyshev_degree(np.abs(radians_per_sample).max() * length)
+            _n_chebyshev_coefficients(np.abs(radians_per_sample).max() * length)
         )
         mean_phasor = (
             line_weights[:, None]
@@ -659,15 +717,16 @@ class FootprintRecord(NamedTuple):
             mean_bin_power,
         )
 
-    def draw_record(self, key: np.ndarray, draw_number: int, group: int) -> np.ndarray:
-        """Draw the record (L,) of a group's speckle.
+    def draw_record(self, key: np.ndarray, draw_number: int, echo_number: int) -> np.ndarray:
+        """Draw the complex windowed record (L,) of an echo in speckle.
 
-        It uses the same random numbers as :func:`draw_bin_amplitudes`.
+        `key` (2,) uint64 is the random key of the point. The random numbers are those of
+        :func:`draw_bin_amplitudes`.
         """
         line_amplitudes = np.empty(len(self.series_coefficients), complex)
         _draw_line_amplitudes(
-            (key[0], key[1], np.int64(draw_number)),
-            GROUP_NUMBER_STRIDE * (1 + group),
+            philox.DrawAddress(key[0], key[1], np.int64(draw_number)),
+            ECHO_NUMBER_STRIDE * (1 + echo_number),
             line_amplitudes,
         )
         record = self.windowed_tone.copy()
@@ -680,52 +739,68 @@ class FootprintRecord(NamedTuple):
 
 
 _RELATIVE_POWER_MIN = 1e-14
-"""Mean power of a bin, over the largest, below which float64 does not resolve it."""
+"""Mean power of a bin, over the largest of all bins, below which float64 does not resolve it."""
 
 
-def _line_offsets_phases_and_weights(
-    line_grid: SpeckleLineGrid, point: int, segment: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return offsets [bins], phases [rad] and weights of lines, (lines,) each.
+class _LineTable(NamedTuple):
+    """Lines of one point in one segment, (lines,) each, in the order of `draw_bin_amplitudes`."""
 
-    The order is that of :func:`draw_bin_amplitudes`.
-    """
-    rule_first, rule_second = line_grid.rule_index[point]
+    offset: np.ndarray
+    """Position relative to the middle of the echo [bins]."""
+    phase: np.ndarray
+    """Phase relative to the up segment [rad]."""
+    weight: np.ndarray
+    """Fraction of the power."""
+
+
+def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTable:
+    """Return the lines of a point in a segment, as a table."""
+    first_quadrature, second_quadrature = line_grid.quadrature_index[point]
     y, x = (
-        line_grid.node[rule_index, : line_grid.nodes_in_rule[rule_index]]
-        for rule_index in (rule_first, rule_second)
+        line_grid.node[quadrature_index, : line_grid.n_nodes[quadrature_index]]
+        for quadrature_index in (first_quadrature, second_quadrature)
     )
     line_weights = (
-        line_grid.weight[rule_first, : y.size, None] * line_grid.weight[rule_second, : x.size]
+        line_grid.weight[first_quadrature, : y.size, None]
+        * line_grid.weight[second_quadrature, : x.size]
     )
-    offsets_and_phases = [
-        gradients[point, segment, 0] * y[:, None] + gradients[point, segment, 1] * x
-        for gradients in line_grid[:2]
-    ]
+    offsets, phases = (
+        gradients[point, segment, _FIRST] * y[:, None] + gradients[point, segment, _SECOND] * x
+        for gradients in (line_grid.line_shift, line_grid.phase)
+    )
     is_used = line_weights >= _LINE_WEIGHT_MIN
-    return offsets_and_phases[0][is_used], offsets_and_phases[1][is_used], line_weights[is_used]
+    return _LineTable(offsets[is_used], phases[is_used], line_weights[is_used])
 
 
 @njit(cache=True, error_model="numpy")
 def _draw_line_amplitudes(address, first_number, amplitudes):
-    """Draw circular complex Gaussian numbers of mean power 2 from the stream of speckle."""
+    """Fill ``amplitudes`` with circular complex Gaussian numbers of mean power 2.
+
+    They follow from the pairs of normal numbers of the stream of speckle, from the pair
+    ``first_number`` on, in the draw of ``address``
+    (:class:`sweep.model.sampling.philox.DrawAddress`).
+    """
+    key_0, key_1, draw = address
     for k in range(amplitudes.size):
-        re, im = philox.normal_pair(
-            address[0], address[1], address[2], philox.STREAM_SPECKLE, first_number + k
-        )
+        re, im = philox.normal_pair(key_0, key_1, draw, philox.STREAM_SPECKLE, first_number + k)
         amplitudes[k] = complex(re, im)
 
 
-def _chebyshev_degree(phase_max: float) -> int:
-    """Return the degree at which a Chebyshev series of exp(i x), |x| <= phase, errs by 1e-7."""
+def _n_chebyshev_coefficients(phase_max: float) -> int:
+    """Return how many Chebyshev coefficients represent exp(i x), |x| <= phase_max, within 1e-7."""
     return 9 + math.ceil(1.5 * phase_max)
 
 
 @lru_cache(maxsize=64)
 def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes (k,) of a Chebyshev series, and the matrix (k, k) that fits one.
+    """Return nodes and a matrix by which a Chebyshev series is fitted to a function.
 
-    The matrix times values at the nodes gives the coefficients.
+    Returns
+    -------
+    nodes : ndarray (k,)
+        Positions -1..1 at which the function is evaluated.
+    matrix : ndarray (k, k)
+        The matrix times the values at the nodes gives the k coefficients of the series.
     """
     node_angles = np.pi * (np.arange(n_coefficients) + 0.5) / n_coefficients
     series_matrix = np.cos(np.arange(n_coefficients)[:, None] * node_angles) * (
@@ -736,12 +811,15 @@ def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.nda
 
 
 _SAMPLES_PER_BATCH = 128
-"""Number of samples at which a series is evaluated together, in vector registers."""
+"""Number of samples at which a Chebyshev series is evaluated together, in vector registers."""
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply_by_chebyshev_series(coefficients, positions, values):
-    """Multiply values in place by a Chebyshev series at positions -1..1 (Clenshaw's algorithm)."""
+    """Multiply complex values (n,) in place by a Chebyshev series at positions -1..1 (n,).
+
+    The series has complex ``coefficients`` (k,), and is evaluated by Clenshaw's algorithm.
+    """
     b1_re, b1_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
     b2_re, b2_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
     twice_positions = np.empty(_SAMPLES_PER_BATCH)
@@ -766,7 +844,10 @@ def _multiply_by_chebyshev_series(coefficients, positions, values):
 
 @lru_cache(maxsize=16)
 def _window_autocorrelation(window: Window, first_sample: int) -> np.ndarray:
-    """Return the autocorrelation (L,) of a window without its first samples, by lag."""
+    """Return the autocorrelation (L,) of a window by lag in samples, from lag 0 on.
+
+    The samples before ``first_sample`` count as 0.
+    """
     window_values = window_samples(window.name, window.length).copy()
     window_values[:first_sample] = 0.0
     spectrum = np.fft.rfft(window_values, 2 * window_values.size)
@@ -781,23 +862,23 @@ def wander_covariance(
     relative_power: np.ndarray,
     echo_fraction: np.ndarray,
 ) -> np.ndarray:
-    """Return the covariance [bins^2] of the positions of two segments' peaks by speckle, (m,).
+    """Return the covariance of the wander of peaks by speckle in two segments, [bins^2], (m,).
 
     Parameters
     ----------
     gradients
-        Gradients of the lines of the footprints of the m peaks.
+        Gradients of the lines of the footprints of m echoes.
     pair
-        Numbers of the two segments.
+        The two segments: 0 up, 1 Doppler, 2 down.
     relative_power
-        (2, m): power q^2 of the two peaks in units of its mean, noise included.
+        (2, m): power q^2 of the peak in either segment, over its mean, both with noise.
     echo_fraction
-        (2, m): fraction v of the echo in that mean.
+        (2, m): fraction v of the echo in that mean power.
 
     Returns
     -------
     numpy.ndarray
-        (m,), signed as the beats.
+        (m,): covariance [bins^2]. Positions have the signs of the beats, before any folding.
 
     Notes
     -----
@@ -838,25 +919,26 @@ def wander_covariance(
 
 
 class SpecklePeaks(NamedTuple):
-    """Detected peaks of m echoes in developed speckle, (m, 3) by segment; nan for none."""
+    """Detected peaks of m echoes in developed speckle, (m, 3) by segment; nan without a peak."""
 
     offset: np.ndarray
     """Interpolated position, relative to the bin about which it was estimated [bins]."""
     folding_sign: np.ndarray
     """-1 if the segment's bin falls as its beat rises (:func:`folding_signs`), else 1."""
     relative_power: np.ndarray
-    """Power q^2 of the peak bin over its mean, echo and noise."""
+    """Power q^2 of the peak bin over its mean power, both with noise."""
     echo_fraction: np.ndarray
     """Fraction v of the echo in the mean power of the peak bin, 0..1."""
 
 
 WANDER_MAX_BINS = 1.5
-"""Bound on the wander of a peak [bins] if only the strongest bin is tested (``peak_bin``)."""
+"""Limit of the wander of a peak [bins] if only the bin that is strongest without noise is tested
+(``peak_bin``)."""
 
 
-SEGMENT_PAIRS_AND_SELF = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
+SEGMENT_PAIRS_WITH_SELF = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
 """All pairs of segments (0 up, 1 Doppler, 2 down), including each segment with itself."""
-CHIRP_PAIRS = (0, 0), (0, 2), (2, 2)
+CHIRP_PAIRS_WITH_SELF = (0, 0), (0, 2), (2, 2)
 """Pairs of the up and down segment alone, including each segment with itself."""
 
 
@@ -864,9 +946,9 @@ def position_error_moments(
     gradients: LineGradients,
     peaks: SpecklePeaks,
     shots: "Shots",
-    pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_AND_SELF,
+    pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_WITH_SELF,
 ) -> np.ndarray:
-    """Return second moments E[e_i e_j] [bins^2] of the errors of peak positions by speckle.
+    """Return second moments E[e_i e_j] of the errors e of peak positions by speckle, [bins^2].
 
     Parameters
     ----------
@@ -882,8 +964,8 @@ def position_error_moments(
     Returns
     -------
     numpy.ndarray
-        (m, 3, 3) by segment, signed as the beats; 0 for pairs without both peaks, or not in
-        `pairs`.
+        (m, 3, 3) by segments i and j [bins^2]. Positions have the signs of the beats, before any
+        folding. 0 for pairs without both peaks, or not in `pairs`.
 
     Notes
     -----
@@ -941,35 +1023,45 @@ def position_error_moments(
 
 
 _TEST_DISPLACEMENT_BINS = 0.05
-"""Displacement for numerical derivatives [bins]: the imaginary shift, and the root of the variance.
-"""
+"""Displacement of tones [bins] by which errors of peak shapes are computed as numerical
+derivatives. """
 
 
 class PeakShapeErrors(NamedTuple):
-    """Position errors of peaks deformed by speckle, to second order in the lines' spread."""
+    """Errors of peak positions because speckle deforms peaks, to second order in the lines' spread.
+
+    Notes
+    -----
+    To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2). The real and
+    imaginary part of the complex shift s each have the variance |b|^2 v / (2 q^2), and
+
+        V = sum a z b^2 y^2 / A - s^2.
+
+    The real part of s is the wander. Im s and V make the magnitudes of three bins differ from those
+    of any tone. The error of the estimate is proportional to (Im s)^2 and to Re V.
+    """
 
     imaginary_shift_error: np.ndarray
-    """Error [bins] by the imaginary part of the tone's complex shift, for the given variance."""
+    """Mean error by the imaginary part of the complex shift s [bins]."""
     error_per_variance: np.ndarray
-    """Error [bins] per bin^2 of Re V, with the complex variance V of the lines."""
+    """Error over Re V, the real part of the lines' complex variance [1/bins]."""
 
     @classmethod
     def from_offset(
         cls, offset: np.ndarray, variance: np.ndarray, shots: "Shots"
     ) -> "PeakShapeErrors":
-        """Return the errors of tones ``offset`` [bins] from the strongest bin.
+        """Return the errors of peaks at an offset from their strongest bin.
 
-        Notes
-        -----
-        To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2). The real
-        and imaginary part of the complex shift s each have the ``variance`` [bins^2], and
-
-            V = sum a z b^2 y^2 / A - s^2.
-
-        The real part of s is the wander. Im s and V make the magnitudes of three bins differ from
-        those of any tone. The error of the estimate is proportional to (Im s)^2 and to Re V.
+        Parameters
+        ----------
+        offset
+            (m, 3): offset of each peak [bins].
+        variance
+            (m, 3): variance of the real, and of the imaginary part of the complex shift [bins^2].
+        shots
+            Prepared shots, for window and FFT size.
         """
-        positions, error_per_square_shift, error_per_variance = _shape_error_table(
+        positions, error_per_square_shift, error_per_variance = _peak_shape_error_table(
             shots.window, shots.fft_size
         )
         sign, distance = np.sign(offset), np.abs(offset)
@@ -980,8 +1072,20 @@ class PeakShapeErrors(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _shape_error_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate positions 0..1 [bins], error / (Im s)^2 [1/bins] and error / Re V [1/bins]."""
+def _peak_shape_error_table(
+    window: Window, fft_size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tabulate the errors of :class:`PeakShapeErrors` by the peak's offset.
+
+    Returns
+    -------
+    positions : ndarray (n,)
+        Offsets of the peak from its strongest bin, 0..1 [bins].
+    error_per_square_shift : ndarray (n,)
+        Error over (Im s)^2 [1/bins].
+    error_per_variance : ndarray (n,)
+        Error over Re V [1/bins].
+    """
     interpolation, tone = interpolator(window, fft_size), tone_spectrum(window, fft_size)
     positions = np.linspace(0.0, 1.0, 65)
     bins = np.array([[-1.0], [0.0], [1.0]]) - positions
@@ -989,7 +1093,7 @@ def _shape_error_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.nd
         tone(bins - 1j * _TEST_DISPLACEMENT_BINS),
         0.5 * (tone(bins + _TEST_DISPLACEMENT_BINS) + tone(bins - _TEST_DISPLACEMENT_BINS)),
     )
-    errors = [
+    error_per_square_shift, error_per_variance = (
         (
             np.array(
                 [
@@ -1001,5 +1105,5 @@ def _shape_error_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.nd
         )
         / _TEST_DISPLACEMENT_BINS**2
         for values in (shifted_tones, broadened_tones)
-    ]
-    return positions, errors[0], errors[1]
+    )
+    return positions, error_per_square_shift, error_per_variance

@@ -1,4 +1,4 @@
-"""Errors of range and radial velocity because positions of peaks vary with speckle."""
+"""Errors of range and radial velocity by speckle wander: peaks move as the speckle changes."""
 
 import numpy as np
 from scipy.special import exp1
@@ -14,7 +14,7 @@ NEGATIVE_LOG_PD_MAX = 700.0
 def wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return mean square errors of range [m^2] and radial velocity [m^2/s^2] by speckle, (2, m).
+    """Return the mean square errors by speckle of m measurements, (2, m).
 
     Parameters
     ----------
@@ -27,6 +27,17 @@ def wander_variance(
     is_detected
         (3, m): True for segments that are detected. The Doppler segment's beat is used only if the
         chirp slopes differ from the default or any two segments detect a shot.
+
+    Returns
+    -------
+    ndarray (2, m)
+        Mean square error of the range [m^2] and of the radial velocity [m^2/s^2]; 0 without
+        developed speckle.
+
+    Notes
+    -----
+    J M J' with the second moments M of the peaks' positions (:func:`position_error_moments`) and
+    the derivatives J of range and velocity by those positions.
     """
     if shots.line_gradients is None:
         return np.zeros((2, point_indices.size))
@@ -53,7 +64,7 @@ def wander_variance(
 
 
 def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
-    """Return mean square errors by speckle, averaged over the detected echoes, (2, n).
+    """Return the mean square errors by speckle of n points, averaged over detected echoes, (2, n).
 
     Parameters
     ----------
@@ -66,8 +77,7 @@ def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.nd
     Returns
     -------
     ndarray (2, n)
-        Mean square errors of range [m^2] and radial velocity [m^2/s^2], as of
-        :func:`wander_variance`.
+        Mean square error of the range [m^2] and of the radial velocity [m^2/s^2].
 
     Notes
     -----

@@ -72,7 +72,7 @@ ECHO_PARAMETERS = (
     PROCESSING_PREFIX + "sample_rate",
     PROCESSING_PREFIX + "fft_size",
     PROCESSING_PREFIX + "window",
-    waveform.TWO_BEATS_PATH,
+    waveform.TWO_BEAT_ASSUMPTION_PATH,
     RECORD_PATH,
     RECEIVER_PREFIX + "architecture",
     LASER_PREFIX + "line_width",
@@ -206,7 +206,7 @@ def diagnose_echoes(
         velocity = np.asarray(velocity)
         diagnosis.is_misread[index] = _is_misread(p, range_, velocity)
         if str(p[RECORD_PATH]) != "complex":
-            assumption = str(p[waveform.TWO_BEATS_PATH])
+            assumption = str(p[waveform.TWO_BEAT_ASSUMPTION_PATH])
             (other_assumption,) = {waveform.FAR_TARGET, waveform.FAST_TARGET} - {assumption}
             is_misread_by = {
                 name: _is_misread(p, range_, velocity, name)
@@ -297,7 +297,7 @@ def _is_misread(
         )
         folded_beat = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
         peaks.append((folded_beat if is_signed else np.abs(folded_beat)) + 0 * range_)
-    reading_assumption = assumption or str(p[waveform.TWO_BEATS_PATH])
+    reading_assumption = assumption or str(p[waveform.TWO_BEAT_ASSUMPTION_PATH])
     if slopes == waveform.DEFAULT_CHIRP_SLOPES:
         reading = waveform.resolve_range_velocity(
             up=peaks[0],
@@ -474,7 +474,7 @@ def _iter_exchange_warnings(
         diagnosis.is_exchanged_by_other_assumption & ~is_absent,
     )
     assumes_far = (
-        str((PARAMETER_DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS_PATH])
+        str((PARAMETER_DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEAT_ASSUMPTION_PATH])
         == waveform.FAR_TARGET
     )
     if not is_range_velocity_exchanged.any() or (

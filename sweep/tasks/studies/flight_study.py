@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.beamlet_counts import effects_tolerance, is_set_by_tolerance
+from sweep.model.beamlet_counts import effects_tolerance, has_numerics_set_by_tolerance
 from sweep.model.effects.catalogue import (
     PARAMETER_DEFAULTS,
     effect_flag_attributes,
@@ -223,7 +223,8 @@ class FlightStudy(ExtendableStudy):
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
         """Return True if a tighter tolerance computes shots more closely, other than by effects."""
         return bool(
-            self.spec.is_ray_number_set_by_tolerance or is_set_by_tolerance(self.spec.parameters())
+            self.spec.is_ray_number_set_by_tolerance
+            or has_numerics_set_by_tolerance(self.spec.parameters())
         )
 
     def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:

@@ -17,7 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model.beamlet_counts import BEAMLETS_PATH, effects_tolerance, is_set_by_tolerance
+from sweep.model.beamlet_counts import (
+    BEAMLETS_PATH,
+    effects_tolerance,
+    has_numerics_set_by_tolerance,
+)
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.effects.catalogue import (
     EFFECT_CATEGORY_PATHS,
@@ -415,7 +419,7 @@ class GridStudy(ExtendableStudy):
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
         """Return a mask (points,), or one bool for all, of points that depend on the tolerance."""
-        return is_set_by_tolerance(self.grid.parameters_of_block(block))
+        return has_numerics_set_by_tolerance(self.grid.parameters_of_block(block))
 
     def store_attributes(self) -> dict[str, Any]:
         """Return title, question, spec and shape of blocks."""

@@ -141,8 +141,8 @@ def test_every_triangle_lies_in_just_one_leaf_and_inside_its_box():
     rng = np.random.default_rng(3)
     vertices, faces = soup(rng, 5000, "sizes")
     tree = build_tree(vertices, faces)
-    np.testing.assert_array_equal(np.sort(tree.order), np.arange(5000))
-    np.testing.assert_array_equal(tree.vertices[tree.faces], vertices[faces[tree.order]])
+    np.testing.assert_array_equal(np.sort(tree.mesh_face_index), np.arange(5000))
+    np.testing.assert_array_equal(tree.vertices[tree.faces], vertices[faces[tree.mesh_face_index]])
     seen = 0
     for box, which in leaves(tree):
         corners = tree.vertices[tree.faces[which]].reshape(-1, 3)
@@ -161,7 +161,7 @@ def test_triangles_that_no_plane_can_part_are_still_divided():
     cascade = size * np.array([[1, 0, 0], [1, 1, 0], [1, 0, 1]])
     for corners in (concentric, cascade):
         tree = build_tree(corners.reshape(-1, 3), np.arange(9000).reshape(3000, 3))
-        np.testing.assert_array_equal(np.sort(tree.order), np.arange(3000))
+        np.testing.assert_array_equal(np.sort(tree.mesh_face_index), np.arange(3000))
         origin = corners[1234].mean(axis=0) + np.array([2.0, 0.01, 0.02])
         towards = unit(corners[1234].mean(axis=0) - origin)
         distance, _ = walk_alone(tree, origin[None], towards[None])

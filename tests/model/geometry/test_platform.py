@@ -109,7 +109,7 @@ def test_an_instrument_on_an_arm_moves_with_the_body_that_turns_it():
 
 @given(st.floats(0, 10), st.floats(0, 2 * math.pi))
 def test_a_fixed_attitude_does_not_turn(t, angle):
-    q = quat.axis_angle(1, angle)
+    q = quat.from_axis_angle(1, angle)
     state = MovingBody(BURN, FixedAttitude(3 * q)).state(np.array([t]))
     np.testing.assert_allclose(state.attitude, [q], atol=1e-15)
     assert not state.angular_velocity.any()
@@ -214,7 +214,7 @@ def test_heading_pitch_and_roll_are_turns_about_up_right_and_forward(heading, pi
             angular_velocity=(0.3, -0.2, 0.9), initial_quaternion=NODES[0], initial_time=1.0
         ),
         AttitudeTrack(NODES_AT, NODES),
-        MountedAttitude(AlongTrackAttitude(), quat.axis_angle(1, 0.8)),
+        MountedAttitude(AlongTrackAttitude(), quat.from_axis_angle(1, 0.8)),
         FixedAttitude(NODES[1]),
     ],
     ids=lambda law: type(law).__name__,
@@ -303,7 +303,7 @@ def test_a_track_turns_at_a_constant_rate_between_nodes():
 
 def test_a_mounted_instrument_is_turned_first():
     q, _ = turned(
-        MountedAttitude(NadirAttitude(), quat.axis_angle(1, -math.pi / 4)), np.array([1.0])
+        MountedAttitude(NadirAttitude(), quat.from_axis_angle(1, -math.pi / 4)), np.array([1.0])
     )
     # Tilted about -y by 45 deg, the nadir beam looks half forward.
     forward = quat.rotate(q, -UP)[0]
