@@ -92,26 +92,22 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
     """
     segment_results = np.full((3, 6, shots.size), np.nan)
     for point in range(shots.size):
-        last_bin_and_width = shots.n_bins - 1, float(shots.sample_rate[point]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.has_segment)):
             look_magnitudes = [
                 time_domain_spectrum(look, point, segment, with_range_walk=with_range_walk)
                 for look in (split_looks(shots) if np.any(shots.line_drift_per_look) else [shots])
             ]
-            magnitude, peak_row = (
-                np.sqrt(np.mean(np.square(look_magnitudes), axis=0)),
-                np.empty((6, 1)),
-            )
-            detect_in_spectra(
+            magnitude = np.sqrt(np.mean(np.square(look_magnitudes), axis=0))
+            detections = detect_in_spectra(
                 magnitude[None],
                 np.zeros(1, np.int64),
-                last_bin_and_width,
+                shots.n_bins - 1,
+                float(shots.sample_rate[point]) / shots.fft_size,
                 shots.detection_rule,
-                shots.bin_threshold_table[:, [point]],
+                shots.bin_thresholds.select(np.array([point])),
                 shots.speckle_table.select(segment, np.array([point])),
-                peak_row,
             )
-            segment_results[segment, :, point] = peak_row[:, 0]
+            segment_results[segment, :, point] = np.array(detections)[:, 0]
             if shots.complex_record:
                 segment_results[segment, 3, point] -= float(shots.sample_rate[point]) / 2
     if shots.looks.is_noncoherent:
