@@ -12,10 +12,8 @@ import numpy as np
 from sweep.model import waveform
 from sweep.model.beamlet_counts import split_with_beamlet_counts
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.echo_detection import at_least_two_of_three
-from sweep.model.detection.looks import DetectionArrays, pd_and_miss_any_two_in_speckle
+from sweep.model.detection.detection_probability import shot_pd_and_miss
 from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
-from sweep.model.detection.pseudo_variance import mean_over_phases
 from sweep.model.effects.catalogue import (
     DEFAULT_EFFECTS,
     EFFECT_CATEGORY_PATHS,
@@ -65,7 +63,7 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Prepare shots on a flat plane, split by category.
+    """Prepare shots on a flat plane, in groups that share strings and sizes.
 
     Parameters
     ----------
@@ -78,7 +76,7 @@ def prepare_shots(
     Yields
     ------
     point_indices : ndarray (m,)
-        Points of a category.
+        Indices of the points of a group.
     shots : Shots
         Prepared shots of these points.
     """
@@ -98,7 +96,7 @@ def prepare_ray_traced_shots(
     effects: Collection[str] = DEFAULT_EFFECTS,
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots of one category whose footprints are given by ray tracing.
+    """Prepare shots whose footprints are given by ray tracing; all share strings and sizes.
 
     Parameters
     ----------
@@ -153,7 +151,7 @@ def apply_effects(
 
 
 def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks (n,) of the effects that not all points have: 1.0 where enabled, else 0.0."""
+    """Return masks (n,) of the effects that only some shots have: 1.0 where enabled, else 0.0."""
     missing_bits = int(np.bitwise_or.reduce(~effect_flags)) if effect_flags.size else 0
     return {
         effect.name: (effect_flags >> k & 1).astype(float)
@@ -177,7 +175,7 @@ def evaluate(
     effects : collection of str
         Names of the effects to simulate.
     segment_evaluator : callable
-        Function that finds the peaks in the spectra; :func:`evaluate_segments` or an equivalent.
+        Function that evaluates the segments' spectra; :func:`evaluate_segments` or an equivalent.
 
     Returns
     -------
@@ -186,7 +184,8 @@ def evaluate(
     """
     categories = list(prepare_shots(parameters, effects))
     if len(categories) == 1:
-        return shot_statistics(categories[0][1], segment_evaluator(categories[0][1]))
+        ((_, shots),) = categories
+        return shot_statistics(shots, segment_evaluator(shots))
     n_points = sum(point_indices.size for point_indices, _ in categories)
     results: dict[str, np.ndarray] = {}
     for point_indices, shots in categories:
@@ -198,14 +197,14 @@ def evaluate(
 def shot_statistics(
     shots: Shots, segment_results: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Compute the outputs of prepared shots.
+    """Compute the output variables of prepared shots.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
     segment_results : ndarray (3, fields, n), optional
-        Result of :func:`evaluate_segments`, if it is known.
+        Result of :func:`evaluate_segments`; computed if it is not given.
 
     Returns
     -------
@@ -213,7 +212,9 @@ def shot_statistics(
         Outputs by name; nan for those that are undefined without an echo.
     """
     segment_results = evaluate_segments(shots) if segment_results is None else segment_results
-    pd, miss, magnitude, _, n_exempt, leakage = np.moveaxis(segment_results, 1, 0)
+    pd, miss, magnitude, frequency, n_exempt, leakage = np.moveaxis(segment_results, 1, 0)
+    leakage_up, _, leakage_down = leakage
+    n_beamlets = shots.relative_range_offset.shape[1]
     snr = shots.snr(magnitude)
     false_alarms = _false_alarm_probabilities(shots, n_exempt)
     measured = measure_range_velocity(shots, segment_results)
@@ -227,9 +228,9 @@ def shot_statistics(
         "pd_shot": pd_shot,
         "miss_shot": miss_shot,
         **false_alarms,
-        "p_leakage_up": leakage[0],
-        "p_leakage_down": leakage[2],
-        "beamlets": np.full(shots.size, float(shots.relative_range_offset.shape[1])),
+        "p_leakage_up": leakage_up,
+        "p_leakage_down": leakage_down,
+        "beamlets": np.full(shots.size, float(n_beamlets)),
         "beamlets_error": shots.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,
         "range_error": measured.range - shots.range,
@@ -237,91 +238,46 @@ def shot_statistics(
         "misread": (is_range_misread | is_velocity_misread).astype(float),
     }
     if shots.any_two:
+        pd_up, _, pd_down = pd
+        magnitude_up, _, magnitude_down = magnitude
         results["pd_both_chirps"] = shots.joint_detection_probability(
-            pd[0], pd[2], (magnitude[0], magnitude[2])
+            pd_up, pd_down, (magnitude_up, magnitude_down)
         )
     if shots.reported_peaks == waveform.STRONGEST_PEAK:
         results |= strongest_peak_probabilities(shots, pd, miss, magnitude)
         # Both peaks are the echo's, but they are resolved to another range.
         pd_misread = np.where(is_range_misread, results["pd_shot"], 0.0)
         results["p_wrong_range_shot"] = results["p_wrong_range_shot"] + pd_misread
-    has_no_echo = (shots.echo_power == 0) | np.isnan(segment_results[shots.has_segment, 3]).any(
-        axis=0
-    )
+    has_no_echo = (shots.echo_power == 0) | np.isnan(frequency[shots.has_segment]).any(axis=0)
     return results | {
         name: np.where(has_no_echo, np.nan, results[name]) for name in NAN_WITHOUT_ECHO_OUTPUTS
     }
 
 
-def shot_pd_and_miss(
-    shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
-) -> DetectionArrays:
-    """Return the probabilities that a shot is detected, and that it is missed.
+def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
+    """Return the range and radial velocity that follow from the strongest bins of the segments.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
-    pd, miss : ndarray (3, n)
-        Probabilities of detection and of a miss of each segment.
-    magnitudes : ndarray (3, n)
-        |X| of the segments' strongest bins [V].
-
-    Returns
-    -------
-    DetectionArrays
-        pd and miss of the shots, (n,). A miss is not computed as 1 - pd, so that both keep their
-        precision.
+    segment_results : ndarray (3, fields, n)
+        Result of :func:`evaluate_segments`.
     """
-    if shots.any_two:
-        if shots.segment_correlations is None:
-            return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
-        threshold_ratio = shots.threshold / shots.line_noise_sigma
-        if shots.looks.is_noncoherent:
-            look_speckle = shots.look_speckle
-            correlations = (
-                np.abs(np.array(shots.segment_correlations))
-                if look_speckle is None
-                else look_speckle.segment_correlation
-            )
-            signal_ratios = magnitudes / shots.line_noise_sigma
-            return shots.looks.pd_and_miss_any_two(
-                signal_ratios, threshold_ratio, correlations, pd, look_speckle
-            )
-        correlations = np.abs(np.array(shots.segment_correlations))
-        pd_shot, miss_shot = pd_and_miss_any_two_in_speckle(pd, miss, threshold_ratio, correlations)
-        speckle_table = shots.speckle_table
-        near_ends = np.flatnonzero(speckle_table.ratio_row.any(axis=0))
-        if near_ends.size:
-            threshold_ratio = np.broadcast_to(threshold_ratio, shots.size)[near_ends]
-            correlations = correlations[:, near_ends]
-            pd_shot[near_ends], miss_shot[near_ends] = mean_over_phases(
-                speckle_table.phase_factors[speckle_table.ratio_row[:, near_ends]],
-                tuple(pd[:, near_ends]),
-                lambda *pd: pd_and_miss_any_two_in_speckle(
-                    np.array(pd), 1 - np.array(pd), threshold_ratio, correlations
-                ),
-            )
-        return DetectionArrays(pd_shot, miss_shot)
-    pd_both = shots.joint_detection_probability(pd[0], pd[2], (magnitudes[0], magnitudes[2]))
-    miss_shot = miss[0] + pd[0] * miss[2]
-    if shots.segment_correlations is not None:
-        miss_shot = miss[0] + np.maximum(pd[0] - pd_both, 0.0)
-    return DetectionArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
-
-
-def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
-    """Return the range and radial velocity that the peaks of the segments report."""
-    peak_frequencies, weights = segment_results[:, 3], segment_results[:, 2] ** 2
+    _, _, magnitudes, peak_frequencies, _, _ = np.moveaxis(segment_results, 1, 0)
+    weights = magnitudes**2
     if shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
         return fit_peaks(
             shots, peak_frequencies, np.where(shots.has_segment[:, None], weights, 0.0)
         )
+    frequency_up, frequency_doppler, frequency_down = peak_frequencies
+    _, has_doppler_segment, _ = shots.has_segment
+    carrier_up, _, _ = shots.carriers
     return waveform.resolve_range_velocity(
-        up=peak_frequencies[0],
-        doppler=peak_frequencies[1] if shots.has_segment[1] else None,
-        down=peak_frequencies[2],
-        carrier=shots.carriers[0],
+        up=frequency_up,
+        doppler=frequency_doppler if has_doppler_segment else None,
+        down=frequency_down,
+        carrier=carrier_up,
         bandwidth=shots.chirp_bandwidth,
         duration=shots.chirp_duration,
         sample_rate=shots.sample_rate,
@@ -332,41 +288,41 @@ def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> wavefor
 
 
 MISREAD_TOLERANCE_BINS = 4
-"""Tolerated error of a measured range or velocity [bins]: rounding of three peaks, and motion
-between and within records."""
+"""Tolerated error [bins] of a measured range or velocity, due to rounding of three peaks and to
+motion between and within records."""
 
 
 def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
-    """Find shots whose noiseless peaks give another range or velocity than the echo's.
+    """Test if noiseless spectra give a range or a radial velocity other than the echo's.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
     measured : RangeVelocity
-        Range and radial velocity of the peaks.
+        Range and radial velocity that follow from the spectra's peaks.
 
     Returns
     -------
     ndarray (2, n) bool
-        Misread range, misread velocity.
+        True where the range, and where the radial velocity, is misread.
 
     Notes
     -----
-    Beats beyond half the sample rate fold, and the assumption that resolves them may be wrong. The
-    extent of the footprint, and motion between and within records, are tolerated.
+    Beats beyond half the sample rate fold, and the assumption that resolves them may be wrong.
+    Errors due to the extent of the footprint, and to motion between and within records, are
+    tolerated.
     """
     frequency_tolerance = MISREAD_TOLERANCE_BINS * shots.sample_rate / shots.fft_size
-    footprint_rows, last_start = (
-        shots.footprint_row,
-        max(float(np.max(start)) for start in shots.scheduled_segment_starts),
-    )
+    footprint_rows = shots.footprint_row
+    last_start = max(float(np.max(start)) for start in shots.scheduled_segment_starts)
     shot_time = last_start + np.asarray(shots.chirp_duration) + np.abs(shots.range_walk_time)
     range_change = (np.abs(shots.approach_speed) + np.abs(shots.radial_velocity)) * shot_time
     range_change = range_change + np.abs(shots.acceleration) * shot_time * shot_time
     # An acceleration shifts beats between segments, which changes both measured range and velocity.
     velocity_change = np.abs(shots.acceleration) * shot_time
-    carrier = np.asarray(shots.carriers[0])
+    carrier_up, _, _ = shots.carriers
+    carrier = np.asarray(carrier_up)
     beat_per_metre = shots.chirp_rate * 2 / SPEED_OF_LIGHT
     range_tolerance = (
         frequency_tolerance + 2 * carrier / SPEED_OF_LIGHT * velocity_change
@@ -400,16 +356,17 @@ def fit_peaks(
     weights: np.ndarray,
     point_indices: np.ndarray | slice = slice(None),
 ) -> waveform.RangeVelocity:
-    """Measure range and radial velocity at the shot's start by fitting the beats.
+    """Fit range and radial velocity at the start of the shot to the peak frequencies.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
     peak_frequencies : ndarray (3, m)
-        Frequencies of peaks by segment [Hz].
+        Peak frequency of each segment [Hz].
     weights : ndarray (3, m)
-        Inverse variances in any unit; 0 where a segment is not detected.
+        Inverse variances of the frequencies up to a common factor; 0 where a segment is not
+        detected.
     point_indices : ndarray (m,) or slice
         Points to which the columns belong.
     """
@@ -428,7 +385,17 @@ def fit_peaks(
 
 
 def _false_alarm_probabilities(shots: Shots, n_exempt: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute noise's Pfa in a bin, the up-chirp, both chirps and any segment, with log10."""
+    """Compute the false-alarm probabilities of noise, and their decimal logarithms.
+
+    They refer to a bin, the up-chirp, both chirps and any segment of the shot.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    n_exempt : ndarray (3, n)
+        Number of bins of each segment that belong to an echo.
+    """
     log_pfa_bin = shots.looks.log_pfa(shots.threshold / shots.bin_noise_sigma)
     has_segment = shots.has_segment[:, None]
     n_equivalent_bins = np.where(

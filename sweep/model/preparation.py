@@ -46,6 +46,7 @@ from sweep.model.window import Window
 
 if TYPE_CHECKING:
     from sweep.model.detection.echo_detection import (
+        BinThresholds,
         DetectionRule,
         SegmentCorrelations,
         SpeckleTable,
@@ -482,12 +483,10 @@ class Shots:
         return self._noise_sigma_of(self.noise_variance + self.pedestal_variance_under_lines)
 
     @cached_property
-    def bin_threshold_table(self) -> np.ndarray:
-        """Thresholds and noise of each point's bins, (7, n): fields of ``BinThreshold``.
+    def bin_thresholds(self) -> "BinThresholds":
+        """Thresholds and noise of each point's bins."""
+        from sweep.model.detection.echo_detection import BinThresholds
 
-        The last three rows are those of its
-        :class:`sweep.model.detection.echo_detection.PedestalShape`.
-        """
         side_noise_sigma = self._noise_sigma_of(
             self.noise_variance + self.pedestal_variance_beside_lines
         )
@@ -497,7 +496,8 @@ class Shots:
             self.bin_noise_sigma,
             side_noise_sigma,
         )
-        return broadcast_rows((*sigmas_and_threshold, *self._pedestal_shape_rows), (self.size,))
+        rows = (*sigmas_and_threshold, *self._pedestal_shape_rows)
+        return BinThresholds(*broadcast_rows(rows, (self.size,)))
 
     @property
     def _pedestal_shape_rows(self) -> np.ndarray:
@@ -955,7 +955,7 @@ class Shots:
             self.leakage_tolerance,
             self.line_error_tolerance,
             self.image_gain,
-            *self.bin_threshold_table[3:],
+            *self.bin_thresholds[3:],
         )
         segment_columns = (
             x

@@ -1,17 +1,17 @@
-"""Threshold, from its ratio to the noise or from a design probability of false alarm.
+"""Threshold on |X| from its ratio to the noise, or from a design probability of false alarm.
 
 In a bin of noise alone |X| is Rayleigh distributed, with mean sigma sqrt(pi/2) and standard
-deviation sigma sqrt(2 - pi/2). A threshold of b sigma is stated in one of five ways:
+deviation sigma sqrt(2 - pi/2). One of five parameters sets the threshold of b sigma:
 
     tnr                  b / sqrt(2 - pi/2), as in the thesis
     threshold_to_mean    b / sqrt(pi/2)
     design_pfa_bin       exp(-b^2 / 2)
-    design_pfa_segment   probability that any bin counted in the up-chirp segment crosses
-    design_pfa_shot      probability that any bin counted in any segment of a shot crosses
+    design_pfa_segment   probability that any counted bin of the up-chirp segment crosses
+    design_pfa_shot      probability that any counted bin of any segment of a shot crosses
 
-Design probabilities are those of noise alone, before a detection excludes bins. With several looks
-(:mod:`sweep.model.detection.looks`) b is the threshold of each record, or of the root of their mean
-power, over sigma of one record. The probabilities then refer to all looks together.
+Design probabilities are those of noise alone, with no bins exempt for an echo. With several looks
+(:mod:`sweep.model.detection.looks`) b sigma is the threshold on each record, or on the root of
+their mean power, with sigma of one record. The probabilities then refer to all looks together.
 """
 
 import math
@@ -50,19 +50,19 @@ PROCESSING_PREFIX = "instrument.processing."
         "design_pfa_shot",
     )
 )
-"""Paths of the parameters that state the threshold; exactly one is given."""
+"""Paths of the parameters that set the threshold; exactly one of them is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
 
 
 def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the threshold-to-noise ratio, from any parameter that states the threshold.
+    """Return the threshold-to-noise ratio from the parameter that sets the threshold.
 
     Parameters
     ----------
     parameters : mapping
-        Parameters by dotted path, of points that share text and sizes.
+        Parameters by dotted path, of points that share strings and sizes.
 
     Returns
     -------
@@ -88,16 +88,17 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
         raise ValueError(
             f"give exactly one of {', '.join(THRESHOLD_PATHS)}, not {len(given_paths)}"
         )
-    value = np.asarray(parameters[given_paths[0]], float)
-    if given_paths[0] == TNR_PATH:
+    (given_path,) = given_paths
+    value = np.asarray(parameters[given_path], float)
+    if given_path == TNR_PATH:
         return value
-    if given_paths[0] == THRESHOLD_TO_MEAN_PATH:
+    if given_path == THRESHOLD_TO_MEAN_PATH:
         return value * (RAYLEIGH_MEAN / RAYLEIGH_DEVIATION)
     log_pfa, looks = np.log(value), Looks.from_parameters(parameters)
-    if given_paths[0] == DESIGN_PFA_BIN_PATH:
+    if given_path == DESIGN_PFA_BIN_PATH:
         return looks.threshold_ratio_from_log_pfa(log_pfa) / RAYLEIGH_DEVIATION
     band_bins, segments = search_band_bins(parameters), ["up"]
-    if given_paths[0] == DESIGN_PFA_SHOT_PATH:  # segments are independent
+    if given_path == DESIGN_PFA_SHOT_PATH:  # segments are independent
         segment_order = existing_segments(
             str(parameters["instrument.receiver.architecture"]),
             str(parameters.get(SEGMENT_ORDER_PATH, WAVEFORM_DEFAULTS[SEGMENT_ORDER_PATH])),
@@ -115,15 +116,15 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
 
 
 class NoiseBins(NamedTuple):
-    """Bins of a segment in which noise raises alarms."""
+    """Bins of a segment in which noise may raise alarms."""
 
     n_bins: float | np.ndarray
-    """Number of the bins; (n,) if a band is searched, else one number for all points."""
+    """Number of bins; (n,) if a search band is set, else one number for all points."""
     neighbour_correlation: float
-    """Correlation of the noise of neighbouring bins; 0 of bins that count as independent."""
+    """Correlation of the noise of neighbouring bins; 0 if bins count as independent."""
 
     def alarm_equivalent_bins(self, threshold_ratio: np.ndarray, looks: Looks) -> np.ndarray:
-        """Return the number of independent bins that alarm as often as these."""
+        """Return the number of independent bins that raise an alarm as often as these bins."""
         return bin_noise.alarm_equivalent_bins(
             self.n_bins,
             threshold_ratio=threshold_ratio,
@@ -136,14 +137,17 @@ class NoiseBins(NamedTuple):
 def _common_threshold_ratio(
     log_pfa: float, looks: Looks, noise_bins: tuple[NoiseBins, ...]
 ) -> np.ndarray:
-    """Return the threshold over sigma of all points of a study that share their probability."""
+    """Return the threshold over sigma for a log false-alarm probability of segments (cached)."""
     return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_law(looks, noise_bins))
 
 
 def _log_pfa_law(
     looks: Looks, noise_bins: Sequence[NoiseBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from b to the log probability that noise raises an alarm in segments."""
+    """Return the function from b to the log probability that noise raises an alarm in any segment.
+
+    ``noise_bins`` are the bins of the segments.
+    """
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
     return lambda threshold_ratio: reduce(
@@ -151,9 +155,9 @@ def _log_pfa_law(
         (
             log_at_least_one_probability(
                 looks.log_pfa(threshold_ratio),
-                of_segment.alarm_equivalent_bins(threshold_ratio, looks),
+                segment_bins.alarm_equivalent_bins(threshold_ratio, looks),
             )
-            for of_segment in noise_bins
+            for segment_bins in noise_bins
         ),
     )
 
@@ -161,16 +165,16 @@ def _log_pfa_law(
 def segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent bins that alarm as often as a segment without a detection.
+    """Return the number of independent bins that raise an alarm as often as a segment of noise.
 
     Parameters
     ----------
     parameters : mapping
-        Parameters by dotted path, of points that share text and sizes.
+        Parameters by dotted path, of points that share strings and sizes.
     threshold_ratio : ndarray
         Threshold b over sigma.
     segment : str
-        Name of the segment; segments differ if a band is searched.
+        Name of the segment. Segments differ if a search band is set.
 
     See Also
     --------
@@ -182,7 +186,7 @@ def segment_alarm_bins(
 
 
 def _noise_bins(parameters: Mapping[str, Any], segment: str) -> NoiseBins:
-    """Return the bins of a segment in which noise raises alarms."""
+    """Return the bins of a segment in which noise may raise alarms."""
     fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
     is_complex_record = str(parameters.get("instrument.receiver.record", "real")) == "complex"
     counts_all_bins = is_complex_record or (

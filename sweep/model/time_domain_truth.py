@@ -109,24 +109,22 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
     )
     segment_results = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
     for point in range(shots.size):
-        last_bin_and_width = shots.n_bins - 1, float(shots.sample_rate[point]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.has_segment)):
             look_magnitudes = [
                 time_domain_spectrum(look, point, segment, with_range_walk=with_range_walk)
                 for look in (split_looks(shots) if np.any(shots.line_drift_per_look) else [shots])
             ]
             magnitude = np.sqrt(np.mean(np.square(look_magnitudes), axis=0))
-            detection = np.empty((len(SEGMENT_FIELDS), 1))
-            detect_in_spectra(
+            detections = detect_in_spectra(
                 magnitude[None],
                 np.zeros(1, np.int64),
-                last_bin_and_width,
+                shots.n_bins - 1,
+                float(shots.sample_rate[point]) / shots.fft_size,
                 shots.detection_rule,
-                shots.bin_threshold_table[:, [point]],
+                shots.bin_thresholds.select(np.array([point])),
                 shots.speckle_table.select(segment, np.array([point])),
-                detection,
             )
-            segment_results[segment, :, point] = detection[:, 0]
+            segment_results[segment, :, point] = np.array(detections)[:, 0]
             if shots.complex_record:
                 segment_results[segment, frequency_row, point] -= (
                     float(shots.sample_rate[point]) / 2

@@ -87,9 +87,8 @@ def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
             root = np.sqrt(SPECKLE_POWER_MAX * 2.0 ** (-k / per_octave))
             chances = np.where(exempt, 0.0, -np.expm1(-direct_rates(root * magnitude, level)))
             brightest = any_crossing_probability(chances, 0, chances.size)
-            noise = 1.0 / root, level / root
             exclude_bins_joining_echo(
-                chances, 0, chances.size, magnitude, exempt, noise, correlation
+                chances, 0, chances.size, magnitude, exempt, 1.0 / root, level / root, correlation
             )
             rate = -np.log1p(-min(any_crossing_probability(chances, 0, chances.size), 1 - 1e-15))
             found.append((np.log(max(rate, leakage.RATE_MIN)), brightest))

@@ -80,8 +80,10 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
         for u in powers:
             stays = marcum_q1(np.sqrt(u) * magnitude / sigma, np.array(level / sigma)).p / quiet
             chances = np.where(counts, np.maximum(1.0 - stays, 0.0), 0.0)
-            noise = sigma / np.sqrt(u), level / np.sqrt(u)
-            exclude_bins_joining_echo(chances, 0, chances.size, magnitude, exempt, noise, near)
+            noise, threshold = sigma / np.sqrt(u), level / np.sqrt(u)
+            exclude_bins_joining_echo(
+                chances, 0, chances.size, magnitude, exempt, noise, threshold, near
+            )
             raised.append(any_crossing_probability(chances, 0, chances.size))
         expected = np.trapezoid(np.array(raised) * np.exp(-powers), powers)
         if expected > 1e-7:

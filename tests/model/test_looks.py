@@ -380,7 +380,7 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
     scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
     near = shots.detection_rule.sidelobe_correlation
     alone = 1 - np.prod(1 - chances)
-    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, own, (sigma / 2, scaled), near)
+    exclude_bins_joining_echo(chances, 0, chances.size, magnitude, own, sigma / 2, scaled, near)
     expected = 1 - np.prod(1 - chances)
     assert 1e-3 < expected < alone < 0.9
     assert told["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)

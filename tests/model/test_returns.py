@@ -8,6 +8,7 @@ from scipy import ndimage, stats
 from shot_helpers import DRAWS, is_within_5_sigma, make_point_keys, prepare_single_category
 
 from sweep.model import time_domain_truth, waveform
+from sweep.model.detection.echo_detection import BinThresholds
 from sweep.model.detection.sub_bin_interpolation import interpolator
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import (
@@ -319,7 +320,8 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     known = DrawInputs(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
-        np.zeros((1, 7)), np.full((1, 3), alarm), np.ones((1, 2)), np.ones((1, 2, 1)),
+        BinThresholds(*np.zeros((7, 1))), np.full((1, 3), alarm), np.ones((1, 2)),
+        np.ones((1, 2, 1)),
         np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)), np.ones((1, 3, 1)),
         np.zeros((1, 6)), np.zeros((1, 3, 1, 0), complex),
     )  # fmt: skip

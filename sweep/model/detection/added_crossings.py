@@ -1,22 +1,22 @@
-"""Threshold crossings that a signal adds to those of noise, for many bins at a time.
+"""Probability that leaked signal makes bins cross the threshold, in addition to noise.
 
 With x = a^2/2 and y = b^2/2, a bin of amplitude a (in units of the noise per quadrature) crosses a
 threshold b with Q_1(a, b); over the e^-y of noise alone that is
 
     Q_1(a, b) - e^-y = e^-x sum_{n >= 1} c_n x^n / n!,    c_n = e^-y sum_{j=1..n} y^j / j!
 
-(the Poisson mixture of chi-square tails less its value at a = 0). All terms are positive, so it
-keeps its digits however small it is; and c_n depends on the threshold alone, so a run of bins
-costs one polynomial in x, which vectorises.
+(the Poisson mixture of chi-square tails less its value at a = 0). All terms are positive, so the
+sum keeps its precision however small it is. c_n depends on the threshold alone, so all bins of a
+point are one polynomial in x, which vectorises.
 
-Adjacent bins that cross are one group. Those next to an echo whose outermost bin crosses with
-probability q are part of its group. If bins 1, 2 .. next to it cross with c_1, c_2 .., a further
-group stands in them with the probability
+Adjacent bins that cross form one group. If the outermost bin of an echo crosses, with probability
+q, bins next to it that cross belong to its group. Let the bins 1, 2, .. next to the echo cross with
+c_1, c_2, ... They hold a further group with the probability
 
-    (1 - c_1) B_2 + c_1 (1 - q + q A_2),    A_j = c_j A_(j+1) + (1 - c_j) B_(j+1),
+    (1 - c_1) B_2 + c_1 (1 - q + q A_2),    A_j = c_j A_(j+1) + (1 - c_j) B_(j+1).
 
-B_j that any of the bins from j on crosses, A_j that one does after a bin that does not. Bins
-between two echoes may join either.
+B_j is the probability that any bin from j on crosses, A_j that one crosses after a bin that does
+not. Bins between two echoes may join either.
 """
 
 import math
@@ -25,28 +25,39 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 
 BINS_PER_BATCH = 256
-"""Bins for which the polynomial is evaluated together."""
+"""Number of bins for which the polynomial is evaluated together."""
 
 SERIES_Y_MAX = 450.0
-"""y up to which the series serves; above, and for amplitudes that dwarf the noise, Marcum's Q."""
+"""Largest y = b^2/2 for which the series is used; above it, and for amplitudes above the threshold,
+Marcum's Q is evaluated bin by bin."""
 
 SERIES_TERMS_MAX = 800
+"""Number of terms of the series that are kept."""
 
 JOINED_PROBABILITY_MIN = 1e-9
-"""Probability that all bins of a run cross, below which no further one is taken to join it."""
+"""Probability that adjacent bins all cross, below which no further bin is taken to join them."""
 
 EDGE_NOISE_DEVIATION_MIN = 0.01
 """Smallest deviation [sigma] of an outermost bin's noise, given that its neighbour crosses."""
 
 _EXPONENTIAL_COEFFICIENTS = tuple((-1) ** n / math.factorial(n) for n in range(12))
-"""Of e^-z, to 1e-16 for z <= 1/4."""
+"""Taylor coefficients of e^-z in rising order; the error is 1e-16 for z <= 1/4."""
+_HIGHEST_COEFFICIENT = _EXPONENTIAL_COEFFICIENTS[-1]
 
 
 @njit(cache=True, error_model="numpy")
 def fill_crossing_series(threshold_ratio, series):
-    """Fill ``series`` with c_n y^n / n!, over the probability that noise alone stays below.
+    """Fill ``series`` with c_n y^n / n! over the probability that noise alone does not cross.
 
-    As many as any amplitude below the threshold asks for; none above :data:`SERIES_Y_MAX`.
+    All terms are filled that an amplitude below the threshold needs; none above
+    :data:`SERIES_Y_MAX`.
+
+    Parameters
+    ----------
+    threshold_ratio
+        Threshold b over the noise per quadrature; y = b^2/2.
+    series
+        (terms,): the result.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
     if not 0.0 < y <= SERIES_Y_MAX:
@@ -62,27 +73,35 @@ def fill_crossing_series(threshold_ratio, series):
 
 @njit(cache=True, error_model="numpy")
 def _n_series_terms(x, y):
-    """Terms that leave less than 1e-16 of the sum for amplitudes up to x (<= y)."""
+    """Return the number of terms that give the sum to 1e-16 for all half squares up to x <= y."""
     root = math.sqrt(x * y)
     return int(8.0 + 1.3 * root + 5.0 * math.sqrt(root) + 4.0 * math.sqrt(x))
 
 
 @njit(cache=True, error_model="numpy")
 def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabilities):
-    """Fill ``probabilities`` (>= count + 7,) with (Q_1 - e^-y) / (1 - e^-y) of bins, 0..1.
+    """Fill ``probabilities`` with (Q_1 - e^-y) / (1 - e^-y), 0..1, of bins below the threshold.
 
-    ``half_squares`` is a^2/2 of each bin, below y; used up, and so are up to seven elements more.
-    ``threshold_ratio``:
-    threshold over the noise per quadrature; ``series``: :func:`fill_crossing_series` of it.
+    Parameters
+    ----------
+    half_squares
+        (n_bins + 7,): a^2/2 of each bin, below y. The array is overwritten.
+    n_bins
+        Number of bins.
+    threshold_ratio
+        Threshold b over the noise per quadrature; y = b^2/2.
+    series
+        Result of :func:`fill_crossing_series` for this threshold.
+    probabilities
+        (n_bins + 7,): the result; the last seven elements are scratch.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
     if y > SERIES_Y_MAX:
         for i in range(n_bins):
             probabilities[i] = marcum_q1_excess(math.sqrt(2.0 * half_squares[i]), threshold_ratio)
         return
-    padded_count = (
-        (n_bins + 7) // 8 * 8
-    )  # whole vectors: what is left over costs as much as all of them
+    # Whole vectors: a remainder would cost as much as all of them.
+    padded_count = (n_bins + 7) // 8 * 8
     half_squares[n_bins:padded_count] = 0.0
     for first in range(0, padded_count, BINS_PER_BATCH):
         last = min(first + BINS_PER_BATCH, padded_count)
@@ -106,7 +125,7 @@ def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabil
 
 @njit(cache=True, error_model="numpy")
 def largest_or_zero(values):
-    """Largest of some numbers, at least 0."""
+    """Return the largest of some numbers, or 0 if all are negative."""
     maximum = 0.0
     for i in range(values.size):
         maximum = values[i] if values[i] > maximum else maximum
@@ -115,10 +134,26 @@ def largest_or_zero(values):
 
 @njit(cache=True, error_model="numpy")
 def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, probabilities):
-    """e^-x sum d_n (x inverse)^n, n = 1 .. terms; e^-x as a power of e^(-x scale)."""
+    """Fill ``probabilities`` with the series e^-x sum_n d_n (x / y)^n, n = 1 .. ``n_terms``.
+
+    Parameters
+    ----------
+    half_squares
+        x of each bin; overwritten by e^-x.
+    inverse_y
+        1/y.
+    series
+        d_n, result of :func:`fill_crossing_series`.
+    n_terms
+        Number of terms.
+    scale, halvings
+        2^-halvings and halvings: e^-x is computed from e^(-x scale) by repeated squaring.
+    probabilities
+        The result.
+    """
     for i in range(half_squares.size):
         probabilities[i] = 0.0
-    for n in range((n_terms + 7) // 8 * 8 - 7, 0, -8):  # eight at a time: fewer loads and stores
+    for n in range((n_terms + 7) // 8 * 8 - 7, 0, -8):  # eight terms at once save loads and stores
         a, b, c, d = series[n], series[n + 1], series[n + 2], series[n + 3]
         e, f, g, h = series[n + 4], series[n + 5], series[n + 6], series[n + 7]
         for i in range(half_squares.size):
@@ -129,7 +164,7 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
             probabilities[i] = u * (u2 * u2 * high + low)
     for i in range(half_squares.size):
         z = scale * half_squares[i]
-        decay = _EXPONENTIAL_COEFFICIENTS[11]
+        decay = _HIGHEST_COEFFICIENT
         for n in range(10, -1, -1):
             decay = z * decay + _EXPONENTIAL_COEFFICIENTS[n]
         half_squares[i] = decay
@@ -142,10 +177,14 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
 
 @njit(cache=True, error_model="numpy")
 def any_crossing_probability(probabilities, first, last):
-    """1 - prod(1 - probability) over probabilities first .. last - 1, with all its digits."""
+    """Return the probability of any of several independent crossings, 1 - prod(1 - p).
+
+    The product is over ``probabilities`` of the indices first .. last - 1. Small results keep their
+    precision.
+    """
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = first
-    while i + 3 < last:  # four at a time, as each waits for the one before
+    while i + 3 < last:  # four independent chains, as each step depends on the one before
         a += probabilities[i] * (1.0 - a)
         b += probabilities[i + 1] * (1.0 - b)
         c += probabilities[i + 2] * (1.0 - c)
@@ -162,7 +201,7 @@ def any_crossing_probability(probabilities, first, last):
 
 @njit(cache=True, error_model="numpy")
 def crossing_rate(probability):
-    """-ln(1 - probability): what adds up over bins."""
+    """Return -ln(1 - p) of a crossing probability p, the rate that is additive over bins."""
     if probability < 1e-4:
         return probability * (
             1.0 + probability * (0.5 + probability * (1.0 / 3.0 + 0.25 * probability))
@@ -172,10 +211,10 @@ def crossing_rate(probability):
 
 @njit(cache=True, error_model="numpy")
 def weighted_crossing_rate(probabilities, weights):
-    """Sum of the weighted -ln(1 - probability)."""
+    """Return the sum of weights times :func:`crossing_rate` of probabilities."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = 0
-    while i + 3 < probabilities.size:  # four at a time, as each sum waits for the one before
+    while i + 3 < probabilities.size:  # four sums, as each addition depends on the one before
         a += weights[i] * crossing_rate(probabilities[i])
         b += weights[i + 1] * crossing_rate(probabilities[i + 1])
         c += weights[i + 2] * crossing_rate(probabilities[i + 2])
@@ -194,18 +233,19 @@ def edge_crossing_probability(edge_ratio, neighbour_ratio, threshold_ratio, side
     Parameters
     ----------
     edge_ratio, neighbour_ratio
-        |X| / sigma of the outermost bin, and of its neighbour outside the echo.
+        |X| without noise of the outermost bin, and of its neighbour outside the echo, over the
+        noise per quadrature sigma.
     threshold_ratio
-        Threshold [sigma].
+        Threshold b over sigma.
     sidelobe_correlation
-        Correlation of their noise in phase with the signal.
+        Correlation rho of the two bins' noise components in phase with their signals.
 
     Notes
     -----
-    A bin crosses by noise n > b - a in phase with its signal. This has the mean m = phi / (1 - Phi)
-    at d = b - a and the variance 1 - m (m - d). In the outermost bin it leaves noise of the mean
-    rho m and the variance s^2 = 1 - rho^2 m (m - d), whose distance from the threshold is that of a
-    bin of the amplitude b - (b - a_edge - rho m) / s in noise of unit variance.
+    The neighbour, of amplitude a, crosses by noise n > d = b - a in phase with its signal. Given
+    this, n has the mean m = phi(d) / (1 - Phi(d)) and the variance 1 - m (m - d). The noise of the
+    outermost bin then has the mean rho m and the variance s^2 = 1 - rho^2 m (m - d). The bin
+    crosses like one of the amplitude b - (b - a_edge - rho m) / s in noise of unit variance.
     """
     if sidelobe_correlation != 0.0:
         distance_to_threshold = threshold_ratio - neighbour_ratio
@@ -236,32 +276,33 @@ def exclude_bins_joining_echo(
     end_index,
     magnitudes,
     is_exempt,
-    sigma_and_threshold,
+    noise_sigma,
+    threshold,
     sidelobe_correlation,
 ):
-    """Leave runs of bins that join an echo out of probabilities, in place.
+    """Exclude crossings that join an echo's group from crossing probabilities, in place.
 
-    The first bin next to an echo takes the probability of a further group in all bins that may join
-    it, and these take 0.
+    Next to an echo the probability of the first bin becomes that of a further group in all bins
+    that may join the echo. The probabilities of these other bins become 0.
 
     Parameters
     ----------
     probabilities
-        Probabilities that signal makes bins cross.
+        (bins,): probability that leaked signal makes each bin cross; the result.
     first_index, end_index
-        First bin, and that after the last, of those that are looked at.
-    magnitudes, is_exempt
-        |X|, and whether bins are of an echo.
-    sigma_and_threshold
-        Noise per quadrature sigma, and threshold on |X|.
+        Index of the first bin to process, and of the bin after the last.
+    magnitudes
+        (bins,): |X| without noise.
+    is_exempt
+        (bins,) bool: True in bins that belong to an echo.
+    noise_sigma
+        Noise per quadrature sigma, in the unit of |X|.
+    threshold
+        Threshold on |X| by which adjacent bins form a group.
     sidelobe_correlation
-        Correlation of neighbours' noise in phase with the signal.
+        Correlation of neighbouring bins' noise components in phase with the signal.
     """
-    noise_sigma, threshold, stretch_end = (
-        sigma_and_threshold[0],
-        sigma_and_threshold[1],
-        first_index,
-    )
+    stretch_end = first_index
     while stretch_end < end_index:
         stretch_begin = stretch_end
         while stretch_end < end_index and not is_exempt[stretch_end]:
@@ -300,7 +341,11 @@ def exclude_bins_joining_echo(
 
 @njit(cache=True, error_model="numpy")
 def _count_joining_bins(probabilities, first_index, step, n_bins):
-    """Return how many of ``n_bins`` bins from ``first_index`` on may all cross."""
+    """Return the number of adjacent bins that may join an echo, at most ``n_bins``.
+
+    They follow from ``first_index`` by ``step``, and cross jointly with a probability above
+    :data:`JOINED_PROBABILITY_MIN`.
+    """
     n_joining, p_all_cross = 1, 1.0
     while n_joining < n_bins and p_all_cross > JOINED_PROBABILITY_MIN:
         p_all_cross *= probabilities[first_index + n_joining * step]
@@ -312,19 +357,23 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
 def _fill_further_group_probability(
     probabilities, first_index, step, n_bins, p_join_first, p_join_last
 ):
-    """Replace the probability of bin ``first_index`` by that of a further group in ``n_bins`` bins.
+    """Replace the crossing probability of a first bin by that of a further group in adjacent bins.
 
-    ``p_join_first`` and ``p_join_last``: probabilities that the first and the last join an echo if
-    they cross. The other bins take 0.
+    The crossing probabilities of the other bins become 0.
+
+    Parameters
+    ----------
+    probabilities
+        Crossing probabilities; changed in place.
+    first_index, step, n_bins
+        Index of the first bin, step to the next one, and number of bins.
+    p_join_first, p_join_last
+        Probability that the first and that the last bin join an echo if they cross.
     """
-    p_after_quiet_bin, p_all_in_echo, p_undecided, p_further_group = (
-        1.0 - p_join_first,
-        p_join_first,
-        0.0,
-        0.0,
-    )
-    # Probabilities of no further group yet: after a bin that does not cross, that is of the echo
-    # or that may join one at the end. Before the first bin there stands an echo or none.
+    # Joint probabilities of no further group so far and the state of the last bin: it does not
+    # cross, belongs to the echo's group, or may join the echo at the other end.
+    p_after_quiet_bin, p_all_in_echo = 1.0 - p_join_first, p_join_first
+    p_undecided, p_further_group = 0.0, 0.0
     for i in range(first_index, first_index + n_bins * step, step):
         p_cross = probabilities[i]
         p_further_group += (1.0 - p_cross) * p_undecided

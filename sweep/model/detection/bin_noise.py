@@ -1,24 +1,25 @@
-"""Noise of a segment's bins: how alike neighbours are, and how often any of many crosses.
+"""Noise of a segment's bins: its correlation between neighbours, and alarms in any of many bins.
 
-The bins' noise is the transform of white noise times the window w, so that bins y apart (in bins of
-fs/L) are correlated as W2(y) / W2(0), W2 the transform of w^2. Of n adjacent bins the alarms are
-taken as a Markov chain of first order. With p the probability that a bin crosses a threshold of b
-sigma,
+The bins' noise is the transform of white noise times the window w. Bins that are y apart (in bins
+of fs/L) have the correlation W2(y) / W2(0), with W2 the transform of w^2. Alarms of n adjacent bins
+are treated as a first-order Markov chain. With the probability p that a bin crosses a threshold of
+b sigma,
 
-    P(none) = (1 - p) (1 - h)^(n - 1),    h = (p - p11) / (1 - p),
+    P(none) = (1 - p) (1 - h)^(n - 1),    h = (p - p11) / (1 - p).
 
-h the probability that a bin crosses after one that does not. p11, that both do, is the joint tail
-of two Rayleigh magnitudes [Simon and Alouini, Digital Communication over Fading Channels, 6.1.2].
-With rho^2 = |W2/W2(0)|^2 of neighbours
+Here h is the probability that a bin crosses after one that does not. Two neighbours both cross with
+the probability p11, the joint tail of two Rayleigh magnitudes [Simon and Alouini, Digital
+Communication over Fading Channels, 6.1.2]. With rho^2 = |W2/W2(0)|^2 of neighbours
 
     p - p11 = p (Q_1(s b, s rho b) - Q_1(s rho b, s b)),    s^2 = 1 / (1 - rho^2).
 
-A real record's noise is real at DC and Nyquist and nearly so next to them, where it alarms far more
-often. Bins whose noise is not circular are not searched for alarms.
+The noise of a real record is real at DC and Nyquist and nearly real next to them, where it raises
+alarms far more often. Bins whose noise is not circular are not searched for alarms.
 
-So n bins alarm as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent ones do: everything that is known
-of independent bins serves, in logarithms too. At TNR 6 it is within 2 % of drawn noise for
-rectangular, Hamming, Hann and Blackman windows, 3 % for flattop and Hann padded by 4.
+n bins thus raise alarms as often as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent bins, to which
+the formulas for independent bins apply, in logarithms too. At TNR 6 the result is within 2 % of
+drawn noise for rectangular, Hamming, Hann and Blackman windows, and within 3 % for flattop and for
+Hann padded by 4.
 """
 
 import math
@@ -31,20 +32,21 @@ from sweep.model.detection.looks import SINGLE_LOOK, Looks
 from sweep.model.window import Window, window_samples
 
 CIRCULAR_RATIO_MAX = 0.01
-"""Share |W2(2k)| / W2(0) by which quadratures of a bin may differ that is taken to be circular."""
+"""Largest |W2(2k)| / W2(0), the relative difference of the quadratures' variances from their mean,
+of bins whose noise counts as circular."""
 
 
 @lru_cache(maxsize=64)
 def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
-    """Correlation |W2(1)| / W2(0), 0..1, of the noise of adjacent bins, fs/N apart."""
+    """Return the modulus of the noise correlation of adjacent bins, fs/N apart, 0..1."""
     return _noise_correlation_at(window, fft_size, 1)
 
 
 @lru_cache(maxsize=64)
 def first_circular_bin(window: Window, fft_size: int) -> int:
-    """First bin, counted from DC or from Nyquist, whose noise is circular; 1 or more.
+    """Return the first bin with circular noise in a real record, counted from DC or Nyquist; >= 1.
 
-    Noise in bin k of a real record has quadratures of variance sigma^2 (1 +- |W2(2k)| / W2(0)).
+    Noise in bin k has quadratures of the variances sigma^2 (1 +- |W2(2k)| / W2(0)).
     """
     padding_factor, last_noncircular_bin = fft_size / window.length, 0
     for k in range(1, math.ceil(8 * padding_factor), max(int(padding_factor / 16), 1)):
@@ -54,14 +56,14 @@ def first_circular_bin(window: Window, fft_size: int) -> int:
 
 
 def _noise_correlation_at(window: Window, fft_size: int, bin_distance: int) -> float:
+    """Return the modulus of the noise correlation of bins at a distance [bins of fs/N], 0..1."""
     squared_window = window_samples(window.name, window.length) ** 2
     exponentials = np.exp(
         -2j * np.pi * (bin_distance * np.arange(window.length) % fft_size) / fft_size
     )
     correlation = abs((squared_window * exponentials).sum()) / squared_window.sum()
-    return (
-        float(correlation) if correlation > 1e-12 else 0.0
-    )  # none but rounding, of unpadded rectangles
+    # Bins of an unpadded rectangular window are uncorrelated except for rounding.
+    return float(correlation) if correlation > 1e-12 else 0.0
 
 
 def alarm_equivalent_bins(
@@ -69,8 +71,16 @@ def alarm_equivalent_bins(
 ) -> np.ndarray:
     """Return the number, 0..n, of independent bins that raise an alarm as often as n adjacent ones.
 
-    By the threshold over sigma, and the correlation of neighbours
-    (:func:`neighbour_noise_correlation`).
+    Parameters
+    ----------
+    n_bins
+        Number n of adjacent bins.
+    threshold_ratio
+        Threshold over sigma, the noise per quadrature.
+    correlation
+        Noise correlation of neighbours, :func:`neighbour_noise_correlation`.
+    looks
+        Number of looks and how they are combined.
     """
     n_bins = np.asarray(n_bins, float)
     equivalent_per_bin = _equivalent_bins_per_bin(
@@ -82,10 +92,10 @@ def alarm_equivalent_bins(
 def _equivalent_bins_per_bin(
     threshold_ratio: np.ndarray, correlation: float, looks: Looks
 ) -> np.ndarray:
-    """ln(1 - h) / ln(1 - p), what each further bin counts for."""
+    """Return ln(1 - h) / ln(1 - p), the number of independent bins per additional adjacent bin."""
     from sweep.model.detection.marcum import marcum_q1
 
-    if correlation in (0.0, 1.0):  # of one sample all bins are alike
+    if correlation in (0.0, 1.0):  # 1: a record of one sample, whose bins are all equal
         return np.full_like(threshold_ratio, 1.0 - correlation)
     if looks.is_noncoherent:
         p_stay_if_neighbour_crosses = looks.p_stay_given_neighbour_crosses(
@@ -93,7 +103,7 @@ def _equivalent_bins_per_bin(
         )
     else:
         scaled_threshold = threshold_ratio / np.sqrt((1 - correlation) * (1 + correlation))
-        # Of complements, which keep their digits where thresholds are low.
+        # By complements, which are precise for low thresholds.
         p_stay_if_neighbour_crosses = marcum_q1(correlation * scaled_threshold, scaled_threshold).p
         p_stay_if_neighbour_crosses = (
             p_stay_if_neighbour_crosses
@@ -111,16 +121,32 @@ def _equivalent_bins_per_bin(
 
 
 NOISE_FILTER_TAPS = 17
-"""Independent numbers of which a bin's noise is made."""
+"""Number of independent normal numbers that make the noise of a bin."""
 
 
 @lru_cache(maxsize=16)
 def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Weights that make the noise of adjacent bins of independent numbers, one each fs/L.
+    """Return the filter that makes the noise of adjacent bins from independent normal numbers.
 
-    The noise of a bin at y [bins of fs/L] is sum_j W(y - j) z_j, as the transform of a record is
-    that of its own bins. In phase with the middle of a line's main lobe W is real. Returns weights
-    (bins, TAPS), their squares' sum 1, and the number of each bin's first (bins,).
+    Parameters
+    ----------
+    window, fft_size
+        Window of L samples, and FFT size N.
+    n_bins
+        Number of adjacent bins.
+
+    Returns
+    -------
+    weights
+        (n_bins, NOISE_FILTER_TAPS): weights of the numbers in each bin; their squares have the sum
+        1.
+    first_number
+        (n_bins,): index of the first number in each bin.
+
+    Notes
+    -----
+    The noise of a bin at the frequency y [bins of fs/L] is sum_j W(y - j) z_j, with one number z_j
+    per bin of fs/L and the window's transform W, which is real about the middle of the record.
     """
     filter_length = min(window.length, 512) // 2 * 2
     window_values = window_samples(window.name, max(filter_length, 1))

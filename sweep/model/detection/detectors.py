@@ -1,9 +1,9 @@
 """Detectors: which bins of a spectrum hold a signal, by a fixed threshold or by their neighbours.
 
-All look at the power |X|^2 of every bin (a square-law detector). A constant-false-alarm-rate (CFAR)
-detector holds each bin against ``factor`` times a level that it takes from *training* cells, half
-of them on either side, with *guard* cells between. Guard cells are left out so that the signal does
-not train its own threshold:
+All are square-law detectors: they compare the power |X|^2 of every bin with a threshold. In a
+constant-false-alarm-rate (CFAR) detector the threshold is ``factor`` times a level, which is
+estimated from *training* cells, half of them on either side. *Guard* cells next to the bin are
+excluded, so that a signal does not raise its own threshold:
 
 - ``ca_cfar``, cell averaging: the mean of all training cells [Finn and Johnson, RCA Review 29, 414,
   1968].
@@ -15,15 +15,15 @@ not train its own threshold:
 The factors follow from the design probability of a false alarm in closed form, for independent
 cells of exponential noise [Gandhi and Kassam, IEEE Trans. Aerosp. Electron. Syst. 24, 427, 1988;
 Richards, Fundamentals of Radar Signal Processing, 2014, chapter 6]. A tapered window or a padded
-FFT makes the noise of neighbouring bins alike: fewer independent cells stand behind the level, and
-more false alarms come than by design (docs/detectors.md has how many).
+FFT correlates the noise of neighbouring bins. The level then comes from fewer independent cells,
+and false alarms are more frequent than by design (numbers in docs/detectors.md).
 
-The same forms give the probability of detection of a signal that fluctuates as speckle does
-(Swerling 1). A cell whose mean is 1 + snr times the noise's crosses as noise does a factor smaller
-by 1 + snr.
+The same formulas give the probability of detection of a signal that fluctuates like speckle
+(Swerling 1). A cell whose mean power is 1 + snr times the noise power crosses as often as noise
+with a factor divided by 1 + snr.
 
-The spectrum of a white record has no ends: training cells beyond DC are those below Nyquist, and
-the other way round; in a complex record's spectrum those beyond its last bin are its first.
+Training cells wrap around. In a real record's spectrum, cells below DC are those below Nyquist, and
+vice versa; in a complex record's spectrum, the cells after its last bin are its first.
 """
 
 import math
@@ -50,22 +50,22 @@ def cached_window_samples(window: Window) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def main_lobe_half_width(window: Window) -> float:
-    """Distance [bins of fs/L] of the first minimum of |W| below its half, to 1/8 bin."""
+    """Return the distance [bins of fs/L] of the first minimum of |W| below its half, to 1/8 bin."""
     magnitude = np.abs(np.fft.rfft(cached_window_samples(window), 8 * window.length))
-    is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # a flattop's top has minima of its own
+    is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # flattop windows have minima above it
     return float(np.argmax(is_below_half & (np.diff(magnitude) > 0))) / 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SpectrumSettings:
-    """Settings by which spectra were made, and by which they are detected."""
+    """Properties of spectra, and settings of the detector that is applied to them."""
 
     fft_size: int
-    """Points N of the FFT; spectra have the bins 0..N/2, or -N/2..N/2 - 1 of a complex record."""
+    """FFT size N. Spectra have the bins 0..N/2, or -N/2..N/2 - 1 of a complex record."""
     sample_rate: float
-    """[Hz]; a bin is ``sample_rate / fft_size`` wide."""
+    """Sample rate [Hz]; a bin is ``sample_rate / fft_size`` wide."""
     window: Window
-    """Its ``length`` L <= N is that of the record, which is padded with zeros to N."""
+    """Window of the record. Its length L <= N is that of the record, which is zero-padded to N."""
     noise_power: float
     """Mean |X|^2 of a bin of noise alone, by the receiver's noise budget [V^2]."""
     threshold: float
@@ -79,7 +79,7 @@ class SpectrumSettings:
     pfa: float
     """Design probability of a false alarm in a bin of noise alone."""
     complex_record: bool = False
-    """True for records of I and Q: bin k stands at index k + N/2."""
+    """True for records of I and Q: bin k has the index k + N/2."""
 
     @property
     def taper(self) -> np.ndarray:
@@ -88,15 +88,28 @@ class SpectrumSettings:
 
 
 Detector = Callable[[np.ndarray, SpectrumSettings], np.ndarray]
-"""From power |X|^2 (m, N/2 + 1) of m spectra, (m, N) of complex records, and the setting to bool of
-the same shape."""
+"""Function from the power |X|^2 of m spectra, (m, N/2 + 1) or (m, N) of complex records, and their
+settings to a bool array of the same shape, True in bins that are detected."""
 
 
 def cfar_crossing_probability(kind: str, factor: float, *, training: int, rank: int) -> float:
-    """Probability that a cell of exponential power exceeds its CFAR threshold.
+    """Return the probability that a cell of exponentially distributed power exceeds its threshold.
 
-    `factor` is the threshold over the level that training cells give; where the cell's own mean is
-    1 + snr times theirs, over 1 + snr. `rank` is 1..training, and training even.
+    Parameters
+    ----------
+    kind : str
+        CFAR detector: ``ca_cfar``, ``goca_cfar`` or ``os_cfar``.
+    factor : float
+        Threshold over the level of the training cells. If the mean power of the cell is 1 + snr
+        times theirs, the factor divided by 1 + snr.
+    training : int
+        Number of training cells, even.
+    rank : int
+        Rank of the ordered statistic, 1..training; used by ``os_cfar``.
+
+    Returns
+    -------
+    float
     """
     if kind == CA_CFAR:
         return float((1 + factor / training) ** -training)
@@ -120,13 +133,27 @@ def cfar_crossing_probability(kind: str, factor: float, *, training: int, rank: 
 
 
 def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
-    """Factor on the level of training cells for a design probability of a false alarm in a bin."""
-    from scipy.optimize import brentq  # slow to import, and only CFAR has a factor to find
+    """Return the threshold factor for a design probability of a false alarm in a bin.
+
+    Parameters
+    ----------
+    kind, training, rank
+        As of :func:`cfar_crossing_probability`.
+    pfa : float
+        Probability of a false alarm in a bin of noise alone.
+
+    Returns
+    -------
+    float
+        Threshold over the level of the training cells.
+    """
+    from scipy.optimize import brentq  # slow to import, and used by CFAR detectors only
 
     if kind == CA_CFAR:
         return training * math.expm1(-math.log(pfa) / training)
 
     def log_pfa_excess(log_factor: float) -> float:
+        """Return the log false-alarm probability for ln(factor) minus the design value."""
         probability = cfar_crossing_probability(
             kind, math.exp(log_factor), training=training, rank=rank
         )
@@ -139,12 +166,12 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
 
 
 def fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Bins at or above the threshold that follows from the TNR."""
+    """Detect bins at or above the fixed threshold; a :data:`Detector`."""
     return power >= settings.threshold**2
 
 
 def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Bins at or above the cell-averaging threshold."""
+    """Detect bins by the mean of their training cells; a :data:`Detector`."""
     below, above = _training_sums(power, settings)
     return _exceeds_cfar_threshold(
         power, (below + above) / (settings.training // 2 * 2), CA_CFAR, settings
@@ -152,13 +179,16 @@ def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Bins at or above the greatest-of cell-averaging threshold."""
+    """Detect bins by the larger mean of both halves of their training cells; a :data:`Detector`."""
     level = np.maximum(*_training_sums(power, settings)) / (settings.training // 2)
     return _exceeds_cfar_threshold(power, level, GOCA_CFAR, settings)
 
 
 def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Bins at or above the threshold of an ordered statistic: so many cells stay below the bin."""
+    """Detect bins by an ordered statistic of their training cells; a :data:`Detector`.
+
+    A bin is detected if at least ``rank`` training cells are below its power over the factor.
+    """
     circular_bins = _circular_bins(power, settings)
     level_max, n_below = (
         circular_bins / _settings_factor(OS_CFAR, settings),
@@ -179,25 +209,26 @@ DETECTORS: dict[str, Detector] = {
 
 
 def _settings_factor(kind: str, settings: SpectrumSettings) -> float:
+    """Return the threshold factor of a CFAR detector for settings."""
     return cfar_factor(kind, training=settings.training, rank=settings.rank, pfa=settings.pfa)
 
 
 def _circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Bins whose noise is circular: all but DC and Nyquist of a real record."""
+    """Return the power in bins of circular noise: all but DC and Nyquist of a real record."""
     return power if settings.complex_record else power[:, 1:-1]
 
 
 def _pad_to_all_bins(flags: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Extend flags to all bins from those of :func:`_circular_bins`."""
+    """Extend detections from bins of circular noise to all bins, False at DC and Nyquist."""
     return flags if settings.complex_record else np.pad(flags, ((0, 0), (1, 1)))
 
 
 def _iter_training_pairs(
     power: np.ndarray, settings: SpectrumSettings
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Training cells of the bins of :func:`_circular_bins`, one below and one above at a time.
+    """Yield pairs of training cells, one below and one above each bin of circular noise.
 
-    The spectrum goes on at either end with its other end's bins.
+    Each is an array of the shape of the bins. Cells wrap around the ends of the spectrum.
     """
     circular_bins, half_cells = _circular_bins(power, settings), settings.training // 2
     n_bins, reach_cells = circular_bins.shape[1], half_cells + settings.guard
@@ -209,15 +240,17 @@ def _iter_training_pairs(
 
 def _training_sums(power: np.ndarray, settings: SpectrumSettings) -> tuple[np.ndarray, np.ndarray]:
     """Sum the training cells below and above each bin."""
-    sums = np.zeros((2, *_circular_bins(power, settings).shape))
-    for pair in _iter_training_pairs(power, settings):
-        sums += pair
-    return sums[0], sums[1]
+    below, above = np.zeros((2, *_circular_bins(power, settings).shape))
+    for cells_below, cells_above in _iter_training_pairs(power, settings):
+        below += cells_below
+        above += cells_above
+    return below, above
 
 
 def _exceeds_cfar_threshold(
     power: np.ndarray, level: np.ndarray, kind: str, settings: SpectrumSettings
 ) -> np.ndarray:
+    """Test if the power of bins is at or above the threshold factor times a level."""
     return _pad_to_all_bins(
         _circular_bins(power, settings) >= _settings_factor(kind, settings) * level, settings
     )

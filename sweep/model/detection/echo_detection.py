@@ -1,4 +1,10 @@
-"""Detection in one segment's spectrum: threshold, echoes, and bins exempt from false alarms."""
+"""Detection of an echo in the spectrum of one segment, and bins exempt from false alarms.
+
+:func:`pd_and_miss` is the law of all records that are evaluated one by one. It turns |X| of the
+echo's bins without noise, the detection rule and the threshold into a probability of detection.
+Laws of several looks and of whole shots are listed in
+:mod:`sweep.model.detection.detection_probability`.
+"""
 
 import math
 from typing import NamedTuple
@@ -30,10 +36,24 @@ RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 
 
 def threshold_from_tnr(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
-    """Compute the threshold on |X|: TNR standard deviations of a noise-only bin's magnitude.
+    """Compute the threshold on |X| from the threshold-to-noise ratio.
 
-    The only reading of [T]'s threshold-to-noise ratio that gives its Table 4.2 (PHYSICS section
-    6): a noise-only bin crosses with probability exp(-(4 - pi)/4 TNR^2).
+    Parameters
+    ----------
+    tnr
+        Threshold over the standard deviation of |X| in a bin of noise alone.
+    bin_deviation
+        Standard deviation sigma of the bin's noise per quadrature [V].
+
+    Returns
+    -------
+    numpy.ndarray
+        Threshold [V], of the broadcast shape.
+
+    Notes
+    -----
+    A bin of noise alone crosses with the probability exp(-(4 - pi)/4 TNR^2). No other reading of
+    [T]'s threshold-to-noise ratio gives its Table 4.2 (PHYSICS section 6).
     """
     return tnr * bin_deviation * RAYLEIGH_DEVIATION
 
@@ -46,11 +66,16 @@ def negligible_signal_ratio(
     Parameters
     ----------
     leakage_probability
-        (n,): probability of leakage that all these bins together may add.
+        (n,): tolerated error of the leakage probability, summed over all such bins.
     threshold_ratio
         (n,): threshold b [sigma].
     n_bins
-        Number of bins.
+        Number of bins of the spectrum.
+
+    Returns
+    -------
+    numpy.ndarray
+        (n,): amplitude over sigma, the noise per quadrature.
 
     Notes
     -----
@@ -73,14 +98,14 @@ def negligible_signal_ratio(
 
 
 class DetectionRule(NamedTuple):
-    """Rule by which the bins of an echo detect it; common to all points."""
+    """Rule of detection from the bins of an echo in one record; common to all points."""
 
     any_bin: bool
     """True if any bin of an echo may detect it, False if only its strongest bin."""
     lobe_half_width: int
-    """Half-width of a main lobe [bins of fs/N], rounded up; 0 unless ``any_bin``."""
+    """Half-width of the window's main lobe [bins of fs/N], rounded up; 0 unless ``any_bin``."""
     real_noise_at_ends: bool
-    """True if the noise in bins 0 and N/2 is real, as that of a real record is."""
+    """True if the noise in bins 0 and N/2 is real, as in a real record."""
     fft_size: int
     """FFT size N."""
     in_speckle: bool
@@ -88,22 +113,22 @@ class DetectionRule(NamedTuple):
     noise_correlation: float
     """Correlation of the noise of neighbouring bins, 0..1."""
     real_record_in_speckle: bool
-    """True if echoes in developed speckle come from a real record. Their amplitudes are then
-    noncircular near DC and Nyquist."""
+    """True for echoes in developed speckle in a real record. Their amplitudes are noncircular near
+    DC and Nyquist."""
     joint_tail_rule: JointTailRule
     """Quadrature for the joint crossing of neighbouring bins."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the noise, by bins from the nearer of DC and Nyquist; empty
-    unless the noise is real there and echoes are in developed speckle."""
+    """(bins,): pseudo-variance ratio of the noise by distance [bins] from the nearer of DC and
+    Nyquist. Empty unless ``real_noise_at_ends`` and ``in_speckle``."""
     mode_table: ModeTable
     """Speckle modes of an echo; ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
     sidelobe_correlation: float = 0.0
-    """Correlation of the noise of neighbouring bins in phase with the sidelobes of a line, -1..1.
-    Sidelobes change sign from one to the next."""
+    """Correlation of neighbouring bins' noise components in phase with a line's sidelobes, -1..1.
+    Sidelobes alternate in sign."""
 
 
 class EchoBins(NamedTuple):
-    """Noiseless magnitudes of a span of bins, and the bins that belong to the echo."""
+    """|X| without noise in adjacent bins, and the bins that belong to the echo."""
 
     magnitude: np.ndarray
     """(bins,): |X| without noise [V, summed over the record]."""
@@ -113,27 +138,48 @@ class EchoBins(NamedTuple):
     """Number of the first bin."""
 
 
-class GivenMode(NamedTuple):
-    """Parameters of an echo's bins given the amplitude z of its strongest speckle mode.
+class EchoSpans(NamedTuple):
+    """|X| without noise in spans of adjacent bins, one span for each segment of m points."""
 
-    All are over the noise of the bin: that of the receiver plus the other speckle modes.
+    first_bin: np.ndarray
+    """(segments, m) int64: number of the span's first bin."""
+    n_bins: np.ndarray
+    """(segments, m) int64: number of bins of the span; 0 if it is empty."""
+    peak_index: np.ndarray
+    """(segments, m) int64: index of the span's strongest bin within the span."""
+    span_start: np.ndarray
+    """(segments, m) int64: index of the span's first bin in ``magnitudes`` and ``is_exempt``."""
+    magnitudes: np.ndarray
+    """(bins,): |X| of all spans, one after the other [V, summed over the record]."""
+    is_exempt: np.ndarray
+    """(bins,) bool: True in bins that belong to an echo, and so can raise no false alarm."""
+
+
+class GivenMode(NamedTuple):
+    """Parameters of an echo's bins given the complex amplitude z of its strongest speckle mode.
+
+    All are relative to the noise of the bin, which is receiver noise plus the other speckle modes.
     """
 
     signal: np.ndarray
-    """(bins,): root mean square magnitude of the mode, over the noise per quadrature."""
+    """(bins,): root mean square magnitude of the mode over the noise per quadrature."""
     threshold: np.ndarray
-    """(bins,): threshold, over the noise per quadrature."""
+    """(bins,): threshold over the noise per quadrature."""
     correlation: np.ndarray
-    """(bins,): correlation of the noise with that of the bin below."""
+    """(bins,): correlation of the bin's noise with the noise of the bin below it, -1..1."""
     pedestal: np.ndarray
-    """(bins,): mean power of the phase-noise pedestal that fades with the mode, over the noise."""
+    """(bins,): mean power of the phase-noise pedestal that fades with the mode, over the noise
+    power."""
     other_echo_fraction: np.ndarray
-    """(bins,): part of the noise that is other modes, which turn with the mode's phase near DC and
-    Nyquist."""
+    """(bins,): fraction of the noise power due to other speckle modes, 0..1. Near DC and Nyquist
+    their power depends on the phase of z."""
 
 
 class Detection(NamedTuple):
-    """Probabilities that an echo is detected and that it is missed; each keeps all its digits."""
+    """Probabilities that an echo is detected and that it is missed.
+
+    Both are computed separately to keep precision in both tails.
+    """
 
     pd: float
     """Probability that the echo is detected, 0..1."""
@@ -142,71 +188,107 @@ class Detection(NamedTuple):
 
 
 class PedestalShape(NamedTuple):
-    """Shape of the pedestal of phase noise about the lines of an echo.
+    """Spectral shape of the pedestal that laser phase noise leaves about the lines of an echo.
 
-    Of light that is mixed with itself after a delay tau, whose phase has a line width dnu: with
-    Gamma = 2 pi dnu, at a frequency omega from the line
+    Notes
+    -----
+    Light of the line width dnu is mixed with itself after a delay tau. With Gamma = 2 pi dnu, the
+    power density at the angular frequency omega from the line is proportional to [1]_
 
         [1 - e^(-Gamma tau) (cos omega tau + Gamma / omega sin omega tau)] / (1 + omega^2 / Gamma^2)
 
-    over its value under the line [Richter et al., IEEE J. Quantum Electron. 22, 2070, 1986].
+    References
+    ----------
+    .. [1] L. E. Richter et al., "Linewidth determination from self-heterodyne measurements with
+       subcoherence delay times," IEEE J. Quantum Electron. 22, 2070, 1986.
     """
 
     reach_bins: float
-    """Bins on either side of lines that the echo has by its pedestal: up to the last in which this
-    has at least the power of the noise. 0 where these are no more than it has by its lines."""
+    """Distance [bins] from a line up to which the pedestal's bins belong to the echo: that of the
+    last bin in which the pedestal has at least the power of the noise. 0 if it does not exceed the
+    half-width of the main lobe."""
     line_width_bins: float
     """Line width dnu of the laser [bins of fs/N]."""
     delay: float
-    """Delay tau, or the record's duration if that is shorter [N/fs]."""
+    """Delay tau of the echo, at most the record's duration [N/fs]."""
 
 
 NO_PEDESTAL = PedestalShape(0.0, 0.0, 0.0)
+"""Shape without a pedestal."""
 
 
 class BinThreshold(NamedTuple):
-    """Threshold on |X|, and noise per quadrature, in an echo's bins [V, summed over the record]."""
+    """Threshold on |X| and noise in the bins of one echo [V, summed over the record].
+
+    Noise is the standard deviation per quadrature.
+    """
 
     line_noise: float
-    """Noise in bins that the lines fill, with that part of the phase-noise pedestal that changes
-    |X|."""
+    """Noise in bins that hold lines. It includes the part of the phase-noise pedestal that changes
+    |X| there."""
     threshold: float
+    """Threshold on |X|."""
     noise_without_pedestal: float
-    """Noise without the pedestal."""
+    """Receiver noise alone."""
     side_noise: float
-    """Noise in bins beside the lines, with the whole pedestal."""
+    """Noise in bins next to the lines. It includes the whole pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
     """Shape of the pedestal about the lines."""
 
 
+class BinThresholds(NamedTuple):
+    """Threshold on |X| and noise of n points: arrays (n,) of fields of :class:`BinThreshold`."""
+
+    line_noise: np.ndarray
+    """:attr:`BinThreshold.line_noise` [V]."""
+    threshold: np.ndarray
+    """:attr:`BinThreshold.threshold` [V]."""
+    noise_without_pedestal: np.ndarray
+    """:attr:`BinThreshold.noise_without_pedestal` [V]."""
+    side_noise: np.ndarray
+    """:attr:`BinThreshold.side_noise` [V]."""
+    pedestal_reach_bins: np.ndarray
+    """:attr:`PedestalShape.reach_bins`."""
+    pedestal_line_width_bins: np.ndarray
+    """:attr:`PedestalShape.line_width_bins` [bins of fs/N]."""
+    pedestal_delay: np.ndarray
+    """:attr:`PedestalShape.delay` [N/fs]."""
+
+    def select(self, points: np.ndarray) -> "BinThresholds":
+        """Select points by their indices."""
+        return BinThresholds(*(values[points] for values in self))
+
+
 class BinSpeckle(NamedTuple):
-    """Speckle parameters of the bins of one point's segment."""
+    """Speckle parameters of the echo in one segment of one point."""
 
     line_deviation_bins: float
-    """Deviation of the footprint's lines [bins of fs/N]."""
+    """Standard deviation of the positions of the footprint's lines [bins of fs/N]."""
     pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the signal, by bins from the nearer of DC and Nyquist;
-    empty if the echo lies far from both."""
+    """(bins,): pseudo-variance ratio of the signal by distance [bins] from the nearer of DC and
+    Nyquist. Empty if the echo lies far from both."""
 
 
 NO_SPECKLE = BinSpeckle(0.0, np.empty(0))
-"""Parameters of echoes that do not fade, or have circular amplitudes in all bins."""
+"""Parameters of an echo without speckle, or of a single line far from DC and Nyquist."""
 
 
 class SpeckleTable(NamedTuple):
-    """Speckle parameters of the bins of all points, by segment."""
+    """Speckle parameters of the echoes of n points, by segment."""
 
     line_deviation_bins: np.ndarray
     """(segments, n): :attr:`BinSpeckle.line_deviation_bins`."""
     ratio_row: np.ndarray
-    """(segments, n) int64: row of ``pseudo_variance_ratio``; 0 far from DC and Nyquist."""
+    """(segments, n) int64: row of ``pseudo_variance_ratio``; 0 for echoes far from DC and
+    Nyquist."""
     pseudo_variance_ratio: np.ndarray
-    """(rows, bins)"""
+    """(rows, bins): :attr:`BinSpeckle.pseudo_variance_ratio`."""
     phase_factors: np.ndarray
-    """(rows, angles): ``phase_factors`` of :mod:`sweep.model.detection.pseudo_variance`."""
+    """(rows, angles): relative power of the echo's strongest bin by the phase of the speckle,
+    :attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.phase_factors`."""
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":
-        """Select one segment of some points."""
+        """Select one segment of points by their indices."""
         line_deviation_bins, ratio_row = (
             values[[segment]][:, points] for values in (self.line_deviation_bins, self.ratio_row)
         )
@@ -215,16 +297,34 @@ class SpeckleTable(NamedTuple):
         )
 
 
-@njit(cache=True, error_model="numpy", borrows=True)
-def bin_threshold_at(rows, point):
-    """Return the :class:`BinThreshold` of point i from an array (7, n)."""
-    pedestal = PedestalShape(rows[4, point], rows[5, point], rows[6, point])
-    return BinThreshold(rows[0, point], rows[1, point], rows[2, point], rows[3, point], pedestal)
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+def bin_threshold_at(bin_thresholds, point):
+    """Return the :class:`BinThreshold` of the point with an index."""
+    return BinThreshold(
+        bin_thresholds.line_noise[point],
+        bin_thresholds.threshold[point],
+        bin_thresholds.noise_without_pedestal[point],
+        bin_thresholds.side_noise[point],
+        PedestalShape(
+            bin_thresholds.pedestal_reach_bins[point],
+            bin_thresholds.pedestal_line_width_bins[point],
+            bin_thresholds.pedestal_delay[point],
+        ),
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+def echo_half_width(rule, pedestal_reach_bins):
+    """Return the half-width [bins] of an echo about its lines: of its main lobe or its pedestal."""
+    return max(rule.lobe_half_width, int(pedestal_reach_bins))
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pedestal_power_ratio(pedestal, distance):
-    """Return the pedestal's power ``distance`` bins from its line, over that under the line."""
+    """Return the power density of a pedestal at a distance [bins] over its density under the line.
+
+    ``pedestal`` is a :class:`PedestalShape`.
+    """
     gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay
     coherence, omega = math.exp(-gamma * delay), 2.0 * math.pi * distance
     if not distance > 0.0 or not gamma * delay > 1e-5:
@@ -236,11 +336,16 @@ def pedestal_power_ratio(pedestal, distance):
 
 @njit(cache=True, error_model="numpy")
 def pedestal_reach_bins(pedestal_to_noise, line_width_bins, delay, reach_max):
-    """Distance of the last bin in which a pedestal has at least the power of the noise, (n,).
+    """Return the distance [bins] of the last bin whose pedestal has the power of the noise, (n,).
 
-    ``pedestal_to_noise`` (n,) is the power of the pedestal under the line over that of the noise;
-    ``line_width_bins`` and
-    ``delay`` (n,) are those of :class:`PedestalShape`. No result exceeds ``reach_max``.
+    Parameters
+    ----------
+    pedestal_to_noise
+        (n,): power of the pedestal under the line over the power of the noise.
+    line_width_bins, delay
+        (n,): fields of :class:`PedestalShape`.
+    reach_max
+        Largest result [bins].
     """
     reaches = np.zeros(pedestal_to_noise.size)
     for i in range(pedestal_to_noise.size):
@@ -264,14 +369,22 @@ def pedestal_reach_bins(pedestal_to_noise, line_width_bins, delay, reach_max):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
-    """Fill ``pedestal_ratios`` with the pedestal's power over the noise's in the bins of an echo.
+    """Fill ``pedestal_ratios`` (bins,) with the pedestal's power over the noise power in each bin.
 
-    Bins of half the largest magnitude hold lines; of the pedestal in others all counts as noise.
+    Bins of at least half the largest magnitude count as bins with lines. Under lines only the part
+    of the pedestal that changes |X| counts, elsewhere the whole pedestal.
+
+    Parameters
+    ----------
+    magnitude, is_echo
+        Fields of :class:`EchoBins`.
+    bin_threshold
+        :class:`BinThreshold`.
+    pedestal_ratios
+        (bins,): the result.
     """
-    largest, noise_power = (
-        0.0,
-        bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal,
-    )
+    largest = 0.0
+    noise_power = bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
     for i in range(magnitude.size):
         largest = max(largest, magnitude[i] if is_echo[i] else 0.0)
     ratio_under_lines = bin_threshold.line_noise * bin_threshold.line_noise / noise_power - 1.0
@@ -291,7 +404,7 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
 
 @njit(cache=True, error_model="numpy")
 def bin_speckle_at(speckle_table, segment, point):
-    """:class:`BinSpeckle` of a point's segment, from a :class:`SpeckleTable`."""
+    """Return the :class:`BinSpeckle` of a point's segment from a :class:`SpeckleTable`."""
     ratio_row = speckle_table.ratio_row[segment, point]
     n_bins = speckle_table.pseudo_variance_ratio.shape[1] if ratio_row > 0 else 0
     return BinSpeckle(
@@ -301,32 +414,39 @@ def bin_speckle_at(speckle_table, segment, point):
 
 
 class SegmentCorrelations(NamedTuple):
-    """Complex correlations of an echo's amplitudes between segments in speckle, (n,) each."""
+    """Complex correlations (n,) of an echo's amplitudes in developed speckle between segments."""
 
     up_doppler: np.ndarray
-    """Between up and Doppler segment, |.| <= 1."""
+    """Correlation of up and Doppler segment, of a modulus up to 1."""
     up_down: np.ndarray
-    """Between up and down segment."""
+    """Correlation of up and down segment."""
     doppler_down: np.ndarray
-    """Between Doppler and down segment."""
+    """Correlation of Doppler and down segment."""
 
     def cholesky_factors(self) -> np.ndarray:
         """Return the Cholesky factors of the segments' correlation matrix, (6, n).
 
+        Returns
+        -------
+        numpy.ndarray
+            Rows m, sqrt(1 - m^2), o, Re c, Im c and d.
+
+        Notes
+        -----
         The amplitudes are A_up = z_0, A_doppler = m z_0 + sqrt(1 - m^2) z_1 and A_down = o z_0 + c
-        z_1 + d z_2, with independent circular z of unit power. Phases that do not change joint
-        magnitudes are removed. Rows: m, sqrt(1 - m^2), o, Re c, Im c, d.
+        z_1 + d z_2, with independent circular complex Gaussian z of unit power. Phases that do not
+        change the joint law of the magnitudes are removed.
         """
         up_doppler, up_down, doppler_down = (
             np.minimum(np.abs(correlation), 1.0) for correlation in self
         )
-        turned_doppler_down = doppler_down * np.exp(
+        rotated_doppler_down = doppler_down * np.exp(
             1j * np.angle(self.up_doppler * self.doppler_down * np.conj(self.up_down))
         )
         doppler_own = np.sqrt(1 - up_doppler**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             down_from_doppler = np.where(
-                doppler_own > 1e-7, (turned_doppler_down - up_doppler * up_down) / doppler_own, 0.0
+                doppler_own > 1e-7, (rotated_doppler_down - up_doppler * up_down) / doppler_own, 0.0
             )
         down_own = np.sqrt(np.maximum(1 - up_down**2 - np.abs(down_from_doppler) ** 2, 0.0))
         return np.array(
@@ -353,34 +473,39 @@ def joint_pd_in_speckle(
     Parameters
     ----------
     pd_first, pd_second
-        Probabilities that each segment is detected, (..., n); nan where it does not exist.
+        (..., n): probability of detection of each segment; nan where it does not exist.
     threshold_ratio
-        Threshold over the noise per quadrature, (n,).
+        (n,): threshold over the noise per quadrature.
     correlation
-        Magnitude of the correlation of the echoes' amplitudes, (n,).
+        (n,): modulus of the correlation of the two segments' echo amplitudes.
     n_independent_bins
-        Number of independent bins as which each echo counts, :func:`detection_equivalent_bins`.
+        Number M of independent bins that represent each echo, :func:`detection_equivalent_bins`.
 
     Returns
     -------
     numpy.ndarray
-        (..., n); nan where either is nan.
+        (..., n); nan where either probability is nan.
 
     Notes
     -----
-    Of one bin these are two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
-    Communication Systems and Techniques, 1966, appendix A]. A, B are Th^2 over the mean powers, so
-    that the segments are detected with e^-A and e^-B. r is the squared correlation of signal and
-    noise: ``correlation``^2 times the product of SNR / (1 + SNR). Then both are detected with
+    For one bin per segment these are two correlated Rayleigh magnitudes [1]_. A and B are Th^2 over
+    the mean powers, so that the segments are detected with e^-A and e^-B. r is the squared
+    correlation of signal plus noise: ``correlation``^2 times the two SNR / (1 + SNR). Both segments
+    are detected with the probability
 
         J = e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
 
-    An echo that any of its bins detects counts as M independent bins, each of which is detected
-    with q = 1 - (1 - p)^(1/M) and sees in the other segment the one that matches it. Both are
-    missed with (1 - q_1 - q_2 + J(q_1, q_2))^M, so that both are detected with
+    An echo that any of its bins may detect is represented by M independent bins. Each of them is
+    detected with q = 1 - (1 - p)^(1/M), and is correlated with one bin of the other segment. Both
+    segments are missed with (1 - q_1 - q_2 + J(q_1, q_2))^M, so that both are detected with
 
         p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
+
+    References
+    ----------
+    .. [1] M. Schwartz, W. R. Bennett and S. Stein, Communication Systems and Techniques, 1966,
+       appendix A.
     """
     is_defined, half_square_threshold = (
         np.isfinite(pd_first) & np.isfinite(pd_second),
@@ -388,15 +513,15 @@ def joint_pd_in_speckle(
     )
     with np.errstate(divide="ignore"):
         bin_pds = [np.where(is_defined, p, 1.0) for p in (pd_first, pd_second)]
-        bin_pds = [
+        bin_pd_first, bin_pd_second = (
             np.where(n_independent_bins > 1, -np.expm1(np.log1p(-p) / n_independent_bins), p)
             for p in bin_pds
-        ]
-        a, b = (np.minimum(-np.log(p), 700.0) for p in bin_pds)
-    echo_fractions = np.maximum(1 - a / half_square_threshold, 0.0) * np.maximum(
+        )
+        a, b = (np.minimum(-np.log(p), 700.0) for p in (bin_pd_first, bin_pd_second))
+    echo_fraction_product = np.maximum(1 - a / half_square_threshold, 0.0) * np.maximum(
         1 - b / half_square_threshold, 0.0
-    )  # SNR / (1 + SNR)
-    squared_correlation = np.minimum(correlation**2 * echo_fractions, 1 - 1e-12)
+    )  # of SNR / (1 + SNR)
+    squared_correlation = np.minimum(correlation**2 * echo_fraction_product, 1 - 1e-12)
     inverse_remainder = 1 / (1 - squared_correlation)
     p_both = (
         np.exp(-a)
@@ -412,14 +537,16 @@ def joint_pd_in_speckle(
             np.sqrt(2 * a * inverse_remainder),
         ).q
     )
-    bin_misses = np.maximum((1 - bin_pds[0]) * (1 - bin_pds[1]), 1e-300)
-    misses = (1 - pd_first) * (1 - pd_second)
+    bin_miss_product = np.maximum((1 - bin_pd_first) * (1 - bin_pd_second), 1e-300)
+    miss_product = (1 - pd_first) * (1 - pd_second)
     with np.errstate(over="ignore", invalid="ignore"):
         excess = np.expm1(
             n_independent_bins
-            * np.log1p(np.maximum(p_both - bin_pds[0] * bin_pds[1], 0.0) / bin_misses)
+            * np.log1p(np.maximum(p_both - bin_pd_first * bin_pd_second, 0.0) / bin_miss_product)
         )
-        p_both_of_many = pd_first * pd_second + np.where(misses > 0, misses * excess, 0.0)
+        p_both_of_many = pd_first * pd_second + np.where(
+            miss_product > 0, miss_product * excess, 0.0
+        )
     p_both = np.where(
         n_independent_bins > 1, np.minimum(p_both_of_many, np.minimum(pd_first, pd_second)), p_both
     )
@@ -427,31 +554,35 @@ def joint_pd_in_speckle(
 
 
 INDEPENDENT_BINS_MAX = 1e3
-"""Largest number of independent bins as which an echo counts."""
+"""Largest number of independent bins that represent an echo."""
 
 
 def detection_equivalent_bins(
     pd: np.ndarray, peak_ratio: np.ndarray, threshold_ratio: np.ndarray
 ) -> np.ndarray:
-    """Return the number M of independent bins like the strongest that detect as often as an echo.
+    """Return the number M of independent bins that are together detected as often as an echo.
+
+    Each of them has the magnitude of the echo's strongest bin.
 
     Parameters
     ----------
     pd
         Probability that any bin of the echo is detected.
-    peak_ratio, threshold_ratio
-        |X| of its strongest bin, and threshold Th, both over the noise per quadrature sigma.
+    peak_ratio
+        |X| of the echo's strongest bin over the noise per quadrature sigma.
+    threshold_ratio
+        Threshold Th over sigma.
 
     Returns
     -------
     numpy.ndarray
-        M, not a whole number, from 1 to :data:`INDEPENDENT_BINS_MAX`; 1 where pd is nan, or where
-        pd and q both round to 1.
+        M, in general not an integer, from 1 to :data:`INDEPENDENT_BINS_MAX`. 1 where pd is nan, or
+        where pd and q both round to 1.
 
     Notes
     -----
     The strongest bin alone is detected with q = exp(-Th^2 / (2 sigma^2 (1 + SNR))), SNR = |X|^2 /
-    (2 sigma^2), and 1 - pd = (1 - q)^M. A lone line has M = 1, as all its bins fade together.
+    (2 sigma^2). M solves 1 - pd = (1 - q)^M. A single line has M = 1: all its bins fade together.
     """
     single_bin_pd = np.exp(-0.5 * np.square(threshold_ratio) / (1 + 0.5 * np.square(peak_ratio)))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -464,9 +595,19 @@ def detection_equivalent_bins(
 def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) -> np.ndarray:
     """Return the probability that at least two of three independent events happen.
 
-    ``probabilities`` and ``complements`` (3, ...) are the events' probabilities and their
-    complements, which are passed separately to keep precision in both tails.
+    Parameters
+    ----------
+    probabilities, complements
+        (3, ...): probability of each event, and one minus it. They are separate arguments to keep
+        precision in both tails.
 
+    Returns
+    -------
+    numpy.ndarray
+        (...)
+
+    Examples
+    --------
     >>> round(float(at_least_two_of_three(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
     0.85
     """
@@ -476,30 +617,31 @@ def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) ->
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
-    """Find the strongest bin of a run, and mark the bins that cannot raise a false alarm.
-
-    Adjacent bins at or above the threshold form a group, and its largest bin is the detection.
-    Exempt are the bins of each group and the two next to it, and the strongest bin and its
-    neighbours, group or not. If any bin of the echo may detect it (``lobe_half_width`` > 0,
-    half-width of
-    the main lobe), bins within a main lobe of a bin of at least half the largest magnitude are
-    exempt as well.
+    """Find the strongest of adjacent bins, and mark the bins that cannot raise a false alarm.
 
     Parameters
     ----------
     magnitude
-        |X|, at least ``n_bins`` bins.
+        |X| without noise, at least ``n_bins`` bins.
+    n_bins
+        Number of bins.
     threshold
         Threshold on |X|.
     is_exempt
-        Result, bool: bins that cannot raise a false alarm.
+        Result, bool: True in bins that belong to an echo, and so can raise no false alarm.
     lobe_half_width
-        Half-width of the main lobe [bins], or 0.
+        Half-width [bins] of an echo about its lines if any bin of the echo may detect it, else 0.
 
     Returns
     -------
     peak, n_exempt
-        Index of the largest bin; number of exempt bins.
+        Index of the strongest bin; number of exempt bins.
+
+    Notes
+    -----
+    Adjacent bins at or above the threshold form a group. Three kinds of bins are exempt: those of
+    each group and the two next to it; the strongest bin and its two neighbours; and bins within
+    ``lobe_half_width`` of a bin of at least half the largest magnitude.
     """
     largest, n_above = _largest_and_count(magnitude[:n_bins], threshold)
     peak = 0
@@ -528,20 +670,28 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_real_bin(bin_, real_noise_at_ends, fft_size):
-    """Return True if the noise of a bin is real: bins 0 and N/2 of a real record.
+    """Test if the noise of a bin is real, as in bins 0 and N/2 of a real record.
 
-    ``real_noise_at_ends`` and ``fft_size`` are those of :class:`DetectionRule`.
+    ``real_noise_at_ends`` and ``fft_size`` are fields of :class:`DetectionRule`.
     """
     return real_noise_at_ends and (bin_ == 0 or 2 * bin_ == fft_size)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
-    """Return both :class:`.Tails` of |X| of a bin with a steady signal at the threshold.
+    """Return the probabilities that a bin with a steady signal crosses the threshold, or not.
 
-    ``signal_ratio`` a and ``threshold_ratio`` b are over the noise per quadrature sigma. The tails
-    are Q_1(a, b) and its complement. If the noise ``is_real``, it has the power of both quadratures
-    in one, a variance of 2 sigma^2, and the upper tail is P(|a + n| >= b).
+    Parameters
+    ----------
+    signal_ratio, threshold_ratio
+        |X| without noise a, and threshold b, over the noise per quadrature sigma.
+    is_real
+        True if the noise n is real. It then has the variance 2 sigma^2.
+
+    Returns
+    -------
+    Tails
+        Q_1(a, b) and 1 - Q_1(a, b); for real noise P(|a + n| >= b) and its complement.
     """
     if not is_real:
         return marcum_q1_tails(signal_ratio, threshold_ratio)
@@ -564,24 +714,26 @@ def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
-    """Return the probabilities that an echo is detected and that it is missed.
-
-    If ``rule.any_bin``, any bin of the echo detects it (:func:`pd_and_miss_any_bin`), else the
-    largest bin of the span alone. The pedestal of phase noise is light of the echo and fades with
-    it.
+    """Return the probabilities that an echo is detected in one record, and that it is missed.
 
     Parameters
     ----------
     echo
-        :class:`EchoBins` of the span.
+        :class:`EchoBins` of adjacent bins around the echo's lines.
     peak_index
-        Index of the largest bin in the span.
+        Index of the strongest of these bins.
     rule, bin_threshold, bin_speckle
         :class:`DetectionRule`, :class:`BinThreshold` and :class:`BinSpeckle`.
 
     Returns
     -------
     Detection
+
+    Notes
+    -----
+    If ``rule.any_bin``, any bin of the echo may detect it: :func:`pd_and_miss_any_bin`, or
+    :func:`pd_and_miss_in_speckle`. Otherwise only the strongest bin counts. The pedestal of phase
+    noise is light of the echo and fades with it.
     """
     if rule.in_speckle:
         if rule.any_bin:
@@ -616,9 +768,9 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return pd and 1 - pd of a bin in developed speckle, by itself, without a pedestal.
+    """Return the :class:`Detection` of a single bin in developed speckle without a pedestal.
 
-    ``magnitude`` is the root mean square |X| of its signal [V].
+    ``magnitude`` is the root mean square |X| of the bin's signal [V].
     """
     signal_power = magnitude * magnitude
     noise_power = 2.0 * bin_threshold.line_noise * bin_threshold.line_noise
@@ -638,31 +790,48 @@ def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_sp
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return pd and 1 - pd of a bin in developed speckle, by itself, whose pedestal fades too."""
+    """Return the :class:`Detection` of a single bin in developed speckle with a fading pedestal.
+
+    ``magnitude`` is the root mean square |X| of the bin's signal [V].
+    """
     noise = bin_threshold.noise_without_pedestal
-    rows = np.zeros((5, 1))
-    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
-    given_mode.signal[0] = magnitude / noise
-    given_mode.threshold[0] = bin_threshold.threshold / noise
-    given_mode.pedestal[0] = (bin_threshold.line_noise / noise) ** 2 - 1.0
+    given_mode = _zero_given_mode(1)
+    given_mode.signal[:] = magnitude / noise
+    given_mode.threshold[:] = bin_threshold.threshold / noise
+    given_mode.pedestal[:] = (bin_threshold.line_noise / noise) ** 2 - 1.0
     echo = EchoBins(np.full(1, magnitude), np.ones(1, np.bool_), bin_)
     return _mean_over_mode_phase(given_mode, echo, rule, bin_speckle)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pd_and_miss_any_bin(echo, rule, bin_threshold):
-    """Return the probabilities that any bin of an echo reaches the threshold, and that none does.
+    """Return the probabilities that any bin of a steady echo crosses the threshold, and none does.
 
-    Each bin by itself crosses with :func:`bin_crossing_tails`. The noise of neighbours is
-    correlated, in phase with a signal that is in step from bin to bin, as in a main lobe. The joint
-    probability of two neighbours is that of correlated normal numbers with the same probabilities:
-    their product plus
+    Parameters
+    ----------
+    echo, rule, bin_threshold
+        :class:`EchoBins`, :class:`DetectionRule` and :class:`BinThreshold`.
+
+    Returns
+    -------
+    Detection
+
+    Notes
+    -----
+    A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins is
+    correlated, in phase with a signal that keeps its phase from bin to bin as in a main lobe. Two
+    neighbours cross jointly like two correlated normal numbers of the same probabilities, which is
+    the product of these plus [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
-    [Owen, Ann. Math. Statist. 27, 1956], with the normal deviates s and t, by the quadrature
-    ``rule.joint_tail_rule`` (:class:`sweep.model.detection.joint_tail.JointTailRule`). Bins are
-    treated as a first-order Markov chain.
+    with the normal deviates s and t, by the quadrature ``rule.joint_tail_rule``. Bins are treated
+    as a first-order Markov chain.
+
+    References
+    ----------
+    .. [1] D. B. Owen, "Tables for computing bivariate normal probabilities," Ann. Math. Statist.
+       27, 1956.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     pd, miss, previous_p_stay, previous_deviate, largest = 0.0, 1.0, -1.0, 0.0, 0.0
@@ -691,10 +860,9 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
-    """Compute :func:`pd_and_miss_any_bin` for an echo whose pedestal detects too."""
+    """Compute :func:`pd_and_miss_any_bin` for a steady echo with bins of its pedestal alone."""
     n_bins = echo.magnitude.size
-    pedestal_ratios, rows = np.empty(n_bins), np.zeros((5, n_bins))
-    given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+    pedestal_ratios, given_mode = np.empty(n_bins), _zero_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
     for k in range(n_bins):
         noise = bin_threshold.noise_without_pedestal * math.sqrt(1.0 + pedestal_ratios[k])
@@ -706,13 +874,31 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
     )
 
 
+@njit(cache=True, error_model="numpy")
+def _zero_given_mode(n_bins):
+    """Return a :class:`GivenMode` of bins, filled with zeros."""
+    rows = np.zeros((5, n_bins))  # one allocation instead of five
+    return GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
+
+
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, joint_tail_rule):
-    """Return the :class:`.Tails` of a bin if the bin below it does not cross.
+    """Return a bin's :class:`.Tails` given that the bin below does not cross, and its deviate.
 
-    ``tails`` are those of the bin by itself. ``previous_p_stay`` is the probability that the bin
-    below does not cross, ``previous_deviate`` its normal deviate; the probability is below 0 if no
-    bin of the echo lies below. The second result is the normal deviate of this bin.
+    Parameters
+    ----------
+    tails
+        Unconditional :class:`.Tails` of the bin.
+    previous_p_stay, previous_deviate
+        Probability that the bin below does not cross, and the bin's normal deviate. The probability
+        is negative if no bin of the echo lies below.
+    joint_tail_rule
+        :class:`sweep.model.detection.joint_tail.JointTailRule` of the noise of neighbours.
+
+    Returns
+    -------
+    given_neighbour, deviate
+        Conditional :class:`.Tails`, and the normal deviate of ``tails``.
     """
     deviate = _normal_deviate_of_tails(tails)
     if not previous_p_stay > 0.0:
@@ -724,10 +910,19 @@ def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, jo
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
-    """Return the probability that any of ``n_bins`` adjacent bins crosses, given each bin's own.
+    """Return the probability that any of adjacent bins crosses, from the probability of each bin.
 
-    Neighbours are correlated as in :func:`pd_and_miss_any_bin`; bins that cross with less than 1e-4
+    Neighbours are correlated as in :func:`pd_and_miss_any_bin`. Bins that cross with less than 1e-4
     count as independent.
+
+    Parameters
+    ----------
+    probabilities
+        Crossing probability of each bin, at least ``n_bins`` of them.
+    n_bins
+        Number of bins.
+    joint_tail_rule
+        :class:`sweep.model.detection.joint_tail.JointTailRule` of the noise of neighbours.
     """
     p_any, p_none, previous_p_stay, previous_deviate = 0.0, 1.0, -1.0, 0.0
     for i in range(n_bins):
@@ -749,12 +944,23 @@ def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def clear_image_exemptions(magnitude, is_exempt, first_bin, fft_size, image_gain):
-    """Clear the exemption of bins dominated by an I/Q image; return the number still exempt.
+    """Clear the exemption of bins that an I/Q image dominates; return the number still exempt.
 
-    The image of ``image_gain`` times the line's |X| stands at the opposite frequency. It dominates
-    a bin
-    where it makes at least half of |X|. ``first_bin`` is the number of the first bin, ``fft_size``
-    the FFT size N.
+    The image of a line lies at the opposite frequency and has ``image_gain`` times its |X|. It
+    dominates a bin if it makes at least half of the bin's |X|.
+
+    Parameters
+    ----------
+    magnitude
+        (bins,): |X| without noise of adjacent bins.
+    is_exempt
+        (bins,) bool: exempt bins; changed in place.
+    first_bin
+        Number of the first bin.
+    fft_size
+        FFT size N.
+    image_gain
+        |X| of an image over |X| of its line.
     """
     n_exempt = 0
     for k in range(magnitude.size):
@@ -769,8 +975,19 @@ def clear_image_exemptions(magnitude, is_exempt, first_bin, fft_size, image_gain
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
-    """Return the probabilities that any, and that no, bin of an echo in developed speckle crosses.
+    """Return the probabilities that any bin of an echo in developed speckle crosses, and none does.
 
+    Parameters
+    ----------
+    echo, rule, bin_threshold, bin_speckle
+        :class:`EchoBins`, :class:`DetectionRule`, :class:`BinThreshold` and :class:`BinSpeckle`.
+
+    Returns
+    -------
+    Detection
+
+    Notes
+    -----
     The strongest speckle mode (:mod:`sweep.model.detection.speckle_modes`) is one complex Gaussian
     number z for all bins. Given z, bin k has the steady signal u_k z. The other modes add to its
     noise, with their own variance and correlation. The result is the mean over |z|^2, which is
@@ -778,8 +995,9 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
     DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
     pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.detection.pseudo_variance`).
 
-    Stretches of bins of half the largest magnitude are echoes by themselves; weaker stretches
-    belong to the one below. Errors: docs/physics.md.
+    Stretches of adjacent echo bins fade independently of each other if they hold a bin of at least
+    half the largest magnitude. Weaker stretches belong to the strong stretch below. Errors of these
+    approximations: docs/physics.md.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     largest = 0.0
@@ -810,19 +1028,24 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
 
 
 _GAUSS_ORDER = 7
+"""Order of the Gauss-Legendre quadrature over the mode's magnitude |z|."""
 _THRESHOLD_REACH_SIGMA = 4.5
+"""Distance [sigma] of |X| from the threshold beyond which crossing is taken as certain or
+impossible."""
 _MODE_MAGNITUDE_MAX = 6.0
+"""Largest magnitude |z| of the mode, in units of its root mean square, in the quadrature."""
 _RARE_CROSSING_MAX = 1e-6
+"""Crossing probability below which a bin counts as independent of its neighbours."""
 _NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-8, 1e-6
-"""Probability, and part of pd and of 1 - pd, below which what a bin adds may be left out."""
+"""Contribution of a bin to pd that may be neglected: absolute, and relative to pd and to 1 - pd."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
-    """Return pd and 1 - pd of one stretch of :func:`pd_and_miss_in_speckle`.
+    """Return the :class:`Detection` of one stretch of an echo in developed speckle.
 
-    It is the bins of the indices begin .. end - 1 of the span ``echo``.
+    The stretch is the bins begin .. end - 1 of ``echo``; see :func:`pd_and_miss_in_speckle`.
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
@@ -841,13 +1064,12 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
     ):
         below = above = max(below, above)  # bins mirror there
     asymmetry = power_asymmetry(below, magnitude[strongest], above)
-    cell, mode_table = (
-        locate_in_mode_table(rule.mode_table, bin_speckle.line_deviation_bins, asymmetry),
-        rule.mode_table,
-    )
+    mode_table = rule.mode_table
+    cell = locate_in_mode_table(mode_table, bin_speckle.line_deviation_bins, asymmetry)
     noise_power = 2.0 * bin_threshold.noise_without_pedestal * bin_threshold.noise_without_pedestal
     n_bins = end - begin
     stretch = EchoBins(magnitude[begin:end], is_echo[begin:end], echo.first_bin + begin)
+    # Not by _zero_given_mode: a call and zeros cost 6 % of the time of an echo.
     rows, pedestal_ratios = np.empty((5, n_bins)), np.empty(n_bins)
     given_mode = GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
     previous_fraction, previous_inverse_noise = 0.0, 0.0
@@ -855,7 +1077,7 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
     for k in range(n_bins):
         i = begin + k
         signal_power, pedestal_power = magnitude[i] * magnitude[i], noise_power * pedestal_ratios[k]
-        # A pedestal has the light of all lines, as the bins amid them.
+        # A pedestal holds the light of all lines, as the bins between them do.
         is_near = (
             abs(i - strongest) <= rule.lobe_half_width
             or not bin_threshold.pedestal.reach_bins > 0.0
@@ -885,7 +1107,7 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
                 max(0.5 * noise_covariance * inverse_noise * previous_inverse_noise, -0.999), 0.999
             )
         previous_fraction, previous_inverse_noise = mode_fraction, inverse_noise
-        # The other modes turn with the phase too, except in the bins 0 and N/2 themselves.
+        # The power of the other modes depends on the phase too, except in bins 0 and N/2.
         bin_, other_modes_power = stretch.first_bin + k, (1.0 - mode_fraction) * magnitude[i] ** 2
         given_mode.other_echo_fraction[k] = 0.0
         if bin_ != 0 and bin_ != nyquist_bin:
@@ -897,7 +1119,7 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
-    """Average :func:`_mean_over_mode_power` over the phase of the mode if bins are noncircular."""
+    """Return the mean :class:`Detection` over the mode's power, and over its phase if needed."""
     if bin_speckle.pseudo_variance_ratio.size == 0:
         return _mean_over_mode_power(given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
     return _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle)
@@ -905,15 +1127,18 @@ def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
 
 @njit(cache=True, error_model="numpy")
 def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
-    """Average :func:`_mean_over_mode_power` over the phase t of the mode, for noncircular bins.
+    """Return the mean :class:`Detection` over power and phase t of the mode, for noncircular bins.
 
-    At a phase the mode's power in a bin changes by the factor 1 + q cos t, with the pseudo-variance
-    ratio q of the bin. So does the power of the other modes.
+    At the phase t the power of all modes in a bin is 1 + q cos t times its mean over t, with the
+    pseudo-variance ratio q of the bin.
     """
     pd, miss, n_bins = 0.0, 0.0, echo.is_echo.size
-    rows = np.empty((3, n_bins))
     given_phase = GivenMode(
-        rows[0], rows[1], given_mode.correlation, rows[2], given_mode.other_echo_fraction
+        np.empty(n_bins),
+        np.empty(n_bins),
+        given_mode.correlation,
+        np.empty(n_bins),
+        given_mode.other_echo_fraction,
     )
     for node in range(N_PHASE_NODES):
         for k in range(n_bins):
@@ -936,20 +1161,21 @@ def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
-    """Return the probabilities that any, and that no, bin crosses, averaged over the mode's power.
+    """Return the mean :class:`Detection` over the power of the strongest speckle mode.
 
-    Given z the signal of a bin is |z| times ``given_mode.signal``, a :class:`GivenMode`. The
-    average is over |z| with the density 2 z e^(-z^2). ``real_noise_at_ends`` and ``fft_size`` are
-    those of :class:`DetectionRule`.
+    Given z the signal of a bin is |z| times ``given_mode.signal``, and |z| has the density
+    2 z e^(-z^2).
+
+    Parameters
+    ----------
+    given_mode, echo
+        :class:`GivenMode` and :class:`EchoBins`.
+    real_noise_at_ends, fft_size
+        Fields of :class:`DetectionRule`.
     """
     is_echo = echo.is_echo
-    z_first, z_last, z_middle, pedestal_ratio_max, strongest_index = (
-        _MODE_MAGNITUDE_MAX,
-        _MODE_MAGNITUDE_MAX,
-        _MODE_MAGNITUDE_MAX,
-        0.0,
-        -1,
-    )
+    z_first = z_last = z_middle = _MODE_MAGNITUDE_MAX
+    pedestal_ratio_max, strongest_index = 0.0, -1
     for k in range(is_echo.size):
         pedestal_ratio_max = max(pedestal_ratio_max, given_mode.pedestal[k])
         if is_echo[k] and given_mode.signal[k] > 0.0:
@@ -967,15 +1193,15 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
                     (given_mode.threshold[k] + _THRESHOLD_REACH_SIGMA)
                     / (given_mode.signal[k] - pedestal_reach),
                 )
-    z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # what is beyond is 5e-5 of it all
+    z_last = min(z_last, math.sqrt(z_middle * z_middle + 10.0))  # 5e-5 of the mean lies beyond
     interval_ends = (z_first, z_last, z_last)
     if pedestal_ratio_max > 0.0:
-        # Where a pedestal fades they rise about the middle, or slowly all the way.
-        z_last = max(z_first, min(z_last, 4.5))  # what is beyond is 2e-9
+        # With a fading pedestal pd rises about the middle, or slowly over the whole interval.
+        z_last = max(z_first, min(z_last, 4.5))  # |z| is larger with a probability of 2e-9
         z_between = z_middle if z_first < z_middle < z_last else 0.5 * (z_first + z_last)
         interval_ends = (z_first, z_between, z_last)
     is_real = is_real_bin(echo.first_bin + strongest_index, real_noise_at_ends, fft_size)
-    # From the largest |z| on, so that bins that add nothing to what there is can be left out.
+    # From the largest |z| down: bins that hardly add to the sum so far can then be left out.
     pd, miss, p_below_first = math.exp(-z_last * z_last), 0.0, -math.expm1(-z_first * z_first)
     for interval in range(1, -1, -1):
         half_width = 0.5 * (interval_ends[interval + 1] - interval_ends[interval])
@@ -1031,11 +1257,24 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligible_probability):
-    """Return the squared distance below the threshold from which on bins do not count, given z.
+    """Return the squared distance [sigma^2] below the threshold beyond which bins are negligible.
 
-    A bin adds at most e^(-(b - a)^2 / 2) to what the strongest one leaves, which is missed with
-    less than e^(-(a - b)^2 / 2), or the root of it where noise is real. Bins that add less than
-    ``negligible_probability`` do not count.
+    A bin of signal a < b adds at most e^(-(b - a)^2 / 2) times the miss probability of the
+    strongest bin. That is less than e^(-(a - b)^2 / 2) for its signal a > b, or the root of this
+    for real noise.
+
+    Parameters
+    ----------
+    z
+        Magnitude of the strongest speckle mode.
+    given_mode
+        :class:`GivenMode`.
+    strongest_index
+        Index of the bin that crosses at the smallest z; negative if there is none.
+    is_real
+        True if the noise of this bin is real.
+    negligible_probability
+        Largest contribution to pd that may be neglected.
     """
     if not negligible_probability > 0.0 or strongest_index < 0:
         return math.inf
@@ -1051,18 +1290,25 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
 def _pd_and_miss_given_mode(
     given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
 ):
-    """Return the probabilities that any, and that no, bin crosses, given the mode's magnitude z.
+    """Return the :class:`Detection` by any bin given the magnitude z of the strongest mode.
 
-    As :func:`pd_and_miss_any_bin`, with a noise correlation r of each pair of neighbours. Their
-    powers then have the correlation
+    The law is that of :func:`pd_and_miss_any_bin`, with a noise correlation r of each pair of
+    neighbours. The powers of two neighbours, with signals a and b over the noise, are correlated by
 
         (r^2 + r a b) / sqrt((1 + a^2) (1 + b^2)),
 
-    with their signals a and b over the noise: r^2 for noise alone, r for strong signals.
+    which is r^2 for noise alone and r for strong signals.
 
-    Bins that are further below the threshold than the root of ``squared_reach`` are left out. Bins
-    that add less than ``negligible_probability`` to the probability count as independent of their
-    neighbours.
+    Parameters
+    ----------
+    given_mode, z, echo
+        :class:`GivenMode`, magnitude of the mode, and :class:`EchoBins`.
+    real_noise_at_ends, fft_size
+        Fields of :class:`DetectionRule`.
+    squared_reach
+        Squared distance [sigma^2] below the threshold beyond which bins are left out.
+    negligible_probability
+        Contribution to pd below which a bin counts as independent of its neighbours.
     """
     is_echo = echo.is_echo
     pd, miss, previous_p_stay, previous_deviate, previous_signal = 0.0, 1.0, -1.0, 0.0, 0.0
@@ -1083,9 +1329,8 @@ def _pd_and_miss_given_mode(
         p_cross, p_stay = tails.above, tails.below
         if not p_stay > 0.0:
             return Detection(1.0, 0.0)
-        if (
-            p_cross < _RARE_CROSSING_MAX or miss * p_cross < negligible_probability
-        ):  # so is that both of a pair cross
+        if p_cross < _RARE_CROSSING_MAX or miss * p_cross < negligible_probability:
+            # That both of a pair cross is at most as likely.
             pd, miss, previous_p_stay = pd + miss * p_cross, miss * p_stay, -1.0
             continue
         deviate = _normal_deviate_of_tails(tails)
@@ -1106,7 +1351,7 @@ def _pd_and_miss_given_mode(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _normal_deviate_of_tails(tails):
-    """Return the normal deviate that a standard normal number exceeds with ``tails.above``."""
+    """Return the number that a standard normal variable exceeds with ``tails.above``."""
     if tails.above < tails.below:
         return _normal_deviate(tails.above)
     return -_normal_deviate(tails.below)
@@ -1114,7 +1359,10 @@ def _normal_deviate_of_tails(tails):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _normal_deviate(probability):
-    """Return the normal deviate exceeded with probability ``probability`` <= 1/2, to about 1e-4."""
+    """Return the number that a standard normal variable exceeds with a probability <= 1/2.
+
+    The error is about 1e-4.
+    """
     if probability < 1e-300:
         return 37.0
     s = math.sqrt(-2.0 * math.log(probability))
@@ -1126,11 +1374,23 @@ def _normal_deviate(probability):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
-    """Return the first and last bin of the echo around a group of bins first .. last.
+    """Return the indices of the first and last bin of the echo around a group of bins.
 
-    The echo has the adjacent bins of at least half the group's largest magnitude, and a main lobe's
-    half-width ``lobe_half_width`` on either side, up to the next group. With ``lobe_half_width`` 0
-    it is the group.
+    Parameters
+    ----------
+    magnitude
+        (bins,): |X| without noise of adjacent bins.
+    first, last
+        Indices of the group's first and last bin, which are at or above the threshold.
+    threshold
+        Threshold on |X|.
+    lobe_half_width
+        Half-width [bins] of an echo about its lines; with 0 the echo is the group.
+
+    Notes
+    -----
+    The echo extends over adjacent bins of at least half the group's largest magnitude, and then by
+    ``lobe_half_width`` on either side. It ends at the next group.
     """
     if lobe_half_width == 0:
         return first, last
@@ -1150,7 +1410,7 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _largest_and_count(magnitude, threshold):
-    """Return the largest magnitude, and the number of bins at or above a level."""
+    """Return the largest magnitude, and the number of bins at or above the threshold."""
     largest, n_above = magnitude[0], 0
     for i in range(magnitude.size):
         largest = magnitude[i] if magnitude[i] > largest else largest
@@ -1160,45 +1420,86 @@ def _largest_and_count(magnitude, threshold):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _exempt_group(first, last, n_bins, is_exempt):
-    """Mark the bins first .. last and their two neighbours as exempt; return their number."""
+    """Mark the bins first .. last and their two neighbours as exempt; return their number.
+
+    ``n_bins`` is the number of bins, beyond which there are no neighbours.
+    """
     first, last = max(first - 1, 0), min(last + 1, n_bins - 1)
     is_exempt[first : last + 1] = True
     return last - first + 1
 
 
+class SpectrumDetections(NamedTuple):
+    """Results of detection in the noiseless spectra of m points, arrays (m,)."""
+
+    pd: np.ndarray
+    """Probability of detection, 0..1."""
+    miss: np.ndarray
+    """Probability of a miss, 1 - pd."""
+    magnitude: np.ndarray
+    """|X| of the strongest bin [V, summed over the record]."""
+    frequency: np.ndarray
+    """Frequency of the strongest bin [Hz]."""
+    n_exempt: np.ndarray
+    """Number of bins that can raise no false alarm."""
+    leakage: np.ndarray
+    """Probability of a false peak by leakage: 0, as leakage is not evaluated."""
+
+
 @njit(cache=True, error_model="numpy")
 def detect_in_spectra(
-    magnitude, first_bins, nyquist_bin_and_width, rule, threshold_rows, speckle_table, results
+    magnitude, first_bins, last_bin, bin_width, rule, bin_thresholds, speckle_table
 ):
-    """Detect in runs of noiseless spectra, one per point.
+    """Detect the echo in noiseless spectra, one per point; leakage is not evaluated.
 
-    Its rows are those of :data:`sweep.model.spectrum.segment_spectra.SEGMENT_FIELDS`; no leakage.
-    ``nyquist_bin_and_width`` are the
-    last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.
-    ``threshold_rows`` (7, m) are those of :class:`BinThreshold`; ``speckle_table`` is a
-    :class:`SpeckleTable`, (1, m).
+    Parameters
+    ----------
+    magnitude
+        (m, bins): |X| without noise of adjacent bins [V].
+    first_bins
+        (m,): number of each spectrum's first bin. Bins outside 0 .. ``last_bin`` are ignored.
+    last_bin
+        Number of the last bin of the spectrum.
+    bin_width
+        Width of a bin [Hz].
+    rule, bin_thresholds, speckle_table
+        :class:`DetectionRule`, :class:`BinThresholds` (m,), and a :class:`SpeckleTable` (1, m).
+
+    Returns
+    -------
+    SpectrumDetections
     """
-    nyquist_bin, bin_width = nyquist_bin_and_width
+    n_points = magnitude.shape[0]
+    detections = SpectrumDetections(
+        np.empty(n_points),
+        np.empty(n_points),
+        np.empty(n_points),
+        np.empty(n_points),
+        np.empty(n_points),
+        np.zeros(n_points),
+    )
     is_exempt = np.empty(magnitude.shape[1], np.bool_)
-    for i in range(magnitude.shape[0]):
+    for i in range(n_points):
         low = max(-first_bins[i], 0)
-        high = min(nyquist_bin + 1 - first_bins[i], magnitude.shape[1])
+        high = min(last_bin + 1 - first_bins[i], magnitude.shape[1])
         searched = magnitude[i, low:high]
-        lobe_half_width = max(rule.lobe_half_width, int(threshold_rows[4, i]))
+        bin_threshold = bin_threshold_at(bin_thresholds, i)
         peak, n_exempt = mark_exempt_bins(
-            searched, searched.size, threshold_rows[1, i], is_exempt, lobe_half_width
+            searched,
+            searched.size,
+            bin_threshold.threshold,
+            is_exempt,
+            echo_half_width(rule, bin_threshold.pedestal.reach_bins),
         )
         detection = pd_and_miss(
             EchoBins(searched, is_exempt[: searched.size], first_bins[i] + low),
             peak,
             rule,
-            bin_threshold_at(threshold_rows, i),
+            bin_threshold,
             bin_speckle_at(speckle_table, 0, i),
         )
-        results[0, i], results[1, i], results[2, i] = (
-            detection.pd,
-            detection.miss,
-            searched[peak],
-        )
-        results[3, i] = (first_bins[i] + low + peak) * bin_width
-        results[4, i], results[5, i] = n_exempt, 0.0
+        detections.pd[i], detections.miss[i] = detection.pd, detection.miss
+        detections.magnitude[i] = searched[peak]
+        detections.frequency[i] = (first_bins[i] + low + peak) * bin_width
+        detections.n_exempt[i] = n_exempt
+    return detections

@@ -1,50 +1,51 @@
-"""Estimators of a peak's frequency from the complex spectrum around it, and their bounds.
+"""Estimators of a peak's frequency from the complex spectrum around it, and bounds of their error.
 
-All take spectra of records, windowed and transformed, and give places by index. These are
-frequencies in bins of a real record; for a complex one N/2 is added, and its last bin is a
-neighbour of its first. If a window matters, what they need of it comes from its own samples, so
-that any window and any padding will do. With Z_j the bins about the peak, turned so that a lone
-tone's are real and even in its distance (the phase of half a record a bin taken off):
+All take spectra of windowed records and return positions as fractional indices. In a real record
+these are frequencies in bins. In a complex record N/2 is added, and the last bin is a neighbour of
+the first. What an estimator needs to know of the window follows from the window's samples, so that
+any window and any padding is supported. Z_j are the bins about the peak without the linear phase of
+half a record per bin; those of a single tone are then real and even in the distance from the tone:
 
-- ``peak_bin``: the largest bin, off by up to half a bin.
+- ``peak_bin``: the strongest bin, with an error of up to half a bin.
 - ``parabolic``, ``parabolic_log``: the vertex of a parabola through three magnitudes, or through
   their logarithms [Smith and Serra, PARSHL, 1987]; biased between bins.
 - ``jacobsen``: Q Re[(Z_+ - Z_-) / (2 Z_0 - Z_- - Z_+)] for tapered windows, and
   Re[(Z_+ - Z_-) / (2 Z_0 + Z_- + Z_+)] where the neighbours of a tone on a bin vanish [Jacobsen and
   Kootsookos, IEEE Signal Process. Mag. 24(3), 123, 2007], Q the window's factor, by least squares
-  over half a bin (that of the published table within its digits); biased between bins.
-- ``candan``: the second form for every window, its bias taken out: Candan's factor [IEEE Signal
+  over half a bin (equal to the published table to its digits); biased between bins.
+- ``candan``: the second form for every window, without its bias. Candan's factor [IEEE Signal
   Process. Lett. 18, 351, 2011, and 20, 913, 2013; Signal Process. 114, 245, 2015, for windows] is
-  the slope at the bin, here the whole curve is inverted.
-- ``centroid``: centre of the power, less the noise's, within two resolution cells; biased by
-  what noise is left.
-- ``chirp_z``: the largest value of the windowed record's spectrum, on a grid of 1/32 bin by a
-  chirp-z transform [Rabiner, Schafer and Rader, Bell Syst. Tech. J. 48, 1249, 1969], and a
-  parabola; it reaches :func:`windowed_peak_deviation`.
-- ``maximum_likelihood``: the window is divided out of the record again, and the largest value of
-  the unwindowed spectrum found by Newton's method. This is repeated without the tone's image at
-  negative frequency. For a lone tone in white noise the result is the most likely one [Rife and
-  Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
+  the slope at the bin; here the whole curve is inverted.
+- ``centroid``: centre of the power minus the mean noise power, within two resolution cells; biased
+  by the remaining noise.
+- ``chirp_z``: the maximum of the windowed record's spectrum on a grid of 1/32 bin, by a chirp-z
+  transform [Rabiner, Schafer and Rader, Bell Syst. Tech. J. 48, 1249, 1969], refined by a parabola;
+  it reaches :func:`windowed_peak_deviation`.
+- ``maximum_likelihood``: the record is divided by the window, and Newton's method finds the maximum
+  of the unwindowed spectrum. This is repeated without the tone's image at negative frequency. For a
+  single tone in white noise this is the maximum-likelihood estimate [Rife and Boorstyn, IEEE Trans.
+  Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
 
-The Cramer-Rao bound is the least error of any unbiased estimate of a beat, a range, a velocity. For
-a tone A cos(2 pi f n / fs + phi) in L samples with white Gaussian noise of variance s^2, all of A,
-f and phi are unknown. With cnr = A^2 / (2 s^2), the tone's power over the noise's before the FFT,
+The Cramer-Rao bound is the least error of any unbiased estimate of a beat, a range or a velocity.
+Consider a tone A cos(2 pi f n / fs + phi) in L samples with white Gaussian noise of variance s^2,
+where A, f and phi are unknown. With cnr = A^2 / (2 s^2), the tone's power over the noise power
+before the FFT,
 
     var(f) >= 12 / (cnr L (L^2 - 1)) (fs / 2 pi)^2
 
 [Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974; Kay, Fundamentals of Statistical Signal
-Processing: Estimation Theory, 1993, section 3.11]. For a tone some bins away from DC and Nyquist,
-where the bound does not depend on its phase. Of a complex tone of power cnr over the noise's, I and
-Q together, it is half as much. It is that of the whole record. A window throws away
-what it tapers off, and the largest value of a windowed spectrum knows the tone less well
-(:func:`windowed_peak_deviation`), unless the window is taken back first.
+Processing: Estimation Theory, 1993, section 3.11]. This holds for a tone some bins away from DC and
+Nyquist, where the bound does not depend on its phase. For a complex tone, whose power over the
+noise power of I and Q together is cnr, the variance is half of that. The bound is that of the whole
+record. A window attenuates samples, so the maximum of a windowed spectrum has a larger error
+(:func:`windowed_peak_deviation`), unless the window is undone first.
 
-Three segments know two unknowns: the Fisher information of independent beats adds, weighted with
-what range and velocity change in each (:mod:`sweep.model.waveform`). The record of a segment is
-taken to tell of its beat's frequency only; its phase, 4 pi R / lambda, is known modulo 2 pi.
+Three segments determine two unknowns: the Fisher information of independent beats adds, weighted
+with the derivatives of each beat by range and velocity (:mod:`sweep.model.waveform`). Only the
+frequency of a segment's beat is used, as its phase, 4 pi R / lambda, is known modulo 2 pi.
 
-Below some SNR estimates are not unbiased and the bound says nothing: noise elsewhere in the
-spectrum is taken for the tone (the threshold effect).
+Below some SNR estimates are biased, and the bound does not apply: noise elsewhere in the spectrum
+is mistaken for the tone (the threshold effect).
 """
 
 from __future__ import annotations
@@ -64,11 +65,13 @@ from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
 from sweep.model.window import Window
 
 Estimator = Callable[[np.ndarray, np.ndarray, SpectrumSettings], np.ndarray]
-"""From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
-setting to frequencies (m,) [bins], float64; by index 0..N - 1 in spectra (m, N) of complex
-records."""
+"""Function from complex spectra, indices of their peaks and settings to frequencies (m,) [bins].
+
+Spectra are (m, N/2 + 1), and peaks (m,) int64 in 1..N/2 - 1; of complex records (m, N), and indices
+0..N - 1."""
 
 PEAK_BIN = "peak_bin"
+"""Name of the estimator by the peak bin itself."""
 
 DETECTOR_PREFIX, ESTIMATOR_PREFIX = (
     "instrument.processing.detector.",
@@ -82,47 +85,48 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
     DETECTOR_PREFIX + "pfa": 1e-6,
     ESTIMATOR_PREFIX + "kind": PEAK_BIN,
 }
-"""Of the parameters that say how whole spectra are looked at."""
+"""Default parameters, by dotted path, of detector and estimator in full spectra."""
 
 _TABLE_STEPS = 512
-"""Places between -1 and 1 bin at which curves are known."""
+"""Number of steps per bin in tables of tones between -1 and 1 bin."""
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Height of the neighbours of a tone on a bin, over its own, under which they count as none."""
+"""|X| of the neighbours of a tone on a bin, over the bin's, below which they count as vanishing."""
 _CENTROID_REACH_CELLS = 2
-"""Resolution cells fs/L to either side over which a centroid is taken."""
+"""Number of resolution cells fs/L on either side of the peak in a centroid."""
 _ZOOM_POINTS_PER_BIN = 32
-"""Places a bin of the chirp-z transform."""
+"""Number of points of the chirp-z transform per bin."""
 _WINDOW_FRACTION_MIN = 1e-3
-"""Samples where the window is less than that, of its largest, are left out when it is undone."""
+"""Window value over its maximum below which samples are excluded when the window is undone."""
 _NEWTON_STEPS = 6
+"""Largest number of steps of Newton's method."""
 _NEWTON_REACH_BINS = 0.5
-"""Steps of Newton's method, and bins that they may go in all."""
+"""Largest distance from the start in Newton's method [bins]."""
 
 
 def peak_bin(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the peak bin itself."""
+    """Return the index of the peak bin; an :data:`Estimator`."""
     return peak.astype(float)
 
 
 def parabolic(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Vertex of the parabola through three magnitudes."""
+    """Return the vertex of the parabola through three magnitudes; an :data:`Estimator`."""
     return peak + _parabola_vertex(np.abs(_three_bins(spectrum, peak)))
 
 
 def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Vertex of the parabola through the logarithms of three magnitudes."""
+    """Return the vertex of the parabola through three log magnitudes; an :data:`Estimator`."""
     with np.errstate(divide="ignore"):
         return peak + _parabola_vertex(np.log(np.abs(_three_bins(spectrum, peak))))
 
 
 def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Jacobsen's ratio with the window's factor."""
+    """Estimate by Jacobsen's ratio times the window's factor; an :data:`Estimator`."""
     sign, factor = jacobsen_coefficients(settings.window, settings.fft_size)
     return peak + factor * _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), sign)
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Jacobsen's ratio, as a lone tone in this window has it, inverted."""
+    """Invert Jacobsen's ratio of a single tone in the window; an :data:`Estimator`."""
     offset, tone_bins = _tone_bins(settings.window, settings.fft_size)
     tone_ratios = np.maximum.accumulate(_jacobsen_ratio(tone_bins, 1))
     return peak + np.interp(
@@ -131,7 +135,7 @@ def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -
 
 
 def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Centre of the power about the peak, less that of the noise."""
+    """Return the centroid of the power minus the mean noise power; an :data:`Estimator`."""
     reach_bins = math.ceil(_CENTROID_REACH_CELLS * settings.fft_size / settings.window.length)
     distance = np.arange(-reach_bins, reach_bins + 1)
     bins = peak[:, None] + distance
@@ -146,13 +150,13 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
 
 def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Largest value of the spectrum between bins, by a chirp-z transform."""
+    """Return the maximum of the spectrum by a chirp-z transform; an :data:`Estimator`."""
     zoom, positions = (
         _zoom_transform(settings.window.length, settings.fft_size),
         np.empty(peak.size),
     )
     zoom_grid = np.arange(2 * _ZOOM_POINTS_PER_BIN + 1)
-    for row, bin_ in enumerate(peak):  # one by one, so that bits do not depend on the others
+    for row, bin_ in enumerate(peak):  # one by one: bits must not depend on other rows
         magnitude = np.abs(
             zoom(
                 _shift_bin_to_zero(
@@ -169,7 +173,7 @@ def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) 
 def maximum_likelihood(
     spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings
 ) -> np.ndarray:
-    """Most likely frequency of a lone tone in white noise."""
+    """Return the maximum-likelihood frequency of a tone in white noise; an :data:`Estimator`."""
     from sweep.model.detection.sub_bin_interpolation import complex_exponentials
 
     w = settings.taper
@@ -183,7 +187,7 @@ def maximum_likelihood(
         if not settings.complex_record:
             tone = complex_exponentials(frequencies[row] / fft_size, record.size)
             image = ((record * tone).sum() / n_used).conjugate() * tone
-            # Where the window was not undone there is no tone.
+            # Samples in which the window was not undone hold no tone.
             frequencies[row] = _refine_maximum(
                 np.where(is_used, record - image, 0.0), start[row], fft_size
             )
@@ -203,7 +207,7 @@ ESTIMATORS: dict[str, Estimator] = {
 
 
 def _three_bins(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
-    """Bins below, at and above each peak, (m, 3)."""
+    """Return the complex values of the bins below, at and above each peak, (m, 3)."""
     bins = (peak[:, None] + np.array([-1, 0, 1])) % spectrum.shape[1]
     return np.take_along_axis(spectrum, bins, axis=1)
 
@@ -211,13 +215,16 @@ def _three_bins(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
 def _three_bins_about_middle(
     spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings
 ) -> np.ndarray:
-    """Return the same bins, with phases counted from the middle of the record."""
+    """Return the three bins about each peak with phases relative to the record's middle, (m, 3)."""
     cycles_per_bin = 0.5 * settings.window.length / settings.fft_size
     return _three_bins(spectrum, peak) * np.exp(2j * np.pi * cycles_per_bin * np.array([-1, 0, 1]))
 
 
 def _parabola_vertex(values: np.ndarray) -> np.ndarray:
-    """Vertex of the parabola through (m, 3), -1/2..1/2 from the middle; 0 where there is none."""
+    """Return the vertex, -1/2..1/2 from the middle, of parabolas through values (m, 3).
+
+    It is 0 where the parabola has no maximum.
+    """
     below, middle, above = values.T
     curvature = 2 * middle - below - above
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -226,7 +233,10 @@ def _parabola_vertex(values: np.ndarray) -> np.ndarray:
 
 
 def _jacobsen_ratio(three_bins: np.ndarray, neighbour_sign: int) -> np.ndarray:
-    """Re[(Z_+ - Z_-) / (2 Z_0 +- (Z_- + Z_+))] of (m, 3), within -1..1."""
+    """Return Jacobsen's ratio Re[(Z_+ - Z_-) / (2 Z_0 +- (Z_- + Z_+))], -1..1, of bins (m, 3).
+
+    ``neighbour_sign`` is the sign in the denominator.
+    """
     below, middle, above = three_bins.T
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = ((above - below) / (2 * middle + neighbour_sign * (below + above))).real
@@ -235,7 +245,10 @@ def _jacobsen_ratio(three_bins: np.ndarray, neighbour_sign: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [bins] from -1 to 1, and the turned bins of tones that far above one, (k, 3)."""
+    """Return offsets -1 .. 1 [bins], and three bins of tones at these offsets, (k, 3).
+
+    Bins are real, as their phases are relative to the record's middle.
+    """
     from sweep.model.detection.sub_bin_interpolation import tone_spectrum
 
     offset = np.arange(-_TABLE_STEPS, _TABLE_STEPS + 1) / _TABLE_STEPS
@@ -244,10 +257,10 @@ def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=16)
 def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
-    """Sign of the neighbours in Jacobsen's denominator, and the factor of his ratio."""
+    """Return the sign of the neighbours in Jacobsen's denominator, and the factor of his ratio."""
     offset, tone_bins = _tone_bins(window, fft_size)
-    middle = tone_bins[_TABLE_STEPS]
-    if abs(middle[2]) < _NEIGHBOUR_HEIGHT_MIN * middle[1]:
+    _, centre, above = tone_bins[_TABLE_STEPS]
+    if abs(above) < _NEIGHBOUR_HEIGHT_MIN * centre:
         return 1, 1.0
     is_near = np.abs(offset) <= 0.5
     ratio = _jacobsen_ratio(tone_bins[is_near], -1)
@@ -256,7 +269,7 @@ def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
 
 @lru_cache(maxsize=4)
 def _zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Chirp-z transform of a record at rest, from -1 to 1 bin."""
+    """Return the chirp-z transform of records of a length, from -1 to 1 bin of fs/N."""
     from scipy import signal  # slow to import
 
     edge = 1.0 / fft_size
@@ -266,9 +279,10 @@ def _zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.nda
 
 
 def _record_from_spectrum(spectrum: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the windowed record (L,) of a spectrum; of a complex one shifted by half its rate.
+    """Return the windowed record (L,) of a spectrum.
 
-    A tone then has the frequency that its index says.
+    A complex record is shifted by half the sample rate, so that the frequency of a tone [bins] is
+    its index in the spectrum.
     """
     if settings.complex_record:
         return np.asarray(fft.ifft(spectrum))[: settings.window.length]
@@ -276,21 +290,28 @@ def _record_from_spectrum(spectrum: np.ndarray, settings: SpectrumSettings) -> n
 
 
 def _shift_bin_to_zero(record: np.ndarray, bin_: int, settings: SpectrumSettings) -> np.ndarray:
-    """Shift a record in frequency so that a bin lies at zero."""
+    """Shift a record in frequency such that a bin is moved to zero."""
     cycles = np.arange(record.size) * bin_ % settings.fft_size / settings.fft_size
     return np.asarray(record * np.exp(-2j * np.pi * cycles))
 
 
 def _refine_maximum(record: np.ndarray, start: float, fft_size: float) -> float:
-    """Place [bins] of the nearest maximum of |sum x e^{-2 pi i n f / N}|^2, from a start."""
+    """Return the position [bins] of the maximum of |sum x e^{-2 pi i n f / N}|^2 next to a start.
+
+    The start is returned if Newton's method does not converge near it.
+    """
     from sweep.model.detection.sub_bin_interpolation import complex_exponentials
 
     n = np.arange(record.size) - 0.5 * (record.size - 1)
     position = start
     for _ in range(_NEWTON_STEPS):
-        turned_record = record * complex_exponentials(position / fft_size, record.size)
-        s0, s1, s2 = turned_record.sum(), (n * turned_record).sum(), (n * n * turned_record).sum()
-        # of |S|^2 by the angle
+        shifted_record = record * complex_exponentials(position / fft_size, record.size)
+        s0, s1, s2 = (
+            shifted_record.sum(),
+            (n * shifted_record).sum(),
+            (n * n * shifted_record).sum(),
+        )
+        # Derivatives of |s0|^2 by the phase per sample.
         slope = 2.0 * (1j * s1 * s0.conjugate()).real
         curvature = 2.0 * (abs(s1) ** 2 - (s2 * s0.conjugate()).real)
         if not curvature < 0.0:
@@ -305,20 +326,29 @@ def _refine_maximum(record: np.ndarray, start: float, fft_size: float) -> float:
 
 
 class RangeVelocityDeviation(NamedTuple):
-    """Least standard deviations of what three beats are resolved into."""
+    """Least standard deviations of range and radial velocity, by the Cramer-Rao bound."""
 
     range: np.ndarray
-    """[m]"""
+    """Standard deviation of the range [m]."""
     radial_velocity: np.ndarray
-    """[m/s]"""
+    """Standard deviation of the radial velocity [m/s]."""
 
 
 def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
-    """Return the tone-to-noise power ratio before the FFT, by the SNR of its strongest bin.
+    """Return the power of a tone over the noise power before the FFT, from its strongest bin's SNR.
 
-    The tone is taken to lie on a bin; between bins the true ratio is higher by the scalloping loss.
-    For a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2 on a bin, and a
-    bin's noise power is sum(w^2) s^2.
+    Parameters
+    ----------
+    snr
+        Power of the strongest bin over its noise power.
+    window
+        Window of the record.
+
+    Notes
+    -----
+    The tone is assumed on a bin; between bins the true ratio is higher by the scalloping loss. For
+    a tone of amplitude A, window w and noise s per sample, |X| = A sum(w) / 2 on a bin, and the
+    noise power of a bin is sum(w^2) s^2.
     """
     return np.asarray(snr, float) * 2 * window.energy / window.sum**2
 
@@ -326,9 +356,16 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
 def beat_frequency_bound(
     *, cnr: ArrayLike, n_samples: ArrayLike, sample_rate: ArrayLike
 ) -> np.ndarray:
-    """Least standard deviation [Hz] of a tone's frequency in a record of `n_samples`, unpadded.
+    """Return the least standard deviation of a tone's frequency [Hz], by the Cramer-Rao bound.
 
-    `cnr` is the tone's power over the noise's before the FFT, for a complex record twice that.
+    Parameters
+    ----------
+    cnr
+        Power of the tone over the noise power before the FFT; for a complex record twice that.
+    n_samples
+        Number of samples of the record, without padding.
+    sample_rate
+        Sample rate [Hz].
     """
     count = np.asarray(n_samples, float)
     with np.errstate(divide="ignore"):
@@ -339,17 +376,28 @@ def beat_frequency_bound(
 def phase_noise_deviation(
     *, line_width: ArrayLike, delay: ArrayLike, duration: ArrayLike
 ) -> np.ndarray:
-    """Compute the standard deviation [Hz] of a beat's frequency from its laser's phase walk.
+    """Return the standard deviation of a beat's frequency [Hz] due to laser phase noise.
 
-    The error is the slope over 2 pi of the least-squares line through theta(t) - theta(t - tau) in
-    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|, dnu the
-    FWHM of the laser's Lorentzian line. With r = tau / T, or 1 where the delay is longer,
+    Parameters
+    ----------
+    line_width
+        FWHM dnu of the laser's Lorentzian line [Hz].
+    delay
+        Delay tau of the echo [s].
+    duration
+        Duration T of the record [s].
+
+    Notes
+    -----
+    The error is the slope over 2 pi of the least-squares line through theta(t) - theta(t - tau)
+    over the record. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
+    r = tau / T, or 1 for longer delays,
 
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
     The maximum-likelihood frequency in white noise has this error in addition to
-    :func:`beat_frequency_bound`. Estimates that knew the walk's correlation could do better by a
-    few percent for short delays, by a fifth for r = 1/3.
+    :func:`beat_frequency_bound`. Estimates that use the correlation of the phase noise could be
+    better by a few percent for short delays, and by a fifth for r = 1/3.
     """
     delay_fraction = np.minimum(np.asarray(delay, float) / duration, 1.0)
     walk_variance = 12 * np.asarray(line_width, float) / np.asarray(duration, float)
@@ -362,14 +410,29 @@ def phase_noise_deviation(
 def windowed_peak_deviation(
     *, cnr: ArrayLike, window: Window, sample_rate: ArrayLike
 ) -> np.ndarray:
-    """Compute the standard deviation [Hz] of the frequency at which a windowed |X(f)| peaks.
+    """Return the standard deviation [Hz] of the frequency at which a windowed |X(f)| is largest.
 
-    To first order in the noise, with m = n less the middle of the record,
+    Parameters
+    ----------
+    cnr
+        Power of the tone over the noise power before the FFT.
+    window
+        Window w of the record.
+    sample_rate
+        Sample rate fs [Hz].
 
-        var(f) = sum(w^2 m^2) / (cnr sum(w m^2)^2) (fs / 2 pi)^2
+    Notes
+    -----
+    To first order in the noise, with m = n minus the centroid of the window [1]_,
 
-    which is the bound for the rectangular window and more for every other: the expansion of the
-    periodogram about its maximum [Rife and Vincent, Bell Syst. Tech. J. 49, 197, 1970].
+        var(f) = sum(w^2 m^2) / (cnr sum(w m^2)^2) (fs / 2 pi)^2.
+
+    This is the Cramer-Rao bound for the rectangular window, and larger for every other window.
+
+    References
+    ----------
+    .. [1] D. C. Rife and G. A. Vincent, "Use of the discrete Fourier transform in the measurement
+       of frequencies and levels of tones," Bell Syst. Tech. J. 49, 197, 1970.
     """
     w = cached_window_samples(window)
     centred_index = np.arange(window.length) - (w * np.arange(window.length)).sum() / w.sum()
@@ -393,12 +456,27 @@ def range_velocity_deviation(
     radial_velocity: ArrayLike,
     slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> RangeVelocityDeviation:
-    """Least standard deviations of range and radial velocity, of the beats' own [Hz].
+    """Return the least standard deviations of range and radial velocity from those of the beats.
 
-    Those of beats that are not used are inf. :func:`sweep.model.waveform.resolve_range_velocity`
-    takes no more
-    from the Doppler beat than which reading of the others is right: the bound of what it reports
-    has ``doppler=np.inf``. `slopes` are chirp rates over `chirp_rate`, signed.
+    Parameters
+    ----------
+    up, doppler, down
+        Standard deviation of each segment's beat frequency [Hz]; inf if the beat is not used.
+        :func:`sweep.model.waveform.resolve_range_velocity` uses the Doppler beat only to resolve an
+        ambiguity; for its bound pass ``doppler=np.inf``.
+    carriers
+        Carrier frequency of each segment [Hz].
+    chirp_rate
+        Chirp rate [Hz/s].
+    range, radial_velocity
+        Range [m] and radial velocity [m/s].
+    slopes
+        Signed chirp rate of each segment over `chirp_rate`.
+
+    Returns
+    -------
+    RangeVelocityDeviation
+        inf where the used beats do not determine both.
     """
     two_over_c = 2 / SPEED_OF_LIGHT
     delay, beta = two_over_c * np.asarray(range, float), two_over_c * np.asarray(radial_velocity)
@@ -410,7 +488,7 @@ def range_velocity_deviation(
     ]
     with np.errstate(divide="ignore"):
         information = [1 / np.asarray(deviation, float) ** 2 for deviation in (up, doppler, down)]
-    # The determinant of a sum of squares as squares again (Cauchy and Binet): nothing cancels.
+    # Cauchy-Binet writes the determinant as a sum of squares, so nothing cancels.
     determinant = sum(
         information[i] * information[j]
         * (beat_per_metre[i] * beat_per_velocity[j] - beat_per_metre[j] * beat_per_velocity[i]) ** 2

@@ -23,14 +23,21 @@ N_PHASE_NODES = 8
 """Number of nodes t_j = pi (j + 1/2) / N_PHASE_NODES of the midpoint rule over the phase t."""
 
 PHASE_COSINES = np.cos(np.pi * (np.arange(N_PHASE_NODES) + 0.5) / N_PHASE_NODES)
+"""cos t_j at these nodes."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pseudo_variance_ratio_at(bin_, nyquist_bin, ratios):
     """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin; 0 far from DC and Nyquist.
 
-    ``bin_`` is 0 .. N/2 and ``nyquist_bin`` is N/2. ``ratios`` (k,): q of the bins 0 .. k - 1,
-    counted from the nearer of DC and Nyquist.
+    Parameters
+    ----------
+    bin_
+        Number of the bin, 0 .. N/2.
+    nyquist_bin
+        N/2.
+    ratios
+        (k,): q at distances of 0 .. k - 1 bins from the nearer of DC and Nyquist.
     """
     distance_from_end = min(bin_, nyquist_bin - bin_)
     return ratios[distance_from_end] if 0 <= distance_from_end < ratios.size else 0.0
@@ -38,10 +45,21 @@ def pseudo_variance_ratio_at(bin_, nyquist_bin, ratios):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def hoyt_tails(power, ratio, threshold):
-    """Return both :class:`Tails` of the magnitude of a noncircular complex Gaussian number X.
+    """Return the tails of the magnitude |X| of a noncircular complex Gaussian number X.
 
-    ``power`` is E[|X|^2], ``ratio`` the pseudo-variance ratio q = E[X^2] / E[|X|^2], -1 .. 1;
-    ``threshold`` is in units of |X|.
+    Parameters
+    ----------
+    power
+        E[|X|^2].
+    ratio
+        Pseudo-variance ratio q = E[X^2] / E[|X|^2], -1 .. 1.
+    threshold
+        Threshold on |X|, in the unit of |X|.
+
+    Returns
+    -------
+    Tails
+        Probabilities that |X| is above and below the threshold.
     """
     q = abs(ratio)
     if q == 0.0:

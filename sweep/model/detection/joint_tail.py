@@ -20,8 +20,8 @@ class JointTailRule(NamedTuple):
 
     Notes
     -----
-    Two numbers of the correlation rho exceed s and t with the product of the probabilities of each,
-    plus [1]_
+    Two numbers of the correlation rho exceed s and t with the product of the two probabilities plus
+    [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du.
 
@@ -41,7 +41,7 @@ class JointTailRule(NamedTuple):
 
 @lru_cache(maxsize=64)
 def joint_tail_rule(correlation: float) -> JointTailRule:
-    """Return the quadrature for numbers of a correlation, 0..1 (cached)."""
+    """Return the quadrature for two numbers with a given correlation, 0..1 (cached)."""
     if correlation == 0.0:
         return JointTailRule(np.empty(0), np.empty(0), np.empty(0))
     node, weight = np.polynomial.legendre.leggauss(12)

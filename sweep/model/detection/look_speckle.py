@@ -1,12 +1,11 @@
-"""Speckle that the looks of a shot share in part, as the target or the beam moves on between them.
+"""Partially correlated speckle of a shot's looks, if the target or the beam moves between them.
 
-In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s, circular complex
-Gaussian of power 1, times the root of the look's SNR, and noise of power 1. The speckles of looks
-k and l have the correlation mu(l - k), equation (2) of
-:mod:`sweep.model.detection.speckle_correlation`: with
-the turn F beta (l - k) T of a scatterer between two looks, which start T apart. If the echo spreads
-over bins it is equation (3). Looks in which the line has moved on to other bins have less power in
-this one.
+In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s_k, a circular
+complex Gaussian number of power 1, times the root of the look's SNR x_k, plus noise of power 1. The
+speckle of looks k and l has the correlation mu(l - k), by equation (2) of
+:mod:`sweep.model.detection.speckle_correlation` with the phase F beta (l - k) T of a scatterer
+between two looks that start a time T apart. If the echo spreads over bins, mu follows from equation
+(3). A line that moves to other bins has less power in this bin in some looks.
 
 **Mean power.** Let x be the mean SNR, and c_j the eigenvalues of the matrix sqrt(x_k x_l) mu(l - k)
 over x, of which the sum is N. The sum of |z_k|^2 is one of independent exponential variables, of
@@ -14,24 +13,25 @@ means 1 + x c_j. It exceeds y with
 
     P(y) = 1 / (2 pi i) int exp(-s y) / s prod_j (1 - (1 + x c_j) s)^(-m_j) ds                 (1)
 
-along a parabola through the saddle point of the integrand, which the poles lie within. In contrast
-to partial fractions this keeps its digits where eigenvalues are alike. m_j is 1. More than
-MATRIX_LOOKS_MAX looks have the eigenvalues of as many looks that are farther apart. If their
-speckle has no memory over this distance, there is one of multiplicity M = N^2 / sum c^2: a gamma
-variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007, 4.6].
+along a parabola through the saddle point of the integrand, which encloses the poles. Unlike partial
+fractions this is precise where eigenvalues are close to each other. The multiplicities m_j are 1.
+More than MATRIX_LOOKS_MAX looks are represented by that number of looks at a larger spacing. If
+their speckle is uncorrelated over this spacing, one eigenvalue of multiplicity M = N^2 / sum c^2
+replaces all: a gamma variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007,
+4.6].
 
-**Votes.** Given the speckles, records cross independently, by Q_1. The probability that enough do
-is averaged over NODES fixed speckles, a Kronecker lattice with its second moments made exact. The
-lattice's error for looks of independent speckle, of which the binomial law is known, is taken off
-in proportion to (M - 1) / (N - 1).
+**Votes.** Given the speckle, records cross independently, by Q_1. The probability that enough of
+them cross is averaged over SPECKLE_LATTICE_SIZE fixed realisations, a Kronecker lattice whose
+second moments are made exact. The error of the lattice is known for looks of independent speckle,
+whose law is binomial. This error times (M - 1) / (N - 1) is subtracted.
 
 **Two segments.** Let r be the correlation of the segments' mean powers,
 
     r = sum_kl |mu_12(k, l)|^2 / sqrt(sum_kl |mu_11|^2 sum_kl |mu_22|^2).
 
-If they share all their speckle, the product of both is averaged over it. Of the covariance that
-this leaves they have a part: that which two Rayleigh magnitudes have at r if M is 1, and r if M is
-large.
+With the same speckle in both segments the joint probability is the mean over the speckle of the
+product of both probabilities. For r < 1 the covariance of the two detections is a fraction of that
+mean's: for M = 1 the fraction of two Rayleigh magnitudes with the correlation r, for large M r.
 """
 
 import math
@@ -54,9 +54,12 @@ SPECKLE_LATTICE_SIZE = 2048
 """Number of lattice points (joint speckles of all looks) over which votes are averaged."""
 
 _CONTOUR_NODES = 40
+"""Number of nodes of the quadrature of equation (1) on the upper half of the parabola."""
 _CONTOUR_END = 4.6
+"""Largest value of asinh(Im s / scale) on the parabola."""
 _BISECTION_STEPS = 60
 _CROSSING_TABLE_STEPS = 512
+"""Number of steps in the table of crossing probabilities by speckle magnitude."""
 _TABULATED_SPECKLE_MAX = 5.0
 """Largest tabulated speckle magnitude, in units of its root mean square."""
 
@@ -69,11 +72,11 @@ class LookSpeckle(NamedTuple):
     multiplicity: np.ndarray
     """(3, n, k): multiplicities m_j, 0 for unused entries; sum_j c_j m_j = N."""
     effective_looks: np.ndarray
-    """(3, n): effective number M of looks of independent speckle, 1 .. N."""
+    """(3, n): number M of looks of independent speckle that are equivalent to the looks, 1 .. N."""
     segment_correlation: np.ndarray
     """(3, n): sqrt(r) for the pairs (up, Doppler), (up, down), (Doppler, down)."""
     correlation_by_lag: np.ndarray
-    """(3, n, N) complex: correlation mu of two looks by their distance 0 .. N - 1."""
+    """(3, n, N) complex: correlation mu of the speckle of two looks by their lag 0 .. N - 1."""
     look_power: np.ndarray
     """(3, n, N): relative power of each look in the strongest bin; mean 1."""
 
@@ -81,9 +84,9 @@ class LookSpeckle(NamedTuple):
     def from_correlations(
         cls, correlation_by_lag: np.ndarray, look_power: np.ndarray, segment_correlation: np.ndarray
     ) -> "LookSpeckle":
-        """Compute eigenvalues and effective number of looks from correlations and powers.
+        """Compute the eigenvalues and the effective number of looks from correlations and powers.
 
-        ``correlation_by_lag``, ``look_power`` and ``segment_correlation`` are as of the fields.
+        The arguments are fields of the result.
         """
         n_looks = correlation_by_lag.shape[2]
         eigenvalue = np.maximum(
@@ -117,10 +120,10 @@ class LookSpeckle(NamedTuple):
         return LookSpeckle(*(column[:, points] for column in self))
 
     def covariance_root(self, segment: int, point: int) -> np.ndarray:
-        """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle.
+        """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle amplitudes.
 
-        A z are the speckles of the N looks, each times the root of its power, if the z are
-        independent, of mean power 1.
+        For independent circular complex Gaussian z of power 1, A z are speckle amplitudes of the N
+        looks.
         """
         correlation_by_lag = self.correlation_by_lag[segment, point]
         covariance = look_covariances(
@@ -130,9 +133,9 @@ class LookSpeckle(NamedTuple):
         return eigenvector[:, ::-1] * np.sqrt(np.maximum(eigenvalue[::-1], 0.0))
 
     def covariance_roots(self) -> np.ndarray:
-        """Return the matrices of :meth:`covariance_root` of all segments and points, (3, n, N, k).
+        """Return :meth:`covariance_root` of all segments and points, (3, n, N, k).
 
-        With as many columns as independent speckles have a share in the looks of any point.
+        Only the first k columns are kept, those with a noticeable power at any point.
         """
         n_looks = self.correlation_by_lag.shape[2]
         eigenvalues, eigenvectors = np.linalg.eigh(
@@ -144,7 +147,7 @@ class LookSpeckle(NamedTuple):
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Share of the looks' power below which an independent speckle is left out."""
+"""Fraction of the looks' power below which an eigenvalue of the covariance is neglected."""
 
 
 def look_covariances(
@@ -152,7 +155,12 @@ def look_covariances(
 ) -> np.ndarray:
     """Return the covariance matrices sqrt(x_k x_l) mu(l - k) of the looks' speckle, (..., k, k).
 
-    More than ``looks_max`` looks are represented by those of :func:`representative_look_positions`.
+    Parameters
+    ----------
+    correlation_by_lag, look_power
+        (..., N): as of :class:`LookSpeckle`.
+    looks_max
+        Largest number k of looks; more are represented by :func:`representative_look_positions`.
     """
     n_looks = correlation_by_lag.shape[-1]
     position = representative_look_positions(n_looks, looks_max)
@@ -171,9 +179,9 @@ def look_covariances(
 
 
 def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MAX) -> np.ndarray:
-    """Return the positions of the looks, at most ``looks_max``, that represent ``n_looks`` looks.
+    """Return positions of at most ``looks_max`` looks that represent ``n_looks`` looks.
 
-    They have the same mean square time from the middle.
+    Positions count looks from 0, and need not be integers. Their variance is that of all looks.
     """
     n_kept = min(n_looks, looks_max)
     position_step = math.sqrt((n_looks**2 - 1) / (n_kept**2 - 1)) if n_kept < n_looks else 1.0
@@ -183,14 +191,14 @@ def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MA
 def phase_rotated_look_covariances(
     correlation_by_lag: np.ndarray, look_power: np.ndarray, cycles_per_look: np.ndarray
 ) -> np.ndarray:
-    """Return :func:`look_covariances` of echoes whose phase turns from look to look, (m, k, k).
+    """Return covariances of echo amplitudes whose phase rotates from look to look, (m, k, k).
 
     Parameters
     ----------
     correlation_by_lag, look_power
         (m, N): as of :class:`LookSpeckle`.
     cycles_per_look
-        (m,): turn of the line's phase from one look to the next [cycles].
+        (m,): rotation of the line's phase from one look to the next [cycles].
     """
     positions = representative_look_positions(correlation_by_lag.shape[-1])
     phase = 2 * np.pi * np.mod(cycles_per_look[:, None] * positions, 1.0)
@@ -235,9 +243,9 @@ def gamma_sum_tails(
     gamma_shape
         (..., k): shapes of the variables: 1 of an exponential one, 1/2 of a squared Gaussian one.
     gamma_scale
-        (..., k): their means over their shapes.
+        (..., k): scales of the variables, mean over shape.
     threshold
-        (...).
+        (...): threshold on the sum.
     """
     scale_max = gamma_scale.max(axis=-1)
     gamma_scale, scaled_threshold = gamma_scale / scale_max[..., None], threshold / scale_max
@@ -277,9 +285,24 @@ def _saddle_point(
     scaled_threshold: np.ndarray,
     is_rare: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Saddle point of the integrand of (1), and the second and third derivative of its logarithm.
+    """Return the saddle point of the integrand of (1) and two derivatives of its logarithm there.
 
-    It lies between 0 and the first pole for the upper tail, below 0 for the lower one.
+    The saddle point lies between 0 and the first pole for the upper tail, and below 0 for the lower
+    tail.
+
+    Parameters
+    ----------
+    multiplicity, mean_power
+        (..., k): shapes and scales of the gamma variables; the largest scale is 1.
+    scaled_threshold
+        (...): threshold over the largest scale.
+    is_rare
+        (...) bool: True if the upper tail is computed.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        (...) each: saddle point, second derivative and third derivative.
     """
     low = np.where(is_rare, 1e-12, -1e12)
     high = np.where(is_rare, 1 - 1e-12, -1e-12)
@@ -297,9 +320,11 @@ def _saddle_point(
 
 @lru_cache(maxsize=8)
 def speckle_lattice(n_looks: int) -> np.ndarray:
-    """Return a fixed lattice of independent speckles, (NODES, number) complex.
+    """Return fixed realisations of the independent speckle amplitudes of N looks.
 
-    Kronecker lattice of the roots of primes, standardised: mean 0, covariance the unit matrix.
+    They are (SPECKLE_LATTICE_SIZE, N) complex: a Kronecker lattice of the roots of primes,
+    transformed to circular Gaussian numbers and standardised to mean 0 and the unit covariance
+    matrix.
     """
     primes = [2]
     while len(primes) < 2 * n_looks:
@@ -317,10 +342,14 @@ def speckle_lattice(n_looks: int) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def correlated_speckle_magnitudes(speckle, covariance_root):
-    """Return magnitudes |A z| of correlated speckles, (m, N).
+    """Return magnitudes |A z| of correlated speckle amplitudes of N looks, (m, N).
 
-    ``speckle`` (m, k): independent speckles z; ``covariance_root`` (N, k): A, as of
-    :meth:`LookSpeckle.covariance_root`.
+    Parameters
+    ----------
+    speckle
+        (m, k) complex: m realisations of independent amplitudes z.
+    covariance_root
+        (N, k) complex: A, as of :meth:`LookSpeckle.covariance_root`.
     """
     magnitude = np.empty((speckle.shape[0], covariance_root.shape[0]))
     for i in range(speckle.shape[0]):
@@ -347,12 +376,13 @@ def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnit
     magnitude
         (m, N): magnitudes of the looks' speckle, of mean square 1.
     is_real
-        The noise is real: it has the power of both quadratures in one.
+        True if the noise is real: one quadrature has the noise power of both.
 
     Notes
     -----
-    Looks cross independently, with Q_1(signal |s_k|, level), or the tails of a normal variable. The
-    number of crossings has a Poisson binomial distribution, summed up look by look.
+    Given their speckle s_k, looks cross independently with Q_1(signal |s_k|, threshold), or the
+    tails of a normal variable for real noise. The number of crossings has a Poisson binomial
+    distribution, which is built up look by look.
     """
     crossing_table = np.empty(_CROSSING_TABLE_STEPS + 1)
     step = _TABULATED_SPECKLE_MAX / _CROSSING_TABLE_STEPS

@@ -1,31 +1,33 @@
-"""Looks: a shot's detection from several records of each of its segments.
+"""Detection of a shot from several looks: N records of each of its segments.
 
-A shot is its waveform N times over, without a pause. Of a bin, with a and the threshold b over the
-noise per quadrature of one record,
+The waveform of a shot is repeated N times without a pause. In a bin, let a be |X| without noise and
+b the threshold, both over the noise per quadrature of one record. Looks are combined in one of
+three ways:
 
-- ``power``: the N periodograms |X|^2 are averaged, and their root is held against the threshold.
-  The sum of powers is a noncentral chi square of 2 N degrees of freedom. It crosses with
-  ``Q_N(sqrt(N) a, sqrt(N) b)``, Marcum's Q of order N, and noise alone, a Gamma(N), with
-  ``Q(N, N b^2 / 2)``, the regularised incomplete Gamma function [Marcum, IRE Trans. Inf. Theory 6,
-  59, 1960].
-- ``binary``: each record is held against the threshold, and M of them must cross in the bin.
-- ``coherent``: records are added, with the phase between them that a steady velocity makes taken
-  off, and are then one record of N times less noise. The part of their sum that a laser's walking
-  phase and an acceleration leave is in :func:`coherent_gain`.
+- ``power``: the N periodograms |X|^2 are averaged, and the root of the mean is compared with the
+  threshold. The sum of powers is a noncentral chi-square variable of 2 N degrees of freedom. It
+  crosses with ``Q_N(sqrt(N) a, sqrt(N) b)``, Marcum's Q of order N. Noise alone is a Gamma(N)
+  variable and crosses with ``Q(N, N b^2 / 2)``, the regularised incomplete Gamma function [Marcum,
+  IRE Trans. Inf. Theory 6, 59, 1960].
+- ``binary``: each record is compared with the threshold, and M of them must cross in the bin.
+- ``coherent``: records are added after the phase between them due to a steady velocity is removed.
+  The sum counts as one record of N times less noise. :func:`coherent_gain` gives its loss by an
+  acceleration; a laser's phase noise adds to the loss.
 
-An echo in developed speckle fades. All looks have one speckle (``speckle: common``), or each has
-its own, as the beam moves on by its own width from look to look (``speckle: independent``). The
-mean of Q_N over speckle is Swerling's first case, with x = a^2 / 2 the mean SNR of one record and
-Y = N b^2 / 2,
+An echo in developed speckle fades. All looks have the same speckle (``speckle: common``), or each
+look has independent speckle, as when the beam moves by its width from look to look (``speckle:
+independent``). With x = a^2 / 2 the mean SNR of one record and Y = N b^2 / 2, the mean of Q_N over
+common speckle is Swerling's first case,
 
     Q(N-1, Y) + (1 + 1 / (N x))^(N-1) e^(-Y / (1 + N x)) P(N-1, Y / (1 + 1 / (N x))),
 
-or, where looks fade apart, his second: Q(N, Y / (1 + x)) [Swerling, IRE Trans. Inf. Theory 6, 269,
-1960; Richards, Fundamentals of Radar Signal Processing, 2005, 6.3]. Between these two, looks share
-their speckle in part, by the motion from one to the next (``speckle: motion``):
+and over independent speckle his second, Q(N, Y / (1 + x)) [Swerling, IRE Trans. Inf. Theory 6, 269,
+1960; Richards, Fundamentals of Radar Signal Processing, 2005, 6.3]. In between, the speckle of
+looks is partially correlated by the motion from one to the next (``speckle: motion``):
 :mod:`sweep.model.detection.look_speckle`.
 
-Q_N is that of scipy's noncentral chi square, whose error is 1e-11 of either tail down to 1e-300.
+Q_N is computed as scipy's noncentral chi square, with a relative error of 1e-11 in either tail down
+to 1e-300.
 """
 
 import math
@@ -59,28 +61,28 @@ LOOKS_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
 }
 
 DRIFT_POSITIONS_MAX = 64
-"""Places of a line that moves on from look to look."""
+"""Largest number of positions that represent a line which moves from look to look."""
 
 _CERTAIN_MARGIN_SIGMA = 40.0
-"""Distance of magnitude and threshold over sigma from where on a tail is 0 to float64."""
+"""Distance of magnitude and threshold [sigma] beyond which the smaller tail is 0 in float64."""
 _BISECTION_STEPS = 60
 _LOG_POWER_GRID = -5.0, math.log(16.0), 64
-"""Ends and number of the nodes of a mean over speckle, in ln(power)."""
+"""First and last ln(power), and number of nodes, of the quadrature over the speckle's power."""
 _GAUSS_NODES = 24
-"""Gauss points of each stretch of a mean over speckle."""
+"""Number of Gauss points in each interval of the quadrature over the speckle's magnitude."""
 
 
 class DetectionArrays(NamedTuple):
-    """Probabilities of detection and of a miss of many bins or shots, of one common shape."""
+    """Probabilities of detection and of a miss of bins or shots, arrays of one shape."""
 
     pd: np.ndarray
     """Probability of detection, 0..1."""
     miss: np.ndarray
-    """Probability of a miss, 1 - pd; keeps its digits where pd is near 1."""
+    """Probability of a miss, 1 - pd; precise where pd is near 1."""
 
 
 class Looks(NamedTuple):
-    """Records of each segment, and how a bin is detected from them.
+    """Number of records of each segment, and the rule by which they are combined.
 
     Examples
     --------
@@ -90,15 +92,19 @@ class Looks(NamedTuple):
     """
 
     number: int = 1
+    """Number N of records of each segment."""
     combine: str = COMBINE_POWER
+    """How records are combined, one of :data:`COMBINE_KINDS`."""
     votes: int = 1
+    """Number M of records that must cross in a bin; used by ``binary``."""
     has_independent_speckle: bool = False
+    """True if the speckle of looks is independent."""
     has_moving_speckle: bool = False
-    """Speckle changes from look to look as the motion between them makes it."""
+    """True if the correlation of the looks' speckle follows from the motion between them."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "Looks":
-        """Return the looks that points share, by dotted path; a single look by default."""
+        """Return the looks from parameters by dotted path; a single look by default."""
         number, combine_kind, votes, speckle = (
             np.asarray(parameters.get(path, value)).flat[0]
             for path, value in LOOKS_DEFAULTS.items()
@@ -114,26 +120,30 @@ class Looks(NamedTuple):
 
     @property
     def is_noncoherent(self) -> bool:
-        """True where a bin is detected by another law than that of one record."""
+        """True if several looks are combined by power or by votes, and not as one record."""
         return self.number > 1 and self.combine != COMBINE_COHERENT
 
     @property
     def n_coherent(self) -> int:
-        """Records that are added in amplitude, 1 where none are."""
+        """Number of records that are added coherently; 1 if none are."""
         return self.number if self.combine == COMBINE_COHERENT else 1
 
     @property
     def n_power_averaged(self) -> int:
-        """Records whose powers are averaged, 1 where none are."""
+        """Number of records whose powers are averaged; 1 if none are."""
         return self.number if self.combine == COMBINE_POWER else 1
 
     @property
     def amplitude_gain_max(self) -> float:
-        """Factor on magnitude over sigma by which one record would be as sure, at the most."""
+        """Largest gain in amplitude over noise by which one record could equal all looks."""
         return math.sqrt(self.number) if self.is_noncoherent else 1.0
 
     def equivalent_threshold_ratio(self, threshold_ratio: np.ndarray) -> np.ndarray:
-        """Threshold over sigma of a record as sure as these, at which it detects as often."""
+        """Return the threshold over sigma at which one equivalent record detects as often.
+
+        The amplitudes over sigma of the equivalent record are ``amplitude_gain_max`` times those of
+        one look.
+        """
         scaled = np.asarray(self.amplitude_gain_max * threshold_ratio)
         if self.n_power_averaged == 1:
             return scaled
@@ -142,11 +152,19 @@ class Looks(NamedTuple):
     def pd_and_miss_steady(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, is_real: np.ndarray | bool = False
     ) -> DetectionArrays:
-        """Return the probabilities that a bin of a steady signal is detected and missed.
+        """Return the probabilities that a bin with a steady signal is detected and is missed.
 
-        |X| (``signal``) and threshold are over the noise per quadrature of one record. If the noise
-        ``is_real``, it has the power of both quadratures in one. The results have the shape of the
-        broadcast arguments.
+        Parameters
+        ----------
+        signal, threshold_ratio
+            |X| without noise, and threshold, over the noise per quadrature of one record.
+        is_real
+            True if the noise is real: one quadrature has the noise power of both.
+
+        Returns
+        -------
+        DetectionArrays
+            Of the broadcast shape of the arguments.
         """
         from sweep.model.detection.marcum import marcum_q1
 
@@ -160,7 +178,7 @@ class Looks(NamedTuple):
             if self.is_noncoherent:
                 return self.vote_probabilities(pd, miss)
             return DetectionArrays(pd, miss)
-        from scipy import stats  # which takes a second, and one look has no need of
+        from scipy import stats  # slow to import, and not needed for one look
 
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, threshold_ratio))
         pd, miss = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
@@ -172,7 +190,7 @@ class Looks(NamedTuple):
             np.where(is_real, n, 2 * n)[near] for n in (self.number, 1.0)
         )
         x, signal = 0.5 * noise_fraction * b[near] ** 2, 0.5 * noise_fraction * a[near] ** 2
-        # The tail that is small, and its complement.
+        # The smaller tail is computed, and the other as its complement.
         is_upper_tail, tail = x > degrees_of_freedom + signal, np.empty(x.shape)
         for members, tail_law in ((is_upper_tail, stats.ncx2.sf), (~is_upper_tail, stats.ncx2.cdf)):
             tail[members] = tail_law(x[members], degrees_of_freedom[members], signal[members])
@@ -185,9 +203,20 @@ class Looks(NamedTuple):
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
     ) -> DetectionArrays:
-        """Compute pd and 1 - pd for a signal in developed speckle, of mean power signal^2.
+        """Return the probabilities that a bin in developed speckle is detected and is missed.
 
-        ``look_speckle`` is that of looks which share it in part; signals are (..., 3, n) then.
+        Parameters
+        ----------
+        signal, threshold_ratio
+            Root mean square |X| without noise, and threshold, over the noise per quadrature of one
+            record.
+        look_speckle
+            Correlation of the looks' speckle if it is partial. Signals are (..., 3, n) then.
+
+        Returns
+        -------
+        DetectionArrays
+            Of the broadcast shape of the arguments.
         """
         signal, threshold_ratio = np.broadcast_arrays(
             np.asarray(signal, float), np.asarray(threshold_ratio, float)
@@ -218,7 +247,7 @@ class Looks(NamedTuple):
         n, gamma_threshold = self.number, 0.5 * self.number * np.square(threshold_ratio)
         total_snr = np.maximum(0.5 * self.number * np.square(signal), 1e-200)
         noise_tail = special.gammaincc(n - 1, gamma_threshold)
-        # P of small arguments by its series, as it leaves float64's range and is multiplied again.
+        # P of small arguments by its series: P underflows, and is multiplied by a large factor.
         z = gamma_threshold * (total_snr / (1 + total_snr))
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             log_p_series = (n - 1) * np.log(z) - z - special.gammaln(n)
@@ -233,7 +262,7 @@ class Looks(NamedTuple):
     def _pd_and_miss_in_moving_speckle(
         self, signal: np.ndarray, threshold_ratio: np.ndarray, look_speckle: "LookSpeckle"
     ) -> DetectionArrays:
-        """Compute :meth:`pd_and_miss_in_speckle` for looks that share their speckle in part."""
+        """Compute :meth:`pd_and_miss_in_speckle` for partially correlated speckle of the looks."""
         from sweep.model.detection.look_speckle import (
             mean_power_tails,
             vote_probability_given_speckle,
@@ -263,7 +292,7 @@ class Looks(NamedTuple):
         return DetectionArrays(pd, 1 - pd)
 
     def _lattice_magnitudes(self) -> np.ndarray:
-        """Magnitudes (nodes, N) of independent speckles."""
+        """Return magnitudes (nodes, N) of the speckle of N looks with independent speckle."""
         from sweep.model.detection.look_speckle import speckle_lattice
 
         return np.abs(speckle_lattice(self.number))
@@ -271,7 +300,7 @@ class Looks(NamedTuple):
     def _correlated_magnitudes(
         self, look_speckle: "LookSpeckle", segment: int, point: int
     ) -> np.ndarray:
-        """Magnitudes (nodes, N) of the speckle of a segment's looks."""
+        """Return magnitudes (nodes, N) of the correlated speckle of a segment's N looks."""
         from sweep.model.detection.look_speckle import (
             correlated_speckle_magnitudes,
             speckle_lattice,
@@ -288,14 +317,23 @@ class Looks(NamedTuple):
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> tuple[list[np.ndarray], np.ndarray]:
-        """Compute detection given the speckle of all looks, if segments share all of it.
+        """Compute pd of segments given the speckle of all looks, the same in all segments.
+
+        Parameters
+        ----------
+        signals
+            (..., n) for each segment: root mean square |X| over the noise per quadrature.
+        threshold_ratio
+            (..., n): threshold over the same.
+        look_speckle
+            Correlation of the looks' speckle if it is partial.
 
         Returns
         -------
         list
-            Of each signal (..., n) the probability (..., n, k) in k speckles.
+            pd (..., n, k) of each segment, in k realisations of the speckle.
         numpy.ndarray
-            Weights of the speckles, which add to 1.
+            (..., k): weights of the realisations, of the sum 1.
         """
         if self.combine == COMBINE_POWER or (
             look_speckle is None and not self.has_independent_speckle
@@ -337,16 +375,35 @@ class Looks(NamedTuple):
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
     ) -> np.ndarray:
-        """Probability that up and down segment in developed speckle are both detected.
+        """Return the probability that two segments in developed speckle are both detected.
 
-        By |X| of their bins and threshold over the noise per quadrature, and the size of the
-        correlation of their signals' amplitudes (``correlation``). Looks of their own speckle are
-        summed
-        over that of the first segment: given it, the second's are a noncentral chi square. In one
-        speckle of all, both segments see it: the mean over it of the product. If they share but a
-        part of it, what they have in common is that share of it which two Rayleigh magnitudes of
-        the same probabilities have. Looks that share their speckle in part (``look_speckle``) are
-        treated likewise, as :mod:`sweep.model.detection.look_speckle` has it.
+        Parameters
+        ----------
+        signal_first, signal_second
+            (..., n): root mean square |X| of the segments' bins over the noise per quadrature.
+        threshold_ratio
+            (n,): threshold over the same.
+        correlation
+            (n,): modulus of the correlation of the segments' signal amplitudes.
+        look_speckle
+            Correlation of the looks' speckle if it is partial.
+
+        Returns
+        -------
+        numpy.ndarray
+            (..., n)
+
+        Notes
+        -----
+        Independent speckle of the looks: the joint probability is an integral over the power of
+        the first segment's looks. Given it, the power of the second segment's looks is a
+        noncentral chi-square variable.
+
+        Common speckle: with a correlation of 1 the joint probability is the mean over the speckle
+        of the product of both probabilities. With a smaller correlation the segments have a
+        fraction of the covariance at correlation 1: that which two Rayleigh magnitudes of the same
+        probabilities have. Partially correlated looks are treated likewise
+        (:mod:`sweep.model.detection.look_speckle`).
         """
         from scipy import stats
 
@@ -376,29 +433,37 @@ class Looks(NamedTuple):
             (pd_first, pd_second), weight = self.pd_given_speckle(
                 (a, b), threshold_ratio, look_speckle
             )
-            mean_pds = [
+            mean_pd_first, mean_pd_second = (
                 (conditional * weight).sum(axis=-1) for conditional in (pd_first, pd_second)
-            ]
-            shared = (pd_first * pd_second * weight).sum(axis=-1) - mean_pds[0] * mean_pds[1]
+            )
+            covariance = (pd_first * pd_second * weight).sum(
+                axis=-1
+            ) - mean_pd_first * mean_pd_second
             shared_fraction = self._shared_fraction(p, q, correlation, look_speckle)
             return np.where(
-                is_defined, np.clip(p * q + shared_fraction * shared, 0.0, np.minimum(p, q)), np.nan
+                is_defined,
+                np.clip(p * q + shared_fraction * covariance, 0.0, np.minimum(p, q)),
+                np.nan,
             )
         echo_fractions = (np.square(v) / (2 + np.square(v)) for v in (a, b))
-        shared = np.minimum(
+        squared_correlation = np.minimum(
             np.square(correlation) * np.prod(list(echo_fractions), axis=0), 1 - 1e-9
         )
         y, z = (np.square(threshold_ratio) / (2 + np.square(v)) for v in (a, b))
         if self.combine == COMBINE_BINARY:
-            p_both = joint_pd_in_speckle(np.exp(-y), np.exp(-z), infinite_threshold, shared**0.5)
+            p_both = joint_pd_in_speckle(
+                np.exp(-y), np.exp(-z), infinite_threshold, squared_correlation**0.5
+            )
             return np.where(
                 is_defined, p - self.p_votes_first_only(np.exp(-y), np.exp(-z), p_both), np.nan
             )
-        n, inverse_remainder = self.number, 1 / (1 - shared)
+        n, inverse_remainder = self.number, 1 / (1 - squared_correlation)
         with np.errstate(divide="ignore"):
-            # Chance of the first at which the second's mean is at its threshold: a step if alike.
+            # Upper-tail probability of the first segment's power at which the mean of the second's
+            # is at the threshold. The integrand is a step there if both are fully correlated.
             step_probability = special.gammaincc(
-                n, np.maximum((n * z - n * (1 - shared)) / shared, 0.0)
+                n,
+                np.maximum((n * z - n * (1 - squared_correlation)) / squared_correlation, 0.0),
             )
         node, weight = _gauss_in_intervals(
             np.stack([0 * p, np.minimum(step_probability, p), p], axis=-1)
@@ -407,10 +472,10 @@ class Looks(NamedTuple):
             2 * inverse_remainder[..., None] * special.gammainccinv(n, np.maximum(node, 1e-300))
         )
         signal, threshold_ratio = (
-            shared[..., None] * conditional,
+            squared_correlation[..., None] * conditional,
             2 * (inverse_remainder * n * z)[..., None],
         )
-        # Of a large signal the root is normal, within 1e-4.
+        # The root of a noncentral chi square of a large signal is normal, within 1e-4.
         root_difference = np.sqrt(signal + 2 * n - 1) - np.sqrt(threshold_ratio)
         p_cross = special.ndtr(root_difference * np.sqrt((signal + 2 * n) / (signal + n)))
         is_small = signal < 1e4
@@ -428,7 +493,17 @@ class Looks(NamedTuple):
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> np.ndarray:
-        """Part that two segments have of the covariance which they would have in one speckle."""
+        """Return the covariance of two segments' detections over that in the same speckle, 0..1.
+
+        Parameters
+        ----------
+        p, q
+            Probabilities of detection of the two segments.
+        correlation
+            Modulus of the correlation of the segments' signal amplitudes.
+        look_speckle
+            Correlation of the looks' speckle if it is partial.
+        """
         from sweep.model.detection.echo_detection import joint_pd_in_speckle
 
         infinite_threshold = np.full(np.shape(p), 1e100)
@@ -445,7 +520,7 @@ class Looks(NamedTuple):
         return np.asarray(inverse_looks * fraction + (1 - inverse_looks) * np.square(correlation))
 
     def _effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
-        """Return M, the number of looks of independent speckle that these are worth."""
+        """Return the number M of looks of independent speckle equivalent to all looks."""
         if look_speckle is not None:
             return np.asarray(look_speckle.effective_looks.mean(axis=0))
         return float(self.number if self.has_independent_speckle else 1)
@@ -458,28 +533,30 @@ class Looks(NamedTuple):
         pd: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
     ) -> DetectionArrays:
-        """Return the probabilities that at least two of three segments, or fewer, are detected.
+        """Return the probabilities that two or more of three segments are detected, or fewer.
 
         Parameters
         ----------
         signals
-            |X| of their bins over the noise per quadrature, (3, n).
+            (3, n): root mean square |X| of the segments' bins over the noise per quadrature.
         threshold_ratio
-            Threshold over the same, (n,).
+            (n,): threshold over the same.
         correlations
-            Correlations of up and Doppler, up and down, Doppler and down segment, (3, n).
+            (3, n): moduli of the correlations of up and Doppler, up and down, Doppler and down
+            segment.
         pd
-            Of the segments, (3, n).
+            (3, n): probability of detection of each segment.
+        look_speckle
+            Correlation of the looks' speckle if it is partial.
 
         Notes
         -----
-        Segment i shares a common speckle in a part l_i of cases and else has its own, with
-        l_i l_j the part that :meth:`joint_pd_in_speckle` gives two segments. Given that speckle
-        segments
-        are independent, with probabilities l_i P_i(speckle) + (1 - l_i) P_i. If all looks have one
-        speckle, segments are detected as :func:`pd_and_miss_any_two_in_speckle` has it of three
-        magnitudes with the
-        same probabilities. The result is the mean of both, with weights 1 - 1/M and 1/M.
+        The result is the mean of two laws, with weights 1 - 1/M and 1/M for M effective looks. In
+        the first law segment i has a common speckle with probability l_i, and else an independent
+        one. l_i l_j is the fraction of covariance in :meth:`joint_pd_in_speckle`. Given the common
+        speckle, segments are independent and detected with l_i P_i(speckle) + (1 - l_i) P_i. The
+        second law is :func:`pd_and_miss_any_two_in_speckle` of three magnitudes with the same
+        probabilities.
         """
         from sweep.model.detection.echo_detection import at_least_two_of_three
 
@@ -520,10 +597,17 @@ class Looks(NamedTuple):
         )
 
     def log_pfa(self, threshold_ratio: np.ndarray) -> np.ndarray:
-        """Natural logarithm of the probability that a bin of noise alone is detected.
+        """Return the natural logarithm of the probability that a bin of noise alone is detected.
 
-        It keeps its digits where the probability itself leaves float64's range.
+        It is precise even where the probability itself underflows.
 
+        Parameters
+        ----------
+        threshold_ratio
+            Threshold over the noise per quadrature of one record.
+
+        Examples
+        --------
         >>> round(float(Looks(4).log_pfa(np.array(2.0))), 4)  # ln Q(4, 8)
         -3.1611
         """
@@ -552,9 +636,14 @@ class Looks(NamedTuple):
         return np.asarray(np.sqrt(-2 * np.asarray(log_pfa)))
 
     def decisive_magnitude(self, magnitudes: np.ndarray) -> np.ndarray:
-        """Of |X| of each record (N, ...) that which is at or above the threshold if it detects.
+        """Return the magnitude that reaches the threshold if and only if the looks detect the bin.
 
-        The root of the mean power, or the least of the largest that are enough.
+        It is the root of the mean power, or the M-th largest |X| for M votes.
+
+        Parameters
+        ----------
+        magnitudes
+            (N, ...): |X| in each record.
         """
         if self.combine == COMBINE_BINARY:
             return np.asarray(np.sort(magnitudes, axis=0)[-self.votes])
@@ -563,12 +652,25 @@ class Looks(NamedTuple):
     def p_stay_given_neighbour_crosses(
         self, threshold_ratio: np.ndarray, correlation: float
     ) -> np.ndarray:
-        """Probability that a bin of noise is not detected where its neighbour is, by the threshold.
+        """Return the probability that a noise bin is not detected, given that its neighbour is.
 
-        ``correlation`` is that of their noise, 0..1. Of sums of powers by the Gamma distribution of
-        two variables [Kibble, Sankhya 5, 137, 1941]: with r = correlation^2, both cross with
+        Parameters
+        ----------
+        threshold_ratio
+            Threshold b over the noise per quadrature of one record.
+        correlation
+            Correlation of the two bins' noise, 0..1.
+
+        Notes
+        -----
+        Sums of powers have a bivariate Gamma distribution [1]_. With r = correlation^2 and
+        Y = N b^2 / 2, both bins cross with
 
             sum_j C(N+j-1, j) (1-r)^N r^j Q(N+j, Y / (1-r))^2.
+
+        References
+        ----------
+        .. [1] W. F. Kibble, "A two-variate gamma type distribution," Sankhya 5, 137, 1941.
         """
         from sweep.model.detection.marcum import marcum_q1
 
@@ -607,10 +709,12 @@ class Looks(NamedTuple):
     def p_votes_first_only(
         self, p_first: np.ndarray, p_second: np.ndarray, p_both: np.ndarray
     ) -> np.ndarray:
-        """Probability that the first of two bins has enough records, and the second has not.
+        """Return the probability that enough records cross in the first of two bins only.
 
-        ``p_first``, ``p_second`` and ``p_both`` are the probabilities that a record crosses in the
-        first, in the second and in both.
+        Parameters
+        ----------
+        p_first, p_second, p_both
+            Probabilities that a record crosses in the first bin, in the second, and in both.
         """
         from scipy import stats
 
@@ -631,27 +735,42 @@ class Looks(NamedTuple):
         return probability
 
     def added_crossing_probability(self, signal: np.ndarray, threshold_ratio: float) -> np.ndarray:
-        """Compute the crossing probability that bins' signals add, over noise's of not crossing.
+        """Compute the crossing probability that bins' signals add to noise.
 
-        ``signal`` (m,) over the noise per quadrature of one record, at one level. By a table over
-        the signal, within 1e-4 of it.
+        Parameters
+        ----------
+        signal
+            (m,): |X| without noise over the noise per quadrature of one record.
+        threshold_ratio
+            Threshold over the same.
+
+        Returns
+        -------
+        numpy.ndarray
+            (m,): increase of the crossing probability, over the probability that noise alone does
+            not cross. It is interpolated in a table, within 1e-4 of its value.
         """
         log_signals, log_added = _added_crossing_table(self, float(threshold_ratio))
         with np.errstate(divide="ignore"):
             log_signal = np.log(np.asarray(signal, float))
         log_probability = np.interp(log_signal, log_signals, log_added, left=-np.inf)
-        is_below_table = log_signal < log_signals[0]  # as the square of the signal
+        log_signal_min, log_added_min = log_signals[0], log_added[0]
+        is_below_table = log_signal < log_signal_min  # proportional to the square of the signal
         return np.exp(
             np.where(
-                is_below_table, log_added[0] + 2 * (log_signal - log_signals[0]), log_probability
+                is_below_table, log_added_min + 2 * (log_signal - log_signal_min), log_probability
             )
         )
 
     def negligible_signal_ratio(
         self, *, leakage_probability: np.ndarray, threshold_ratio: np.ndarray, n_bins: int
     ) -> np.ndarray:
-        """|X| over sigma below which a bin of several records counts as noise alone."""
-        # Where tables begin chances rise as the signal's square.
+        """Return the signal [sigma of one record] below which bins may count as noise alone, (n,).
+
+        Parameters are as of
+        :func:`sweep.model.detection.echo_detection.negligible_signal_ratio`.
+        """
+        # At small signals the added probability is proportional to the signal's power.
         added_per_signal_power = (
             np.array(
                 [
@@ -686,10 +805,17 @@ class Looks(NamedTuple):
     def speckle_power_quadrature(
         self, look_speckle: "LookSpeckle | None", segment: int, point: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Powers of the speckle of all looks together, of mean 1, and weights, which add to 1.
+        """Return nodes and weights of a mean over the speckle power that all looks have together.
 
-        Their mean power is taken to be a gamma variable, of the shape M of as many independent
-        looks. ``look_speckle`` is that of looks which share it in part.
+        The power, of mean 1, is treated as a gamma variable whose shape is the number M of looks of
+        independent speckle. Weights have the sum 1.
+
+        Parameters
+        ----------
+        look_speckle
+            Correlation of the looks' speckle if it is partial.
+        segment, point
+            Indices in ``look_speckle``.
         """
         gamma_shape = float(self.number if self.has_independent_speckle else 1)
         if look_speckle is not None:
@@ -705,16 +831,25 @@ class Looks(NamedTuple):
         *signals: np.ndarray,
         gamma_shape: np.ndarray | float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds.
+        """Return nodes and weights (..., k) of a mean over the magnitude of speckle.
 
-        Its power is a gamma variable of a ``gamma_shape`` (...), exponential for 1.
+        Nodes are dense where the signals cross the threshold.
+
+        Parameters
+        ----------
+        threshold_ratio
+            (...): threshold over the noise per quadrature.
+        *signals
+            (...): root mean square |X| of each segment over the same.
+        gamma_shape
+            Shape of the gamma distribution of the speckle's power, of mean 1; 1 is exponential.
         """
         squared_threshold, magnitude_max = (
             np.square(threshold_ratio),
             np.full(threshold_ratio.shape, 7.0),
         )
         interval_ends = [0 * magnitude_max, magnitude_max]
-        # Enough votes come and go within a part of what one record takes.
+        # The vote's probability changes within a fraction of one record's transition width.
         n_pieces = 2 if self.combine == COMBINE_POWER else 2 + math.isqrt(self.number)
         snr_at_threshold = np.maximum(squared_threshold - 2, 0.0)
         width = 16 * np.sqrt((snr_at_threshold + 1) / self.n_power_averaged)
@@ -742,17 +877,31 @@ class Looks(NamedTuple):
 
 
 SINGLE_LOOK = Looks()
-"""A record of each segment."""
+"""One record of each segment."""
 
 
 def coherent_gain(
     looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, look_period: np.ndarray
 ) -> np.ndarray:
-    """Amplitude of the mean of records over that of one, by the acceleration from look to look.
+    """Return the amplitude of the mean of coherent looks over that of one, under acceleration.
 
-    |mean exp(2 pi i f a t^2 / c)|, t the looks' times about their middle: what a velocity that is
-    put right leaves. A laser's walking phase leaves the root of
-    :func:`sweep.model.effects.line_width.coherent_power_fraction` besides.
+    Parameters
+    ----------
+    looks
+        Number of coherent looks.
+    acceleration
+        Radial acceleration a [m/s^2].
+    carrier
+        Optical frequency f [Hz].
+    look_period
+        Time from one look to the next [s].
+
+    Returns
+    -------
+    numpy.ndarray
+        |mean exp(2 pi i f a t^2 / c)|, 0..1, with the looks' times t about their middle. The phase
+        of a steady velocity is corrected. A laser's phase noise reduces the amplitude further, by
+        the root of :func:`sweep.model.effects.line_width.coherent_power_fraction`.
     """
     look_index = np.arange(looks.n_coherent) - (looks.n_coherent - 1) / 2
     cycles_per_square_index = np.asarray(
@@ -766,8 +915,12 @@ def coherent_gain(
 def solve_threshold_ratio(
     log_pfa: np.ndarray, log_pfa_law: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Find the threshold over sigma (n,) at which ``log_pfa_law``, falling, is a given ln(pfa)."""
-    # A bin alone alarms less often than n of them, and these no oftener than n each for itself.
+    """Return the threshold over sigma (n,) at which ln(pfa) has a given value, by bisection.
+
+    ``log_pfa_law`` is the decreasing function from the threshold to ln(pfa); ``log_pfa`` (n,) are
+    the given values.
+    """
+    # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
     for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
@@ -781,23 +934,39 @@ def pd_and_miss_any_two_in_speckle(
 ) -> DetectionArrays:
     """Return the probabilities that two or more of three segments in speckle are detected, or not.
 
-    The amplitude of each segment, signal and noise, is normal, of the part l_i z of one common
-    amplitude z and a rest of its own. With A_i = Th^2 over the mean power, u = |z|^2 exponential,
+    Parameters
+    ----------
+    pd, miss
+        (3, n): probabilities of detection and of a miss of each segment.
+    threshold_ratio
+        (n,): threshold Th over the noise per quadrature.
+    correlations
+        (3, n): moduli of :class:`sweep.model.detection.echo_detection.SegmentCorrelations`.
 
-        P_i(u) = Q_1(l_i sqrt(2 u / (1 - l_i^2)), sqrt(2 A_i / (1 - l_i^2)))
+    Returns
+    -------
+    DetectionArrays
+        (n,); nan where the pd of a segment is.
 
-    and given u the segments are independent. The correlations, those of
-    :func:`sweep.model.detection.echo_detection.joint_pd_in_speckle` by
-    :class:`sweep.model.detection.echo_detection.SegmentCorrelations`, give l_i
-    = sqrt(rho_ij rho_ik / rho_jk): exact for segments that share their speckle, or each have their
-    own. If speckle moves on between them one l_k may come out above 1. It is then 1, z is that
-    segment's own amplitude, and of the others a covariance kappa = rho_ij - rho_ik rho_jk is left,
-    which adds to the probability of both
+    Notes
+    -----
+    The amplitude of each segment, signal plus noise, is complex Gaussian: l_i z with an amplitude z
+    common to all segments, plus an independent remainder. With A_i = Th^2 over the mean power, and
+    u = |z|^2 exponential, segment i is detected given u with
+
+        P_i(u) = Q_1(l_i sqrt(2 u / (1 - l_i^2)), sqrt(2 A_i / (1 - l_i^2))),
+
+    independently of the others. From the correlations rho of signal plus noise follows
+    l_i = sqrt(rho_ij rho_ik / rho_jk), which is exact for common and for independent speckle.
+
+    If the speckle moves between segments, one l_k may exceed 1. It is then set to 1, so that z is
+    the amplitude of that segment. The other two have a remaining covariance
+    kappa = rho_ij - rho_ik rho_jk, which adds to their joint probability
 
         kappa P_i' P_j' / 2 + kappa^2 (A_i A_j + B_i B_j) / 16,    A, B = P'' +- P' / r
 
-    with derivatives by r, the mean given z: Mehler's series to its second term, within 0.002 of
-    drawn amplitudes.
+    with derivatives by r, the mean given z. This is Mehler's series to its second term, within
+    0.002 of drawn amplitudes.
     """
     from sweep.model.detection.echo_detection import at_least_two_of_three
     from sweep.model.detection.marcum import marcum_q1
@@ -860,9 +1029,11 @@ def pd_and_miss_any_two_in_speckle(
             * 2
             / np.sqrt(remainder[i] * remainder[j])[points]
         )
-        slope, plus, minus = _marcum_q1_derivatives(signal[pair_points], threshold[pair_points])
-        square_term = (plus[0] * plus[1] + minus[0] * minus[1]) * np.square(kappa[:, None]) / 16
-        pair_excess = kappa[:, None] * slope[0] * slope[1] / 2 + square_term
+        (slope_i, slope_j), (plus_i, plus_j), (minus_i, minus_j) = _marcum_q1_derivatives(
+            signal[pair_points], threshold[pair_points]
+        )
+        square_term = (plus_i * plus_j + minus_i * minus_j) * np.square(kappa[:, None]) / 16
+        pair_excess = kappa[:, None] * slope_i * slope_j / 2 + square_term
         excess[points] = pair_excess * (p_stay[k, points] - p_cross[k, points])
     probabilities = (
         at_least_two_of_three(p_cross, p_stay) + excess,
@@ -872,7 +1043,7 @@ def pd_and_miss_any_two_in_speckle(
         np.clip((values * weight).sum(axis=-1), 0.0, 1.0) for values in probabilities
     )
     total = p_cross + p_stay  # 1 but for the quadrature
-    # A segment that is never detected has no threshold: what stands for it above is too low.
+    # A segment that is never detected has an infinite threshold, which was clipped above.
     is_possible = np.count_nonzero(pd > 0.0, axis=0) >= 2
     p_cross, p_stay = np.where(is_possible, [p_cross / total, p_stay / total], [[0.0], [1.0]])
     return DetectionArrays(
@@ -883,7 +1054,7 @@ def pd_and_miss_any_two_in_speckle(
 def _marcum_q1_derivatives(
     signal_ratio: np.ndarray, threshold_ratio: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q_1' and Q_1'' +- Q_1' / a by the signal a, at the threshold b."""
+    """Return Q_1'(a, b), Q_1'' + Q_1' / a and Q_1'' - Q_1' / a, derivatives by the signal a."""
     x = np.maximum(signal_ratio * threshold_ratio, 1e-12)
     # special.ive is nan from arguments of 1e9 on.
     scaled_i0, scaled_i1 = (
@@ -896,7 +1067,7 @@ def _marcum_q1_derivatives(
 
 
 def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss points and weights of the stretches between ends (..., k), all behind one another."""
+    """Return Gauss points and weights of all intervals between successive ends (..., k)."""
     node, weight = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     half_width = 0.5 * np.diff(interval_ends, axis=-1)[..., None]
     position = interval_ends[..., :-1, None] + half_width * (node + 1)
@@ -907,7 +1078,10 @@ def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @lru_cache(maxsize=4096)
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of signals and of what :meth:`Looks.added_crossing_probability` has for them."""
+    """Return ln(signal) and ln(added crossing probability), the table behind the interpolation.
+
+    See :meth:`Looks.added_crossing_probability`.
+    """
     signal = np.geomspace(1e-3 / math.sqrt(looks.number), threshold_ratio + 1.0, 300)
     noise = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))
     p_cross = looks.pd_and_miss_steady(signal, np.full(signal.shape, threshold_ratio)).pd

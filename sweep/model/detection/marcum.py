@@ -2,17 +2,17 @@
 
 ``Q1(a, b)`` is the probability that a Rice-distributed magnitude of amplitude ``a`` (in units of
 the noise per quadrature) exceeds ``b``: the detection probability [T 3.3]; ``Q1(0, b)`` is the
-false alarm probability [T 3.4]. Both tails are computed as sums of positive terms, each from the
-side on which it is small, and the other as its complement, so neither loses digits.
+false alarm probability [T 3.4]. The smaller tail is computed as a sum of positive terms, and the
+other as its complement, so neither loses precision.
 
-Below ``ab = 30`` the series of Bessel functions is summed by backward recurrence (Miller). From
-there on the integral over the imaginary axis is summed by the midpoint rule with the residue of its
-pole put back. Arguments are (a, b), not their squares, which could not tell a from b when both are
-large.
+Below ``ab = 30`` the series of Bessel functions is summed by backward recurrence (Miller). Above,
+the integral over the imaginary axis is summed by the midpoint rule, with a correction by the
+residue of its pole. Arguments are (a, b) and not their squares, whose difference would lose
+precision when both are large.
 
-A false alarm somewhere among 1e5 bins, each with a probability of 1e-21 or 1e-2000 [T 3.7]: neither
-the naive ``1 - (1-p)^n``, which is 0 below p = 1e-16, nor float64's range will do. Hence
-log1p/expm1 for probabilities, and a form that takes and returns natural logarithms.
+The probability of a false alarm in 1e5 bins [T 3.7] is needed for probabilities per bin of 1e-21 or
+1e-2000. ``1 - (1-p)^n`` is 0 below p = 1e-16, and float64 ends at 1e-308. Hence log1p and expm1 are
+used for probabilities, and another form takes and returns natural logarithms.
 """
 
 import math
@@ -25,6 +25,7 @@ from sweep.kernel_cache import njit
 from sweep.model.elementary_functions import exact_product
 
 _SERIES_PRODUCT_MAX = 30.0
+"""Largest product a b for which the series of Bessel functions is used."""
 _MIDPOINT_STEP = 0.7
 """Step h of the midpoint rule: its error is exp(-(2 pi / h)^2 / 2) = 3e-18 of the result."""
 
@@ -33,7 +34,7 @@ _MIDPOINT_WEIGHTS = tuple(_MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in
 _POLE_REACH = 2.0 * math.pi / _MIDPOINT_STEP
 
 _SQUARED_DISTANCE_MAX = 1500.0
-"""(a - b)^2 from which on the smaller tail, exp of minus half of it, is 0 to float64."""
+"""(a - b)^2 above which the smaller tail, about exp(-(a - b)^2 / 2), is 0 in float64."""
 
 # Excess crossings, K terms: 1/(m+1) and 1/m^2 for m = K .. 1, so that no step divides.
 _EXCESS_TERMS_MAX = 24
@@ -46,7 +47,10 @@ _LOG_P_TINY = -600.0
 
 
 class Tails(NamedTuple):
-    """Both tails of a magnitude |X| at a threshold, each with all its digits; they add to 1."""
+    """Probabilities that a magnitude |X| is above and below a threshold, of the sum 1.
+
+    Both are precise where they are small.
+    """
 
     above: float
     """P(|X| >= threshold), 0..1."""
@@ -55,20 +59,27 @@ class Tails(NamedTuple):
 
 
 class MarcumQ(NamedTuple):
-    """Both tails of the Rice distribution, of one common shape."""
+    """Both tails of the Rice distribution, arrays of one shape."""
 
     q: np.ndarray
     """Q1(a, b), the probability to exceed b; 0..1."""
     p: np.ndarray
-    """1 - Q1(a, b); 0..1, with its own digits where Q1 is near 1."""
+    """1 - Q1(a, b); 0..1. Precise where Q1 is near 1."""
 
 
 def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
-    """First-order Marcum Q function and its complement [T 3.3], of the broadcast shape.
+    """Compute the first-order Marcum Q function and its complement [T 3.3].
 
-    `a` and `b`, >= 0, are signal and threshold over the noise per quadrature; nan outside the
-    domain and where both are infinite. Relative error at most 2e-15 while results stay above
-    float64's smallest normal number.
+    Parameters
+    ----------
+    a, b
+        Signal and threshold over the noise per quadrature, >= 0.
+
+    Returns
+    -------
+    MarcumQ
+        Of the broadcast shape; nan outside the domain and where both arguments are infinite. The
+        relative error is at most 2e-15 for results above float64's smallest normal number.
     """
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     tails = np.empty((2, a.size))
@@ -78,7 +89,7 @@ def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
 
 @njit(cache=True, error_model="numpy")
 def _fill_tails(a, b, q, p):
-    """Fill ``q`` and ``p`` (n,) with Q1(a, b) and 1 - Q1(a, b) of n pairs."""
+    """Fill ``q`` and ``p`` (n,) with Q1(a, b) and 1 - Q1(a, b) for n pairs of arguments."""
     for i in range(a.size):
         tails = marcum_q1_tails(a[i], b[i])
         q[i], p[i] = tails.above, tails.below
@@ -86,17 +97,30 @@ def _fill_tails(a, b, q, p):
 
 @njit(cache=True, error_model="numpy")
 def marcum_q1_tails(a, b):
-    """Return Q1(a, b) and 1 - Q1(a, b) of one pair as :class:`Tails`; nan outside the domain.
+    """Return Q1(a, b) and 1 - Q1(a, b) of one pair of arguments as :class:`Tails`.
 
+    Parameters
+    ----------
+    a, b
+        Signal and threshold over the noise per quadrature, >= 0. The result is nan outside the
+        domain.
+
+    Notes
+    -----
     The tail that is computed is Q1 if b >= a, else 1 - Q1. Below b = 1.2, where Q1 is near 1 for
-    any a, it is always 1 - Q1. Its exponential, exp(-(a - b)^2 / 2), is carried in two doubles.
+    any a, it is always 1 - Q1. Its factor exp(-(a - b)^2 / 2) is computed in double-double
+    arithmetic.
 
-    Below ab = 30, Q1 = exp(-(a^2+b^2)/2) sum_{k>=0} (a/b)^k I_k(ab), and 1 - Q1 the same from k = 1
-    with a and b exchanged. The recurrence N_k = 2k N_{k+1} + (ab)^2 N_{k+2}, started at k = K from
-    (1, 0), gives I_k / I_0 = (ab)^k N_{k+1} / N_1; exp(ab) = I_0 + 2 sum I_k sets the scale.
+    For ab < 30, Q1 = exp(-(a^2+b^2)/2) sum_{k>=0} (a/b)^k I_k(ab), and 1 - Q1 is the same sum from
+    k = 1 with a and b exchanged. The recurrence N_k = 2k N_{k+1} + (ab)^2 N_{k+2}, started at k = K
+    from (1, 0), gives I_k / I_0 = (ab)^k N_{k+1} / N_1. The scale follows from exp(ab) = I_0 + 2
+    sum I_k.
 
-    Elsewhere, with d = |a - b|, h/pi sum_k exp(-v/2) (b d +- v/2) / ((d^2 + v) sqrt(ab - v/4)),
-    v = (h (k + 1/2))^2, with + for Q1; written in ratios of a and b so that it cannot overflow.
+    Elsewhere, with d = |a - b| and the step h, the tail is
+
+        h/pi sum_k exp(-v/2) (b d +- v/2) / ((d^2 + v) sqrt(ab - v/4)),    v = (h (k + 1/2))^2,
+
+    with + for Q1. It is written in ratios of a and b so that it cannot overflow.
     """
     if not (a >= 0.0 and b >= 0.0) or (math.isinf(a) and math.isinf(b)):
         return Tails(math.nan, math.nan)
@@ -138,15 +162,23 @@ def marcum_q1_tails(a, b):
 
 @njit(cache=True, error_model="numpy")
 def marcum_q1_excess(a, b):
-    """Return the crossing probability that a bin's signal adds, Q1(a, b) - Q1(0, b); nan outside.
+    """Return the crossing probability that a bin's signal adds to noise, Q1(a, b) - Q1(0, b).
 
-    If the sum is short (a <= 2 and ab <= 8; a leaking bin), with x = a^2/2 and y = b^2/2,
+    Parameters
+    ----------
+    a, b
+        Signal and threshold over the noise per quadrature, >= 0. The result is nan outside the
+        domain. Its relative error is at most 2e-15.
+
+    Notes
+    -----
+    For weak signals (a <= 2 and ab <= 8), with x = a^2/2, y = b^2/2 and Kummer's function M, the
+    result is
 
         exp(-x-y) sum_{m>=1} (x y)^m / m!^2  M(1, m+1, x),
 
-    all of it positive (M is Kummer's function; from dQ1/da = b exp(-x-y) I1(ab)), so the result
-    keeps its digits down to ``exp(-y) x y`` for a -> 0. Elsewhere it is a difference of tails in
-    which at most a bit or two cancels. Relative error at most 2e-15.
+    from dQ1/da = b exp(-x-y) I1(ab). All terms are positive, so the result is precise down to
+    ``exp(-y) x y`` for a -> 0. Elsewhere it is a difference of tails that loses at most two bits.
     """
     if not (a >= 0.0 and b >= 0.0):
         return math.nan
@@ -165,7 +197,7 @@ def marcum_q1_excess(a, b):
         low += x - ((high + x) - high)
         decay = math.exp(-(high + x))
         kummer, total = 1.0, 0.0
-        for m in range(terms, 0, -1):  # from the last on, M by its recurrence
+        for m in range(terms, 0, -1):  # backwards, with M by its recurrence
             kummer = x * _HARMONIC[m] * kummer + 1.0
             total = (w * _INVERSE_SQUARE[m]) * (kummer + total)
         return (decay - decay * low) * total
@@ -178,9 +210,10 @@ def marcum_q1_excess(a, b):
 
 
 def at_least_one_probability(p: ArrayLike, n: ArrayLike) -> np.ndarray:
-    """Probability 1 - (1-p)^n of at least one success in n independent tries [T 3.7], 0..1.
+    """Return the probability 1 - (1-p)^n of at least one success in n independent trials [T 3.7].
 
-    `n` >= 0 need not be whole (a mean number of independent bins). Relative error at most 1e-15.
+    `n` >= 0 need not be an integer (a mean number of independent bins). The relative error is at
+    most 1e-15.
     """
     p, n = np.asarray(p, float), np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -188,18 +221,27 @@ def at_least_one_probability(p: ArrayLike, n: ArrayLike) -> np.ndarray:
 
 
 def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
-    """Natural logarithm of 1 - (1-p)^n, from ln p <= 0 and n, 0..1e240; -inf where p or n is 0.
+    """Return ln(1 - (1-p)^n), of the probability of at least one success in n independent trials.
 
-    Relative error at most 1e-15 while n p < 1, at any ln p. Near certainty the result is minus the
-    probability (1-p)^n of none. The rounding of ln p alone moves that by up to n p / (1-p) parts in
-    1e16, and the error stays within 2 + n p / (1-p) parts in 2e15.
+    Parameters
+    ----------
+    log_p
+        ln p <= 0.
+    n
+        Number of trials, 0..1e240; need not be an integer.
+
+    Returns
+    -------
+    numpy.ndarray
+        -inf where p or n is 0. The relative error is at most 1e-15 for n p < 1, at any ln p. Near
+        certainty the result is about -(1-p)^n. Rounding of ln p alone changes that by up to
+        n p / (1-p) parts in 1e16, and the error is within 2 + n p / (1-p) parts in 2e15.
     """
     log_p, n = np.asarray(log_p, float), np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore", under="ignore"):
         p_none_once, is_likely = -np.expm1(log_p), log_p > -_LN2
         exponent = n * np.where(is_likely, np.log(p_none_once), np.log1p(-np.exp(log_p)))
-        # Where p is large, 1-p carries the digits, and its power keeps them where exp(n ln(1-p))
-        # loses some.
+        # For large p, powers of 1-p are more precise than exp(n ln(1-p)).
         p_none_of_n = np.where(is_likely, p_none_once**n, np.exp(exponent))
         log_p_if_rare = np.log(-np.expm1(exponent))
         log_probability = np.where(exponent > -_LN2, log_p_if_rare, np.log1p(-p_none_of_n))
@@ -208,9 +250,10 @@ def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
 
 
 def log_either_probability(log_p_first: np.ndarray, log_p_second: np.ndarray) -> np.ndarray:
-    """Natural logarithm of the probability of either of two independent events, from theirs.
+    """Return the logarithm of the probability of at least one of two independent events.
 
-    ln(p + q (1 - p)) <= 0, with their digits; -inf where neither happens.
+    It is ln(p + q (1 - p)), from ln p (``log_p_first``) and ln q (``log_p_second``); -inf where
+    both probabilities are 0.
     """
     with np.errstate(divide="ignore"):
         return np.minimum(

@@ -1,8 +1,8 @@
-"""False alarms of noise alone, in closed form, and what a published figure says of the noise.
+"""False alarms of noise alone in closed form, and the noise that follows from published figures.
 
-A bin of noise crosses the threshold of TNR standard deviations of its magnitude with probability
-p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a shot raise a false alarm in N bins each with
-probability (1 - (1 - p)^N)^2: what Tables 4.3 to 4.5 of the thesis print.
+A bin of noise crosses the threshold of TNR standard deviations of its magnitude with the
+probability p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a shot, of N bins each, raise a
+false alarm with the probability (1 - (1 - p)^N)^2, as printed in Tables 4.3 to 4.5 of the thesis.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from sweep.model.threshold import segment_alarm_bins
 
 
 def bin_pfa_exponent(tnr: float) -> float:
-    """X = (4 - pi)/4 TNR^2, minus the logarithm of a bin's false-alarm probability."""
+    """Return x = (4 - pi)/4 TNR^2, the negative logarithm of a bin's false-alarm probability."""
     return (4 - math.pi) / 4 * tnr**2
 
 
 def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
-    """Probability that a bin of noise alone crosses the threshold [Table 4.2], 0..1."""
+    """Return the probability that a bin of noise alone crosses the threshold [T Table 4.2]."""
     if looks.is_noncoherent:
         return math.exp(looks.log_pfa(np.asarray(tnr * RAYLEIGH_DEVIATION)))
     return math.exp(-bin_pfa_exponent(tnr))
@@ -34,7 +34,17 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
 def alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
-    """Independent bins with the false alarms of a segment, by the probability of one in a bin."""
+    """Return the number of independent bins that raise a false alarm as often as a segment.
+
+    Parameters
+    ----------
+    parameters
+        Parameters by dotted path.
+    pfa_in_bin
+        Probability of a false alarm in one bin, which gives the threshold.
+    segment
+        Name of the segment.
+    """
     threshold_ratio = Looks.from_parameters(parameters).threshold_ratio_from_log_pfa(
         np.log(np.maximum(pfa_in_bin, 1e-300))
     )
@@ -42,20 +52,27 @@ def alarm_equivalent_bins(
 
 
 def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
-    """Probability of a false alarm in a segment of so many bins, 1 - (1 - p)^N, 0..1."""
+    """Return the probability of a false alarm in any of N independent bins, 1 - (1 - p)^N."""
     with np.errstate(divide="ignore"):
         return np.asarray(-np.expm1(np.asarray(n_bins) * np.log1p(-np.asarray(pfa_in_bin))))
 
 
 def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
-    """Solve exp(-x / (1 + e)) = probability in a bin for the excess e of noise variance; or nan."""
+    """Return the relative excess e of the noise variance that explains a bin's false alarms.
+
+    It solves exp(-x / (1 + e)) = ``probability``; nan unless 0 < ``probability`` < 1.
+    """
     if not 0.0 < probability < 1.0:
         return math.nan
     return -bin_pfa_exponent(tnr) / math.log(probability) - 1
 
 
 def variance_excess_from_shot_pfa(probability: float, tnr: float, n_bins: float) -> float:
-    """Solve (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability for the excess e; or nan."""
+    """Return the relative excess e of the noise variance that explains a shot's false alarms.
+
+    It solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability`` with N = ``n_bins``; nan unless
+    0 < ``probability`` < 1.
+    """
     if not 0.0 < probability < 1.0:
         return math.nan
     pfa_in_bin = -math.expm1(math.log1p(-math.sqrt(probability)) / n_bins)

@@ -1,24 +1,24 @@
-"""Developed speckle in bins near DC and Nyquist of a real record, whose quadratures differ.
+"""Developed speckle in bins near DC and Nyquist of a real record, where it is noncircular.
 
-A real record holds each line A e^(i phase) with its image, the conjugate at the opposite frequency.
-Bin k of the transform about the record's middle, of lines at the places nu with the window's
-transform G, real and even, is
+A real record holds each line A e^(i phase) and its image, the complex conjugate at the opposite
+frequency. With phases relative to the record's middle, the window's transform G is real and even.
+Bin k of lines at the positions nu is
 
     X = sum_b (A_b G(k - nu_b) + conj(A_b) G(k + nu_b)) + noise.
 
-With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number. It has the
-mean power S + 2 sigma^2, and the pseudo-variance
+With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number of the mean
+power S + 2 sigma^2 and the pseudo-variance
 
     E[X^2] = 2 sum_b P_b G(k - nu_b) G(k + nu_b) + 2 sigma^2 W2(2k) / W2(0),
 
-W2 the transform of the squared window. It is real, so that the quadratures are independent, of
-variances (1 +- q) / 2 of the mean power with q = E[X^2] / E[|X|^2]. At DC and Nyquist q is 1: the
-number is real. Some bins away q is 0, and the number is circular.
+with the transform W2 of the squared window. The pseudo-variance is real, so the quadratures are
+independent. Their variances are (1 +- q) / 2 of the mean power, with q = E[X^2] / E[|X|^2]. At DC
+and Nyquist q is 1, and X is real. Some bins away q is 0, and X is circular.
 
 The law of |X|^2 is in :mod:`sweep.model.detection.hoyt`.
 
-Phase errors within the record widen a line. They are left out of G here, as are the samples that
-the echo does not have. Neither changes q at DC, where it is 1.
+Two effects on G are neglected here: phase errors within the record, which widen a line, and missing
+samples of an echo that arrives late. Neither changes q at DC, where it is 1.
 """
 
 import math
@@ -46,16 +46,17 @@ RATIO_MIN = 0.05
 
 
 class SignalPseudoVariance(NamedTuple):
-    """Pseudo-variance ratio q of echoes near DC and Nyquist, which overlap their images there."""
+    """Pseudo-variance ratio q of echoes near DC and Nyquist, where lines overlap their images."""
 
     ratio_row: np.ndarray
-    """(segments, n) int64: point's row of ``ratio`` and ``phase_factors``; row 0, in which q is 0,
-    for echoes far from DC and Nyquist."""
+    """(segments, n) int64: row of ``ratio`` and ``phase_factors``. Row 0, in which q is 0, is that
+    of echoes far from DC and Nyquist."""
     ratio: np.ndarray
-    """(rows, bins): q by bin, counted from the nearer of DC and Nyquist."""
+    """(rows, bins): q by distance [bins] from the nearer of DC and Nyquist."""
     phase_factors: np.ndarray
-    """(rows, ANGLES): echo power at each phase node, 1 + q cos t_j times its mean in the strongest
-    bin. With ``any_bin`` detection, of the bin that is strongest at that phase."""
+    """(rows, N_PHASE_NODES): echo power at each phase node t_j over its mean over the phase, 1 + q
+    cos t_j of the strongest bin. With ``any_bin`` detection the numerator is the power of the bin
+    that is strongest at that phase."""
 
 
 def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
@@ -108,17 +109,17 @@ def mean_over_phases(
     pd_by_segment: tuple[np.ndarray, ...],
     joint_law: Callable[..., tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, ...]:
-    """Average a joint law of detection over the phases of the segments' noncircular echoes.
+    """Average a joint probability of detection over the phases of the segments' noncircular echoes.
 
     Parameters
     ----------
     phase_factors
-        (segments, n, ANGLES): relative echo power at the phase nodes, as of
+        (segments, n, N_PHASE_NODES): relative echo power at the phase nodes, as of
         :class:`SignalPseudoVariance`.
     pd_by_segment
-        For each segment (..., n): probability that it is detected.
+        (..., n) for each segment: probability that it is detected.
     joint_law
-        Function of the segments' probabilities for circular numbers; returns arrays (..., n).
+        Function from the segments' probabilities to arrays (..., n), for circular echoes.
 
     Returns
     -------
@@ -127,9 +128,9 @@ def mean_over_phases(
 
     Notes
     -----
-    At the phase t a bin is detected like a circular number of f = 1 + q cos t times the power, with
-    exp(-A / f); A is solved for, so that the mean over t is the given probability. Phases of
-    different segments are independent.
+    At the phase t a bin is detected like a circular number of f = 1 + q cos t times the mean power,
+    with exp(-A / f). A is such that the mean over t is the given probability. Phases of different
+    segments are independent.
     """
     pd_at_phases = [
         _pd_at_phases(*arguments) for arguments in zip(pd_by_segment, phase_factors, strict=True)
@@ -148,7 +149,7 @@ def mean_over_phases(
 
 
 def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
-    """Return detection probabilities exp(-A / f) at all phase nodes, (ANGLES, ..., n).
+    """Return detection probabilities exp(-A / f) at all phase nodes, (N_PHASE_NODES, ..., n).
 
     A is found by bisection so that their mean over the nodes is ``mean_pd`` (..., n).
     """
@@ -167,7 +168,7 @@ def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
 
 
 def lines_overlap_images(shots: Any) -> np.ndarray:
-    """Mark points whose lines overlap their own images at DC or Nyquist, bool (segments, n)."""
+    """Test if the lines of echoes overlap their images at DC or Nyquist, (segments, n) bool."""
     overlap_distance = _image_reach(shots.window) * shots.fft_size / shots.window.length
     position = axis_line_positions(shots)
     distance_from_end = np.minimum(position, shots.fft_size / 2 - position)
@@ -176,14 +177,14 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def n_tabulated_bins(window: Window, fft_size: int) -> int:
-    """Return the number of bins, counted from DC, whose pseudo-variance is tabulated."""
+    """Return the number of bins from DC or Nyquist whose pseudo-variance is tabulated."""
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
 
 
 @lru_cache(maxsize=64)
 def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
-    """Return the pseudo-variance ratio W2(2k) / W2(0) of white noise by bin k, (bins,)."""
+    """Return the pseudo-variance ratio W2(2k) / W2(0) of white noise in bins k >= 0, (bins,)."""
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
     bin_numbers = np.arange(n_tabulated_bins(window, fft_size))
@@ -201,7 +202,7 @@ def _image_reach(window: Window) -> float:
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Part of the looks' power below which an independent amplitude is left out."""
+"""Fraction of the looks' power below which an eigenvalue of the covariance is neglected."""
 
 
 def multilook_pd_and_miss_near_ends(
@@ -212,7 +213,7 @@ def multilook_pd_and_miss_near_ends(
     noise_pseudo_variance: np.ndarray,
     look_covariance: np.ndarray,
 ) -> DetectionArrays:
-    """Return pd and 1 - pd of a bin near DC or Nyquist for several looks in developed speckle.
+    """Return pd and miss probability of bins near DC or Nyquist in several looks in speckle.
 
     Parameters
     ----------
@@ -221,20 +222,20 @@ def multilook_pd_and_miss_near_ends(
     signal_pseudo_variance, noise_pseudo_variance
         (m,): pseudo-variance ratio q of the signal, and of the noise.
     look_covariance
-        (m, k, k) complex: that of the looks' echoes, of mean power 1, with the turn of the line's
-        phase from look to look. k = N looks, or fewer that represent them.
+        (m, k, k) complex: covariance of the echo amplitudes of k looks, of mean power 1, including
+        the rotation of the line's phase from look to look. k looks represent all N.
 
     Notes
     -----
     Let g_k be the echo's amplitude in look k. Bin X_k = u_k + i v_k has the quadratures
-    ``u = sqrt(1 + q) Re g``, ``v = sqrt(1 - q) Im g`` times the root of the signal's power, for the
-    line and its image have the phases of g and of its conjugate. Their 2N numbers are Gaussian. So
-    the sum of all |X_k|^2 is one of independent squared Gaussian variables, whose variances are the
-    eigenvalues of the quadratures' covariance matrix.
+    ``u = sqrt(1 + q) Re g``, ``v = sqrt(1 - q) Im g`` times the root of the signal's power, as the
+    line and its image have the phases of g and of its conjugate. All 2N quadratures are Gaussian.
+    The sum of all |X_k|^2 is thus one of independent squared Gaussian variables, whose variances
+    are the eigenvalues of the quadratures' covariance matrix.
 
-    Of votes the probability given the amplitudes is averaged over a fixed lattice of them, as of
-    looks far from DC. Of noise whose quadratures differ in part the probabilities of circular and
-    of real noise are averaged.
+    The probability of enough votes given the amplitudes is averaged over a fixed lattice, as for
+    looks far from DC. For noise with a pseudo-variance ratio between 0 and 1, the probabilities for
+    circular and for real noise are averaged.
     """
     signal_power = np.square(signal)
     if looks.combine == COMBINE_POWER:
@@ -271,6 +272,7 @@ def multilook_pd_and_miss_near_ends(
         n_represented = covariance_matrix.shape[-1]
 
         def mean_vote_probability(amplitudes: np.ndarray, bin_index: int = bin_index) -> float:
+            """Return the probability of enough votes, averaged over amplitudes (m, k) of looks."""
             magnitudes = np.hypot(
                 math.sqrt(1 + signal_pseudo_variance[bin_index]) * amplitudes.real,
                 math.sqrt(max(1 - signal_pseudo_variance[bin_index], 0.0)) * amplitudes.imag,

@@ -1,4 +1,4 @@
-"""Correlation of the speckle that the strongest bins of two segments of a shot see.
+"""Correlation of the speckle in the strongest bins of two segments of a shot.
 
 A scatterer of delay tau and Doppler ratio beta has, in the middle t_c of the record of a segment
 that starts at t_s, the beat phase
@@ -6,10 +6,10 @@ that starts at t_s, the beat phase
     -2 pi F tau + 2 pi F beta (t_s + t_c),    F = f + S (t_c - tau_0)                            (1)
 
 with the carrier f and the signed chirp rate S of the segment, and the delay tau_0 on the beam's
-axis. F is the optical frequency of the echo in the middle of the record. If the echo fills a part
-of the record its middle is the centroid of the window there. Between two segments the phases of
-scatterers at different places turn against each other by their difference. If all scatterers lay in
-one bin the two amplitudes, circular complex Gaussian numbers both, would have the correlation
+axis. F is the optical frequency of the echo in the middle of the record. If the echo fills only
+part of the record, t_c is the centroid of the window over that part. The phase difference between
+two segments depends on the scatterer's position. If all scatterers lie in one bin, the two
+amplitudes are circular complex Gaussian numbers with the correlation
 
     mu = E[exp(i (phase_2 - phase_1))]                                                          (2)
 
@@ -22,8 +22,8 @@ the places nu_i(y) of the lines, y the coordinate along which they spread most,
     mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
     S_i = int p G(k_i - nu_i)^2 dy                                                              (3)
 
-Lines are taken to move evenly along y. (3) thus leaves out Doppler shifts that change as the square
-of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) has.
+Line positions are taken as linear in y. (3) thus neglects Doppler shifts that change as the square
+of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) includes.
 
 The probability that both bins cross a threshold is that of two correlated Rayleigh magnitudes,
 :func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`, by |mu|.
@@ -37,7 +37,7 @@ import numpy as np
 from sweep.model.window import Window, window_samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
-"""Pairs (up, Doppler), (up, down), (Doppler, down); the order of all arrays by pair of segments."""
+"""Pairs of segments in the order of arrays: (up, Doppler), (up, down), (Doppler, down)."""
 
 LINE_SHIFT_MIN_BINS = 0.01
 """Line shift per standard deviation of the beam [bins of fs/L] below which one bin holds all
@@ -59,8 +59,8 @@ class LineGradients(NamedTuple):
     """Gradients of line position and phase across the beams of n points, along two coordinates."""
 
     line_shift: np.ndarray
-    """(n, 3, 2): line shift per standard deviation of the beam [bins of fs/N], signed as the
-    beat."""
+    """(n, 3, 2): line shift per standard deviation of the beam [bins of fs/N], with the sign of the
+    beat frequency."""
     phase: np.ndarray
     """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
 
@@ -73,7 +73,8 @@ class LinePairGradients(NamedTuple):
     """Gradients across the beam of the lines of two segments, arrays (n,)."""
 
     bin_distance: tuple[np.ndarray, np.ndarray]
-    """Distance k - nu of each segment's strongest bin from the line of the axis [bins of fs/L]."""
+    """Distance k - nu of each segment's strongest bin from the line on the beam's axis [bins of
+    fs/L]."""
     line_shift: tuple[np.ndarray, np.ndarray]
     """Line shift of each segment per standard deviation of the beam along y [bins of fs/L],
     signed."""
@@ -84,7 +85,7 @@ class LinePairGradients(NamedTuple):
 
     @property
     def line_shift_max(self) -> np.ndarray:
-        """Larger of the two spreads [bins of fs/L]."""
+        """Larger modulus of the two line shifts [bins of fs/L]."""
         return np.maximum(np.abs(self.line_shift[0]), np.abs(self.line_shift[1]))
 
     def select(self, points: np.ndarray) -> "LinePairGradients":
@@ -104,8 +105,8 @@ class LinePairGradients(NamedTuple):
 def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
     """Return the correlation mu, equation (3), of the strongest bins of two segments, (n,) complex.
 
-    If the phase turns too fast for the quadrature, the result is |mu| for a Gaussian window
-    transform of the same half-width, which is close to 0 there.
+    If the phase varies too fast over y for the quadrature, the result is |mu| for a Gaussian window
+    transform of the same half-width, which is close to 0 then.
     """
     from sweep.model.detection.speckle_correlation_integral import (
         fill_peak_bin_correlation,  # a compiler is slow to import
@@ -116,6 +117,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
     )
     is_resolved = np.abs(gradients.phase_difference) * half_interval <= _RESOLVED_PHASE_MAX
     correlation = _gaussian_correlation(window, gradients).astype(complex)
+    _, transform = transform_table(window)
     fill_peak_bin_correlation(
         np.flatnonzero(is_resolved),
         half_interval,
@@ -123,7 +125,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
         np.stack(gradients.line_shift),
         gradients.phase_difference,
         gradients.power_slope,
-        transform_table(window)[1],
+        transform,
         TRANSFORM_SAMPLES_PER_BIN,
         _GAUSS_NODES,
         _GAUSS_WEIGHTS,
@@ -168,7 +170,7 @@ def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.nd
 def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
 
-    ``distance`` is in bins of fs/L. G is set to 0 beyond 2 REACH.
+    ``distance`` is in bins of fs/L. G is set to 0 beyond 2 TRANSFORM_REACH_BINS.
 
     >>> from sweep.model.window import get_window
     >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
@@ -180,22 +182,21 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def centroid_delay(window: Window) -> np.ndarray:
-    """Return by how many samples a centroid is later without a window's first k ones, (L + 1,)."""
+    """Return the shift [samples] of a window's centroid without its first k samples, (L + 1,)."""
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     sum_from = np.cumsum(w[::-1])[::-1]
     moment_from = np.cumsum((w * n)[::-1])[::-1]
     delay = np.zeros(window.length + 1)
-    is_defined = sum_from > 1e-6 * w.sum()  # of hardly a sample left nothing is detected
-    delay[:-1][is_defined] = (
-        moment_from[is_defined] / sum_from[is_defined] - moment_from[0] / sum_from[0]
-    )
+    is_defined = sum_from > 1e-6 * w.sum()  # an echo of fewer samples is not detected
+    centroid_of_all = moment_from[0] / sum_from[0]
+    delay[:-1][is_defined] = moment_from[is_defined] / sum_from[is_defined] - centroid_of_all
     return delay
 
 
 def _half_maximum_distance(window: Window) -> float:
-    """Return the distance [bins of fs/L] at which G falls to 1/2; at most 2 REACH."""
+    """Return the distance [bins of fs/L] at which G is 1/2, at most 2 TRANSFORM_REACH_BINS."""
     distances, transform = transform_table(window)
-    is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as of hann's two
+    is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two
     first_below_half = int(np.argmax(is_below_half)) if is_below_half.any() else transform.size - 1
     return float(
         np.interp(-0.5, -transform[: first_below_half + 1], distances[: first_below_half + 1])
@@ -204,7 +205,7 @@ def _half_maximum_distance(window: Window) -> float:
 
 @lru_cache(maxsize=16)
 def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate the window transform: distances 0 .. 2 REACH [bins of fs/L], and G there."""
+    """Return distances 0 .. 2 TRANSFORM_REACH_BINS [bins of fs/L], and G at these distances."""
     distances = (
         np.arange(int(2 * TRANSFORM_REACH_BINS * TRANSFORM_SAMPLES_PER_BIN) + 1)
         / TRANSFORM_SAMPLES_PER_BIN

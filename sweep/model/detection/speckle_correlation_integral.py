@@ -24,26 +24,28 @@ def fill_peak_bin_correlation(
     weights,
     correlation,
 ):
-    """Integrate equation (3) at some points, into ``correlation`` (n,) complex.
+    """Integrate equation (3) and fill ``correlation`` at points given by their indices.
 
     Parameters
     ----------
     point_indices
-        Indices of these points.
+        Indices of the points.
     half_interval
-        (n,): half-width of the interval of y [standard deviations of the beam].
+        (n,): half-width of the integration interval of y [standard deviations of the beam].
     bin_distance, line_shift, phase_difference, power_slope
-        Of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`, the first two (2,
-        n).
+        Fields of :class:`sweep.model.detection.speckle_correlation.LinePairGradients`; the first
+        two are stacked to (2, n).
     transform, samples_per_bin
-        G of :func:`sweep.model.detection.speckle_correlation.transform_table`, and its values per
-        bin.
+        Tabulated G of :func:`sweep.model.detection.speckle_correlation.transform_table`, and its
+        number of samples per bin.
     nodes, weights
-        Of a rule of quadrature on -1 .. 1.
+        Quadrature on -1 .. 1.
+    correlation
+        (n,) complex: the result.
     """
     node_power, previous_half_interval = np.empty(nodes.size), -1.0
     for point in point_indices:
-        if half_interval[point] != previous_half_interval:  # alike of all footprints within a bin
+        if half_interval[point] != previous_half_interval:  # equal for footprints within a bin
             previous_half_interval = half_interval[point]
             for node in range(nodes.size):
                 node_power[node] = weights[node] * math.exp(
@@ -70,7 +72,7 @@ def fill_peak_bin_correlation(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _interpolate_transform(distance, transform, samples_per_bin):
-    """Interpolate G, tabulated from 0 on, at a distance [bins of fs/L]; 0 beyond the table."""
+    """Interpolate the tabulated window transform G at a distance [bins of fs/L]; 0 beyond."""
     table_position = abs(distance) * samples_per_bin
     if table_position >= transform.size - 1:
         return transform[transform.size - 1] if table_position == transform.size - 1 else 0.0

@@ -1,16 +1,16 @@
-"""Rates of false alarms by leaked signal at many powers of developed speckle, from one table.
+"""Table of the rates of false alarms by leaked signal, for many powers of developed speckle.
 
-Signal of amplitude a, over the noise per quadrature sigma, adds c to the probability that noise
-alone makes its bin cross the threshold b (:mod:`sweep.model.detection.added_crossings`). Bins add
-up by their rates
-r = -ln(1 - c). An echo whose speckle has the power u, of mean 1, leaks signal of amplitude
-a sqrt(u). Its rate is
+Leaked signal of amplitude a, over the noise per quadrature sigma, makes its bin cross the threshold
+b with a probability c in addition to noise (:mod:`sweep.model.detection.added_crossings`). The rate
+r = -ln(1 - c) is additive over bins. An echo whose speckle has the power u, of mean 1, leaks signal
+of amplitude a sqrt(u). The rate of its bin is
 
-    r(a sqrt(u)) = a^2 u rho(ln a + ln(u) / 2),
+    r(a sqrt(u)) = a^2 u rho(ln a + ln(u) / 2).
 
-and rho, which is constant where signal is faint, depends on the threshold alone. It is tabulated
-for a threshold, at evenly spaced ln(a) of which a whole number makes up the distance of two
-powers. A bin's rates at all powers are then a weighted sum of a few rows of the table.
+The relative rate rho depends on the threshold alone, and is constant for faint signal. It is
+tabulated for a threshold at evenly spaced ln(a), such that the spacing of two speckle powers is a
+whole number of steps. A bin's rates at all powers are then weighted sums of a few rows of the
+table.
 """
 
 import math
@@ -25,72 +25,80 @@ from sweep.model.detection.marcum import marcum_q1_tails
 SPECKLE_POWER_MAX = 16.0
 """Largest speckle power (mean 1) in averages of leakage; a fraction e^-16 of draws exceeds it."""
 N_SPECKLE_OCTAVES = 9
-"""Octaves of speckle power below LOUDEST at which leakage is computed."""
+"""Number of octaves below SPECKLE_POWER_MAX over which leakage is computed."""
 POWERS_PER_OCTAVE_MAX = 2
-"""Largest number of powers an octave."""
+"""Largest number of speckle powers per octave."""
 
 N_SPECKLE_POWERS = POWERS_PER_OCTAVE_MAX * N_SPECKLE_OCTAVES + 2
-"""Number of powers: those of the octaves, and a fainter one, as rows take whole vectors."""
+"""Number of tabulated speckle powers: those of the octaves, and a fainter one that completes whole
+SIMD vectors."""
 
 TABULATED_SPECKLE_POWERS = SPECKLE_POWER_MAX * 2.0 ** (
     -np.arange(N_SPECKLE_POWERS - 1, -1, -1) / POWERS_PER_OCTAVE_MAX
 )
-"""(POWERS,): speckle powers in rising order."""
+"""(N_SPECKLE_POWERS,): speckle powers in rising order."""
 
 INTERPOLATION_POINTS = 6
-"""Entries that interpolation takes."""
+"""Number of table entries of the interpolation."""
 
 CERTAIN_CROSSING_RATE = 40.0
-"""Rate from which on a bin is certain to cross."""
+"""Rate above which a bin counts as certain to cross."""
 
 _LOG_AMPLITUDE_PER_POWER = 0.5 * math.log(2.0) / POWERS_PER_OCTAVE_MAX
-"""Distance of two powers in ln(amplitude)."""
+"""Spacing of two tabulated speckle powers in ln(amplitude)."""
 _LOG_AMPLITUDE_AT_FAINTEST_POWER = (
     0.5 * math.log(SPECKLE_POWER_MAX) - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_PER_POWER
 )
 _CONSTANT_RATE_PRODUCT_MAX = 0.01
-"""Product a b at the largest power below which rho is taken to be constant; it changes by 1.3e-5
-there."""
+"""Product a b at the largest power below which rho is taken as constant, with an error of
+1.3e-5."""
 _LOG_RATE_STEP_MAX = 0.3
-"""Largest change of ln(rho) between entries; interpolation then errs by 4e-6 of rho."""
+"""Largest change of ln(rho) between entries; the interpolation error is then 4e-6 of rho."""
 _CERTAIN_MARGIN_SIGMA = 9.0
-"""Amplitude above the threshold [sigma] from which on rates are RATE_MAX."""
+"""Amplitude above the threshold [sigma] beyond which the rate is CERTAIN_CROSSING_RATE."""
 _ENTRIES_PER_POWER_MIN, _ENTRIES_PER_POWER_MAX = 4, 256
+"""Smallest and largest number of table entries between two speckle powers."""
 
 
 class SpeckleCrossingRates(NamedTuple):
-    """Table of rho for a threshold."""
+    """Table of the relative rate rho for one threshold."""
 
     log_amplitude_first: float
     """ln(amplitude) of the first entry."""
     log_amplitude_step: float
-    """Distance of entries in ln(amplitude)."""
+    """Spacing of entries in ln(amplitude)."""
     position_max: float
-    """Largest place, in entries, that interpolation has entries for at all powers."""
+    """Largest fractional entry number at which all speckle powers can be interpolated."""
     relative_rates: np.ndarray
-    """(phases + 5, columns): rho. Entry number ``phases`` c + p is that in row p and column c, so
-    that the powers of a bin are adjacent, and the six entries that it takes are in six rows."""
+    """(p + 5, columns): rho, with p entries between two speckle powers. Entry number p c + r is in
+    row r and column c. The powers of a bin are thus adjacent in a row, and the six entries of an
+    interpolation are in six successive rows."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def empty_crossing_rates():
-    """Return a table of no threshold."""
+    """Return a table without entries."""
     return SpeckleCrossingRates(0.0, 1.0, 0.0, np.empty((0, 0)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def tabulate_crossing_rates(threshold_ratio, crossing_series):
-    """Tabulate the rates at a threshold.
+    """Tabulate the relative rate rho for a threshold.
 
     Parameters
     ----------
     threshold_ratio
         Threshold [sigma].
     crossing_series
-        :func:`sweep.model.detection.added_crossings.fill_crossing_series` of it.
+        Result of :func:`sweep.model.detection.added_crossings.fill_crossing_series` for this
+        threshold.
+
+    Returns
+    -------
+    SpeckleCrossingRates
     """
     threshold_ratio = max(threshold_ratio, 1e-3)
-    # ln(rate) rises by a (b - a) for each unit of ln(a), and rates below e^-30 don't matter.
+    # The slope of ln(rate) over ln(a) is a (b - a), and rates below e^-30 are negligible.
     steepness = min(0.25 * threshold_ratio * threshold_ratio, 7.7 * threshold_ratio) + 1.0
     entries_per_power = int(_LOG_AMPLITUDE_PER_POWER * steepness / _LOG_RATE_STEP_MAX) + 1
     entries_per_power = min(max(entries_per_power, _ENTRIES_PER_POWER_MIN), _ENTRIES_PER_POWER_MAX)
@@ -147,9 +155,18 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
-    """Add ``weight`` times a bin's rates over the speckle power to ``rate_sums``, (POWERS,).
+    """Add a bin's rates at all speckle powers, over the power and times a weight, to sums.
 
-    ``squared_ratio``: squared amplitude over that of sigma, at mean power.
+    Parameters
+    ----------
+    squared_ratio
+        Squared amplitude of the leaked signal over sigma^2, at mean speckle power.
+    weight
+        Weight of the bin.
+    rate_table
+        :class:`SpeckleCrossingRates`.
+    rate_sums
+        (N_SPECKLE_POWERS,): sums by speckle power; changed in place.
     """
     table_position = (
         0.5 * math.log(squared_ratio)
@@ -158,18 +175,16 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
     ) / rate_table.log_amplitude_step
     table_position = min(max(table_position, 2.0), rate_table.position_max)
     first_entry = np.uint64(table_position) - np.uint64(2)
-    fraction, entries_per_power = (
+    relative_rates, fraction = (
+        rate_table.relative_rates,
         table_position - math.floor(table_position),
-        np.uint64(rate_table.relative_rates.shape[0] - (INTERPOLATION_POINTS - 1)),
     )
+    entries_per_power = np.uint64(relative_rates.shape[0] - (INTERPOLATION_POINTS - 1))
     column = first_entry // entries_per_power
-    row, relative_rates = first_entry - column * entries_per_power, rate_table.relative_rates
+    row = first_entry - column * entries_per_power
     # Lagrange's polynomial through six entries.
-    quadratic, cubic, weight = (
-        fraction * fraction - 1.0,
-        (fraction * fraction - 1.0) * (fraction - 2.0),
-        weight * squared_ratio,
-    )
+    quadratic = fraction * fraction - 1.0
+    cubic, weight = (fraction * fraction - 1.0) * (fraction - 2.0), weight * squared_ratio
     a = weight * fraction * cubic * (3.0 - fraction) / 120.0
     b = weight * fraction * (fraction - 1.0) * (fraction * fraction - 4.0) * (fraction - 3.0) / 24.0
     c = weight * quadratic * (fraction * fraction - 4.0) * (3.0 - fraction) / 12.0
@@ -196,7 +211,10 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def rate_at_brightest_speckle(squared_ratio, rate_table):
-    """Return the rate of a bin at the power LOUDEST, by linear interpolation."""
+    """Return the rate of a bin at SPECKLE_POWER_MAX, by linear interpolation.
+
+    ``squared_ratio`` and ``rate_table`` are as of :func:`add_rates_by_power`.
+    """
     table_position = (
         0.5 * math.log(squared_ratio)
         + _LOG_AMPLITUDE_AT_FAINTEST_POWER

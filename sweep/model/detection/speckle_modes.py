@@ -1,4 +1,4 @@
-"""Strongest speckle mode of an echo: the part that fades in all of its bins as one amplitude.
+"""Strongest speckle mode of an echo: the part that fades with one amplitude in all bins.
 
 If the lines of a footprint spread over the bins with the density p(nu), the amplitudes of bins k
 and l in developed speckle have the covariance
@@ -29,43 +29,61 @@ from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, get_window
 LINE_DEVIATIONS = np.array(
     [0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0, 4.5, 7.0, 11.0]
 )
-"""Standard deviations of p in the tables, in units of a bin of fs/L, or of a quarter of the main
-lobe's width where that is more."""
+"""Standard deviations of p in the tables, in units of max(1, h/2) bins of fs/L. h is the half-width
+of the main lobe [bins of fs/L]."""
 
 N_OFFSETS = 9
 """Number of positions of p's centre in the tables, evenly spaced over -1/2 .. 1/2 bin of fs/N."""
 
 _STAND_IN_LENGTH = 1024
+"""Length of the window that replaces longer windows of the same shape in the tables."""
 _POWER_ITERATIONS = 80
 _NODES_MIN = 41
 _NODE_DISTANCE = 0.4
-"""Distance of lines that stand for a Gaussian [bins, as of SPREADS]; a wider one is a comb."""
+"""Largest spacing of the lines that represent a Gaussian density, in units of LINE_DEVIATIONS."""
 _NODE_DEVIATIONS_MAX = 4.5
+"""Distance of the outermost of these lines [standard deviations]."""
 _TABLE_DEVIATION_MAX = 3.0
-"""Spread up to which twice the deviation is in tables; the strongest mode of wider ones is."""
+"""Standard deviation, in units of LINE_DEVIATIONS, up to which tables reach two deviations beyond
+the main lobe."""
 
 
 class ModeTable(NamedTuple):
-    """Power fraction of the strongest mode, and the correlation of neighbouring bins."""
+    """Power fraction of the strongest speckle mode, and correlation of neighbouring bins."""
 
     line_deviation_bins: np.ndarray
-    """(s,): standard deviations of the lines' density [bins of fs/N]; empty in NO_MODES."""
+    """(s,): standard deviations of the lines' density p [bins of fs/N]; empty in NO_MODES."""
     power_fraction: np.ndarray
-    """(s, OFFSETS, k): power fraction of the strongest mode in a bin, k bins about the nearest
-    one."""
+    """(s, N_OFFSETS, k): fraction of a bin's power in the strongest mode, for k bins about the bin
+    nearest to the centre of p."""
     neighbour_correlation: np.ndarray
-    """(s, OFFSETS, k): correlation of the echo's amplitudes in a bin and in the one below it,
-    signed."""
+    """(s, N_OFFSETS, k): correlation of the echo's amplitudes in a bin and in the bin below it,
+    -1..1."""
     asymmetry: np.ndarray
-    """(s, OFFSETS): power asymmetry of the three bins about the nearest; rises with the offset."""
+    """(s, N_OFFSETS): :func:`power_asymmetry` of the three bins about the nearest bin. It rises
+    with the offset."""
 
 
 NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+"""Table without entries, for shots that need none."""
+
+
+class ModeTableCell(NamedTuple):
+    """Cell of a :class:`ModeTable`, and weights of bilinear interpolation in it."""
+
+    deviation_index: int
+    """Index of the line deviation at the lower end of the cell."""
+    deviation_weight: float
+    """Weight of the next line deviation, 0..1."""
+    offset_index: int
+    """Index of the offset at the lower end of the cell."""
+    offset_weight: float
+    """Weight of the next offset, 0..1."""
 
 
 @lru_cache(maxsize=32)
 def mode_table(record_window: Window, fft_size: int) -> ModeTable:
-    """Tabulate the strongest mode for a window and an FFT size (cached)."""
+    """Tabulate the strongest speckle mode for a window and an FFT size (cached)."""
     padding_factor, lobe_half_width = (
         fft_size / record_window.length,
         main_lobe_half_width(record_window),
@@ -110,7 +128,7 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
             neighbour_correlation[s, d, 1:] = neighbour_product / (
                 np.sqrt(power[1:]) * np.sqrt(power[:-1])
             )
-    # Of a lone line, in bins where its transform is 0 as well.
+    # A single line has one mode, also in bins where its transform is 0.
     power_fraction[0], neighbour_correlation[0] = (
         1.0,
         np.where(neighbour_correlation[0] < 0, -1.0, 1.0),
@@ -125,7 +143,10 @@ def mode_table(record_window: Window, fft_size: int) -> ModeTable:
 
 
 def _gaussian_nodes(deviation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return evenly spaced nodes and weights of a mean over a standard normal number."""
+    """Return evenly spaced nodes and weights of a mean over a standard normal variable.
+
+    ``deviation`` is the standard deviation of the lines in units of LINE_DEVIATIONS.
+    """
     n_nodes = max(_NODES_MIN, math.ceil(2 * _NODE_DEVIATIONS_MAX * deviation / _NODE_DISTANCE))
     node = np.linspace(-_NODE_DEVIATIONS_MAX, _NODE_DEVIATIONS_MAX, n_nodes)
     weight = np.exp(-0.5 * node * node)
@@ -135,11 +156,18 @@ def _gaussian_nodes(deviation: float) -> tuple[np.ndarray, np.ndarray]:
 def _strongest_mode(
     bin_transforms: np.ndarray, line_weights: np.ndarray, mode: np.ndarray
 ) -> np.ndarray:
-    """Return the leading eigenvector of a covariance, times the root of its eigenvalue.
+    """Return the leading eigenvector of a covariance matrix times the root of its eigenvalue.
 
-    Power iteration from ``mode`` (bins,). The covariance is the sum of the amplitudes (bins, lines)
-    of each line's bins with themselves, by the weights (lines,) of the lines' powers. It is not
-    formed if there are more bins than lines: of padded spectra it has millions of elements.
+    Parameters
+    ----------
+    bin_transforms
+        (bins, lines): amplitude of each line in each bin.
+    line_weights
+        (lines,): power of each line. The covariance is the weighted sum of the outer products of
+        the lines' amplitudes. With more bins than lines it is not formed, as it may have millions
+        of elements in padded spectra.
+    mode
+        (bins,): start of the power iteration.
     """
     covariance, eigenvalue = None, 1.0
     if len(bin_transforms) <= line_weights.size:
@@ -163,9 +191,10 @@ def _strongest_mode(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def power_asymmetry(below, middle, above):
-    """Return (P_above - P_below) / (P_above + P_below) of the largest bin's neighbours; 0 if faint.
+    """Return (P_above - P_below) / (P_above + P_below) of the powers next to the strongest bin.
 
-    Arguments are magnitudes |X|. The ratio tells on which side of the bin the echo's centre lies.
+    Arguments are the magnitudes |X| of three adjacent bins. The sign shows on which side of the bin
+    the echo's centre lies. The result is 0 if both neighbours are faint.
     """
     neighbour_power = below * below + above * above
     if not neighbour_power > 1e-6 * middle * middle:
@@ -175,9 +204,16 @@ def power_asymmetry(below, middle, above):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def locate_in_mode_table(table, line_deviation_bins, asymmetry):
-    """Return the cell (s, d) of a table around a spread and an asymmetry, and the weights in it.
+    """Return the :class:`ModeTableCell` of a table that holds a line deviation and an asymmetry.
 
-    Result: s, weight of s + 1, d, weight of d + 1; weights 0 .. 1 (bilinear interpolation).
+    Parameters
+    ----------
+    table
+        :class:`ModeTable`.
+    line_deviation_bins
+        Standard deviation of the lines' positions [bins of fs/N].
+    asymmetry
+        Result of :func:`power_asymmetry`, -1..1.
     """
     deviation_index = 0
     while (
@@ -209,14 +245,23 @@ def locate_in_mode_table(table, line_deviation_bins, asymmetry):
         if asymmetry_step > 0.0
         else 0.0
     )
-    return deviation_index, deviation_weight, offset_index, min(max(offset_weight, 0.0), 1.0)
+    return ModeTableCell(
+        deviation_index, deviation_weight, offset_index, min(max(offset_weight, 0.0), 1.0)
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def interpolate_mode_table(values, cell, bin_offset):
-    """Interpolate a table (s, OFFSETS, bins) k bins from the bin nearest to the echo's centre.
+    """Interpolate a quantity of a :class:`ModeTable` in a cell, for one bin.
 
-    The cell ``cell`` is a result of :func:`locate_in_mode_table`.
+    Parameters
+    ----------
+    values
+        (s, N_OFFSETS, k): table of the quantity.
+    cell
+        :class:`ModeTableCell`.
+    bin_offset
+        Number of the bin, counted from the bin nearest to the echo's centre.
     """
     deviation_index, deviation_weight, offset_index, offset_weight = cell
     half_bins = values.shape[2] // 2

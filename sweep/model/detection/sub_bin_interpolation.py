@@ -1,32 +1,32 @@
 """Position of a tone between bins, from the magnitudes of the largest bin and its two neighbours.
 
 With the window's transform W at the spacing of the bins, a lone tone delta bins past the centre bin
-has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The way back to delta depends on
-the window:
+has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The inversion depends on the
+window:
 
-- If the neighbours of a tone on a bin still stand high (Hann, Hamming, wider ones), the measure
+- If the neighbours of a tone on a bin are strong (Hann, Hamming, wider windows), the measure
   (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is delta / 2).
-  One step of least squares follows, weighted by the noise's covariance between the three bins: the
-  least error that three magnitudes allow.
-- If the neighbours vanish (rectangular) the larger of them says the side, and the measure is
-  larger / (centre + larger), for the rectangular window delta itself.
+  One step of least squares follows, weighted by the noise's covariance between the three bins. It
+  gives the least error that three magnitudes allow.
+- If the neighbours vanish (rectangular window), the larger one gives the side. The measure is
+  larger / (centre + larger), which is delta itself for the rectangular window.
 
-The tables are made of the window's own transform, so a noise-free lone tone is placed exactly (1e-6
-bins). Three things bias the estimate: other lines within the reach of the kernel, the tone's own
-image near DC and Nyquist, and a footprint that spreads over bins. A footprint's estimate is that of
-its centre. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
+The tables follow from the window's transform, so the position of a noise-free single tone is exact
+(1e-6 bins). Three things bias the estimate: other lines within the main lobe, the tone's image near
+DC and Nyquist, and a footprint that spreads over bins. The estimate then refers to the centre of
+the footprint. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
 
-An echo that arrives after its record has begun lacks the first samples, and its line is that of a
-shortened window. The place that these tables give is corrected for that, as the instrument knows
-its window and, from the whole bins, the delay (:func:`late_echo_correction`): exact for a lone
-tone.
+An echo that arrives after its record has begun lacks the first samples, and its line has the shape
+of a shortened window. :func:`late_echo_correction` corrects the position. The instrument knows its
+window and, from the strongest bin, the delay. The correction is exact for a single tone.
 
 A footprint whose lines add as powers and spread by s [bins, standard deviation] about their mean
-broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
+broadens the peak. This changes the estimate in proportion to s^2, by the tabulated
+``spread_error_factor``.
 
-The error under noise follows to first order from the noise in phase with the signal, which the
-window correlates between bins. The Cramer-Rao bound (:mod:`sweep.model.detection.estimators`) is
-that of the whole record without a window; three magnitudes of a windowed spectrum do not reach it.
+The standard error follows to first order from the noise in phase with the signal, which the window
+correlates between bins. It does not reach the Cramer-Rao bound
+(:mod:`sweep.model.detection.estimators`), which is that of the whole record without a window.
 """
 
 import math
@@ -42,53 +42,55 @@ from sweep.kernel_cache import njit
 from sweep.model.window import Window, window_samples
 
 _TABLE_INTERVALS = 2048
-"""Number of intervals in the tables; linear interpolation errs by some 1e-7 bins."""
+"""Number of intervals in the tables; the error of linear interpolation is about 1e-7 bins."""
 
 _N_SPREAD_POSITIONS, _SPREAD_BINS = 129, 0.05
-"""Number of places, and standard deviation [bins], at which ``widening`` is evaluated."""
+"""Number of positions, and standard deviation [bins], at which ``spread_error_factor`` is
+evaluated."""
 
 _TONE_DEGREE = 32
 """Degree of the polynomial that represents a tone's complex bin within +-2 bins."""
 
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""Relative height of a centred tone's neighbours below which TWO_BINS is used."""
+"""|X| of a centred tone's neighbours over the centre's, below which TWO_BINS is used."""
 
 THREE_BINS, TWO_BINS = 0, 1
+"""Measures of the position: by three bins, or by the centre bin and its larger neighbour."""
 
 
 class Interpolator(NamedTuple):
-    """Tables of one window and FFT size that convert bin magnitudes to a position between bins.
+    """Tables of a window and FFT size that convert three magnitudes to a position between bins.
 
-    m is the number of places 0 .. 1 bin at which they are given.
+    m is the number of tabulated positions in 0 .. 1 bin.
     """
 
     measure_kind: int
     """THREE_BINS or TWO_BINS."""
     measure_at_centre: float
-    """Measure of a tone exactly on the centre bin."""
+    """Measure of a tone on the centre bin."""
     measure_step: float
     """Spacing of the measures at which ``offset`` is tabulated."""
     offset: np.ndarray
-    """(m,): |delta| [bins], 0 .. 1, for the measures low, low + step, .."""
+    """(m,): |delta| [bins], 0 .. 1, for measures from ``measure_at_centre`` by ``measure_step``."""
     weight: np.ndarray
-    """(3, m): least-squares weights by |delta|, on the bin away from the tone, the centre and the
-    bin on the tone's side, for magnitudes over the centre's. Zero for TWO_BINS."""
+    """(3, m): least-squares weights by |delta| of the smaller neighbour, the centre bin and the
+    larger neighbour, for magnitudes over the centre's. Zero for TWO_BINS."""
     error_at_sigma: np.ndarray
     """(m,): standard error [bins] by |delta| if the centre bin's magnitude equals sigma."""
     noise_mixing: tuple[float, float, float, float]
-    """Factors m0 .. m3 that make the correlated noise of three adjacent bins, in one quadrature, of
-    independent normal numbers z0 (centre), z1, z2: above m0 z0 + m1 z1, below m0 z0 + m2 z1 + m3
-    z2."""
+    """Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins. With independent
+    standard normal numbers z0, z1, z2, the noise in one quadrature is z0 in the centre bin,
+    m0 z0 + m1 z1 above and m0 z0 + m2 z1 + m3 z2 below."""
     sidelobe_correlation: float
-    """Correlation of the noise of neighbouring bins in phase with a tone's sidelobes there, which
-    change sign from one to the next: once in L of N bins, for records of L samples."""
+    """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
+    successive sidelobe bins L change their sign from one to the next, for records of L samples."""
     spread_error_factor: np.ndarray
     """(m,): position error by |delta| over the variance of lines that add as powers [1/bins]."""
 
 
 @lru_cache(maxsize=64)
 def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
-    """Return the noise correlation of bins one and two apart, in phase with a tone's signal."""
+    """Return the noise correlations of bins one and two apart, in phase with a tone's main lobe."""
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
     correlation_1, correlation_2 = (
@@ -98,7 +100,7 @@ def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, 
 
 
 def sidelobe_correlation(window: Window, fft_size: int) -> float:
-    """Return the noise correlation of adjacent bins in phase with a tone's sidelobes there.
+    """Return the noise correlation of adjacent bins in phase with a tone's sidelobes.
 
     See :attr:`Interpolator.sidelobe_correlation`.
     """
@@ -110,8 +112,8 @@ def sidelobe_correlation(window: Window, fft_size: int) -> float:
 def interpolator(window: Window, fft_size: int) -> Interpolator:
     """Prepare the tables for a window and FFT size (cached).
 
-    If the window's top is so flat that no measure grows with delta (flat-top windows in a padded
-    FFT), positions are not resolved: delta is 0 and its error half a bin.
+    Flat-top windows in a padded FFT have no measure that rises with delta. Positions are then not
+    resolved: delta is 0, with an error of half a bin.
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)
@@ -147,7 +149,10 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
 
 
 def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
-    """Return exp(-2 pi i cycles n), n = 0 .. number - 1, from some 2 sqrt(number) exponentials."""
+    """Return exp(-2 pi i cycles n) for n = 0 .. ``n_values`` - 1.
+
+    They are products of about 2 sqrt(n_values) exponentials.
+    """
     step = math.isqrt(n_values) + 1
     angle = -2j * np.pi * cycles * np.arange(step)
     return np.multiply.outer(np.exp(step * angle), np.exp(angle)).ravel()[:n_values]
@@ -155,14 +160,16 @@ def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that gives the complex bin at distances -2 .. 2 [bins] from a lone tone.
+    """Return the function from a distance -2 .. 2 [bins] to the complex bin at it from a tone.
 
-    The phase of half a record is removed, so that it is real for a symmetric window. It turns by at
-    most one cycle, so that a polynomial represents it to 1e-14 of the largest bin.
+    The linear phase of half a record is removed, so that the value is real for a symmetric window.
+    The remaining phase changes by at most one cycle, so that a polynomial represents the value to
+    1e-14 of the largest bin.
     """
     w, record_middle = window_samples(window.name, window.length), window.length / 2
 
     def bin_values(distances: np.ndarray) -> np.ndarray:
+        """Return the complex bins at distances from the tone, without the linear phase."""
         values = [
             (w * complex_exponentials(distance / fft_size, w.size)).sum() for distance in distances
         ]
@@ -172,7 +179,7 @@ def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.nd
 
 
 def _tone_magnitudes(window: Window, fft_size: int, offset: np.ndarray) -> np.ndarray:
-    """Magnitudes of three bins around lone tones delta bins past the middle one, (3, m)."""
+    """Return |X| of three bins about single tones ``offset`` (m,) bins above the middle, (3, m)."""
     return np.abs(tone_spectrum(window, fft_size)(np.array([[-1.0], [0.0], [1.0]]) - offset))
 
 
@@ -184,11 +191,29 @@ def _least_squares_weights(
     *,
     two_bins: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return minimum-variance weights (3, m) on three bins for a small change of delta.
+    """Return minimum-variance weights of three bins for a change of delta, and the standard error.
 
-    The weights annihilate a change of amplitude and respond with 1 to a change of delta, for a
-    centre bin of 1: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone, its slope), with the noise
-    covariance C. The standard error is (m,) [bins], at a centre bin of one sigma.
+    Parameters
+    ----------
+    tone_magnitudes
+        (3, m): |X| of the three bins for tones at the positions ``offset`` (m,) [bins].
+    offset
+        (m,): positions delta [bins].
+    correlation_1, correlation_2
+        Noise correlations of bins one and two apart.
+    two_bins
+        True if only the centre and the bin above are used.
+
+    Returns
+    -------
+    weight, standard_error
+        (3, m) and (m,) [bins], the latter at |X| = sigma in the centre bin.
+
+    Notes
+    -----
+    The weights respond with 0 to a change of the amplitude and with 1 to a change of delta, for
+    |X| = 1 in the centre bin: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone, its slope), with the
+    noise covariance C.
     """
     slope = np.gradient(tone_magnitudes, offset, axis=1)
     used_bins = slice(1 if two_bins else 0, 3)
@@ -200,7 +225,8 @@ def _least_squares_weights(
         ]
     )[used_bins, used_bins]
     inverse = np.linalg.inv(covariance + 1e-12 * np.eye(len(covariance)))
-    scale = np.maximum(tone_magnitudes[1], 1e-3 * tone_magnitudes[1, 0])
+    _, centre, _ = tone_magnitudes
+    scale = np.maximum(centre, 1e-3 * centre[0])
     design = np.stack(
         [tone_magnitudes[used_bins] / scale, slope[used_bins] / scale], axis=-1
     ).swapaxes(0, 1)
@@ -213,8 +239,8 @@ def _least_squares_weights(
 def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
     """Return the position error over the variance of a narrow Gaussian spread, by |delta| (m,).
 
-    The spread is represented by three lines of weights 1/6, 2/3, 1/6, which has its moments up to
-    the fifth.
+    Three lines of weights 1/6, 2/3, 1/6 represent the spread; their moments are those of a Gaussian
+    up to the fifth.
     """
     positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
     power = np.zeros((3, _N_SPREAD_POSITIONS))
@@ -243,8 +269,16 @@ def _noise_mixing(correlation_1: float, correlation_2: float) -> tuple[float, fl
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def estimate_sub_bin_offset(below, centre, above, interpolation):
-    """Estimate a tone's offset from the centre bin [bins, -1 .. 1] from three magnitudes."""
-    offsets, weight = interpolation.offset, interpolation.weight
+    """Estimate a tone's offset from the centre bin [bins, -1 .. 1] from three magnitudes.
+
+    Parameters
+    ----------
+    below, centre, above
+        |X| of three adjacent bins.
+    interpolation
+        :class:`Interpolator`.
+    """
+    offsets = interpolation.offset
     larger, smaller = max(below, above), min(below, above)
     if not larger > 0.0:
         return 0.0
@@ -257,11 +291,18 @@ def estimate_sub_bin_offset(below, centre, above, interpolation):
     )
     if interpolation.measure_kind == THREE_BINS and centre > 0.0:
         table_index = offset * (offsets.size - 1)
+        smaller_weight, centre_weight, larger_weight = (
+            interpolation.weight[0],
+            interpolation.weight[1],
+            interpolation.weight[2],
+        )
         correction = smaller * _interpolate_table(
-            weight[0], table_index
-        ) + larger * _interpolate_table(weight[2], table_index)
+            smaller_weight, table_index
+        ) + larger * _interpolate_table(larger_weight, table_index)
         offset = min(
-            max(offset + _interpolate_table(weight[1], table_index) + correction / centre, -1.0),
+            max(
+                offset + _interpolate_table(centre_weight, table_index) + correction / centre, -1.0
+            ),
             1.0,
         )
     return offset if above >= below else -offset
@@ -269,7 +310,7 @@ def estimate_sub_bin_offset(below, centre, above, interpolation):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _interpolate_table(values, index):
-    """Linear interpolation in a table at a fractional index, which is clipped to the table."""
+    """Interpolate a table linearly at a fractional index, which is clipped to the table."""
     index = min(max(index, 0.0), values.size - 1.0)
     i = min(int(index), values.size - 2)
     return values[i] + (index - i) * (values[i + 1] - values[i])
@@ -279,8 +320,14 @@ def _interpolate_table(values, index):
 def sub_bin_standard_error(offset, magnitude_ratio, interpolation):
     """Return the standard error of :func:`estimate_sub_bin_offset` [bins], at most 1/2.
 
-    ``offset``: estimated position [bins]; ``magnitude_ratio``: magnitude of the centre bin over
-    sigma.
+    Parameters
+    ----------
+    offset
+        Estimated offset from the centre bin [bins].
+    magnitude_ratio
+        |X| of the centre bin over the noise per quadrature sigma.
+    interpolation
+        :class:`Interpolator`.
     """
     if not magnitude_ratio > 0.0:
         return 0.5
@@ -296,8 +343,12 @@ def sub_bin_standard_error(offset, magnitude_ratio, interpolation):
 def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size: int) -> np.ndarray:
     """Return the error of the sub-bin offset [bins] for a tone that drifts within the record.
 
-    The tone lies ``offset`` bins from the centre bin at the record's middle, and moves at a
-    constant rate by ``drift`` bins in all.
+    Parameters
+    ----------
+    offset
+        Position of the tone in the middle of the record, relative to the centre bin [bins].
+    drift
+        Linear change of the position over the whole record [bins].
     """
     error_factor = RegularGridInterpolator(
         (_DRIFTS_BINS, _DRIFT_POSITIONS_BINS),
@@ -314,47 +365,47 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
 
 _DRIFTS_BINS = np.array([0.5, 1.0, 2.0, 4.0])
 _DRIFT_POSITIONS_BINS = np.linspace(0.0, 1.0, 17)
-"""Drifts of a tone within the record, and its places at the record's middle, in the tables
+"""Drifts of a tone within the record, and its positions in the middle of the record, in the tables
 [bins]."""
 
 
 @lru_cache(maxsize=32)
 def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
-    """Tabulate the position error over the square of a tone's drift [1/bins], (drifts, places)."""
+    """Tabulate the position error over a tone's squared drift [1/bins], (drifts, positions)."""
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
     record_position = np.arange(w.size) / w.size - 0.5
     error_factor = np.empty((_DRIFTS_BINS.size, _DRIFT_POSITIONS_BINS.size))
     for i, drift in enumerate(_DRIFTS_BINS):
         drifting_window = w * np.exp(1j * np.pi * drift * w.size / fft_size * record_position**2)
         for j, position in enumerate(_DRIFT_POSITIONS_BINS):
-            magnitudes = [
+            below, centre, above = (
                 abs(
                     (
                         drifting_window * complex_exponentials((k - position) / fft_size, w.size)
                     ).sum()
                 )
                 for k in (-1, 0, 1)
-            ]
-            estimate = estimate_sub_bin_offset(
-                magnitudes[0], magnitudes[1], magnitudes[2], interpolation
             )
+            estimate = estimate_sub_bin_offset(below, centre, above, interpolation)
             error_factor[i, j] = abs(estimate - position) / drift**2
     return error_factor
 
 
 _N_LATE_POSITIONS = 65
-"""Number of places 0 .. 1 bin in the tables of late echoes."""
+"""Number of positions in 0 .. 1 bin in the tables of late echoes."""
 _MISSING_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
 """Fractions of the record without an echo in the tables of late echoes."""
 _SLOPE_MIN = 0.05
+"""Smallest slope of the estimated over the true position in error estimates."""
 _DIFFERENCE_STEP = 1e-4
+"""Step of numerical derivatives by |X|, over |X| of the centre bin."""
 
 
 class LateEchoCorrection(NamedTuple):
-    """Correction of positions between bins for echoes that arrive after the record has begun."""
+    """Correction of the sub-bin offset of echoes that arrive after the record has begun."""
 
     shift: np.ndarray
-    """Shift to add to the estimated position [bins]."""
+    """Correction to add to the estimated offset [bins]."""
     error_factor: np.ndarray
     """Factor on the standard error of :func:`sub_bin_standard_error`."""
 
@@ -362,12 +413,12 @@ class LateEchoCorrection(NamedTuple):
 def late_echo_correction(
     offset: np.ndarray, n_missing: np.ndarray, window: Window, fft_size: int
 ) -> LateEchoCorrection:
-    """Return the correction of the sub-bin offset for an echo without the record's first samples.
+    """Return the correction of the sub-bin offset of an echo that lacks the record's first samples.
 
     Parameters
     ----------
     offset
-        Position that :func:`estimate_sub_bin_offset` gives, relative to the centre bin [bins].
+        Result of :func:`estimate_sub_bin_offset` [bins].
     n_missing
         Number of samples at the record's start without an echo.
     """
@@ -390,7 +441,7 @@ def late_echo_correction(
 
 @lru_cache(maxsize=32)
 def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate the shift [bins] and the error factor, (shares, places), of late echoes."""
+    """Tabulate shift [bins] and error factor of late echoes, (missing fractions, positions)."""
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
     first_sample = np.minimum(np.rint(_MISSING_FRACTIONS * w.size).astype(int), w.size - 2)
     positions = np.linspace(0.0, 1.0, _N_LATE_POSITIONS)
@@ -431,11 +482,10 @@ def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.nda
         weight = derivatives * phase
         variance = np.einsum("jk,kl,jl->j", weight.conj(), noise_covariance, weight).real
         error = np.sqrt(np.maximum(variance, 0.0)) / slope
-        if (
-            interpolation.measure_kind == TWO_BINS
-        ):  # on a bin either neighbour may be the larger one
+        if interpolation.measure_kind == TWO_BINS:
+            # On a bin either neighbour may be the larger one.
             error[0] = error[1]
-        # Of a whole echo's error at the place that is read, by which it is stated.
+        # The error factor is relative to the standard error at the uncorrected position.
         whole_echo_error = np.interp(
             estimates,
             np.linspace(0, 1, interpolation.error_at_sigma.size),
@@ -451,14 +501,14 @@ def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.nda
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def line_spread_error(offset, line_deviation_bins, adds_powers, interpolation):
-    """Return the error of the sub-bin offset [bins] for lines that spread about their mean.
+    """Return the error of the sub-bin offset [bins] due to the spread of a footprint's lines.
 
     Parameters
     ----------
     offset
-        Position relative to the centre bin [bins].
+        Offset from the centre bin [bins].
     line_deviation_bins
-        Standard deviation of the lines [bins].
+        Standard deviation of the lines' positions [bins].
     adds_powers
         True if the lines add as powers. If they add as amplitudes they may cancel, and the error is
         the whole spread.

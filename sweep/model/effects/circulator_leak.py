@@ -468,7 +468,7 @@ def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
                 EchoBins(raised_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
                 peak,
                 rule,
-                bin_threshold_at(shots.bin_threshold_table, bin_spans.point_numbers[i]),
+                bin_threshold_at(shots.bin_thresholds, bin_spans.point_numbers[i]),
                 bin_speckle_at(speckle, segment_index, bin_spans.point_numbers[i]),
             )
         exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)

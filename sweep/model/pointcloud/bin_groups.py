@@ -14,6 +14,7 @@ from sweep.model.detection.echo_detection import (
     bin_speckle_at,
     bin_threshold_at,
     echo_bounds,
+    echo_half_width,
     pd_and_miss,
 )
 from sweep.model.preparation import Shots
@@ -116,7 +117,7 @@ def find_groups_in_spans(
         spans.point_numbers,
         (spans.first_bin, n_bins, spans.peak_index, spans.span_start),
         (magnitudes, spans.is_exempt),
-        shots.bin_threshold_table,
+        shots.bin_thresholds,
         (nyquist_bin, shots.detection_rule, shots.speckle_table),
         bin_rows,
         bin_groups.neighbour_magnitudes,
@@ -166,7 +167,7 @@ def _fill_groups(
     point_indices,
     spans,
     bin_arrays,
-    bin_threshold_table,
+    bin_thresholds,
     config,
     bin_rows,
     neighbour_magnitudes,
@@ -183,8 +184,8 @@ def _fill_groups(
     bin_arrays
         |X| [V] of the bins of all spans, and (bins,) bool, True for bins of echoes; other groups
         are leaked signal.
-    bin_threshold_table
-        (7, n): :attr:`sweep.model.preparation.Shots.bin_threshold_table`.
+    bin_thresholds
+        (n,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`.
     config
         N/2, or 0 of complex records; :attr:`sweep.model.preparation.Shots.detection_rule`; and
         :attr:`~sweep.model.preparation.Shots.speckle_table`.
@@ -195,7 +196,8 @@ def _fill_groups(
     magnitudes, is_echo_all = bin_arrays
     for j in range(point_indices.size):
         i = point_indices[j]
-        threshold = bin_threshold_table[1, i]
+        bin_threshold = bin_threshold_at(bin_thresholds, i)
+        threshold = bin_threshold.threshold
         for segment in range(3):
             if n_bins[segment, j] == 0:
                 continue
@@ -209,7 +211,7 @@ def _fill_groups(
             )
             for group in range(n_groups):
                 strongest_index = bin_rows[STRONGEST_ROW, i, segment, group]
-                lobe_half_width = max(rule.lobe_half_width, int(bin_threshold_table[4, i]))
+                lobe_half_width = echo_half_width(rule, bin_threshold.pedestal.reach_bins)
                 first_index, last_index = echo_bounds(
                     magnitude,
                     bin_rows[FIRST_ROW, i, segment, group],
@@ -225,7 +227,7 @@ def _fill_groups(
                     ),
                     strongest_index - first_index,
                     rule,
-                    bin_threshold_at(bin_threshold_table, i),
+                    bin_threshold,
                     bin_speckle_at(speckle_table, segment, i),
                 ).pd
                 for side in range(3):

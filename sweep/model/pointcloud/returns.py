@@ -54,6 +54,7 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
 from sweep.model.detection.echo_detection import (
+    BinThresholds,
     bin_threshold_at,
     echo_bounds,
     fill_pedestal_ratios,
@@ -413,8 +414,8 @@ class DrawInputs(NamedTuple):
     """(n, beamlets): relative amplitude of each beamlet."""
     noise_and_threshold: np.ndarray
     """(n, 3): sigma [V]; threshold over sigma; noise of bins that hold lines over sigma."""
-    bin_threshold_table: np.ndarray
-    """(n, 7): transposed :attr:`sweep.model.preparation.Shots.bin_threshold_table`."""
+    bin_thresholds: BinThresholds
+    """(n,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`."""
     pfa_noise: np.ndarray
     """(n, 3): probability of a false alarm by noise alone."""
     doppler_prediction: np.ndarray
@@ -444,7 +445,10 @@ class DrawInputs(NamedTuple):
     def select(self, indices: np.ndarray) -> "DrawInputs":
         """Return the quantities of points with the given indices."""
         return DrawInputs(
-            *(v.select(indices) if isinstance(v, SpeckleLineGrid) else v[indices] for v in self)  # type: ignore[arg-type]
+            *(
+                v.select(indices) if isinstance(v, (SpeckleLineGrid, BinThresholds)) else v[indices]
+                for v in self
+            )  # type: ignore[arg-type]
         )
 
 
@@ -553,7 +557,7 @@ def make_draw_inputs(
         line_positions,
         beamlet_amplitude,
         np.stack([shots.bin_noise_sigma, *threshold_and_line_noise_ratios(shots)], axis=1),
-        np.ascontiguousarray(shots.bin_threshold_table.T),
+        shots.bin_thresholds,
         np.zeros(bin_groups.leakage.shape),
         np.stack(
             [np.broadcast_to(part, shots.size) for part in _doppler_prediction(shots, motion)],
@@ -1300,7 +1304,9 @@ def prepare_group_speckle(i, config, inputs, spectra):
                     inputs.group_bins[i, s, FIRST_ROW, g] - span_first_bin,
                     inputs.group_bins[i, s, LAST_ROW, g] - span_first_bin,
                 )
-                lobe_half_width = max(config.lobe_half_width, int(inputs.bin_threshold_table[i, 4]))
+                lobe_half_width = max(
+                    config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[i])
+                )
                 begin, end = echo_bounds(
                     span_ratios,
                     group_ends[0],
@@ -2186,7 +2192,7 @@ def draw_all_bins(
         first_index,
         last_index,
         threshold_ratio,
-        max(config.lobe_half_width, int(inputs.bin_threshold_table[i, 4])),
+        max(config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[i])),
     )
     n_bins, peak_index = last_index - first_index + 1, 0
     pedestal_power, scratch = workspace.pedestal_power[:n_bins], workspace.noise_bins
@@ -2195,7 +2201,7 @@ def draw_all_bins(
         magnitudes = workspace.bin_power[:n_bins]
         for k in range(n_bins):
             magnitudes[k] = noise_sigma * span_ratios[first_index + k]
-        bin_threshold = bin_threshold_at(inputs.bin_threshold_table.T, i)
+        bin_threshold = bin_threshold_at(inputs.bin_thresholds, i)
         fill_pedestal_ratios(magnitudes, workspace.all_echo[:n_bins], bin_threshold, pedestal_power)
     address_of_noise, first_number = (
         (a, b, draw, philox.STREAM_NOISE[s]),

@@ -24,7 +24,11 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
-from sweep.model.detection.echo_detection import bin_threshold_at, fill_pedestal_ratios
+from sweep.model.detection.echo_detection import (
+    BinThresholds,
+    bin_threshold_at,
+    fill_pedestal_ratios,
+)
 from sweep.model.detection.hoyt import pseudo_variance_ratio_at
 from sweep.model.detection.marcum import at_least_one_probability
 from sweep.model.preparation import Shots
@@ -100,7 +104,7 @@ def count_by_probability(
         SpeckleLineGrid.empty(),
     )
     no_speckle = *no_pseudo_variance, np.empty((0, 3))
-    no_levels = np.zeros((2, n_rows)), np.zeros((7, n_rows))
+    no_levels = np.zeros((2, n_rows)), BinThresholds(*np.zeros((7, n_rows)))
     _count_draws(
         draw_ranges,
         batch_edges,
@@ -149,7 +153,7 @@ def count_in_noise(
         filter_rule = make_echo_noise_filter(shots, spectra)
         kernel_arguments = (
             threshold_and_noise[:, indices].copy(),
-            shots.bin_threshold_table[:, indices].copy(),
+            shots.bin_thresholds.select(indices),
             probabilities,
             (True, *filter_rule, np.full(indices.size, shots.any_two)),
             spectra,
@@ -460,7 +464,7 @@ def _count_draws(
     draw_ranges,
     batch_edges,
     threshold_and_noise,
-    bin_threshold_table,
+    bin_thresholds,
     probabilities,
     config,
     spectra,
@@ -480,9 +484,9 @@ def _count_draws(
         draw.
     threshold_and_noise
         (2, m): :func:`threshold_and_line_noise_ratios`.
-    bin_threshold_table
-        (7, m): :attr:`sweep.model.preparation.Shots.bin_threshold_table` of the rows, for echoes
-        that any bin may detect.
+    bin_thresholds
+        (m,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds` of the rows, for echoes that
+        any bin may detect.
     probabilities
         (3, 3, m): probability of a false alarm in bins that are not evaluated one by one, and of a
         detection without and with a condition (:func:`_draw_probabilities`). The last two are
@@ -561,7 +565,7 @@ def _count_draws(
                         (j, s),
                         spectra,
                         (weights, start, real_ends),
-                        bin_threshold_at(bin_threshold_table, j),
+                        bin_threshold_at(bin_thresholds, j),
                         echo_amplitudes[s],
                         noise_scratch,
                         is_detected[s],

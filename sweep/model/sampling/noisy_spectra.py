@@ -249,7 +249,7 @@ def noiseless_signal(
         shots.fft_size * max(float(shots.echo_window_energy(segment)[point]), 1e-300)
     )
     echo_margin = max(
-        lobe_half_width, int(shots.bin_threshold_table[4, point])
+        lobe_half_width, int(shots.bin_thresholds.pedestal_reach_bins[point])
     )  # bins where the echo's pedestal exceeds the noise
     first_bin, last_bin = (
         int(bins_above_half[0]) - echo_margin,

@@ -339,7 +339,7 @@ def _further_group_probability(n_bins, limits, scratch, is_exempt, crossing_seri
     """
     _fill_crossing_probabilities(n_bins, limits, scratch, is_exempt, crossing_series)
     exclude_bins_joining_echo(
-        scratch[CHANCE], ZERO, n_bins, scratch[OUT], is_exempt, limits, limits[3]
+        scratch[CHANCE], ZERO, n_bins, scratch[OUT], is_exempt, limits[0], limits[1], limits[3]
     )
     return any_crossing_probability(scratch[CHANCE], ZERO, n_bins)
 
@@ -408,14 +408,14 @@ def _mean_leakage_over_speckle(
             for i in range(n_listed):
                 probabilities[i] = -math.expm1(-power * joining_rates[i, power_index])
             root_power = math.sqrt(power)
-            sigma_and_threshold = noise_sigma / root_power, threshold / root_power
             exclude_bins_joining_echo(
                 probabilities,
                 ZERO,
                 n_listed,
                 magnitudes,
                 is_echo,
-                sigma_and_threshold,
+                noise_sigma / root_power,
+                threshold / root_power,
                 sidelobe_correlation,
             )
             for i in range(n_listed):
@@ -705,7 +705,8 @@ def _leakage_of_span_and_beyond(
         end_index,
         scratch[OUT],
         is_exempt,
-        limits,
+        limits[0],
+        limits[1],
         sidelobe_correlation,
     )
     span_leakage = any_crossing_probability(scratch[CHANCE], first_index, end_index)

@@ -85,7 +85,6 @@ def find_peaks_on_grid(
         cells_per_point(shots, size),
         (degree, real, folded),
     )
-    first_bin_and_width = shots.fft_size // 2, 1.0 / shots.fft_size
     segments = np.flatnonzero(shots.has_segment).tolist()
     for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
         members = np.flatnonzero(n_cells_of_point == cells)
@@ -95,19 +94,17 @@ def find_peaks_on_grid(
             first_bin, magnitude = grid_magnitudes(
                 shots, point_table, points, segment, cells, grid_options
             )
-            peak_rows = np.empty((6, points.size))
-            bin_levels = shots.bin_threshold_table[:, points]
-            speckle = shots.speckle_table.select(segment, points)
-            detect_in_spectra(
+            detections = detect_in_spectra(
                 magnitude,
                 first_bin,
-                first_bin_and_width,
+                shots.fft_size // 2,
+                1.0 / shots.fft_size,
                 shots.detection_rule,
-                bin_levels,
-                speckle,
-                peak_rows,
+                shots.bin_thresholds.select(points),
+                shots.speckle_table.select(segment, points),
             )
-            peak_rows[3] *= point_table[6, points]
+            detections.frequency[:] *= point_table[6, points]
+            peak_rows = np.array(detections)
             peaks[segment][:, points] = peak_rows
     return peaks
 

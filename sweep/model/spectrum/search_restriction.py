@@ -1,7 +1,11 @@
-"""Runs of bins and beamlets' lines in a search band (:mod:`sweep.model.spectrum.search_band`)."""
+"""Restriction of spans of bins to a search band (:mod:`sweep.model.spectrum.search_band`).
+
+Positions of beamlets' lines, in bins, are computed here as well: they decide which echoes lie in
+the band.
+"""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,95 +16,128 @@ from sweep.model.detection.added_crossings import (
     exclude_bins_joining_echo,
 )
 from sweep.model.detection.echo_detection import (
-    Detection,
-    EchoBins,
-    bin_speckle_at,
+    EchoSpans,
     bin_threshold_at,
     echo_bounds,
-    pd_and_miss,
+    echo_half_width,
 )
 from sweep.model.detection.marcum import marcum_q1_excess
 
 
-def restrict_to_band(shots: Any, spans: Any) -> Any:
-    """Cut runs of bins to the band: what is not searched neither detects nor raises an alarm.
+class SearchBand(NamedTuple):
+    """Bins that are searched for echoes, in one segment or in (segments, m)."""
 
-    Of an echo whose strongest bin is not searched nothing is detected, but for other groups of
-    bins about lines of its footprint; the magnitude stays that of its strongest bin.
+    first_bin: Any
+    """Number of the first bin, 0..N/2; of a complex record -N/2 .. N/2 - 1."""
+    n_bins: Any
+    """Number of bins."""
+    period_bins: int
+    """FFT size N of a complex record, whose spectrum is periodic; 0 of a real record."""
+
+
+def restrict_to_band(shots: Any, spans: Any) -> Any:
+    """Restrict spans of bins to the search band.
+
+    Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
+    outside, the echo is not detected, and only groups of bins about lines of its footprint remain
+    exempt from false alarms. The peak magnitude stays that of the strongest bin of all.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    spans : BinSpans
+        Spans of bins of m points, whose ``magnitudes`` and ``is_exempt`` are changed in place.
+
+    Returns
+    -------
+    BinSpans
+        Spans within the band, with the leakage in them. Probabilities of detection are unchanged:
+        :func:`sweep.model.detection.detection_probability.detect_in_spans` sets them.
     """
     if shots.search_band is None:
         return spans
     points = spans.point_numbers
-    span_numbers = np.array(
-        [spans.first_bin, spans.n_bins, spans.peak_index, spans.n_exempt, spans.span_start]
+    first_bin, n_bins, peak_index, n_exempt, span_start = (
+        np.array(values)
+        for values in (
+            spans.first_bin,
+            spans.n_bins,
+            spans.peak_index,
+            spans.n_exempt,
+            spans.span_start,
+        )
     )
-    probabilities = np.array([spans.pd, spans.miss, spans.leakage])
+    leakage = np.array(spans.leakage)
     period_bins = shots.fft_size if shots.complex_record else 0
-    band_bins = np.ascontiguousarray(shots.search_band[:, :, points])
-    peak_distance = spans.first_bin + spans.peak_index - band_bins[:, 0]
-    peak_distance = peak_distance % period_bins if period_bins else peak_distance
-    peak_is_searched = (spans.n_bins == 0) | (
-        (peak_distance >= 0) & (peak_distance < band_bins[:, 1])
+    band_first_bin, band_n_bins = (
+        np.ascontiguousarray(shots.search_band[:, row][:, points]) for row in range(2)
     )
+    peak_distance = spans.first_bin + spans.peak_index - band_first_bin
+    peak_distance = peak_distance % period_bins if period_bins else peak_distance
+    peak_is_searched = (spans.n_bins == 0) | ((peak_distance >= 0) & (peak_distance < band_n_bins))
     line_positions = (
         np.empty((points.size, 3, 0))
         if peak_is_searched.all()
         else beamlet_line_positions(shots)[points]
     )
-    negligible_signal_ratio = np.broadcast_to(shots.negligible_signal_ratio, shots.size)[points]
-    threshold_rows = np.concatenate(
-        [shots.bin_threshold_table[:, points], negligible_signal_ratio[None]]
-    )
     evaluates_leakage = np.array(
         [shots.includes_leakage and segment.includes_leakage for segment in shots.waveform_segments]
     )
-    band_and_lines = band_bins, period_bins, line_positions, peak_is_searched
-    points_and_speckle = points, shots.speckle_table
     _restrict_spans(
-        span_numbers,
-        band_and_lines,
-        threshold_rows,
-        (shots.detection_rule, evaluates_leakage),
-        points_and_speckle,
-        spans.magnitudes,
-        spans.is_exempt,
-        probabilities,
+        EchoSpans(first_bin, n_bins, peak_index, span_start, spans.magnitudes, spans.is_exempt),
+        SearchBand(band_first_bin, band_n_bins, period_bins),
+        peak_is_searched,
+        line_positions,
+        shots.bin_thresholds.select(points),
+        np.broadcast_to(shots.negligible_signal_ratio, shots.size)[points],
+        shots.detection_rule,
+        evaluates_leakage,
+        n_exempt,
+        leakage,
     )
-    first_bin, n_bins, peak_index, n_exempt, span_start = span_numbers
     return spans._replace(
         first_bin=first_bin,
         n_bins=n_bins,
         peak_index=peak_index,
         n_exempt=n_exempt,
         span_start=span_start,
-        pd=probabilities[0],
-        miss=probabilities[1],
-        leakage=probabilities[2],
+        leakage=leakage,
         peak_is_searched=peak_is_searched,
     )
 
 
 def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (m, 3, beamlets).
+    """Return the positions of each beamlet's line in the three spectra, (m, 3, beamlets) [bins].
 
-    In spectra of complex records -N/2 .. N/2. Lines that drift within the record, by range walk and
-    acceleration, lie where they are at its middle.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    points
+        (m,): indices of points; by default all.
+
+    Returns
+    -------
+    numpy.ndarray
+        0 .. N/2; -N/2 .. N/2 of complex records. For lines that drift within the record, by range
+        walk and acceleration, the position is that in the middle of the record.
     """
 
     def by_point(values: np.ndarray | float) -> np.ndarray:
+        """Return values of the points as a column (m, 1)."""
         return as_columns(shots, values)[points]
 
     hertz_per_metre = by_point(shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
-    range_beat_and_factor = (
-        hertz_per_metre * by_point(shots.range),
-        1 + shots.relative_range_offset[shots.footprint_row[points]],
-    )
+    axis_range_beat = hertz_per_metre * by_point(shots.range)
+    relative_range = 1 + shots.relative_range_offset[shots.footprint_row[points]]
     beamlet_doppler = shots.doppler_ratio_offset[shots.footprint_row[points]]
-    positions = np.empty((beamlet_doppler.shape[0], 3, beamlet_doppler.shape[1]))
+    n_points, n_beamlets = beamlet_doppler.shape
+    positions = np.empty((n_points, 3, n_beamlets))
     for s, segment in enumerate(shots.waveform_segments):
         beta = by_point(segment.doppler_ratio) + beamlet_doppler
         range_drift = SPEED_OF_LIGHT / 2 * beamlet_doppler * by_point(segment.start_time)
-        range_beat = range_beat_and_factor[0] * range_beat_and_factor[1] - hertz_per_metre * (
+        range_beat = axis_range_beat * relative_range - hertz_per_metre * (
             by_point(segment.range_decrease) + range_drift
         )
         beat = by_point(segment.carrier) * beta - segment.chirp_slope * range_beat * (1 + beta)
@@ -110,10 +147,17 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
 
 
 def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarray) -> np.ndarray:
-    """Mean places of the beamlets' lines, weighted by power, (m, 3) [bins].
+    """Return the mean positions of the beamlets' lines, weighted by power, (m, 3) [bins].
 
-    Next to the ``strongest_bins`` bins (m, 3) of complex records, whose bins may be numbered from
-    anywhere on.
+    Parameters
+    ----------
+    shots : Shots
+        Prepared shots.
+    points
+        (m,): indices of points.
+    strongest_bins
+        (m, 3): number of each segment's strongest bin. In complex records, whose spectra are
+        periodic, the result is the position nearest to this bin.
     """
     line_offsets = beamlet_line_positions(shots, points) - strongest_bins[..., None]
     if shots.complex_record:
@@ -125,7 +169,7 @@ def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarr
 
 
 def axis_line_positions(shots: Any) -> np.ndarray:
-    """Positions (segments, n) of the lines on the beam's axis [bins]."""
+    """Return the positions of the lines on the beam's axis, (segments, n) [bins]."""
     cycles_per_sample = [
         (beat + drift) / shots.sample_rate
         for beat, drift in zip(shots.beat_frequencies, shots.mid_record_drifts, strict=True)
@@ -136,82 +180,104 @@ def axis_line_positions(shots: Any) -> np.ndarray:
 
 
 def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
-    """Places [bins] in a spectrum at which lines of a frequency over the sample rate are seen."""
+    """Return the positions [bins] of lines from their frequencies over the sample rate.
+
+    Frequencies alias; those of real records also fold at 0.
+    """
     positions = (cycles_per_sample - np.floor(cycles_per_sample + 0.5)) * shots.fft_size
     return np.asarray(positions if shots.complex_record else abs(positions))
 
 
 def as_columns(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
-    """One value a point, with so many dimensions behind it."""
+    """Broadcast values to all points and append trailing dimensions of size 1, (n, 1, ...)."""
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * n_trailing)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _is_in_band(bin_, first_and_count, period_bins):
-    """Test if a bin is in the band (first bin, number); ``period_bins`` is N of complex records."""
-    distance = bin_ - first_and_count[0]
-    if period_bins > 0:
-        distance %= period_bins
-    return 0 <= distance < first_and_count[1]
+def _is_in_band(bin_, band):
+    """Test if a bin is in a :class:`SearchBand`."""
+    distance = bin_ - band.first_bin
+    if band.period_bins > 0:
+        distance %= band.period_bins
+    return 0 <= distance < band.n_bins
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _restrict_spans(
-    span_numbers,
-    band_and_lines,
-    threshold_rows,
-    rule_and_leakage,
-    points_and_speckle,
-    all_magnitudes,
-    all_is_exempt,
-    probabilities,
+    spans,
+    bands,
+    peak_is_searched,
+    line_positions,
+    bin_thresholds,
+    negligible_signal_ratio,
+    rule,
+    evaluates_leakage,
+    n_exempt,
+    leakage,
 ):
-    """Cut runs to the band, in place.
+    """Restrict spans of bins to the search band, in place.
 
-    ``span_numbers`` (5, segments, m) are low, count, peak, exempted and start of runs;
-    ``band_and_lines`` the
-    band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
-    largest bin is searched; ``threshold_rows`` (8, m) those of
-    :class:`sweep.model.detection.echo_detection.BinThreshold`,
-    and the floor of leakage over the noise; ``rule_and_leakage`` the rule of detection and segments
-    whose leakage is looked at; ``points_and_speckle`` points (m,) and the speckle of all;
-    ``probabilities`` (3, segments, m) pd, miss and leakage.
+    Parameters
+    ----------
+    spans
+        :class:`sweep.model.detection.echo_detection.EchoSpans` (segments, m); all of its arrays are
+        changed.
+    bands
+        :class:`SearchBand` with arrays (segments, m).
+    peak_is_searched
+        (segments, m) bool: True if the strongest bin is in the band.
+    line_positions
+        (m, 3, beamlets): :func:`beamlet_line_positions`; without beamlets if all strongest bins are
+        in the band.
+    bin_thresholds
+        :class:`sweep.model.detection.echo_detection.BinThresholds` (m,).
+    negligible_signal_ratio
+        (m,): |X| over sigma below which a bin counts as noise alone.
+    rule
+        :class:`sweep.model.detection.echo_detection.DetectionRule`.
+    evaluates_leakage
+        (segments,) bool: True for segments whose leakage is evaluated.
+    n_exempt
+        (segments, m): number of exempt bins; the result for spans that are cut.
+    leakage
+        (segments, m): probability of a false peak by leakage; the result for spans that are cut.
     """
-    (band_bins, period_bins, line_positions, peak_is_searched), (rule, evaluates_leakage) = (
-        band_and_lines,
-        rule_and_leakage,
+    first_bin, n_bins, peak_index, span_starts = (
+        spans.first_bin,
+        spans.n_bins,
+        spans.peak_index,
+        spans.span_start,
     )
-    first_bin, n_bins, peak_index, n_exempt, span_starts = span_numbers
     for s in range(first_bin.shape[0]):
         for j in range(first_bin.shape[1]):
+            band = SearchBand(bands.first_bin[s, j], bands.n_bins[s, j], bands.period_bins)
             first, last = n_bins[s, j], -1
             n_searched = 0
             span_bin, span_start = first_bin[s, j], span_starts[s, j]
             for k in range(n_bins[s, j]):
-                if _is_in_band(span_bin + k, band_bins[s, :, j], period_bins):
+                if _is_in_band(span_bin + k, band):
                     first, last, n_searched = min(first, k), k, n_searched + 1
             if n_searched == n_bins[s, j]:
                 continue
-            magnitudes = all_magnitudes[span_start : span_start + n_bins[s, j]]
-            is_exempt = all_is_exempt[span_start : span_start + n_bins[s, j]]
+            bin_threshold = bin_threshold_at(bin_thresholds, j)
+            threshold = bin_threshold.threshold
+            magnitudes = spans.magnitudes[span_start : span_start + n_bins[s, j]]
+            is_exempt = spans.is_exempt[span_start : span_start + n_bins[s, j]]
             if not peak_is_searched[s, j]:
                 is_exempt[:] = False
-                if threshold_rows[1, j] <= magnitudes[peak_index[s, j]]:
-                    lobe_half_width = max(rule.lobe_half_width, int(threshold_rows[4, j]))
+                if threshold <= magnitudes[peak_index[s, j]]:
                     _mark_searched_echoes(
                         magnitudes,
                         is_exempt,
                         span_bin,
-                        threshold_rows[1, j],
-                        lobe_half_width,
-                        (band_bins[s, :, j], period_bins),
+                        threshold,
+                        echo_half_width(rule, bin_threshold.pedestal.reach_bins),
+                        band,
                         line_positions[j, s],
                     )
             largest_index = first
             for k in range(first, last + 1):
-                if not _is_in_band(
-                    span_bin + k, band_bins[s, :, j], period_bins
-                ):  # between both ends of the band
+                if not _is_in_band(span_bin + k, band):  # between both ends of a periodic band
                     magnitudes[k], is_exempt[k] = 0.0, False
                 largest_index = k if magnitudes[k] > magnitudes[largest_index] else largest_index
             first_bin[s, j], span_starts[s, j], n_bins[s, j] = (
@@ -228,32 +294,42 @@ def _restrict_spans(
                 else max(largest_index - first, 0)
             )
             n_exempt[s, j] = is_exempt.sum()
-            detection = Detection(0.0, 1.0)
-            if peak_is_searched[s, j]:
-                detection = pd_and_miss(
-                    EchoBins(magnitudes, is_exempt, first_bin[s, j]),
-                    peak_index[s, j],
-                    rule,
-                    bin_threshold_at(threshold_rows, j),
-                    bin_speckle_at(points_and_speckle[1], s, points_and_speckle[0][j]),
-                )
-            probabilities[0, s, j], probabilities[1, s, j] = detection.pd, detection.miss
             if evaluates_leakage[s]:
-                probabilities[2, s, j] = span_leakage(
+                leakage[s, j] = span_leakage(
                     magnitudes,
                     is_exempt,
-                    (threshold_rows[1, j], threshold_rows[2, j], threshold_rows[7, j]),
-                    threshold_rows[1, j],
+                    threshold,
+                    bin_threshold.noise_without_pedestal,
+                    negligible_signal_ratio[j],
+                    threshold,
                     rule.sidelobe_correlation,
                 )
 
 
 @njit(cache=True, error_model="numpy")
 def _mark_searched_echoes(
-    magnitudes, is_exempt, first_bin, threshold, lobe_half_width, band_and_period, line_positions
+    magnitudes, is_exempt, first_bin, threshold, lobe_half_width, band, line_positions
 ):
-    """Mark the bins of groups about lines whose largest bin is searched, and those beside them."""
-    index, period_bins = 0, band_and_period[1]
+    """Mark the bins of echoes whose strongest bin is in the search band, and their neighbours.
+
+    Parameters
+    ----------
+    magnitudes
+        (bins,): |X| without noise of adjacent bins.
+    is_exempt
+        (bins,) bool: the result.
+    first_bin
+        Number of the first bin.
+    threshold
+        Threshold on |X|; adjacent bins at or above it form a group.
+    lobe_half_width
+        Half-width [bins] of an echo about its lines.
+    band
+        :class:`SearchBand`.
+    line_positions
+        (beamlets,): positions of lines [bins]. Groups without a line are leaked signal, not echoes.
+    """
+    index = 0
     while index < magnitudes.size:
         if not magnitudes[index] >= threshold:  # true of nan too, which would end no loop
             index += 1
@@ -267,32 +343,43 @@ def _mark_searched_echoes(
         holds_line = False
         for position in line_positions:
             distance = position - (first_bin + first - 1)
-            if period_bins > 0:
-                distance -= period_bins * math.floor(distance / period_bins)
+            if band.period_bins > 0:
+                distance -= band.period_bins * math.floor(distance / band.period_bins)
             holds_line |= 0.0 <= distance <= index - first + 1
-        if holds_line and _is_in_band(first_bin + largest_index, band_and_period[0], period_bins):
+        if holds_line and _is_in_band(first_bin + largest_index, band):
             begin, end = echo_bounds(magnitudes, first, index - 1, threshold, lobe_half_width)
             is_exempt[max(min(begin, first - 1), 0) : max(end, index) + 1] = True
 
 
 @njit(cache=True, error_model="numpy")
 def span_leakage(
-    magnitudes, is_exempt, threshold_sigma_and_floor, group_threshold, sidelobe_correlation
+    magnitudes,
+    is_exempt,
+    alarm_threshold,
+    noise_sigma,
+    negligible_signal_ratio,
+    group_threshold,
+    sidelobe_correlation,
 ):
-    """Return the probability that leaked signal in a run raises a further group to a level.
+    """Return the probability that leaked signal makes a further group of bins cross a threshold.
 
     Parameters
     ----------
-    magnitudes, is_exempt
-        |X| of its bins, and whether they are of an echo.
-    threshold_sigma_and_floor
-        Level, noise per quadrature sigma, and lowest |X| / sigma that is looked at.
+    magnitudes
+        (bins,): |X| without noise of adjacent bins.
+    is_exempt
+        (bins,) bool: True in bins that belong to an echo.
+    alarm_threshold
+        Threshold on |X| that a bin has to cross.
+    noise_sigma
+        Noise per quadrature sigma.
+    negligible_signal_ratio
+        |X| over sigma below which a bin counts as noise alone.
     group_threshold
-        Threshold on |X|, which groups hang together by.
+        Threshold on |X| by which adjacent bins form a group.
     sidelobe_correlation
-        Correlation of neighbours' noise in phase with the signal.
+        Correlation of neighbouring bins' noise components in phase with the signal.
     """
-    alarm_threshold, noise_sigma, negligible_signal_ratio = threshold_sigma_and_floor
     threshold_ratio, probabilities = alarm_threshold / noise_sigma, np.zeros(magnitudes.size)
     p_noise_stay = -math.expm1(-0.5 * threshold_ratio * threshold_ratio)
     for k in range(magnitudes.size):
@@ -310,7 +397,8 @@ def span_leakage(
         magnitudes.size,
         magnitudes,
         is_exempt,
-        (noise_sigma, group_threshold),
+        noise_sigma,
+        group_threshold,
         sidelobe_correlation,
     )
     return any_crossing_probability(probabilities, 0, magnitudes.size)

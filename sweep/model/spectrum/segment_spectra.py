@@ -19,6 +19,10 @@ from sweep.model.detection.added_crossings import (
     exclude_bins_joining_echo,
     fill_crossing_series,
 )
+from sweep.model.detection.detection_probability import (
+    detect_in_spans,
+    pd_follows_from_computed_spans,
+)
 from sweep.model.detection.echo_detection import (
     BinThreshold,
     Detection,
@@ -196,6 +200,8 @@ def iter_spans(
     searched as well. Without ``with_pd`` the probabilities of a detection are nan.
     """
     point_rows = shots.point_parameter_table()
+    # Else probabilities are set from the final spans.
+    computes_pd_at_once = with_pd and pd_follows_from_computed_spans(shots)
     point_levels = point_rows[11] if level_min is None else np.broadcast_to(level_min, shots.size)
     chosen_points = np.arange(shots.size) if points is None else points
     for group in _iter_shape_groups(shots, chosen_points):
@@ -212,18 +218,24 @@ def iter_spans(
                 shots.circulator_leak_amplitude is not None or shots.search_band is not None
             )
             spans, n_computed = _evaluate_batch(
-                shots, point_rows, lowest_levels, group, leakage_method, n_done, must_keep, with_pd
+                shots,
+                point_rows,
+                lowest_levels,
+                group,
+                leakage_method,
+                n_done,
+                must_keep,
+                computes_pd_at_once,
             )
             spans = (
                 spans
                 if ignores_band
                 else restrict_to_band(shots, _clear_spans_without_echo(shots, spans))
             )
-            spans = (
-                _apply_looks(shots, spans, bool(leakage_method))
-                if shots.looks.is_noncoherent
-                else spans
-            )
+            if shots.looks.is_noncoherent and leakage_method:
+                spans = _leakage_in_looks(shots, spans)
+            if with_pd:
+                spans = detect_in_spans(shots, spans)
             yield (
                 spans if shots.circulator_leak_amplitude is None else apply_leak_line(shots, spans)
             )
@@ -231,7 +243,7 @@ def iter_spans(
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Empty the runs of segments whose echo has no sample of the record: nothing is detected."""
+    """Empty the spans of segments whose echo has no sample in the record; nothing is searched."""
     if shots.n_samples_before_echo is None:
         return spans
     lacks_echo = (shots.n_samples_before_echo[:, spans.point_numbers] >= shots.window.length) & (
@@ -243,21 +255,19 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
         n_bins=np.where(lacks_echo, 0, spans.n_bins),
         peak_index=np.where(lacks_echo, 0, spans.peak_index),
         n_exempt=np.where(lacks_echo, 0, spans.n_exempt),
-        pd=np.where(lacks_echo, 0.0, spans.pd),
-        miss=np.where(lacks_echo, 1.0, spans.miss),
         leakage=np.where(lacks_echo, 0.0, spans.leakage),
         peak_is_searched=spans.peak_is_searched & ~lacks_echo,
     )
 
 
-def _apply_looks(shots: Shots, spans: BinSpans, leakage: bool) -> BinSpans:
-    """Replace one record's probabilities in runs by those of several looks."""
+def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
+    """Replace one record's probability of leakage in spans by that of several looks."""
     negligible_signal_ratio, noise_sigma, threshold = (
         np.broadcast_to(value, shots.size)[spans.point_numbers]
         for value in (shots.negligible_signal_ratio, shots.bin_noise_sigma, shots.threshold)
     )
     leakage_in_looks, looks = spans.leakage.copy(), shots.looks
-    for s, column in np.argwhere(spans.n_bins > 0) if leakage and shots.includes_leakage else ():
+    for s, column in np.argwhere(spans.n_bins > 0) if shots.includes_leakage else ():
         if not shots.waveform_segments[s].includes_leakage:
             continue
         span_slice = slice(
@@ -290,29 +300,19 @@ def _apply_looks(shots: Shots, spans: BinSpans, leakage: bool) -> BinSpans:
         for root_power, weight, probabilities in zip(
             root_powers, weights, crossing_probabilities, strict=True
         ):
-            sigma_and_threshold = (
-                1 / (looks.amplitude_gain_max * root_power),
-                equivalent_threshold_ratio / (looks.amplitude_gain_max * root_power),
-            )
             exclude_bins_joining_echo(
                 probabilities,
                 0,
                 probabilities.size,
                 signal,
                 is_exempt,
-                sigma_and_threshold,
+                1 / (looks.amplitude_gain_max * root_power),
+                equivalent_threshold_ratio / (looks.amplitude_gain_max * root_power),
                 sidelobe_correlation,
             )
             mean_leakage += weight * any_crossing_probability(probabilities, 0, probabilities.size)
         leakage_in_looks[s, column] = mean_leakage
-    pd, miss = shots.pd_and_miss_in_looks(
-        spans.peak_magnitude, spans.first_bin + spans.peak_index, spans.point_numbers
-    )
-    pd, miss = (
-        np.where(spans.peak_is_searched, pd, 0.0),
-        np.where(spans.peak_is_searched, miss, 1.0),
-    )
-    return spans._replace(pd=pd, miss=miss, leakage=leakage_in_looks)
+    return spans._replace(leakage=leakage_in_looks)
 
 
 def segment_spectrum(shots: Shots, point: int, segment: int, *, level_min: float = 0.0) -> tuple:

@@ -126,7 +126,8 @@ def _span_probabilities(
         spans.peak_is_searched,
         (spans.magnitudes, spans.is_exempt),
         levels,
-        np.concatenate([shots.bin_threshold_table[:, points], negligible_signal_ratio[None]]),
+        shots.bin_thresholds.select(points),
+        negligible_signal_ratio,
         (shots.detection_rule, shots.includes_leakage),
         (points, shots.speckle_table),
         pd_loss,
@@ -230,7 +231,8 @@ def _evaluate_levels(
     peak_is_searched,
     span_bins,
     levels,
-    threshold_rows,
+    bin_thresholds,
+    negligible_signal_ratio,
     rule_and_leakage,
     points_and_speckle,
     pd_loss,
@@ -241,22 +243,21 @@ def _evaluate_levels(
     ``span_numbers`` (4, segments, m) are low, count, peak and start of runs; ``span_bins`` |X| [V]
     of all
     runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
-    ``threshold_rows`` (8, m) levels of the bins
-    (:class:`sweep.model.detection.echo_detection.BinThreshold`), and the floor of
-    leakage over the noise; ``rule_and_leakage`` the rule of detection, and whether leakage is
+    ``bin_thresholds`` (m,) :class:`sweep.model.detection.echo_detection.BinThresholds`;
+    ``negligible_signal_ratio`` (m,) the floor of leakage over the noise;
+    ``rule_and_leakage`` the rule of detection, and whether leakage is
     looked at;
     ``points_and_speckle`` points (m,) and the speckle of all. Results, of the levels' shape:
     ``pd_loss`` P_b - P_z; ``exponents`` -ln P(Z < z), to which that of leaked signal is added.
     """
     first_bin, n_bins, peak_index, span_start = span_numbers
-    noise_sigma, negligible_signal_ratio = threshold_rows[2], threshold_rows[7]
     for s in range(first_bin.shape[0]):
         for j in range(first_bin.shape[1]):
             if n_bins[s, j] == 0:
                 continue
             magnitudes = span_bins[0][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
             is_echo = span_bins[1][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
-            at_threshold, bin_threshold = Detection(0.0, 1.0), bin_threshold_at(threshold_rows, j)
+            at_threshold, bin_threshold = Detection(0.0, 1.0), bin_threshold_at(bin_thresholds, j)
             for k in range(levels.shape[2]):
                 threshold = levels[s, j, k]
                 if peak_is_searched[s, j]:
@@ -284,7 +285,9 @@ def _evaluate_levels(
                     p_leak = span_leakage(
                         magnitudes,
                         is_echo,
-                        (threshold, noise_sigma[j], negligible_signal_ratio[j]),
+                        threshold,
+                        bin_threshold.noise_without_pedestal,
+                        negligible_signal_ratio[j],
                         levels[s, j, 0],
                         rule_and_leakage[0].sidelobe_correlation,
                     )

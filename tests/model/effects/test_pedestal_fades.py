@@ -155,9 +155,9 @@ def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
 def test_weak_phase_noise_gives_an_echo_no_more_bins(table_4_1):
     for width, rule in ((1e3, "any_bin"), (300e3, "peak_bin")):
         p = parameters_of(table_4_1, width, 150.0, "none", rule, 1.5)
-        assert shots_of(p, effects_of("none")).bin_threshold_table[4] == 0
+        assert shots_of(p, effects_of("none")).bin_thresholds.pedestal_reach_bins == 0
     p = parameters_of(table_4_1, 300e3, 150.0, "none", "any_bin", 1.5)
     wide = shots_of(p, effects_of("none"))
-    assert wide.bin_threshold_table[4] > 10
+    assert wide.bin_thresholds.pedestal_reach_bins > 10
     narrow = [name for name in effects_of("none") if name != "line_width"]
     assert evaluate_segments(wide)[0, 4, 0] > evaluate_segments(shots_of(p, narrow))[0, 4, 0] + 10
