@@ -53,6 +53,22 @@ class BinGroups(NamedTuple):
         """|X| of the strongest bin [V, summed over the record], (n, 3, groups)."""
         return self.neighbour_magnitudes[..., 1]
 
+    def without_unused_groups(self) -> "BinGroups":
+        """Return the groups with as few groups a segment, at least one, as hold all that exist."""
+        n_groups = max(int((self.strongest_bin >= 0).any(axis=(0, 1)).sum()), 1)
+        return self._replace(
+            **{
+                name: np.ascontiguousarray(getattr(self, name)[:, :, :n_groups])
+                for name in (
+                    "strongest_bin",
+                    "first_bin",
+                    "last_bin",
+                    "neighbour_magnitudes",
+                    "pd",
+                )
+            }
+        )
+
 
 def list_bin_groups(
     shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True

@@ -124,7 +124,7 @@ from sweep.model.sampling.speckle_lines import (
     position_error_moments,
     speckle_line_grid,
 )
-from sweep.model.spectrum.search_restriction import as_columns, beamlet_line_positions
+from sweep.model.spectrum.search_restriction import beamlet_line_positions
 
 BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
 """Columns of a peak: bin; position between bins and its standard error by noise [bins]; |X| /
@@ -181,6 +181,21 @@ class Returns(NamedTuple):
     radial_velocity_per_slip: np.ndarray
     """Change of the interpolated radial velocity [m/s] for 1 m/s of slip."""
 
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "Returns":
+        """Return arrays (n, draws, returns) without returns."""
+        arrays: dict[str, np.ndarray] = {
+            "flags": np.zeros(shape, np.uint8),
+            "beamlet": np.full(shape, -1, np.int32),
+            "group": np.full((*shape, 3), FALSE_PEAK, np.int8),
+        }
+        return cls(
+            **{
+                name: arrays[name] if name in arrays else np.full(shape, np.nan)
+                for name in cls._fields
+            }
+        )
+
 
 def draw_returns(
     shots: Shots,
@@ -231,7 +246,6 @@ def draw_returns(
         part_inputs = part_inputs._replace(
             pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
         )
-        part_peaks = DrawnPeaks(*(column[indices] for column in drawn_peaks))
         filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
         n_noise_bins = filter_rule[0].shape[0]
         if n_noise_bins not in noise_roots:
@@ -265,16 +279,15 @@ def draw_returns(
         workspace = DrawWorkspace.allocate(n_filter_bins, bin_groups.strongest_bin.shape[2])
         _draw_points(
             keys[indices],
+            np.ascontiguousarray(indices, np.int64),
             part_config,
             part_inputs,
             spectra,
             part_leakage_bins,
             interpolation,
             workspace,
-            part_peaks,
+            drawn_peaks,
         )
-        for column, values in zip(drawn_peaks, part_peaks, strict=True):
-            column[indices] = values
     return measure_returns(shots, inputs, drawn_peaks, motion)
 
 
@@ -295,14 +308,18 @@ def _iter_spectra(
         return
     n_noise_bins = np.nan_to_num(shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T)
     leaking_indices = find_leaking_points(shots, bin_groups)
+    is_leaking_point = np.zeros(shots.size, bool)
+    is_leaking_point[leaking_indices] = True
     leakage_bins_by_part: Iterable[tuple[np.ndarray, LeakageBins]] = iter_leakage_bins(
         shots, bin_groups, leaking_indices
     )
     if known_leakage_bins is not None:
         leakage_bins_by_part = (
-            (indices[is_leaking], leakage_bins.select(is_leaking))
+            (indices, leakage_bins)
+            if is_leaking.all()
+            else (indices[is_leaking], leakage_bins.select(is_leaking))
             for indices, leakage_bins in known_leakage_bins
-            if (is_leaking := np.isin(indices, leaking_indices)).any()
+            if (is_leaking := is_leaking_point[indices]).any()
         )
     for indices, leakage_bins in leakage_bins_by_part:
         yield (
@@ -310,7 +327,9 @@ def _iter_spectra(
             NoiselessSpectra.empty(indices.size)._replace(n_noise_bins=n_noise_bins[indices]),
             leakage_bins,
         )
-    other_indices = np.setdiff1d(np.arange(shots.size), leaking_indices)
+    other_indices = np.flatnonzero(~is_leaking_point)
+    if not other_indices.size:
+        return
     empty_spectra = NoiselessSpectra.empty(other_indices.size)._replace(
         n_noise_bins=n_noise_bins[other_indices]
     )
@@ -511,13 +530,33 @@ class DrawnPeaks(NamedTuple):
         )
 
 
+class ListedReturns(NamedTuple):
+    """Returns of all points and draws, listed one after the other, (m,)."""
+
+    point: np.ndarray
+    """(m,) int64: index of the point."""
+    peaks: np.ndarray
+    """(m, 3, 4): up, Doppler and down peak, with the columns BIN_COLUMN to RATIO_COLUMN; nan for
+    none."""
+    reading: np.ndarray
+    """(m,) int64: reading of the peaks with the default slopes."""
+    group: np.ndarray
+    """(m, 3) int8: group of the up, Doppler and down peak, FALSE_PEAK or NO_PEAK."""
+    flags: np.ndarray
+    """(m,) uint8: bits of FLAG_BITS."""
+    beamlet: np.ndarray
+    """(m,) int32: beamlet that a true or misread return measures, -1 otherwise."""
+
+
 def make_draw_inputs(
     shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
 ) -> DrawInputs:
     """Return the quantities of shots and their groups that draws depend on.
 
-    ``motion`` is the known motion, as in :func:`draw_returns`.
+    ``motion`` is the known motion, as in :func:`draw_returns`. The groups' axis of the result has
+    only as many groups as the segment with the most.
     """
+    bin_groups = bin_groups.without_unused_groups()
     line_positions, beamlet_amplitude = (
         beamlet_line_positions(shots),
         shots.relative_amplitude[shots.footprint_row],
@@ -701,27 +740,26 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
 
 
 class Measurements(NamedTuple):
-    """Range [m] and radial velocity [m/s] of returns, (n, draws, returns, 2).
+    """Range and radial velocity of m returns.
 
-    The last axis has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions between bins.
-    Errors are standard errors by noise. ``range_per_half_bin`` and ``velocity_per_half_bin`` (n, 1,
-    1) are the changes by half a bin of the chirps.
+    The last axis of arrays (m, 2) has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions
+    between bins.
     """
 
     range: np.ndarray
-    """Range [m]."""
+    """(m, 2): range [m]."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s]."""
+    """(m, 2): radial velocity [m/s]."""
     range_error: np.ndarray
-    """Standard error of the range [m]."""
+    """(m, 2): standard error of the range by noise [m]."""
     velocity_error: np.ndarray
-    """Standard error of the radial velocity [m/s]."""
+    """(m, 2): standard error of the radial velocity by noise [m/s]."""
     range_per_half_bin: np.ndarray
-    """Change of the range by half a bin of the chirps [m]."""
+    """(m,): change of the range by half a bin of the chirps [m]."""
     velocity_per_half_bin: np.ndarray
-    """Change of the radial velocity by half a bin of the chirps [m/s]."""
+    """(m,): change of the radial velocity by half a bin of the chirps [m/s]."""
     range_bias: np.ndarray | float
-    """Measured range minus that at the shot's start [m], (n, 1, 1)."""
+    """(m,): measured range minus that at the shot's start [m]."""
 
 
 def measure_returns(
@@ -748,108 +786,134 @@ def measure_returns(
         True if positions between bins are those of
         :mod:`sweep.model.detection.sub_bin_interpolation`; False for another estimator's.
     """
+    is_return = drawn_peaks.flags > 0  # few of the entries
+    returns = Returns.empty(is_return.shape)
+    if is_return.any():
+        listed_returns = ListedReturns(
+            np.nonzero(is_return)[0], *(column[is_return] for column in drawn_peaks)
+        )
+        measured_columns = _measure_listed_returns(
+            shots, inputs, listed_returns, motion, from_three_bins
+        )
+        for column, values in zip(returns, measured_columns, strict=True):
+            column[is_return] = values
+    return returns
+
+
+def _measure_listed_returns(
+    shots: Shots,
+    inputs: DrawInputs,
+    listed_returns: ListedReturns,
+    motion: EgoMotion | None,
+    from_three_bins: bool,
+) -> Returns:
+    """Compute :func:`measure_returns` for m listed returns; the fields of the result are (m,)."""
     uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
-    drawn_peaks = _add_drift_errors(shots, drawn_peaks, motion)
+    point, at_returns = listed_returns.point, partial(_values_at, shots, listed_returns.point)
+    listed_returns = _add_drift_errors(shots, listed_returns, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
     if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise alone
-        drawn_peaks = _correct_late_echoes(shots, drawn_peaks, measure(shots, drawn_peaks, None))
-    wander_covariance = _wander_covariance(shots, inputs, drawn_peaks)
+        listed_returns = _correct_late_echoes(
+            shots, listed_returns, measure(shots, listed_returns, None)
+        )
+    wander_covariance = _wander_covariance(shots, inputs, listed_returns)
     if wander_covariance is not None:
-        peaks = drawn_peaks.peaks.copy()
+        peaks = listed_returns.peaks.copy()
         wander_variance = np.diagonal(wander_covariance, axis1=-2, axis2=-1)
         peaks[..., ERROR_COLUMN] = np.sqrt(peaks[..., ERROR_COLUMN] ** 2 + wander_variance)
-        drawn_peaks = drawn_peaks._replace(peaks=peaks)
-    measurements = measure(shots, drawn_peaks, wander_covariance)
-    point_index, group = np.arange(shots.size)[:, None, None], np.maximum(drawn_peaks.group, 0)
+        listed_returns = listed_returns._replace(peaks=peaks)
+    measurements = measure(shots, listed_returns, wander_covariance)
+    group = np.maximum(listed_returns.group, 0)
     group_widths = (inputs.group_bins[:, :, LAST_ROW] - inputs.group_bins[:, :, FIRST_ROW])[
-        point_index[..., None], np.arange(3), group
+        point[:, None], np.arange(3), group
     ]
     tolerance_half_bins = 2 * (
-        4 + np.where(drawn_peaks.group >= 0, group_widths, 0).sum(axis=-1)
+        4 + np.where(listed_returns.group >= 0, group_widths, 0).sum(axis=-1)
     )  # number of half bins
-    range_offset, velocity_offset = (
-        shots.relative_range_offset[shots.footprint_row],
-        SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[shots.footprint_row],
+    beamlet = np.maximum(listed_returns.beamlet, 0)
+    footprint_row = shots.footprint_row[point]
+    true_range = at_returns(shots.range) * (1 + shots.relative_range_offset[footprint_row, beamlet])
+    true_velocity = (
+        at_returns(shots.radial_velocity)
+        + SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[footprint_row, beamlet]
     )
-    true_velocity = as_columns(shots, shots.radial_velocity) + velocity_offset
-    axis_range, beamlet = as_columns(shots, shots.range, 2), np.maximum(drawn_peaks.beamlet, 0)
-    range_error = (
-        measurements.range[..., POSITION_COLUMN]
-        - measurements.range_bias
-        - axis_range * (1 + range_offset[point_index, beamlet])
-    )
+    range_error = measurements.range[:, POSITION_COLUMN] - measurements.range_bias - true_range
     is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
     is_right &= (
-        abs(
-            measurements.radial_velocity[..., POSITION_COLUMN] - true_velocity[point_index, beamlet]
-        )
+        abs(measurements.radial_velocity[:, POSITION_COLUMN] - true_velocity)
         <= tolerance_half_bins * measurements.velocity_per_half_bin
     )
-    is_signal = (drawn_peaks.group[..., ::2] >= 0).all(axis=-1) & (
-        drawn_peaks.group[..., 1] != FALSE_PEAK
-    )
-    pd = (
-        inputs.pd[point_index, 0, group[..., 0]]
-        * inputs.down_pd_given_up[point_index, 1, group[..., 2]]
-    )
-    is_misread = (drawn_peaks.flags & TRUE_FLAG > 0) & ~is_right
+    up_group, doppler_group, down_group = listed_returns.group.T
+    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK)
+    pd = inputs.pd[point, 0, group[:, 0]] * inputs.down_pd_given_up[point, 1, group[:, 2]]
+    is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
     uncorrected = (
-        measurements.range[..., POSITION_COLUMN].copy(),
-        measurements.radial_velocity[..., POSITION_COLUMN].copy(),
+        measurements.range[:, POSITION_COLUMN].copy(),
+        measurements.radial_velocity[:, POSITION_COLUMN].copy(),
     )
     if not uses_fit:  # refer to the shot's start by the measured velocity
-        measurements.radial_velocity[..., POSITION_COLUMN] *= 1 + as_columns(
-            shots, shots.velocity_bias_fraction, 2
+        measurements.radial_velocity[:, POSITION_COLUMN] *= 1 + at_returns(
+            shots.velocity_bias_fraction
         )
-        measurements.range[..., POSITION_COLUMN] += measurements.radial_velocity[
-            ..., POSITION_COLUMN
-        ] * as_columns(shots, shots.range_walk_time, 2)
+        measurements.range[:, POSITION_COLUMN] += measurements.radial_velocity[
+            :, POSITION_COLUMN
+        ] * at_returns(shots.range_walk_time)
     per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
     if motion is not None:
-        per_slip = _apply_motion_correction(shots, drawn_peaks, measurements, motion)
+        per_slip = _apply_motion_correction(shots, listed_returns, measurements, motion)
     for values, errors, uncorrected_values in zip(
         (measurements.range, measurements.radial_velocity),
         (measurements.range_error, measurements.velocity_error),
         uncorrected,
         strict=True,
     ):  # values by whole bins stay uncorrected; add the correction to their errors
-        errors[..., BIN_COLUMN] = np.hypot(
-            errors[..., BIN_COLUMN], values[..., POSITION_COLUMN] - uncorrected_values
+        errors[:, BIN_COLUMN] = np.hypot(
+            errors[:, BIN_COLUMN], values[:, POSITION_COLUMN] - uncorrected_values
         )
     return Returns(
-        measurements.range[..., BIN_COLUMN],
-        measurements.range[..., POSITION_COLUMN],
-        measurements.radial_velocity[..., BIN_COLUMN],
-        measurements.radial_velocity[..., POSITION_COLUMN],
-        measurements.range_error[..., BIN_COLUMN],
-        measurements.range_error[..., POSITION_COLUMN],
-        measurements.velocity_error[..., BIN_COLUMN],
-        measurements.velocity_error[..., POSITION_COLUMN],
-        drawn_peaks.peaks[..., ::2, RATIO_COLUMN].min(axis=-1) ** 2 / 2,
+        measurements.range[:, BIN_COLUMN],
+        measurements.range[:, POSITION_COLUMN],
+        measurements.radial_velocity[:, BIN_COLUMN],
+        measurements.radial_velocity[:, POSITION_COLUMN],
+        measurements.range_error[:, BIN_COLUMN],
+        measurements.range_error[:, POSITION_COLUMN],
+        measurements.velocity_error[:, BIN_COLUMN],
+        measurements.velocity_error[:, POSITION_COLUMN],
+        np.minimum(
+            listed_returns.peaks[:, 0, RATIO_COLUMN], listed_returns.peaks[:, 2, RATIO_COLUMN]
+        )
+        ** 2
+        / 2,
         np.where(is_signal, pd, np.nan),
-        np.where(is_misread, drawn_peaks.flags ^ (TRUE_FLAG | MISREAD_FLAG), drawn_peaks.flags),
-        drawn_peaks.beamlet,
-        np.maximum(drawn_peaks.group, FALSE_PEAK),
-        *(np.where(drawn_peaks.flags > 0, change, np.nan) for change in per_slip),
+        np.where(
+            is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
+        ),
+        listed_returns.beamlet,
+        np.maximum(listed_returns.group, FALSE_PEAK),
+        *(np.broadcast_to(change, point.shape) for change in per_slip),
     )
 
 
+def _values_at(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
+    """Return the values (n,) of the points with the indices ``point`` (m,)."""
+    return np.broadcast_to(values, shots.size)[point]
+
+
 def _wander_covariance(
-    shots: Shots, inputs: DrawInputs, drawn_peaks: DrawnPeaks
+    shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns
 ) -> np.ndarray | None:
     """Return the mean products [bins^2] of the errors of each return's peaks by speckle.
 
-    They are (n, draws, returns, 3, 3) by segment, signed as the beats; None for shots without
-    speckle.
+    They are (m, 3, 3) by segment, signed as the beats; None for shots without speckle.
     """
     line_gradients = shots.line_gradients
     if line_gradients is None:
         return None
-    covariance = np.zeros((*drawn_peaks.group.shape, 3))
-    point, draw, return_number = np.nonzero((drawn_peaks.group >= 0).any(axis=-1))
-    group, peaks = (
-        drawn_peaks.group[point, draw, return_number],
-        drawn_peaks.peaks[point, draw, return_number],
+    covariance = np.zeros((*listed_returns.group.shape, 3))
+    is_echo = (listed_returns.group >= 0).any(axis=-1)
+    point, group, peaks = (
+        column[is_echo]
+        for column in (listed_returns.point, listed_returns.group, listed_returns.peaks)
     )
     segment, point_column = np.arange(3), point[:, None]
     present = np.where(group >= 0, 1.0, np.nan)
@@ -880,15 +944,15 @@ def _wander_covariance(
         if shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
         else SEGMENT_PAIRS_AND_SELF
     )
-    covariance[point, draw, return_number] = position_error_moments(
+    covariance[is_echo] = position_error_moments(
         line_gradients.select(point), speckle_peaks, shots, segment_pairs
     )
     return covariance
 
 
 def _add_drift_errors(
-    shots: Shots, drawn_peaks: DrawnPeaks, motion: EgoMotion | None
-) -> DrawnPeaks:
+    shots: Shots, listed_returns: ListedReturns, motion: EgoMotion | None
+) -> ListedReturns:
     """Add the errors by the drift of lines within the record to the peaks' standard errors.
 
     The drift is that of the known motion, if given, else that of the shots.
@@ -909,13 +973,13 @@ def _add_drift_errors(
             for rate in shots.frequency_drift_rates
         ]
     )
-    peaks = drawn_peaks.peaks.copy()
+    peaks = listed_returns.peaks.copy()
     offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
-    has_peak = np.isfinite(offset)  # few of the entries for returns are filled
-    drift_of_peak = np.broadcast_to(drift_bins.T[:, None, None], offset.shape)[has_peak]
+    has_peak = np.isfinite(offset)
+    drift_of_peak = drift_bins.T[listed_returns.point][has_peak]
     drift_errors = drift_error(offset[has_peak], drift_of_peak, shots.window, shots.fft_size)
     peaks[has_peak, ERROR_COLUMN] = np.hypot(peaks[has_peak, ERROR_COLUMN], drift_errors)
-    return drawn_peaks._replace(peaks=peaks)
+    return listed_returns._replace(peaks=peaks)
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
@@ -923,23 +987,23 @@ _POSITION_ERROR_MAX_BINS = 0.5
 
 
 def _correct_late_echoes(
-    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements
-) -> DrawnPeaks:
+    shots: Shots, listed_returns: ListedReturns, measurements: Measurements
+) -> ListedReturns:
     """Correct positions between bins for the samples that are missing before the echo arrives.
 
     The instrument knows their number from the range by whole bins. No error exceeds half a bin,
     because a position is always within one.
     """
-    column = partial(as_columns, shots, n_trailing=2)
-    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[..., BIN_COLUMN])
-    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[..., BIN_COLUMN])
+    at_returns = partial(_values_at, shots, listed_returns.point)
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[:, BIN_COLUMN])
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[:, BIN_COLUMN])
     n_missing = waveform.count_samples_before_echo(
-        delay=delay, doppler_ratio=beta, record_start=column(shots.acquisition_delay),
-        sample_rate=column(shots.sample_rate), length=shots.window.length,
+        delay=delay, doppler_ratio=beta, record_start=at_returns(shots.acquisition_delay),
+        sample_rate=at_returns(shots.sample_rate), length=shots.window.length,
     )  # fmt: skip
-    peaks = drawn_peaks.peaks.copy()
+    peaks = listed_returns.peaks.copy()
     offset = np.nan_to_num(peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN])
-    correction = late_echo_correction(offset, n_missing[..., None], shots.window, shots.fft_size)
+    correction = late_echo_correction(offset, n_missing[:, None], shots.window, shots.fft_size)
     peaks[..., POSITION_COLUMN] += correction.shift
     widened_errors = np.minimum(
         peaks[..., ERROR_COLUMN] * correction.error_factor, _POSITION_ERROR_MAX_BINS
@@ -949,30 +1013,27 @@ def _correct_late_echoes(
         np.maximum(widened_errors, peaks[..., ERROR_COLUMN]),
         widened_errors,
     )
-    return drawn_peaks._replace(peaks=peaks)
+    return listed_returns._replace(peaks=peaks)
 
 
 def _apply_motion_correction(
-    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements, motion: EgoMotion
+    shots: Shots, listed_returns: ListedReturns, measurements: Measurements, motion: EgoMotion
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correct interpolated range and velocity for the known motion, in place.
 
     The standard deviation of the unknown motion is added to the standard errors
     (:mod:`sweep.model.pointcloud.ego_motion`). Returns the changes of range [s] and velocity by 1
-    m/s of slip.
+    m/s of slip, (m,).
     """
-    per_acceleration, per_slip = _response_to_motion(shots, drawn_peaks)
-    known_slip = motion.slip_at(measurements.range[..., POSITION_COLUMN])
-    known_acceleration, acceleration_error = (
-        as_columns(shots, values, 2)
-        for values in (motion.acceleration, motion.acceleration_standard_error)
-    )
+    motion = motion.select(listed_returns.point)
+    per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
+    known_slip = motion.slip_at(measurements.range[:, POSITION_COLUMN])
     values_by = zip(
         (measurements.range, measurements.radial_velocity), per_slip, per_acceleration, strict=True
     )
     for values, by_slip, by_acceleration in values_by:
-        values[..., POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * known_acceleration
-    slip_error = motion.slip_standard_error(measurements.range[..., POSITION_COLUMN])
+        values[:, POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * motion.acceleration
+    slip_error = motion.slip_standard_error(measurements.range[:, POSITION_COLUMN])
     errors_by = zip(
         (measurements.range_error, measurements.velocity_error),
         per_slip,
@@ -980,35 +1041,36 @@ def _apply_motion_correction(
         strict=True,
     )
     for errors, by_slip, by_acceleration in errors_by:
-        unknown_error = np.hypot(by_slip * slip_error, by_acceleration * acceleration_error)
-        errors[:] = np.hypot(errors, unknown_error[..., None])
+        unknown_error = np.hypot(
+            by_slip * slip_error, by_acceleration * motion.acceleration_standard_error
+        )
+        errors[:] = np.hypot(errors, unknown_error[:, None])
     return per_slip
 
 
 def _response_to_motion(
-    shots: Shots, drawn_peaks: DrawnPeaks
+    shots: Shots, listed_returns: ListedReturns
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return the changes of range [m] and velocity [m/s] by motion that the beats do not show.
 
-    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip. The slip is the
-    radial velocity minus the speed at which the range falls. All values broadcast with the returns
-    (n, draws, returns).
+    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip, (m,) each. The slip
+    is the radial velocity minus the speed at which the range falls.
     """
     carriers, chirp_rates = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
+    point = listed_returns.point
+    point_index: np.ndarray | slice = point
     if (
         shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
-    ):  # half sum and half difference of up and down beat
-        point_index: np.ndarray | slice = slice(None)
-        weights, shape = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates, (shots.size, 1, 1)
+    ):  # half sum and half difference of up and down beat, which all returns of a point share
+        point_index = slice(None)
+        weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
     else:
-        shape = drawn_peaks.flags.shape
-        point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
-        peaks = np.moveaxis(drawn_peaks.peaks[..., ERROR_COLUMN], 3, 0).reshape(3, point_index.size)
-        weights = np.where(np.isfinite(peaks), 1 / peaks**2, 0.0)
+        peak_errors = listed_returns.peaks[:, :, ERROR_COLUMN].T
+        weights = np.where(np.isfinite(peak_errors), 1 / peak_errors**2, 0.0)
     per_acceleration, per_slip = (
         tuple(
-            responses.reshape(shape)
+            responses[point] if isinstance(point_index, slice) else responses
             for responses in waveform.range_velocity_response(
                 beats[:, point_index],
                 weights=weights,
@@ -1038,16 +1100,17 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measure_by_reading(
-    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+    shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
     """Measure range and velocity at mid-chirp by each return's reading of its up and down peak.
 
     The errors of both peaks by common speckle are correlated. Their covariance reduces the variance
     of the range, and adds to that of the velocity.
     """
+    at_returns = partial(_values_at, shots, listed_returns.point)
     carrier, bandwidth, duration, sample_rate = (
-        as_columns(shots, column, 3)
-        for column in (
+        at_returns(values)
+        for values in (
             shots.carriers[0],
             shots.chirp_bandwidth,
             shots.chirp_duration,
@@ -1055,23 +1118,23 @@ def _measure_by_reading(
         )
     )
     bin_width, chirp_rate = sample_rate / shots.fft_size, bandwidth / duration
-    up, down = (drawn_peaks.peaks[..., side, : POSITION_COLUMN + 1] * bin_width for side in (0, 2))
+    up, down = (
+        listed_returns.peaks[:, side, : POSITION_COLUMN + 1] * bin_width[:, None] for side in (0, 2)
+    )
     f_d, f_r = np.full((2, *up.shape), np.nan)
-    for reading in np.unique(drawn_peaks.reading[drawn_peaks.reading >= 0]):
-        has_reading = (drawn_peaks.reading == reading)[..., None]
-        f_d, f_r = (
-            np.where(has_reading, new, old)
-            for new, old in zip(
-                waveform.read_beats(reading, up, down, sample_rate), (f_d, f_r), strict=True
-            )
+    for reading in np.unique(listed_returns.reading):
+        has_reading = listed_returns.reading == reading
+        f_d[has_reading], f_r[has_reading] = waveform.read_beats(
+            reading, up[has_reading], down[has_reading], sample_rate[has_reading, None]
         )
     measured_range, measured_velocity = waveform.range_velocity_of_beats(
-        f_d, f_r, carrier, bandwidth, duration
+        f_d, f_r, carrier[:, None], bandwidth[:, None], duration[:, None]
     )
     range_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / chirp_rate
     velocity_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / (carrier + bandwidth / 2)
-    variance = (drawn_peaks.peaks[..., ::2, ERROR_COLUMN] ** 2).sum(axis=-1)
-    covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[..., 0, 2]
+    up_error, _, down_error = listed_returns.peaks[:, :, ERROR_COLUMN].T
+    variance = up_error**2 + down_error**2
+    covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[:, 0, 2]
     range_variance, velocity_variance = (
         np.maximum(variance + v, 0.0) for v in (-covariance, covariance)
     )
@@ -1080,34 +1143,33 @@ def _measure_by_reading(
         for value in (range_variance, velocity_variance)
     )
     # Up and down beat give the range at the mean of their starts, plus a term by acceleration.
-    up_start, down_start = (as_columns(shots, shots.segment_starts[s], 2) for s in (0, 2))
-    range_bias = (carrier / chirp_rate)[..., 0] * as_columns(shots, shots.acceleration, 2)
+    up_start, down_start = (at_returns(shots.segment_starts[s]) for s in (0, 2))
+    range_bias = carrier / chirp_rate * at_returns(shots.acceleration)
     range_bias = 0.5 * (down_start - up_start) * range_bias
-    range_bias -= 0.5 * (down_start + up_start) * as_columns(shots, shots.approach_speed, 2)
+    range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.approach_speed)
     return Measurements(
         measured_range,
         measured_velocity,
-        range_per_half_bin * range_error,
-        velocity_per_half_bin * velocity_error,
-        range_per_half_bin[..., 0],
-        velocity_per_half_bin[..., 0],
+        range_per_half_bin[:, None] * range_error,
+        velocity_per_half_bin[:, None] * velocity_error,
+        range_per_half_bin,
+        velocity_per_half_bin,
         range_bias,
     )
 
 
 def _measure_by_fit(
-    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+    shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
     """Measure range and velocity at the shot's start by the fit of each return's peaks."""
-    shape = drawn_peaks.flags.shape
-    point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+    point = listed_returns.point
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
     chirp_rate = np.broadcast_to(shots.chirp_rate, shots.size)
-    peaks = np.moveaxis(drawn_peaks.peaks, 3, 0).reshape(3, point_index.size, -1)
+    peaks = np.moveaxis(listed_returns.peaks, 1, 0)
     is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
 
-    def bound_of(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
+    def deviations_by_errors(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
         """Return the deviations of range and velocity by errors of the beats [bins], (3, m)."""
         up, doppler, down = errors * bin_width[points]
         return range_velocity_deviation(
@@ -1125,38 +1187,28 @@ def _measure_by_fit(
     for column in (BIN_COLUMN, POSITION_COLUMN):
         errors = np.where(is_finite, peaks[..., ERROR_COLUMN], np.inf)
         errors = np.hypot(errors, math.sqrt(1 / 12) if column == BIN_COLUMN else 0.0)
-        fitted = fit_peaks(
-            shots, peaks[..., column] * bin_width[point_index], 1 / errors**2, point_index
-        )
-        deviations = bound_of(errors, point_index)
+        fitted = fit_peaks(shots, peaks[..., column] * bin_width[point], 1 / errors**2, point)
+        deviations = deviations_by_errors(errors, point)
         if wander_covariance is not None:
-            beat_covariance = (
-                wander_covariance.reshape(point_index.size, 3, 3)
-                * (bin_width[point_index] ** 2)[:, None, None]
-            )
+            beat_covariance = wander_covariance * (bin_width[point] ** 2)[:, None, None]
             deviations = _add_wander_covariance(
-                shots, deviations, beat_covariance, 1 / errors**2, point_index
+                shots, deviations, beat_covariance, 1 / errors**2, point
             )
         results_by_column.append((*fitted, *deviations))
-    has_return = (drawn_peaks.reading >= 0)[..., None]
     measured_range, measured_velocity, range_error, velocity_error = (
-        np.where(has_return, np.stack(pair, axis=-1).reshape(*shape, 2), np.nan)
-        for pair in zip(*results_by_column, strict=True)
+        np.stack(pair, axis=-1) for pair in zip(*results_by_column, strict=True)
     )
     segments = np.array(shots.has_segment)[:, None]
-    half_bin_deviation = bound_of(
+    half_bin_deviation = deviations_by_errors(
         np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
-    )
-    range_per_half_bin, velocity_per_half_bin = (
-        value[:, None, None] for value in half_bin_deviation
     )
     return Measurements(
         measured_range,
         measured_velocity,
         range_error,
         velocity_error,
-        range_per_half_bin,
-        velocity_per_half_bin,
+        half_bin_deviation[0][point],
+        half_bin_deviation[1][point],
         0.0,
     )
 
@@ -1195,16 +1247,32 @@ def _add_wander_covariance(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_points(
-    keys, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
+    keys, rows, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
 ):
-    """Draw and pair the peaks of all segments, draws and points into returns."""
-    n, draws, returns_max = drawn_peaks.flags.shape
+    """Draw and pair the peaks of all segments, draws and points into returns.
+
+    Parameters
+    ----------
+    keys
+        (m, 2) uint64: random key of each point.
+    rows
+        (m,) int64: index of each point in ``drawn_peaks``.
+    config, inputs, spectra, leakage_bins
+        Settings, and quantities, noiseless spectra and bins of leaked signal of the m points.
+    interpolation
+        Interpolator of the window.
+    workspace
+        Scratch.
+    drawn_peaks
+        Result, for these and other points.
+    """
+    _, draws, returns_max = drawn_peaks.flags.shape
     peaks, peak_groups = np.zeros((3, returns_max + 1, 4)), np.empty((3, returns_max + 1), np.int64)
     n_peaks, pairs = np.empty(3, np.int64), np.empty((returns_max + 1, 4), np.int64)
     is_up_detected, speckle_factors = np.zeros(returns_max, np.bool_), np.ones((returns_max, 3))
     in_speckle = inputs.line_grid.line_shift.shape[0] > 0
     speckle = empty_group_speckle(returns_max)
-    for i in range(n):
+    for i in range(rows.size):
         if in_speckle:
             speckle = prepare_group_speckle(i, config, inputs, spectra)
         for d in range(draws):
@@ -1229,7 +1297,14 @@ def _draw_points(
                         is_up_detected,
                     )
             pair_into_returns(
-                (i, d), config, inputs, (peaks, peak_groups, n_peaks), pairs, workspace, drawn_peaks
+                i,
+                (rows[i], d),
+                config,
+                inputs,
+                (peaks, peak_groups, n_peaks),
+                pairs,
+                workspace,
+                drawn_peaks,
             )
 
 
@@ -1485,13 +1560,15 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
+def pair_into_returns(i, row_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
     """Pair the peaks of one point and draw into returns, and judge each.
 
     Parameters
     ----------
-    point_and_draw
-        Index of the point, and index of the draw in `drawn_peaks`.
+    i
+        Index of the point in ``inputs``.
+    row_and_draw
+        Index of the point, and index of the draw, in ``drawn_peaks``.
     config, inputs
         Settings, and quantities of the points.
     peak_lists
@@ -1503,7 +1580,7 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
     drawn_peaks
         Result.
     """
-    (i, d), (peaks, peak_groups, n_peaks) = point_and_draw, peak_lists
+    (row, d), (peaks, peak_groups, n_peaks) = row_and_draw, peak_lists
     if config.has_doppler:
         n_confirmed, n_pairs = pair_peaks(
             peaks[0, : n_peaks[0], POSITION_COLUMN],
@@ -1521,8 +1598,8 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
         for r in range(n_pairs):
             pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, config.two_beat_reading
     for r in range(min(n_pairs, drawn_peaks.flags.shape[2])):
-        up_index, doppler_index, down_index, drawn_peaks.reading[i, d, r] = pairs[r]
-        peak_group_row, positions = drawn_peaks.group[i, d, r], workspace.peak_positions
+        up_index, doppler_index, down_index, drawn_peaks.reading[row, d, r] = pairs[r]
+        peak_group_row, positions = drawn_peaks.group[row, d, r], workspace.peak_positions
         positions[1] = 0.0
         peak_group_row[0], peak_group_row[2] = peak_groups[0, up_index], peak_groups[2, down_index]
         positions[0], positions[2] = (
@@ -1549,18 +1626,18 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
                     * config.nyquist_bin
                     * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
                 )
-        peak_rows = drawn_peaks.peaks[i, d, r]
+        peak_rows = drawn_peaks.peaks[row, d, r]
         for f in range(4):  # slices would compile an error message about shapes
             peak_rows[0, f], peak_rows[2, f] = peaks[0, up_index, f], peaks[2, down_index, f]
             peak_rows[1, f] = peaks[1, doppler_index, f] if doppler_index >= 0 else np.nan
-        flag, drawn_peaks.beamlet[i, d, r] = judge_return(
+        flag, drawn_peaks.beamlet[row, d, r] = judge_return(
             peak_group_row,
             positions,
             inputs.group_bins[i],
             inputs.line_positions[i],
             inputs.beamlet_amplitude[i],
         )
-        drawn_peaks.flags[i, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
+        drawn_peaks.flags[row, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -2144,9 +2221,17 @@ def draw_three_bin_noise(address, first_index, interpolation, scratch):
     """
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
     a, b, draw, stream = address
-    re, im = philox.normal_pair(a, b, draw, stream, first_index)
-    re_above, im_above = philox.normal_pair(a, b, draw, stream, first_index + 1)
-    re_below, im_below = philox.normal_pair(a, b, draw, stream, first_index + 2)
+    # Each four words make two of the pairs.
+    words = philox.four_words(a, b, draw, stream, first_index >> 1)
+    next_words = philox.four_words(a, b, draw, stream, (first_index >> 1) + 1)
+    if first_index & 1:
+        re, im = philox.to_normals(words[2], words[3])
+        re_above, im_above = philox.to_normals(next_words[0], next_words[1])
+        re_below, im_below = philox.to_normals(next_words[2], next_words[3])
+    else:
+        re, im = philox.to_normals(words[0], words[1])
+        re_above, im_above = philox.to_normals(words[2], words[3])
+        re_below, im_below = philox.to_normals(next_words[0], next_words[1])
     scratch[0, 0] = from_centre * re + below_from_above * re_above + below_own * re_below
     scratch[1, 0] = from_centre * im + below_from_above * im_above + below_own * im_below
     scratch[0, 1], scratch[1, 1] = re, im

@@ -167,6 +167,7 @@ def draw_spectra_returns(
                     peak_groups[s, k] = echo_of_peak[k]
                 n_peaks[s] = bins.size
             pair_into_returns(
+                point,
                 (point, d),
                 config,
                 inputs,
