@@ -52,7 +52,7 @@ import numpy as np
 from sweep.kernel_cache import njit
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.bin_noise import noise_filter
 from sweep.model.detection.echo_detection import (
     bin_threshold_at,
     echo_bounds,
@@ -97,7 +97,9 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import (
     ECHO_NOISE_FIRST_INDEX,
+    NoiseFilter,
     NoiselessSpectra,
+    NoiseScratch,
     down_pd_given_up,
     draw_bin_noise,
     draw_bin_noise_by_root,
@@ -232,7 +234,7 @@ def draw_returns(
         make_draw_inputs(shots, bin_groups, motion),
         DrawnPeaks.empty(bin_groups, draws),
     )
-    pfa_bin = np.exp(shots.looks.log_pfa(inputs.noise_and_threshold[:, 1:2]))
+    pfa_bin = np.exp(shots.looks.log_pfa(inputs.threshold_ratio[:, None]))
     config, interpolation = (
         DrawConfig.from_shots(shots, first_draw, in_noise),
         interpolator(shots.window, shots.fft_size),
@@ -247,7 +249,7 @@ def draw_returns(
             pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
         )
         filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
-        n_noise_bins = filter_rule[0].shape[0]
+        n_noise_bins = filter_rule.weights.shape[0]
         if n_noise_bins not in noise_roots:
             noise_roots[n_noise_bins] = noise_covariance_root(filter_rule)
         part_config = config._replace(
@@ -263,7 +265,7 @@ def draw_returns(
                 np.flatnonzero(np.abs(noise_ratio) > _CIRCULAR_PSEUDO_VARIANCE_MAX)[-1]
             )
             n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
-            end_filter = (
+            end_filter = NoiseFilter(
                 *noise_filter(shots.window, shots.fft_size, n_filter_bins),
                 shots.real_fft_size,
             )
@@ -273,7 +275,7 @@ def draw_returns(
             )
         n_filter_bins = max(
             window_bins,
-            part_config.end_noise_filter[0].shape[0],
+            part_config.end_noise_filter.weights.shape[0],
             int(spectra.n_bins.max(initial=0)),
         )
         workspace = DrawWorkspace.allocate(n_filter_bins, bin_groups.strongest_bin.shape[2])
@@ -358,11 +360,11 @@ class DrawConfig(NamedTuple):
     """FFT size N if noise at DC and Nyquist is real, else 0."""
     lobe_half_width: int
     """Half-width of a main lobe [bins] if any bin of an echo detects it, else 0."""
-    noise_filter: tuple[np.ndarray, np.ndarray, int]
-    """Result of :func:`sweep.model.sampling.draws.make_echo_noise_filter`."""
+    noise_filter: NoiseFilter
+    """Filter of the noise of echoes' bins."""
     noise_root: np.ndarray
     """Result of :func:`sweep.model.sampling.draws.noise_covariance_root` for ``noise_filter``."""
-    end_noise_filter: tuple[np.ndarray, np.ndarray, int]
+    end_noise_filter: NoiseFilter
     """Filter, like ``noise_filter``, of bins from DC or Nyquist on; without bins if no echo in
     developed speckle is near."""
     noise_pseudo_variance_ratio: np.ndarray
@@ -430,8 +432,12 @@ class DrawInputs(NamedTuple):
     signed, and shifted by multiples of N to be nearest to the strongest group."""
     beamlet_amplitude: np.ndarray
     """(n, beamlets): relative amplitude of each beamlet."""
-    noise_and_threshold: np.ndarray
-    """(n, 3): sigma [V]; threshold over sigma; noise of bins that hold lines over sigma."""
+    noise_sigma: np.ndarray
+    """(n,): sigma, noise of a bin per quadrature [V]."""
+    threshold_ratio: np.ndarray
+    """(n,): threshold over sigma."""
+    line_noise_ratio: np.ndarray
+    """(n,): noise of bins that hold lines, over sigma."""
     bin_threshold_table: np.ndarray
     """(n, 7): transposed :attr:`sweep.model.preparation.Shots.bin_threshold_table`."""
     pfa_noise: np.ndarray
@@ -470,9 +476,10 @@ class DrawInputs(NamedTuple):
 class DrawWorkspace(NamedTuple):
     """Arrays that kernels write to within a draw, allocated once for all draws."""
 
-    noise_bins: np.ndarray
-    """(4, bins + NOISE_FILTER_TAPS): noise of an echo's bins (rows 0 and 1), and independent
-    numbers."""
+    noise: NoiseScratch
+    """Noise of an echo's bins."""
+    bin_ratio: np.ndarray
+    """(bins,): |X| / sigma of an echo's bins."""
     bin_power: np.ndarray
     """(bins,): power of an echo's bins over sigma^2."""
     pedestal_power: np.ndarray
@@ -490,7 +497,8 @@ class DrawWorkspace(NamedTuple):
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
         """Allocate arrays for echoes of `n_bins` bins, and for `groups_max` groups of a segment."""
         return cls(
-            np.empty((4, n_bins + NOISE_FILTER_TAPS)),
+            NoiseScratch.allocate(n_bins),
+            np.empty(n_bins),
             np.empty(n_bins),
             np.empty(n_bins),
             np.ones(n_bins, np.bool_),
@@ -591,7 +599,8 @@ def make_draw_inputs(
         line_deviation,
         line_positions,
         beamlet_amplitude,
-        np.stack([shots.bin_noise_sigma, *threshold_and_line_noise_ratios(shots)], axis=1),
+        np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
+        *threshold_and_line_noise_ratios(shots),
         np.ascontiguousarray(shots.bin_threshold_table.T),
         np.zeros(bin_groups.leakage.shape),
         np.stack(
@@ -1380,7 +1389,7 @@ def prepare_group_speckle(i, config, inputs, spectra):
                     span_ratios,
                     group_ends[0],
                     group_ends[1],
-                    inputs.noise_and_threshold[i, 1],
+                    inputs.threshold_ratio[i],
                     lobe_half_width,
                 )
                 first_bin[g, s], n_bins[g, s] = span_first_bin + begin, end - begin + 1
@@ -1443,7 +1452,7 @@ def prepare_group_speckle(i, config, inputs, spectra):
             )
             strongest_index, noise_sigma = (
                 inputs.group_bins[i, s, STRONGEST_ROW, g] - first_bin[g, s],
-                inputs.noise_and_threshold[i, 0],
+                inputs.noise_sigma[i],
             )
             magnitudes = inputs.group_magnitudes[i, s, g]
             for k in range(n_bins[g, s]):
@@ -1680,7 +1689,8 @@ def draw_segment_peaks(
         (groups,) bool: groups detected in the up segment, which is drawn first and sets it.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     group_bins, n_peaks = inputs.group_bins[i, s], 0
     for g in range(group_bins.shape[1]):
         if group_bins[STRONGEST_ROW, g] < 0:
@@ -1903,7 +1913,8 @@ def draw_peak_bin(
 ):
     """Test a group's strongest bin with its noise; return True and set the peak if it crosses."""
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
     k = strongest_bin - spectra.first_bin[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
@@ -1913,16 +1924,16 @@ def draw_peak_bin(
     re, im = re * line_noise_ratio, im * line_noise_ratio
     group_magnitudes = inputs.group_magnitudes[i, s, group]
     near_end = speckle.n_bins[group, s] > 0 and is_near_end(strongest_bin - 1, 3, config)
-    scratch = workspace.noise_bins
+    noise = workspace.noise
     if near_end:
         draw_noise_near_end(
             (a, b, draw, stream),
             ECHO_NOISE_FIRST_INDEX * (1 + group),
             (strongest_bin - 1, 3),
             config,
-            scratch,
+            noise,
         )
-        re, im = line_noise_ratio * scratch[0, 1], line_noise_ratio * scratch[1, 1]
+        re, im = line_noise_ratio * noise.in_phase[1], line_noise_ratio * noise.in_quadrature[1]
     amplitude = speckled_amplitude(group_magnitudes[1] / noise_sigma, speckle, group, s, 1)
     if (amplitude.real + re) ** 2 + (amplitude.imag + im) ** 2 < threshold_ratio * threshold_ratio:
         return False
@@ -1947,10 +1958,10 @@ def draw_peak_bin(
     )
     if near_end:
         below_ratio = abs(
-            amplitude_below + line_noise_ratio * complex(scratch[0, 0], scratch[1, 0])
+            amplitude_below + line_noise_ratio * complex(noise.in_phase[0], noise.in_quadrature[0])
         )
         above_ratio = abs(
-            amplitude_above + line_noise_ratio * complex(scratch[0, 2], scratch[1, 2])
+            amplitude_above + line_noise_ratio * complex(noise.in_phase[2], noise.in_quadrature[2])
         )
     offset = estimate_sub_bin_offset(below_ratio, centre_ratio, above_ratio, interpolation)
     peak_shift = 0
@@ -1996,7 +2007,7 @@ def detect_in_speckle(
     Several looks detect by the powers of their strongest bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    _, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    threshold_ratio, line_noise_ratio = inputs.threshold_ratio[i], inputs.line_noise_ratio[i]
     strongest_bin, first_bin = (
         inputs.group_bins[i, s, STRONGEST_ROW, group],
         speckle.first_bin[group, s],
@@ -2015,7 +2026,7 @@ def detect_in_speckle(
     )
     if not pd > 0.0:
         return False
-    power, scratch = workspace.bin_power[:n_bins], workspace.noise_bins
+    power, noise = workspace.bin_power[:n_bins], workspace.noise
     power[:] = 0.0
     in_phase, in_quadrature, n_votes = 0.0, 0.0, 0
     echo_weight, noise_weight = math.sqrt(echo_fraction), math.sqrt(0.5 * (1.0 - echo_fraction))
@@ -2023,14 +2034,14 @@ def detect_in_speckle(
         look_draw = draw + look * LOOK_DRAW_STRIDE
         address_of_noise = a, b, look_draw, philox.STREAM_NOISE[s]
         if n_bins == 3 and not is_noncircular:
-            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, scratch)
+            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, noise)
         else:
             draw_adjacent_noise(
                 address_of_noise,
                 ECHO_NOISE_FIRST_INDEX * (1 + group),
                 (first_bin, n_bins),
                 config,
-                scratch,
+                noise,
             )
         bin_amplitudes = speckle.amplitudes[
             group, look if speckle.amplitudes.shape[1] > 1 else 0, s
@@ -2040,8 +2051,10 @@ def detect_in_speckle(
                 speckle.rms_ratio[group, s, k],
                 echo_weight * speckle.detection_weights[group, s, k],
             )
-            re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * scratch[0, k]
-            im = magnitude_ratio * bin_amplitudes[k].imag + line_noise_ratio * scratch[1, k]
+            re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]
+            im = (
+                magnitude_ratio * bin_amplitudes[k].imag + line_noise_ratio * noise.in_quadrature[k]
+            )
             if look == 0:
                 in_phase, in_quadrature = (
                     in_phase + bin_weight * bin_amplitudes[k].real,
@@ -2049,8 +2062,8 @@ def detect_in_speckle(
                 )
             if k == strongest_index and look == 0:
                 in_phase, in_quadrature = (
-                    in_phase + noise_weight * scratch[0, k],
-                    in_quadrature + noise_weight * scratch[1, k],
+                    in_phase + noise_weight * noise.in_phase[k],
+                    in_quadrature + noise_weight * noise.in_quadrature[k],
                 )
             if k == strongest_index:
                 n_votes += re * re + im * im >= threshold_ratio * threshold_ratio
@@ -2143,8 +2156,8 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
-    """Draw the noise of adjacent bins over sigma into rows 0 and 1 of ``scratch``.
+def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
+    """Draw the noise of adjacent bins over sigma.
 
     Parameters
     ----------
@@ -2156,20 +2169,20 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
         First bin, and number of bins.
     config
         Settings with the filters.
-    scratch
-        (4, >= bins + NOISE_FILTER_TAPS); for bins near DC or Nyquist with all bins of
-        ``config.end_noise_filter`` in place of `bins`.
+    noise
+        :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
+        for bins near DC or Nyquist as many as ``config.end_noise_filter``.
     """
     first_bin, n_bins = first_and_count
     touches_end = config.real_fft_size > 0 and (
         first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
     )
     if is_near_end(first_bin, n_bins, config):
-        draw_noise_near_end(address, first_index, first_and_count, config, scratch)
+        draw_noise_near_end(address, first_index, first_and_count, config, noise)
     elif n_bins <= config.noise_root.shape[0] and not touches_end:
-        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, scratch)
+        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, noise)
     else:
-        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, scratch)
+        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, noise)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -2182,7 +2195,7 @@ def is_near_end(first_bin, n_bins, config):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
+def draw_noise_near_end(address, first_index, first_and_count, config, noise):
     """Draw the noise of :func:`draw_adjacent_noise` near DC or Nyquist.
 
     Bins beyond DC or Nyquist are complex conjugates of their mirror images.
@@ -2201,24 +2214,34 @@ def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
         drawn_first,
         drawn_last - drawn_first + 1,
         config.end_noise_filter,
-        scratch,
+        noise,
     )
+    drawn_re, drawn_im = noise.number_in_phase, noise.number_in_quadrature  # no longer needed
     for k in range(drawn_last - drawn_first + 1):
-        scratch[2, k], scratch[3, k] = scratch[0, k], scratch[1, k]
+        drawn_re[k], drawn_im[k] = noise.in_phase[k], noise.in_quadrature[k]
     for k in range(n_bins):
         bin_ = abs(first_bin + k)
         sign = -1.0 if first_bin + k < 0 or bin_ > config.nyquist_bin else 1.0
         bin_ = min(bin_, 2 * config.nyquist_bin - bin_) - drawn_first
-        scratch[0, k], scratch[1, k] = scratch[2, bin_], sign * scratch[3, bin_]
+        noise.in_phase[k], noise.in_quadrature[k] = drawn_re[bin_], sign * drawn_im[bin_]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_three_bin_noise(address, first_index, interpolation, scratch):
-    """Draw the noise of three adjacent bins over sigma into rows 0 and 1 of ``scratch``.
+def draw_three_bin_noise(address, first_index, interpolation, noise):
+    """Draw the noise of three adjacent bins over sigma.
 
-    ``address`` holds key, draw and stream; the first pair of independent numbers has the index
-    ``first_index``.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64), number of the draw, and stream.
+    first_index
+        Stream index of the first pair of independent numbers.
+    interpolation
+        Interpolator of the window.
+    noise
+        :class:`sweep.model.sampling.draws.NoiseScratch`, the result.
     """
+    noise_re, noise_im = noise.in_phase, noise.in_quadrature
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
     a, b, draw, stream = address
     # Each four words make two of the pairs.
@@ -2232,10 +2255,10 @@ def draw_three_bin_noise(address, first_index, interpolation, scratch):
         re, im = philox.to_normals(words[0], words[1])
         re_above, im_above = philox.to_normals(words[2], words[3])
         re_below, im_below = philox.to_normals(next_words[0], next_words[1])
-    scratch[0, 0] = from_centre * re + below_from_above * re_above + below_own * re_below
-    scratch[1, 0] = from_centre * im + below_from_above * im_above + below_own * im_below
-    scratch[0, 1], scratch[1, 1] = re, im
-    scratch[0, 2], scratch[1, 2] = (
+    noise_re[0] = from_centre * re + below_from_above * re_above + below_own * re_below
+    noise_im[0] = from_centre * im + below_from_above * im_above + below_own * im_below
+    noise_re[1], noise_im[1] = re, im
+    noise_re[2], noise_im[2] = (
         from_centre * re + above_own * re_above,
         from_centre * im + above_own * im_above,
     )
@@ -2259,7 +2282,8 @@ def draw_all_bins(
     The peak is the largest of these bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
     span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
     first_index, last_index = (
@@ -2274,7 +2298,8 @@ def draw_all_bins(
         max(config.lobe_half_width, int(inputs.bin_threshold_table[i, 4])),
     )
     n_bins, peak_index = last_index - first_index + 1, 0
-    pedestal_power, scratch = workspace.pedestal_power[:n_bins], workspace.noise_bins
+    pedestal_power, noise = workspace.pedestal_power[:n_bins], workspace.noise
+    ratios = workspace.bin_ratio
     pedestal_power[:] = 0.0
     if line_noise_ratio > 1.0:
         magnitudes = workspace.bin_power[:n_bins]
@@ -2288,7 +2313,7 @@ def draw_all_bins(
     )
     if speckle.n_bins[group, s] > 0:
         draw_adjacent_noise(
-            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, scratch
+            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, noise
         )
     else:
         draw_bin_noise(
@@ -2297,7 +2322,7 @@ def draw_all_bins(
             span_first_bin + first_index,
             n_bins,
             config.noise_filter,
-            scratch,
+            noise,
         )
     for k in range(n_bins):
         amplitude, noise_deviation = (
@@ -2308,16 +2333,16 @@ def draw_all_bins(
             power = pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, s, k)) ** 2
             noise_deviation = math.sqrt(1.0 + power)
         re, im = (
-            amplitude.real + noise_deviation * scratch[0, k],
-            amplitude.imag + noise_deviation * scratch[1, k],
+            amplitude.real + noise_deviation * noise.in_phase[k],
+            amplitude.imag + noise_deviation * noise.in_quadrature[k],
         )
-        scratch[0, k] = math.hypot(re, im)
-        peak_index = k if scratch[0, k] > scratch[0, peak_index] else peak_index
-    peak_ratio, line_deviation = scratch[0, peak_index], inputs.line_deviation_bins[i, s, group]
+        ratios[k] = math.hypot(re, im)
+        peak_index = k if ratios[k] > ratios[peak_index] else peak_index
+    peak_ratio, line_deviation = ratios[peak_index], inputs.line_deviation_bins[i, s, group]
     if peak_ratio < threshold_ratio:
         return False
-    below_ratio = scratch[0, peak_index - 1] if peak_index > 0 else 0.0
-    above_ratio = scratch[0, peak_index + 1] if peak_index + 1 < n_bins else 0.0
+    below_ratio = ratios[peak_index - 1] if peak_index > 0 else 0.0
+    above_ratio = ratios[peak_index + 1] if peak_index + 1 < n_bins else 0.0
     offset, peak_bin = (
         estimate_sub_bin_offset(below_ratio, peak_ratio, above_ratio, interpolation),
         span_first_bin + first_index + peak_index,

@@ -119,7 +119,7 @@ def draw_spectra_returns(
             bin_groups.strongest_bin[point],
             inputs.line_grid,
         )
-        noise_sigma, _, line_noise_ratio = inputs.noise_and_threshold[point]
+        noise_sigma, line_noise_ratio = inputs.noise_sigma[point], inputs.line_noise_ratio[point]
         echo_bounds = [
             _echo_bin_bounds(spectrum_view, s, signal)
             for s, signal in enumerate(spectrum_view.signals)
