@@ -41,7 +41,7 @@ from sweep.model.pointcloud.returns import (
     judge_return,
     largest_noise_magnitude,
 )
-from sweep.model.sampling.draws import NoiselessSpectra
+from sweep.model.sampling.draws import NoiseFilter, NoiselessSpectra
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.sampling.speckle_lines import SpeckleLineGrid
 from sweep.model.window import get_window, window_samples
@@ -298,7 +298,7 @@ NO_LINES = SpeckleLineGrid(
 
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
-    rule = np.empty((0, 17)), np.empty(0, np.int64), 0
+    rule = NoiseFilter(np.empty((0, 17)), np.empty(0, np.int64), 0)
     how = DrawConfig(
         0,
         True,
@@ -319,7 +319,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     )
     known = DrawInputs(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
-        np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
+        np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), *np.array(levels)[:, None],
         BinThresholds(*np.zeros((7, 1))), np.full((1, 3), alarm), np.ones((1, 2)),
         np.ones((1, 2, 1)),
         np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)), np.ones((1, 3, 1)),

@@ -54,6 +54,22 @@ class BinGroups(NamedTuple):
         """|X| of the strongest bin [V, summed over the record], (n, 3, groups)."""
         return self.neighbour_magnitudes[..., 1]
 
+    def without_unused_groups(self) -> "BinGroups":
+        """Return the groups with as few groups a segment, at least one, as hold all that exist."""
+        n_groups = max(int((self.strongest_bin >= 0).any(axis=(0, 1)).sum()), 1)
+        return self._replace(
+            **{
+                name: np.ascontiguousarray(getattr(self, name)[:, :, :n_groups])
+                for name in (
+                    "strongest_bin",
+                    "first_bin",
+                    "last_bin",
+                    "neighbour_magnitudes",
+                    "pd",
+                )
+            }
+        )
+
 
 def list_bin_groups(
     shots: Shots, *, groups_max: int = 4, every_bin: bool = False, with_leakage: bool = True
@@ -115,10 +131,17 @@ def find_groups_in_spans(
     )
     _fill_groups(
         spans.point_numbers,
-        (spans.first_bin, n_bins, spans.peak_index, spans.span_start),
-        (magnitudes, spans.is_exempt),
+        # In C order: numba compiles anew for each order.
+        np.ascontiguousarray(spans.first_bin),
+        np.ascontiguousarray(n_bins),
+        np.ascontiguousarray(spans.peak_index),
+        np.ascontiguousarray(spans.span_start),
+        magnitudes,
+        spans.is_exempt,
         shots.bin_thresholds,
-        (nyquist_bin, shots.detection_rule, shots.speckle_table),
+        nyquist_bin,
+        shots.detection_rule,
+        shots.speckle_table,
         bin_rows,
         bin_groups.neighbour_magnitudes,
         pd,
@@ -164,11 +187,17 @@ def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_groups(
-    point_indices,
-    spans,
-    bin_arrays,
+    point_numbers,
+    first_bin,
+    n_bins,
+    peak_index,
+    span_start,
+    magnitudes,
+    is_exempt,
     bin_thresholds,
-    config,
+    nyquist_bin,
+    rule,
+    speckle_table,
     bin_rows,
     neighbour_magnitudes,
     pd,
@@ -177,35 +206,39 @@ def _fill_groups(
 
     Parameters
     ----------
-    point_indices
+    point_numbers
         (m,): index of each point.
-    spans
-        First bin, number of bins, index of the largest bin, and start in `bin_arrays`, (3, m) each.
-    bin_arrays
-        |X| [V] of the bins of all spans, and (bins,) bool, True for bins of echoes; other groups
-        are leaked signal.
+    first_bin, n_bins, peak_index, span_start
+        (3, m): first bin, number of bins, index of the largest bin, and begin in ``magnitudes`` and
+        ``is_exempt``, of each span.
+    magnitudes
+        (bins,): |X| of the bins of all spans [V, summed over the record].
+    is_exempt
+        (bins,) bool: True for bins of echoes. Groups in other bins are leaked signal.
     bin_thresholds
         (n,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`.
-    config
-        N/2, or 0 of complex records; :attr:`sweep.model.preparation.Shots.detection_rule`; and
-        :attr:`~sweep.model.preparation.Shots.speckle_table`.
-    bin_rows, neighbour_magnitudes, pd
-        Results.
+    nyquist_bin
+        Half of the FFT size, N/2, or 0 for a complex record.
+    rule
+        :attr:`sweep.model.preparation.Shots.detection_rule`.
+    speckle_table
+        :attr:`sweep.model.preparation.Shots.speckle_table`.
+    bin_rows
+        (3, n, 3, groups) int64, in rows STRONGEST_ROW, FIRST_ROW and LAST_ROW; a result.
+    neighbour_magnitudes, pd
+        Results, as in :class:`BinGroups`.
     """
-    (first_bin, n_bins, peak_index, start), (nyquist_bin, rule, speckle_table) = spans, config
-    magnitudes, is_echo_all = bin_arrays
-    for j in range(point_indices.size):
-        i = point_indices[j]
+    for j in range(point_numbers.size):
+        i = point_numbers[j]
         bin_threshold = bin_threshold_at(bin_thresholds, i)
         threshold = bin_threshold.threshold
         for segment in range(3):
             if n_bins[segment, j] == 0:
                 continue
-            magnitude = magnitudes[start[segment, j] : start[segment, j] + n_bins[segment, j]]
-            is_echo = is_echo_all[
-                start[segment, j] : start[segment, j]
-                + (n_bins[segment, j] if nyquist_bin == 0 else 0)
-            ]
+            begin = span_start[segment, j]
+            end = begin + n_bins[segment, j]
+            magnitude = magnitudes[begin:end]
+            is_echo = is_exempt[begin : end if nyquist_bin == 0 else begin]
             n_groups = _list_groups(
                 magnitude, is_echo, peak_index[segment, j], threshold, bin_rows[:, i, segment]
             )

@@ -94,6 +94,12 @@ class EgoMotion(NamedTuple):
     priors: MotionPriors
     """Prior standard deviations of unknown motion."""
 
+    def select(self, beams: np.ndarray) -> EgoMotion:
+        """Return the motion along the beams with the given indices."""
+        return self._replace(
+            **{name: getattr(self, name)[beams] for name in self._fields if name != "priors"}
+        )
+
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
         """Return the slip [m/s] at ranges (n, ...) [m], for level ground at rest."""
         slip, per_range = (

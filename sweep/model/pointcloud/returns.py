@@ -52,7 +52,7 @@ import numpy as np
 from sweep.kernel_cache import njit
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.bin_noise import NOISE_FILTER_TAPS, noise_filter
+from sweep.model.detection.bin_noise import noise_filter
 from sweep.model.detection.echo_detection import (
     BinThresholds,
     bin_threshold_at,
@@ -98,7 +98,9 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import (
     ECHO_NOISE_FIRST_INDEX,
+    NoiseFilter,
     NoiselessSpectra,
+    NoiseScratch,
     down_pd_given_up,
     draw_bin_noise,
     draw_bin_noise_by_root,
@@ -125,7 +127,7 @@ from sweep.model.sampling.speckle_lines import (
     position_error_moments,
     speckle_line_grid,
 )
-from sweep.model.spectrum.search_restriction import as_columns, beamlet_line_positions
+from sweep.model.spectrum.search_restriction import beamlet_line_positions
 
 BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
 """Columns of a peak: bin; position between bins and its standard error by noise [bins]; |X| /
@@ -182,6 +184,21 @@ class Returns(NamedTuple):
     radial_velocity_per_slip: np.ndarray
     """Change of the interpolated radial velocity [m/s] for 1 m/s of slip."""
 
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "Returns":
+        """Return arrays (n, draws, returns) without returns."""
+        arrays: dict[str, np.ndarray] = {
+            "flags": np.zeros(shape, np.uint8),
+            "beamlet": np.full(shape, -1, np.int32),
+            "group": np.full((*shape, 3), FALSE_PEAK, np.int8),
+        }
+        return cls(
+            **{
+                name: arrays[name] if name in arrays else np.full(shape, np.nan)
+                for name in cls._fields
+            }
+        )
+
 
 def draw_returns(
     shots: Shots,
@@ -218,7 +235,7 @@ def draw_returns(
         make_draw_inputs(shots, bin_groups, motion),
         DrawnPeaks.empty(bin_groups, draws),
     )
-    pfa_bin = np.exp(shots.looks.log_pfa(inputs.noise_and_threshold[:, 1:2]))
+    pfa_bin = np.exp(shots.looks.log_pfa(inputs.threshold_ratio[:, None]))
     config, interpolation = (
         DrawConfig.from_shots(shots, first_draw, in_noise),
         interpolator(shots.window, shots.fft_size),
@@ -232,9 +249,8 @@ def draw_returns(
         part_inputs = part_inputs._replace(
             pfa_noise=at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins)
         )
-        part_peaks = DrawnPeaks(*(column[indices] for column in drawn_peaks))
         filter_rule = make_echo_noise_filter(shots, spectra, 0 if in_noise else window_bins)
-        n_noise_bins = filter_rule[0].shape[0]
+        n_noise_bins = filter_rule.weights.shape[0]
         if n_noise_bins not in noise_roots:
             noise_roots[n_noise_bins] = noise_covariance_root(filter_rule)
         part_config = config._replace(
@@ -250,7 +266,7 @@ def draw_returns(
                 np.flatnonzero(np.abs(noise_ratio) > _CIRCULAR_PSEUDO_VARIANCE_MAX)[-1]
             )
             n_filter_bins = 2 * (n_near_bins + window_bins + int(spectra.n_bins.max(initial=0)))
-            end_filter = (
+            end_filter = NoiseFilter(
                 *noise_filter(shots.window, shots.fft_size, n_filter_bins),
                 shots.real_fft_size,
             )
@@ -260,22 +276,21 @@ def draw_returns(
             )
         n_filter_bins = max(
             window_bins,
-            part_config.end_noise_filter[0].shape[0],
+            part_config.end_noise_filter.weights.shape[0],
             int(spectra.n_bins.max(initial=0)),
         )
         workspace = DrawWorkspace.allocate(n_filter_bins, bin_groups.strongest_bin.shape[2])
         _draw_points(
             keys[indices],
+            np.ascontiguousarray(indices, np.int64),
             part_config,
             part_inputs,
             spectra,
             part_leakage_bins,
             interpolation,
             workspace,
-            part_peaks,
+            drawn_peaks,
         )
-        for column, values in zip(drawn_peaks, part_peaks, strict=True):
-            column[indices] = values
     return measure_returns(shots, inputs, drawn_peaks, motion)
 
 
@@ -296,14 +311,18 @@ def _iter_spectra(
         return
     n_noise_bins = np.nan_to_num(shots.alarm_equivalent_bins(bin_groups.n_exempt.T).T)
     leaking_indices = find_leaking_points(shots, bin_groups)
+    is_leaking_point = np.zeros(shots.size, bool)
+    is_leaking_point[leaking_indices] = True
     leakage_bins_by_part: Iterable[tuple[np.ndarray, LeakageBins]] = iter_leakage_bins(
         shots, bin_groups, leaking_indices
     )
     if known_leakage_bins is not None:
         leakage_bins_by_part = (
-            (indices[is_leaking], leakage_bins.select(is_leaking))
+            (indices, leakage_bins)
+            if is_leaking.all()
+            else (indices[is_leaking], leakage_bins.select(is_leaking))
             for indices, leakage_bins in known_leakage_bins
-            if (is_leaking := np.isin(indices, leaking_indices)).any()
+            if (is_leaking := is_leaking_point[indices]).any()
         )
     for indices, leakage_bins in leakage_bins_by_part:
         yield (
@@ -311,7 +330,9 @@ def _iter_spectra(
             NoiselessSpectra.empty(indices.size)._replace(n_noise_bins=n_noise_bins[indices]),
             leakage_bins,
         )
-    other_indices = np.setdiff1d(np.arange(shots.size), leaking_indices)
+    other_indices = np.flatnonzero(~is_leaking_point)
+    if not other_indices.size:
+        return
     empty_spectra = NoiselessSpectra.empty(other_indices.size)._replace(
         n_noise_bins=n_noise_bins[other_indices]
     )
@@ -340,11 +361,11 @@ class DrawConfig(NamedTuple):
     """FFT size N if noise at DC and Nyquist is real, else 0."""
     lobe_half_width: int
     """Half-width of a main lobe [bins] if any bin of an echo detects it, else 0."""
-    noise_filter: tuple[np.ndarray, np.ndarray, int]
-    """Result of :func:`sweep.model.sampling.draws.make_echo_noise_filter`."""
+    noise_filter: NoiseFilter
+    """Filter of the noise of echoes' bins."""
     noise_root: np.ndarray
     """Result of :func:`sweep.model.sampling.draws.noise_covariance_root` for ``noise_filter``."""
-    end_noise_filter: tuple[np.ndarray, np.ndarray, int]
+    end_noise_filter: NoiseFilter
     """Filter, like ``noise_filter``, of bins from DC or Nyquist on; without bins if no echo in
     developed speckle is near."""
     noise_pseudo_variance_ratio: np.ndarray
@@ -412,8 +433,12 @@ class DrawInputs(NamedTuple):
     signed, and shifted by multiples of N to be nearest to the strongest group."""
     beamlet_amplitude: np.ndarray
     """(n, beamlets): relative amplitude of each beamlet."""
-    noise_and_threshold: np.ndarray
-    """(n, 3): sigma [V]; threshold over sigma; noise of bins that hold lines over sigma."""
+    noise_sigma: np.ndarray
+    """(n,): sigma, noise of a bin per quadrature [V]."""
+    threshold_ratio: np.ndarray
+    """(n,): threshold over sigma."""
+    line_noise_ratio: np.ndarray
+    """(n,): noise of bins that hold lines, over sigma."""
     bin_thresholds: BinThresholds
     """(n,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`."""
     pfa_noise: np.ndarray
@@ -455,9 +480,10 @@ class DrawInputs(NamedTuple):
 class DrawWorkspace(NamedTuple):
     """Arrays that kernels write to within a draw, allocated once for all draws."""
 
-    noise_bins: np.ndarray
-    """(4, bins + NOISE_FILTER_TAPS): noise of an echo's bins (rows 0 and 1), and independent
-    numbers."""
+    noise: NoiseScratch
+    """Noise of an echo's bins."""
+    bin_ratio: np.ndarray
+    """(bins,): |X| / sigma of an echo's bins."""
     bin_power: np.ndarray
     """(bins,): power of an echo's bins over sigma^2."""
     pedestal_power: np.ndarray
@@ -475,7 +501,8 @@ class DrawWorkspace(NamedTuple):
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
         """Allocate arrays for echoes of `n_bins` bins, and for `groups_max` groups of a segment."""
         return cls(
-            np.empty((4, n_bins + NOISE_FILTER_TAPS)),
+            NoiseScratch.allocate(n_bins),
+            np.empty(n_bins),
             np.empty(n_bins),
             np.empty(n_bins),
             np.ones(n_bins, np.bool_),
@@ -515,13 +542,33 @@ class DrawnPeaks(NamedTuple):
         )
 
 
+class ListedReturns(NamedTuple):
+    """Returns of all points and draws, listed one after the other, (m,)."""
+
+    point: np.ndarray
+    """(m,) int64: index of the point."""
+    peaks: np.ndarray
+    """(m, 3, 4): up, Doppler and down peak, with the columns BIN_COLUMN to RATIO_COLUMN; nan for
+    none."""
+    reading: np.ndarray
+    """(m,) int64: reading of the peaks with the default slopes."""
+    group: np.ndarray
+    """(m, 3) int8: group of the up, Doppler and down peak, FALSE_PEAK or NO_PEAK."""
+    flags: np.ndarray
+    """(m,) uint8: bits of FLAG_BITS."""
+    beamlet: np.ndarray
+    """(m,) int32: beamlet that a true or misread return measures, -1 otherwise."""
+
+
 def make_draw_inputs(
     shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
 ) -> DrawInputs:
     """Return the quantities of shots and their groups that draws depend on.
 
-    ``motion`` is the known motion, as in :func:`draw_returns`.
+    ``motion`` is the known motion, as in :func:`draw_returns`. The groups' axis of the result has
+    only as many groups as the segment with the most.
     """
+    bin_groups = bin_groups.without_unused_groups()
     line_positions, beamlet_amplitude = (
         beamlet_line_positions(shots),
         shots.relative_amplitude[shots.footprint_row],
@@ -556,7 +603,8 @@ def make_draw_inputs(
         line_deviation,
         line_positions,
         beamlet_amplitude,
-        np.stack([shots.bin_noise_sigma, *threshold_and_line_noise_ratios(shots)], axis=1),
+        np.array(np.broadcast_to(shots.bin_noise_sigma, shots.size)),
+        *threshold_and_line_noise_ratios(shots),
         shots.bin_thresholds,
         np.zeros(bin_groups.leakage.shape),
         np.stack(
@@ -705,27 +753,26 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
 
 
 class Measurements(NamedTuple):
-    """Range [m] and radial velocity [m/s] of returns, (n, draws, returns, 2).
+    """Range and radial velocity of m returns.
 
-    The last axis has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions between bins.
-    Errors are standard errors by noise. ``range_per_half_bin`` and ``velocity_per_half_bin`` (n, 1,
-    1) are the changes by half a bin of the chirps.
+    The last axis of arrays (m, 2) has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions
+    between bins.
     """
 
     range: np.ndarray
-    """Range [m]."""
+    """(m, 2): range [m]."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s]."""
+    """(m, 2): radial velocity [m/s]."""
     range_error: np.ndarray
-    """Standard error of the range [m]."""
+    """(m, 2): standard error of the range by noise [m]."""
     velocity_error: np.ndarray
-    """Standard error of the radial velocity [m/s]."""
+    """(m, 2): standard error of the radial velocity by noise [m/s]."""
     range_per_half_bin: np.ndarray
-    """Change of the range by half a bin of the chirps [m]."""
+    """(m,): change of the range by half a bin of the chirps [m]."""
     velocity_per_half_bin: np.ndarray
-    """Change of the radial velocity by half a bin of the chirps [m/s]."""
+    """(m,): change of the radial velocity by half a bin of the chirps [m/s]."""
     range_bias: np.ndarray | float
-    """Measured range minus that at the shot's start [m], (n, 1, 1)."""
+    """(m,): measured range minus that at the shot's start [m]."""
 
 
 def measure_returns(
@@ -752,108 +799,134 @@ def measure_returns(
         True if positions between bins are those of
         :mod:`sweep.model.detection.sub_bin_interpolation`; False for another estimator's.
     """
+    is_return = drawn_peaks.flags > 0  # few of the entries
+    returns = Returns.empty(is_return.shape)
+    if is_return.any():
+        listed_returns = ListedReturns(
+            np.nonzero(is_return)[0], *(column[is_return] for column in drawn_peaks)
+        )
+        measured_columns = _measure_listed_returns(
+            shots, inputs, listed_returns, motion, from_three_bins
+        )
+        for column, values in zip(returns, measured_columns, strict=True):
+            column[is_return] = values
+    return returns
+
+
+def _measure_listed_returns(
+    shots: Shots,
+    inputs: DrawInputs,
+    listed_returns: ListedReturns,
+    motion: EgoMotion | None,
+    from_three_bins: bool,
+) -> Returns:
+    """Compute :func:`measure_returns` for m listed returns; the fields of the result are (m,)."""
     uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
-    drawn_peaks = _add_drift_errors(shots, drawn_peaks, motion)
+    point, at_returns = listed_returns.point, partial(_values_at, shots, listed_returns.point)
+    listed_returns = _add_drift_errors(shots, listed_returns, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
     if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise alone
-        drawn_peaks = _correct_late_echoes(shots, drawn_peaks, measure(shots, drawn_peaks, None))
-    wander_covariance = _wander_covariance(shots, inputs, drawn_peaks)
+        listed_returns = _correct_late_echoes(
+            shots, listed_returns, measure(shots, listed_returns, None)
+        )
+    wander_covariance = _wander_covariance(shots, inputs, listed_returns)
     if wander_covariance is not None:
-        peaks = drawn_peaks.peaks.copy()
+        peaks = listed_returns.peaks.copy()
         wander_variance = np.diagonal(wander_covariance, axis1=-2, axis2=-1)
         peaks[..., ERROR_COLUMN] = np.sqrt(peaks[..., ERROR_COLUMN] ** 2 + wander_variance)
-        drawn_peaks = drawn_peaks._replace(peaks=peaks)
-    measurements = measure(shots, drawn_peaks, wander_covariance)
-    point_index, group = np.arange(shots.size)[:, None, None], np.maximum(drawn_peaks.group, 0)
+        listed_returns = listed_returns._replace(peaks=peaks)
+    measurements = measure(shots, listed_returns, wander_covariance)
+    group = np.maximum(listed_returns.group, 0)
     group_widths = (inputs.group_bins[:, :, LAST_ROW] - inputs.group_bins[:, :, FIRST_ROW])[
-        point_index[..., None], np.arange(3), group
+        point[:, None], np.arange(3), group
     ]
     tolerance_half_bins = 2 * (
-        4 + np.where(drawn_peaks.group >= 0, group_widths, 0).sum(axis=-1)
+        4 + np.where(listed_returns.group >= 0, group_widths, 0).sum(axis=-1)
     )  # number of half bins
-    range_offset, velocity_offset = (
-        shots.relative_range_offset[shots.footprint_row],
-        SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[shots.footprint_row],
+    beamlet = np.maximum(listed_returns.beamlet, 0)
+    footprint_row = shots.footprint_row[point]
+    true_range = at_returns(shots.range) * (1 + shots.relative_range_offset[footprint_row, beamlet])
+    true_velocity = (
+        at_returns(shots.radial_velocity)
+        + SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[footprint_row, beamlet]
     )
-    true_velocity = as_columns(shots, shots.radial_velocity) + velocity_offset
-    axis_range, beamlet = as_columns(shots, shots.range, 2), np.maximum(drawn_peaks.beamlet, 0)
-    range_error = (
-        measurements.range[..., POSITION_COLUMN]
-        - measurements.range_bias
-        - axis_range * (1 + range_offset[point_index, beamlet])
-    )
+    range_error = measurements.range[:, POSITION_COLUMN] - measurements.range_bias - true_range
     is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
     is_right &= (
-        abs(
-            measurements.radial_velocity[..., POSITION_COLUMN] - true_velocity[point_index, beamlet]
-        )
+        abs(measurements.radial_velocity[:, POSITION_COLUMN] - true_velocity)
         <= tolerance_half_bins * measurements.velocity_per_half_bin
     )
-    is_signal = (drawn_peaks.group[..., ::2] >= 0).all(axis=-1) & (
-        drawn_peaks.group[..., 1] != FALSE_PEAK
-    )
-    pd = (
-        inputs.pd[point_index, 0, group[..., 0]]
-        * inputs.down_pd_given_up[point_index, 1, group[..., 2]]
-    )
-    is_misread = (drawn_peaks.flags & TRUE_FLAG > 0) & ~is_right
+    up_group, doppler_group, down_group = listed_returns.group.T
+    is_signal = (up_group >= 0) & (down_group >= 0) & (doppler_group != FALSE_PEAK)
+    pd = inputs.pd[point, 0, group[:, 0]] * inputs.down_pd_given_up[point, 1, group[:, 2]]
+    is_misread = (listed_returns.flags & TRUE_FLAG > 0) & ~is_right
     uncorrected = (
-        measurements.range[..., POSITION_COLUMN].copy(),
-        measurements.radial_velocity[..., POSITION_COLUMN].copy(),
+        measurements.range[:, POSITION_COLUMN].copy(),
+        measurements.radial_velocity[:, POSITION_COLUMN].copy(),
     )
     if not uses_fit:  # refer to the shot's start by the measured velocity
-        measurements.radial_velocity[..., POSITION_COLUMN] *= 1 + as_columns(
-            shots, shots.velocity_bias_fraction, 2
+        measurements.radial_velocity[:, POSITION_COLUMN] *= 1 + at_returns(
+            shots.velocity_bias_fraction
         )
-        measurements.range[..., POSITION_COLUMN] += measurements.radial_velocity[
-            ..., POSITION_COLUMN
-        ] * as_columns(shots, shots.range_walk_time, 2)
+        measurements.range[:, POSITION_COLUMN] += measurements.radial_velocity[
+            :, POSITION_COLUMN
+        ] * at_returns(shots.range_walk_time)
     per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
     if motion is not None:
-        per_slip = _apply_motion_correction(shots, drawn_peaks, measurements, motion)
+        per_slip = _apply_motion_correction(shots, listed_returns, measurements, motion)
     for values, errors, uncorrected_values in zip(
         (measurements.range, measurements.radial_velocity),
         (measurements.range_error, measurements.velocity_error),
         uncorrected,
         strict=True,
     ):  # values by whole bins stay uncorrected; add the correction to their errors
-        errors[..., BIN_COLUMN] = np.hypot(
-            errors[..., BIN_COLUMN], values[..., POSITION_COLUMN] - uncorrected_values
+        errors[:, BIN_COLUMN] = np.hypot(
+            errors[:, BIN_COLUMN], values[:, POSITION_COLUMN] - uncorrected_values
         )
     return Returns(
-        measurements.range[..., BIN_COLUMN],
-        measurements.range[..., POSITION_COLUMN],
-        measurements.radial_velocity[..., BIN_COLUMN],
-        measurements.radial_velocity[..., POSITION_COLUMN],
-        measurements.range_error[..., BIN_COLUMN],
-        measurements.range_error[..., POSITION_COLUMN],
-        measurements.velocity_error[..., BIN_COLUMN],
-        measurements.velocity_error[..., POSITION_COLUMN],
-        drawn_peaks.peaks[..., ::2, RATIO_COLUMN].min(axis=-1) ** 2 / 2,
+        measurements.range[:, BIN_COLUMN],
+        measurements.range[:, POSITION_COLUMN],
+        measurements.radial_velocity[:, BIN_COLUMN],
+        measurements.radial_velocity[:, POSITION_COLUMN],
+        measurements.range_error[:, BIN_COLUMN],
+        measurements.range_error[:, POSITION_COLUMN],
+        measurements.velocity_error[:, BIN_COLUMN],
+        measurements.velocity_error[:, POSITION_COLUMN],
+        np.minimum(
+            listed_returns.peaks[:, 0, RATIO_COLUMN], listed_returns.peaks[:, 2, RATIO_COLUMN]
+        )
+        ** 2
+        / 2,
         np.where(is_signal, pd, np.nan),
-        np.where(is_misread, drawn_peaks.flags ^ (TRUE_FLAG | MISREAD_FLAG), drawn_peaks.flags),
-        drawn_peaks.beamlet,
-        np.maximum(drawn_peaks.group, FALSE_PEAK),
-        *(np.where(drawn_peaks.flags > 0, change, np.nan) for change in per_slip),
+        np.where(
+            is_misread, listed_returns.flags ^ (TRUE_FLAG | MISREAD_FLAG), listed_returns.flags
+        ),
+        listed_returns.beamlet,
+        np.maximum(listed_returns.group, FALSE_PEAK),
+        *(np.broadcast_to(change, point.shape) for change in per_slip),
     )
 
 
+def _values_at(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
+    """Return the values (n,) of the points with the indices ``point`` (m,)."""
+    return np.broadcast_to(values, shots.size)[point]
+
+
 def _wander_covariance(
-    shots: Shots, inputs: DrawInputs, drawn_peaks: DrawnPeaks
+    shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns
 ) -> np.ndarray | None:
     """Return the mean products [bins^2] of the errors of each return's peaks by speckle.
 
-    They are (n, draws, returns, 3, 3) by segment, signed as the beats; None for shots without
-    speckle.
+    They are (m, 3, 3) by segment, signed as the beats; None for shots without speckle.
     """
     line_gradients = shots.line_gradients
     if line_gradients is None:
         return None
-    covariance = np.zeros((*drawn_peaks.group.shape, 3))
-    point, draw, return_number = np.nonzero((drawn_peaks.group >= 0).any(axis=-1))
-    group, peaks = (
-        drawn_peaks.group[point, draw, return_number],
-        drawn_peaks.peaks[point, draw, return_number],
+    covariance = np.zeros((*listed_returns.group.shape, 3))
+    is_echo = (listed_returns.group >= 0).any(axis=-1)
+    point, group, peaks = (
+        column[is_echo]
+        for column in (listed_returns.point, listed_returns.group, listed_returns.peaks)
     )
     segment, point_column = np.arange(3), point[:, None]
     present = np.where(group >= 0, 1.0, np.nan)
@@ -884,15 +957,15 @@ def _wander_covariance(
         if shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
         else SEGMENT_PAIRS_WITH_SELF
     )
-    covariance[point, draw, return_number] = position_error_moments(
+    covariance[is_echo] = position_error_moments(
         line_gradients.select(point), speckle_peaks, shots, segment_pairs
     )
     return covariance
 
 
 def _add_drift_errors(
-    shots: Shots, drawn_peaks: DrawnPeaks, motion: EgoMotion | None
-) -> DrawnPeaks:
+    shots: Shots, listed_returns: ListedReturns, motion: EgoMotion | None
+) -> ListedReturns:
     """Add the errors by the drift of lines within the record to the peaks' standard errors.
 
     The drift is that of the known motion, if given, else that of the shots.
@@ -913,13 +986,13 @@ def _add_drift_errors(
             for rate in shots.frequency_drift_rates
         ]
     )
-    peaks = drawn_peaks.peaks.copy()
+    peaks = listed_returns.peaks.copy()
     offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
-    has_peak = np.isfinite(offset)  # few of the entries for returns are filled
-    drift_of_peak = np.broadcast_to(drift_bins.T[:, None, None], offset.shape)[has_peak]
+    has_peak = np.isfinite(offset)
+    drift_of_peak = drift_bins.T[listed_returns.point][has_peak]
     drift_errors = drift_error(offset[has_peak], drift_of_peak, shots.window, shots.fft_size)
     peaks[has_peak, ERROR_COLUMN] = np.hypot(peaks[has_peak, ERROR_COLUMN], drift_errors)
-    return drawn_peaks._replace(peaks=peaks)
+    return listed_returns._replace(peaks=peaks)
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
@@ -927,23 +1000,23 @@ _POSITION_ERROR_MAX_BINS = 0.5
 
 
 def _correct_late_echoes(
-    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements
-) -> DrawnPeaks:
+    shots: Shots, listed_returns: ListedReturns, measurements: Measurements
+) -> ListedReturns:
     """Correct positions between bins for the samples that are missing before the echo arrives.
 
     The instrument knows their number from the range by whole bins. No error exceeds half a bin,
     because a position is always within one.
     """
-    column = partial(as_columns, shots, n_trailing=2)
-    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[..., BIN_COLUMN])
-    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[..., BIN_COLUMN])
+    at_returns = partial(_values_at, shots, listed_returns.point)
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[:, BIN_COLUMN])
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[:, BIN_COLUMN])
     n_missing = waveform.count_samples_before_echo(
-        delay=delay, doppler_ratio=beta, record_start=column(shots.acquisition_delay),
-        sample_rate=column(shots.sample_rate), length=shots.window.length,
+        delay=delay, doppler_ratio=beta, record_start=at_returns(shots.acquisition_delay),
+        sample_rate=at_returns(shots.sample_rate), length=shots.window.length,
     )  # fmt: skip
-    peaks = drawn_peaks.peaks.copy()
+    peaks = listed_returns.peaks.copy()
     offset = np.nan_to_num(peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN])
-    correction = late_echo_correction(offset, n_missing[..., None], shots.window, shots.fft_size)
+    correction = late_echo_correction(offset, n_missing[:, None], shots.window, shots.fft_size)
     peaks[..., POSITION_COLUMN] += correction.shift
     widened_errors = np.minimum(
         peaks[..., ERROR_COLUMN] * correction.error_factor, _POSITION_ERROR_MAX_BINS
@@ -953,30 +1026,27 @@ def _correct_late_echoes(
         np.maximum(widened_errors, peaks[..., ERROR_COLUMN]),
         widened_errors,
     )
-    return drawn_peaks._replace(peaks=peaks)
+    return listed_returns._replace(peaks=peaks)
 
 
 def _apply_motion_correction(
-    shots: Shots, drawn_peaks: DrawnPeaks, measurements: Measurements, motion: EgoMotion
+    shots: Shots, listed_returns: ListedReturns, measurements: Measurements, motion: EgoMotion
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correct interpolated range and velocity for the known motion, in place.
 
     The standard deviation of the unknown motion is added to the standard errors
     (:mod:`sweep.model.pointcloud.ego_motion`). Returns the changes of range [s] and velocity by 1
-    m/s of slip.
+    m/s of slip, (m,).
     """
-    per_acceleration, per_slip = _response_to_motion(shots, drawn_peaks)
-    known_slip = motion.slip_at(measurements.range[..., POSITION_COLUMN])
-    known_acceleration, acceleration_error = (
-        as_columns(shots, values, 2)
-        for values in (motion.acceleration, motion.acceleration_standard_error)
-    )
+    motion = motion.select(listed_returns.point)
+    per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
+    known_slip = motion.slip_at(measurements.range[:, POSITION_COLUMN])
     values_by = zip(
         (measurements.range, measurements.radial_velocity), per_slip, per_acceleration, strict=True
     )
     for values, by_slip, by_acceleration in values_by:
-        values[..., POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * known_acceleration
-    slip_error = motion.slip_standard_error(measurements.range[..., POSITION_COLUMN])
+        values[:, POSITION_COLUMN] -= by_slip * known_slip + by_acceleration * motion.acceleration
+    slip_error = motion.slip_standard_error(measurements.range[:, POSITION_COLUMN])
     errors_by = zip(
         (measurements.range_error, measurements.velocity_error),
         per_slip,
@@ -984,35 +1054,36 @@ def _apply_motion_correction(
         strict=True,
     )
     for errors, by_slip, by_acceleration in errors_by:
-        unknown_error = np.hypot(by_slip * slip_error, by_acceleration * acceleration_error)
-        errors[:] = np.hypot(errors, unknown_error[..., None])
+        unknown_error = np.hypot(
+            by_slip * slip_error, by_acceleration * motion.acceleration_standard_error
+        )
+        errors[:] = np.hypot(errors, unknown_error[:, None])
     return per_slip
 
 
 def _response_to_motion(
-    shots: Shots, drawn_peaks: DrawnPeaks
+    shots: Shots, listed_returns: ListedReturns
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return the changes of range [m] and velocity [m/s] by motion that the beats do not show.
 
-    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip. The slip is the
-    radial velocity minus the speed at which the range falls. All values broadcast with the returns
-    (n, draws, returns).
+    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip, (m,) each. The slip
+    is the radial velocity minus the speed at which the range falls.
     """
     carriers, chirp_rates = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
+    point = listed_returns.point
+    point_index: np.ndarray | slice = point
     if (
         shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
-    ):  # half sum and half difference of up and down beat
-        point_index: np.ndarray | slice = slice(None)
-        weights, shape = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates, (shots.size, 1, 1)
+    ):  # half sum and half difference of up and down beat, which all returns of a point share
+        point_index = slice(None)
+        weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
     else:
-        shape = drawn_peaks.flags.shape
-        point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
-        peaks = np.moveaxis(drawn_peaks.peaks[..., ERROR_COLUMN], 3, 0).reshape(3, point_index.size)
-        weights = np.where(np.isfinite(peaks), 1 / peaks**2, 0.0)
+        peak_errors = listed_returns.peaks[:, :, ERROR_COLUMN].T
+        weights = np.where(np.isfinite(peak_errors), 1 / peak_errors**2, 0.0)
     per_acceleration, per_slip = (
         tuple(
-            responses.reshape(shape)
+            responses[point] if isinstance(point_index, slice) else responses
             for responses in waveform.range_velocity_response(
                 beats[:, point_index],
                 weights=weights,
@@ -1042,16 +1113,17 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measure_by_reading(
-    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+    shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
     """Measure range and velocity at mid-chirp by each return's reading of its up and down peak.
 
     The errors of both peaks by common speckle are correlated. Their covariance reduces the variance
     of the range, and adds to that of the velocity.
     """
+    at_returns = partial(_values_at, shots, listed_returns.point)
     carrier, bandwidth, duration, sample_rate = (
-        as_columns(shots, column, 3)
-        for column in (
+        at_returns(values)
+        for values in (
             shots.carriers[0],
             shots.chirp_bandwidth,
             shots.chirp_duration,
@@ -1059,23 +1131,23 @@ def _measure_by_reading(
         )
     )
     bin_width, chirp_rate = sample_rate / shots.fft_size, bandwidth / duration
-    up, down = (drawn_peaks.peaks[..., side, : POSITION_COLUMN + 1] * bin_width for side in (0, 2))
+    up, down = (
+        listed_returns.peaks[:, side, : POSITION_COLUMN + 1] * bin_width[:, None] for side in (0, 2)
+    )
     f_d, f_r = np.full((2, *up.shape), np.nan)
-    for reading in np.unique(drawn_peaks.reading[drawn_peaks.reading >= 0]):
-        has_reading = (drawn_peaks.reading == reading)[..., None]
-        f_d, f_r = (
-            np.where(has_reading, new, old)
-            for new, old in zip(
-                waveform.beats_of_reading(reading, up, down, sample_rate), (f_d, f_r), strict=True
-            )
+    for reading in np.unique(listed_returns.reading):
+        has_reading = listed_returns.reading == reading
+        f_d[has_reading], f_r[has_reading] = waveform.beats_of_reading(
+            reading, up[has_reading], down[has_reading], sample_rate[has_reading, None]
         )
     measured_range, measured_velocity = waveform.range_velocity_of_beats(
-        f_d, f_r, carrier, bandwidth, duration
+        f_d, f_r, carrier[:, None], bandwidth[:, None], duration[:, None]
     )
     range_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / chirp_rate
     velocity_per_half_bin = SPEED_OF_LIGHT / 4 * bin_width / (carrier + bandwidth / 2)
-    variance = (drawn_peaks.peaks[..., ::2, ERROR_COLUMN] ** 2).sum(axis=-1)
-    covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[..., 0, 2]
+    up_error, _, down_error = listed_returns.peaks[:, :, ERROR_COLUMN].T
+    variance = up_error**2 + down_error**2
+    covariance = 0.0 if wander_covariance is None else 2 * wander_covariance[:, 0, 2]
     range_variance, velocity_variance = (
         np.maximum(variance + v, 0.0) for v in (-covariance, covariance)
     )
@@ -1084,34 +1156,33 @@ def _measure_by_reading(
         for value in (range_variance, velocity_variance)
     )
     # Up and down beat give the range at the mean of their starts, plus a term by acceleration.
-    up_start, down_start = (as_columns(shots, shots.segment_starts[s], 2) for s in (0, 2))
-    range_bias = (carrier / chirp_rate)[..., 0] * as_columns(shots, shots.acceleration, 2)
+    up_start, down_start = (at_returns(shots.segment_starts[s]) for s in (0, 2))
+    range_bias = carrier / chirp_rate * at_returns(shots.acceleration)
     range_bias = 0.5 * (down_start - up_start) * range_bias
-    range_bias -= 0.5 * (down_start + up_start) * as_columns(shots, shots.approach_speed, 2)
+    range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.approach_speed)
     return Measurements(
         measured_range,
         measured_velocity,
-        range_per_half_bin * range_error,
-        velocity_per_half_bin * velocity_error,
-        range_per_half_bin[..., 0],
-        velocity_per_half_bin[..., 0],
+        range_per_half_bin[:, None] * range_error,
+        velocity_per_half_bin[:, None] * velocity_error,
+        range_per_half_bin,
+        velocity_per_half_bin,
         range_bias,
     )
 
 
 def _measure_by_fit(
-    shots: Shots, drawn_peaks: DrawnPeaks, wander_covariance: np.ndarray | None
+    shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
     """Measure range and velocity at the shot's start by the fit of each return's peaks."""
-    shape = drawn_peaks.flags.shape
-    point_index = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+    point = listed_returns.point
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
     chirp_rate = np.broadcast_to(shots.chirp_rate, shots.size)
-    peaks = np.moveaxis(drawn_peaks.peaks, 3, 0).reshape(3, point_index.size, -1)
+    peaks = np.moveaxis(listed_returns.peaks, 1, 0)
     is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
 
-    def bound_of(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
+    def deviations_by_errors(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
         """Return the deviations of range and velocity by errors of the beats [bins], (3, m)."""
         up, doppler, down = errors * bin_width[points]
         return range_velocity_deviation(
@@ -1129,38 +1200,28 @@ def _measure_by_fit(
     for column in (BIN_COLUMN, POSITION_COLUMN):
         errors = np.where(is_finite, peaks[..., ERROR_COLUMN], np.inf)
         errors = np.hypot(errors, math.sqrt(1 / 12) if column == BIN_COLUMN else 0.0)
-        fitted = fit_peaks(
-            shots, peaks[..., column] * bin_width[point_index], 1 / errors**2, point_index
-        )
-        deviations = bound_of(errors, point_index)
+        fitted = fit_peaks(shots, peaks[..., column] * bin_width[point], 1 / errors**2, point)
+        deviations = deviations_by_errors(errors, point)
         if wander_covariance is not None:
-            beat_covariance = (
-                wander_covariance.reshape(point_index.size, 3, 3)
-                * (bin_width[point_index] ** 2)[:, None, None]
-            )
+            beat_covariance = wander_covariance * (bin_width[point] ** 2)[:, None, None]
             deviations = _add_wander_covariance(
-                shots, deviations, beat_covariance, 1 / errors**2, point_index
+                shots, deviations, beat_covariance, 1 / errors**2, point
             )
         results_by_column.append((*fitted, *deviations))
-    has_return = (drawn_peaks.reading >= 0)[..., None]
     measured_range, measured_velocity, range_error, velocity_error = (
-        np.where(has_return, np.stack(pair, axis=-1).reshape(*shape, 2), np.nan)
-        for pair in zip(*results_by_column, strict=True)
+        np.stack(pair, axis=-1) for pair in zip(*results_by_column, strict=True)
     )
     segments = np.array(shots.has_segment)[:, None]
-    half_bin_deviation = bound_of(
+    half_bin_deviation = deviations_by_errors(
         np.where(segments, np.sqrt(0.5), np.inf) + 0 * bin_width, np.arange(shots.size)
-    )
-    range_per_half_bin, velocity_per_half_bin = (
-        value[:, None, None] for value in half_bin_deviation
     )
     return Measurements(
         measured_range,
         measured_velocity,
         range_error,
         velocity_error,
-        range_per_half_bin,
-        velocity_per_half_bin,
+        half_bin_deviation[0][point],
+        half_bin_deviation[1][point],
         0.0,
     )
 
@@ -1199,16 +1260,32 @@ def _add_wander_covariance(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw_points(
-    keys, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
+    keys, rows, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
 ):
-    """Draw and pair the peaks of all segments, draws and points into returns."""
-    n, draws, returns_max = drawn_peaks.flags.shape
+    """Draw and pair the peaks of all segments, draws and points into returns.
+
+    Parameters
+    ----------
+    keys
+        (m, 2) uint64: random key of each point.
+    rows
+        (m,) int64: index of each point in ``drawn_peaks``.
+    config, inputs, spectra, leakage_bins
+        Settings, and quantities, noiseless spectra and bins of leaked signal of the m points.
+    interpolation
+        Interpolator of the window.
+    workspace
+        Scratch.
+    drawn_peaks
+        Result, for these and other points.
+    """
+    _, draws, returns_max = drawn_peaks.flags.shape
     peaks, peak_groups = np.zeros((3, returns_max + 1, 4)), np.empty((3, returns_max + 1), np.int64)
     n_peaks, pairs = np.empty(3, np.int64), np.empty((returns_max + 1, 4), np.int64)
     is_up_detected, speckle_factors = np.zeros(returns_max, np.bool_), np.ones((returns_max, 3))
     in_speckle = inputs.line_grid.line_shift.shape[0] > 0
     speckle = empty_group_speckle(returns_max)
-    for i in range(n):
+    for i in range(rows.size):
         if in_speckle:
             speckle = prepare_group_speckle(i, config, inputs, spectra)
         for d in range(draws):
@@ -1233,7 +1310,14 @@ def _draw_points(
                         is_up_detected,
                     )
             pair_into_returns(
-                (i, d), config, inputs, (peaks, peak_groups, n_peaks), pairs, workspace, drawn_peaks
+                i,
+                (rows[i], d),
+                config,
+                inputs,
+                (peaks, peak_groups, n_peaks),
+                pairs,
+                workspace,
+                drawn_peaks,
             )
 
 
@@ -1311,7 +1395,7 @@ def prepare_group_speckle(i, config, inputs, spectra):
                     span_ratios,
                     group_ends[0],
                     group_ends[1],
-                    inputs.noise_and_threshold[i, 1],
+                    inputs.threshold_ratio[i],
                     lobe_half_width,
                 )
                 first_bin[g, s], n_bins[g, s] = span_first_bin + begin, end - begin + 1
@@ -1374,7 +1458,7 @@ def prepare_group_speckle(i, config, inputs, spectra):
             )
             strongest_index, noise_sigma = (
                 inputs.group_bins[i, s, STRONGEST_ROW, g] - first_bin[g, s],
-                inputs.noise_and_threshold[i, 0],
+                inputs.noise_sigma[i],
             )
             magnitudes = inputs.group_magnitudes[i, s, g]
             for k in range(n_bins[g, s]):
@@ -1491,13 +1575,15 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
-def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
+def pair_into_returns(i, row_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
     """Pair the peaks of one point and draw into returns, and judge each.
 
     Parameters
     ----------
-    point_and_draw
-        Index of the point, and index of the draw in `drawn_peaks`.
+    i
+        Index of the point in ``inputs``.
+    row_and_draw
+        Index of the point, and index of the draw, in ``drawn_peaks``.
     config, inputs
         Settings, and quantities of the points.
     peak_lists
@@ -1509,7 +1595,7 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
     drawn_peaks
         Result.
     """
-    (i, d), (peaks, peak_groups, n_peaks) = point_and_draw, peak_lists
+    (row, d), (peaks, peak_groups, n_peaks) = row_and_draw, peak_lists
     if config.has_doppler:
         n_confirmed, n_pairs = pair_peaks(
             peaks[0, : n_peaks[0], POSITION_COLUMN],
@@ -1527,8 +1613,8 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
         for r in range(n_pairs):
             pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, config.two_beat_reading
     for r in range(min(n_pairs, drawn_peaks.flags.shape[2])):
-        up_index, doppler_index, down_index, drawn_peaks.reading[i, d, r] = pairs[r]
-        peak_group_row, positions = drawn_peaks.group[i, d, r], workspace.peak_positions
+        up_index, doppler_index, down_index, drawn_peaks.reading[row, d, r] = pairs[r]
+        peak_group_row, positions = drawn_peaks.group[row, d, r], workspace.peak_positions
         positions[1] = 0.0
         peak_group_row[0], peak_group_row[2] = peak_groups[0, up_index], peak_groups[2, down_index]
         positions[0], positions[2] = (
@@ -1555,18 +1641,18 @@ def pair_into_returns(point_and_draw, config, inputs, peak_lists, pairs, workspa
                     * config.nyquist_bin
                     * math.floor(bin_distance / (2 * config.nyquist_bin) + 0.5)
                 )
-        peak_rows = drawn_peaks.peaks[i, d, r]
+        peak_rows = drawn_peaks.peaks[row, d, r]
         for f in range(4):  # slices would compile an error message about shapes
             peak_rows[0, f], peak_rows[2, f] = peaks[0, up_index, f], peaks[2, down_index, f]
             peak_rows[1, f] = peaks[1, doppler_index, f] if doppler_index >= 0 else np.nan
-        flag, drawn_peaks.beamlet[i, d, r] = judge_return(
+        flag, drawn_peaks.beamlet[row, d, r] = judge_return(
             peak_group_row,
             positions,
             inputs.group_bins[i],
             inputs.line_positions[i],
             inputs.beamlet_amplitude[i],
         )
-        drawn_peaks.flags[i, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
+        drawn_peaks.flags[row, d, r] = flag | (UNCONFIRMED_FLAG if r >= n_confirmed else 0)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -1609,7 +1695,8 @@ def draw_segment_peaks(
         (groups,) bool: groups detected in the up segment, which is drawn first and sets it.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     group_bins, n_peaks = inputs.group_bins[i, s], 0
     for g in range(group_bins.shape[1]):
         if group_bins[STRONGEST_ROW, g] < 0:
@@ -1832,7 +1919,8 @@ def draw_peak_bin(
 ):
     """Test a group's strongest bin with its noise; return True and set the peak if it crosses."""
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     strongest_bin, stream = inputs.group_bins[i, s, STRONGEST_ROW, group], philox.STREAM_NOISE[s]
     k = strongest_bin - spectra.first_bin[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
@@ -1842,16 +1930,16 @@ def draw_peak_bin(
     re, im = re * line_noise_ratio, im * line_noise_ratio
     group_magnitudes = inputs.group_magnitudes[i, s, group]
     near_end = speckle.n_bins[group, s] > 0 and is_near_end(strongest_bin - 1, 3, config)
-    scratch = workspace.noise_bins
+    noise = workspace.noise
     if near_end:
         draw_noise_near_end(
             (a, b, draw, stream),
             ECHO_NOISE_FIRST_INDEX * (1 + group),
             (strongest_bin - 1, 3),
             config,
-            scratch,
+            noise,
         )
-        re, im = line_noise_ratio * scratch[0, 1], line_noise_ratio * scratch[1, 1]
+        re, im = line_noise_ratio * noise.in_phase[1], line_noise_ratio * noise.in_quadrature[1]
     amplitude = speckled_amplitude(group_magnitudes[1] / noise_sigma, speckle, group, s, 1)
     if (amplitude.real + re) ** 2 + (amplitude.imag + im) ** 2 < threshold_ratio * threshold_ratio:
         return False
@@ -1876,10 +1964,10 @@ def draw_peak_bin(
     )
     if near_end:
         below_ratio = abs(
-            amplitude_below + line_noise_ratio * complex(scratch[0, 0], scratch[1, 0])
+            amplitude_below + line_noise_ratio * complex(noise.in_phase[0], noise.in_quadrature[0])
         )
         above_ratio = abs(
-            amplitude_above + line_noise_ratio * complex(scratch[0, 2], scratch[1, 2])
+            amplitude_above + line_noise_ratio * complex(noise.in_phase[2], noise.in_quadrature[2])
         )
     offset = estimate_sub_bin_offset(below_ratio, centre_ratio, above_ratio, interpolation)
     peak_shift = 0
@@ -1925,7 +2013,7 @@ def detect_in_speckle(
     Several looks detect by the powers of their strongest bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    _, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    threshold_ratio, line_noise_ratio = inputs.threshold_ratio[i], inputs.line_noise_ratio[i]
     strongest_bin, first_bin = (
         inputs.group_bins[i, s, STRONGEST_ROW, group],
         speckle.first_bin[group, s],
@@ -1944,7 +2032,7 @@ def detect_in_speckle(
     )
     if not pd > 0.0:
         return False
-    power, scratch = workspace.bin_power[:n_bins], workspace.noise_bins
+    power, noise = workspace.bin_power[:n_bins], workspace.noise
     power[:] = 0.0
     in_phase, in_quadrature, n_votes = 0.0, 0.0, 0
     echo_weight, noise_weight = math.sqrt(echo_fraction), math.sqrt(0.5 * (1.0 - echo_fraction))
@@ -1952,14 +2040,14 @@ def detect_in_speckle(
         look_draw = draw + look * LOOK_DRAW_STRIDE
         address_of_noise = a, b, look_draw, philox.STREAM_NOISE[s]
         if n_bins == 3 and not is_noncircular:
-            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, scratch)
+            draw_three_bin_noise(address_of_noise, 3 * group, interpolation, noise)
         else:
             draw_adjacent_noise(
                 address_of_noise,
                 ECHO_NOISE_FIRST_INDEX * (1 + group),
                 (first_bin, n_bins),
                 config,
-                scratch,
+                noise,
             )
         bin_amplitudes = speckle.amplitudes[
             group, look if speckle.amplitudes.shape[1] > 1 else 0, s
@@ -1969,8 +2057,10 @@ def detect_in_speckle(
                 speckle.rms_ratio[group, s, k],
                 echo_weight * speckle.detection_weights[group, s, k],
             )
-            re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * scratch[0, k]
-            im = magnitude_ratio * bin_amplitudes[k].imag + line_noise_ratio * scratch[1, k]
+            re = magnitude_ratio * bin_amplitudes[k].real + line_noise_ratio * noise.in_phase[k]
+            im = (
+                magnitude_ratio * bin_amplitudes[k].imag + line_noise_ratio * noise.in_quadrature[k]
+            )
             if look == 0:
                 in_phase, in_quadrature = (
                     in_phase + bin_weight * bin_amplitudes[k].real,
@@ -1978,8 +2068,8 @@ def detect_in_speckle(
                 )
             if k == strongest_index and look == 0:
                 in_phase, in_quadrature = (
-                    in_phase + noise_weight * scratch[0, k],
-                    in_quadrature + noise_weight * scratch[1, k],
+                    in_phase + noise_weight * noise.in_phase[k],
+                    in_quadrature + noise_weight * noise.in_quadrature[k],
                 )
             if k == strongest_index:
                 n_votes += re * re + im * im >= threshold_ratio * threshold_ratio
@@ -2072,8 +2162,8 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
-    """Draw the noise of adjacent bins over sigma into rows 0 and 1 of ``scratch``.
+def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
+    """Draw the noise of adjacent bins over sigma.
 
     Parameters
     ----------
@@ -2085,20 +2175,20 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, scratch):
         First bin, and number of bins.
     config
         Settings with the filters.
-    scratch
-        (4, >= bins + NOISE_FILTER_TAPS); for bins near DC or Nyquist with all bins of
-        ``config.end_noise_filter`` in place of `bins`.
+    noise
+        :class:`sweep.model.sampling.draws.NoiseScratch`, the result. It has at least as many bins;
+        for bins near DC or Nyquist as many as ``config.end_noise_filter``.
     """
     first_bin, n_bins = first_and_count
     touches_end = config.real_fft_size > 0 and (
         first_bin == 0 or 2 * (first_bin + n_bins - 1) == config.real_fft_size
     )
     if is_near_end(first_bin, n_bins, config):
-        draw_noise_near_end(address, first_index, first_and_count, config, scratch)
+        draw_noise_near_end(address, first_index, first_and_count, config, noise)
     elif n_bins <= config.noise_root.shape[0] and not touches_end:
-        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, scratch)
+        draw_bin_noise_by_root(address, first_index, n_bins, config.noise_root, noise)
     else:
-        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, scratch)
+        draw_bin_noise(address, first_index, first_bin, n_bins, config.noise_filter, noise)
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -2111,7 +2201,7 @@ def is_near_end(first_bin, n_bins, config):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
+def draw_noise_near_end(address, first_index, first_and_count, config, noise):
     """Draw the noise of :func:`draw_adjacent_noise` near DC or Nyquist.
 
     Bins beyond DC or Nyquist are complex conjugates of their mirror images.
@@ -2130,33 +2220,51 @@ def draw_noise_near_end(address, first_index, first_and_count, config, scratch):
         drawn_first,
         drawn_last - drawn_first + 1,
         config.end_noise_filter,
-        scratch,
+        noise,
     )
+    drawn_re, drawn_im = noise.number_in_phase, noise.number_in_quadrature  # no longer needed
     for k in range(drawn_last - drawn_first + 1):
-        scratch[2, k], scratch[3, k] = scratch[0, k], scratch[1, k]
+        drawn_re[k], drawn_im[k] = noise.in_phase[k], noise.in_quadrature[k]
     for k in range(n_bins):
         bin_ = abs(first_bin + k)
         sign = -1.0 if first_bin + k < 0 or bin_ > config.nyquist_bin else 1.0
         bin_ = min(bin_, 2 * config.nyquist_bin - bin_) - drawn_first
-        scratch[0, k], scratch[1, k] = scratch[2, bin_], sign * scratch[3, bin_]
+        noise.in_phase[k], noise.in_quadrature[k] = drawn_re[bin_], sign * drawn_im[bin_]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_three_bin_noise(address, first_index, interpolation, scratch):
-    """Draw the noise of three adjacent bins over sigma into rows 0 and 1 of ``scratch``.
+def draw_three_bin_noise(address, first_index, interpolation, noise):
+    """Draw the noise of three adjacent bins over sigma.
 
-    ``address`` holds key, draw and stream; the first pair of independent numbers has the index
-    ``first_index``.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64), number of the draw, and stream.
+    first_index
+        Stream index of the first pair of independent numbers.
+    interpolation
+        Interpolator of the window.
+    noise
+        :class:`sweep.model.sampling.draws.NoiseScratch`, the result.
     """
+    noise_re, noise_im = noise.in_phase, noise.in_quadrature
     from_centre, above_own, below_from_above, below_own = interpolation.noise_mixing
     a, b, draw, stream = address
-    re, im = philox.normal_pair(a, b, draw, stream, first_index)
-    re_above, im_above = philox.normal_pair(a, b, draw, stream, first_index + 1)
-    re_below, im_below = philox.normal_pair(a, b, draw, stream, first_index + 2)
-    scratch[0, 0] = from_centre * re + below_from_above * re_above + below_own * re_below
-    scratch[1, 0] = from_centre * im + below_from_above * im_above + below_own * im_below
-    scratch[0, 1], scratch[1, 1] = re, im
-    scratch[0, 2], scratch[1, 2] = (
+    # Each four words make two of the pairs.
+    words = philox.four_words(a, b, draw, stream, first_index >> 1)
+    next_words = philox.four_words(a, b, draw, stream, (first_index >> 1) + 1)
+    if first_index & 1:
+        re, im = philox.to_normals(words[2], words[3])
+        re_above, im_above = philox.to_normals(next_words[0], next_words[1])
+        re_below, im_below = philox.to_normals(next_words[2], next_words[3])
+    else:
+        re, im = philox.to_normals(words[0], words[1])
+        re_above, im_above = philox.to_normals(words[2], words[3])
+        re_below, im_below = philox.to_normals(next_words[0], next_words[1])
+    noise_re[0] = from_centre * re + below_from_above * re_above + below_own * re_below
+    noise_im[0] = from_centre * im + below_from_above * im_above + below_own * im_below
+    noise_re[1], noise_im[1] = re, im
+    noise_re[2], noise_im[2] = (
         from_centre * re + above_own * re_above,
         from_centre * im + above_own * im_above,
     )
@@ -2180,7 +2288,8 @@ def draw_all_bins(
     The peak is the largest of these bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
-    noise_sigma, threshold_ratio, line_noise_ratio = inputs.noise_and_threshold[i]
+    noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
+    line_noise_ratio = inputs.line_noise_ratio[i]
     span_first_bin, span_start = spectra.first_bin[i, s], spectra.bins_start[i, s]
     span_ratios = spectra.bin_ratios[span_start : span_start + spectra.n_bins[i, s]]
     first_index, last_index = (
@@ -2195,7 +2304,8 @@ def draw_all_bins(
         max(config.lobe_half_width, int(inputs.bin_thresholds.pedestal_reach_bins[i])),
     )
     n_bins, peak_index = last_index - first_index + 1, 0
-    pedestal_power, scratch = workspace.pedestal_power[:n_bins], workspace.noise_bins
+    pedestal_power, noise = workspace.pedestal_power[:n_bins], workspace.noise
+    ratios = workspace.bin_ratio
     pedestal_power[:] = 0.0
     if line_noise_ratio > 1.0:
         magnitudes = workspace.bin_power[:n_bins]
@@ -2209,7 +2319,7 @@ def draw_all_bins(
     )
     if speckle.n_bins[group, s] > 0:
         draw_adjacent_noise(
-            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, scratch
+            address_of_noise, first_number, (span_first_bin + first_index, n_bins), config, noise
         )
     else:
         draw_bin_noise(
@@ -2218,7 +2328,7 @@ def draw_all_bins(
             span_first_bin + first_index,
             n_bins,
             config.noise_filter,
-            scratch,
+            noise,
         )
     for k in range(n_bins):
         amplitude, noise_deviation = (
@@ -2229,16 +2339,16 @@ def draw_all_bins(
             power = pedestal_power[k] * abs(speckled_amplitude(1.0, speckle, group, s, k)) ** 2
             noise_deviation = math.sqrt(1.0 + power)
         re, im = (
-            amplitude.real + noise_deviation * scratch[0, k],
-            amplitude.imag + noise_deviation * scratch[1, k],
+            amplitude.real + noise_deviation * noise.in_phase[k],
+            amplitude.imag + noise_deviation * noise.in_quadrature[k],
         )
-        scratch[0, k] = math.hypot(re, im)
-        peak_index = k if scratch[0, k] > scratch[0, peak_index] else peak_index
-    peak_ratio, line_deviation = scratch[0, peak_index], inputs.line_deviation_bins[i, s, group]
+        ratios[k] = math.hypot(re, im)
+        peak_index = k if ratios[k] > ratios[peak_index] else peak_index
+    peak_ratio, line_deviation = ratios[peak_index], inputs.line_deviation_bins[i, s, group]
     if peak_ratio < threshold_ratio:
         return False
-    below_ratio = scratch[0, peak_index - 1] if peak_index > 0 else 0.0
-    above_ratio = scratch[0, peak_index + 1] if peak_index + 1 < n_bins else 0.0
+    below_ratio = ratios[peak_index - 1] if peak_index > 0 else 0.0
+    above_ratio = ratios[peak_index + 1] if peak_index + 1 < n_bins else 0.0
     offset, peak_bin = (
         estimate_sub_bin_offset(below_ratio, peak_ratio, above_ratio, interpolation),
         span_first_bin + first_index + peak_index,

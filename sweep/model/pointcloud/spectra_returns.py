@@ -120,7 +120,7 @@ def draw_spectra_returns(
             bin_groups.strongest_bin[point],
             inputs.line_grid,
         )
-        noise_sigma, _, line_noise_ratio = inputs.noise_and_threshold[point]
+        noise_sigma, line_noise_ratio = inputs.noise_sigma[point], inputs.line_noise_ratio[point]
         echo_bounds = [
             _echo_bin_bounds(point_spectra, s, signal)
             for s, signal in enumerate(point_spectra.signals)
@@ -168,6 +168,7 @@ def draw_spectra_returns(
                     peak_groups[s, k] = echo_of_peak[k]
                 n_peaks[s] = bins.size
             pair_into_returns(
+                point,
                 (point, d),
                 config,
                 inputs,

@@ -72,6 +72,52 @@ class DrawRanges(NamedTuple):
     """int64: number after the last draw."""
 
 
+class CountConfig(NamedTuple):
+    """Settings and tables of counting that are common to all rows."""
+
+    in_noise: bool
+    """True if noise is drawn, False if draws are compared with probabilities."""
+    noise_filter: "NoiseFilter"
+    """Filter of the noise of echoes' bins; without bins if only the strongest bin detects."""
+    sidelobe_correlation: float
+    """Correlation of the noise of neighbouring bins in phase with the signal."""
+    pseudo_variance_ratio: np.ndarray
+    """(ratio rows, bins): pseudo-variance ratios near DC and Nyquist, as in
+    :class:`sweep.model.detection.echo_detection.SpeckleTable`."""
+    nyquist_bin: int
+    """Half of the FFT size, N/2."""
+
+
+class CountInputs(NamedTuple):
+    """Quantities of m rows on which counts depend; segments are up, Doppler and down."""
+
+    threshold_ratio: np.ndarray
+    """(m,): threshold over sigma."""
+    line_noise_ratio: np.ndarray
+    """(m,): noise of bins that hold lines, over sigma."""
+    bin_thresholds: BinThresholds
+    """(m,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`, for echoes that any bin may
+    detect."""
+    pfa: np.ndarray
+    """(3, m): probability of a false alarm in bins that are not evaluated one by one."""
+    pd_otherwise: np.ndarray
+    """(3, m): probability of a detection without the condition of :func:`_draw_probabilities`;
+    unused if noise is drawn."""
+    pd_if_condition: np.ndarray
+    """(3, m): probability of a detection with that condition; unused if noise is drawn."""
+    any_two: np.ndarray
+    """(m,) bool: True if any two segments detect a shot."""
+    mixing: np.ndarray
+    """(6, m): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`;
+    (0, m) without speckle."""
+    ratio_row: np.ndarray
+    """(3, m) int64: row of ``CountConfig.pseudo_variance_ratio``; 0 far from DC and Nyquist."""
+    line_grid: SpeckleLineGrid
+    """Lines of the footprints in developed speckle."""
+    line_centre: np.ndarray
+    """(m, 3): mean position of the lines [bins]; (0, 3) without speckle."""
+
+
 def count_by_probability(
     draw_ranges: DrawRanges,
     batch_edges: np.ndarray,
@@ -94,26 +140,26 @@ def count_by_probability(
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
     n_rows, probabilities = draw_ranges.point_index.size, _draw_probabilities(outputs)
-    no_filter = np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0
-    config = False, *no_filter, np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan)))
-    no_spectra = NoiselessSpectra.empty(n_rows), np.empty((0, n_rows))
-    no_pseudo_variance = (
-        np.zeros((3, n_rows), np.int64),
-        np.zeros((1, 0)),
-        0,
-        SpeckleLineGrid.empty(),
+    no_filter = NoiseFilter(np.empty((0, NOISE_FILTER_TAPS)), np.empty(0, np.int64), 0)
+    inputs = CountInputs(
+        threshold_ratio=np.zeros(n_rows),
+        line_noise_ratio=np.zeros(n_rows),
+        bin_thresholds=BinThresholds(*np.zeros((7, n_rows))),
+        pfa=probabilities[0],
+        pd_otherwise=probabilities[1],
+        pd_if_condition=probabilities[2],
+        any_two=np.isfinite(outputs.get(PD_BOTH_CHIRPS, np.full(n_rows, np.nan))),
+        mixing=np.empty((0, n_rows)),
+        ratio_row=np.zeros((3, n_rows), np.int64),
+        line_grid=SpeckleLineGrid.empty(),
+        line_centre=np.empty((0, 3)),
     )
-    no_speckle = *no_pseudo_variance, np.empty((0, 3))
-    no_levels = np.zeros((2, n_rows)), BinThresholds(*np.zeros((7, n_rows)))
     _count_draws(
         draw_ranges,
         batch_edges,
-        *no_levels,
-        probabilities,
-        config,
-        *no_spectra,
-        no_speckle,
-        0.0,
+        CountConfig(False, no_filter, 0.0, np.zeros((1, 0)), 0),
+        inputs,
+        NoiselessSpectra.empty(n_rows),
         counts,
     )
 
@@ -136,45 +182,75 @@ def count_in_noise(
         (names, points, batches) int64, in the order of
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
-    threshold_and_noise = threshold_and_line_noise_ratios(shots)
+    threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
     mixing = (
         np.empty((0, shots.size))
         if shots.segment_correlations is None
         else shots.segment_correlations.cholesky_factors()
     )
-    pfa_bin, speckle_table = np.exp(-0.5 * threshold_and_noise[0] ** 2), shots.speckle_table
+    pfa_bin, speckle_table = np.exp(-0.5 * threshold_ratio**2), shots.speckle_table
     line_grid = speckle_line_grid(shots)
     for indices, spectra in iter_noiseless_spectra(shots):
         pfa_elsewhere = at_least_one_probability(pfa_bin[indices], spectra.n_noise_bins.T)
-        probabilities = np.array(
-            [pfa_elsewhere, *np.zeros((2, *pfa_elsewhere.shape))]
-        )  # in C order
-        part_ranges = DrawRanges(*(column[indices] for column in draw_ranges))
-        filter_rule = make_echo_noise_filter(shots, spectra)
-        kernel_arguments = (
-            threshold_and_noise[:, indices].copy(),
-            shots.bin_thresholds.select(indices),
-            probabilities,
-            (True, *filter_rule, np.full(indices.size, shots.any_two)),
-            spectra,
-            mixing[:, indices].copy(),
-            (
-                speckle_table.ratio_row[:, indices].copy(),
-                speckle_table.pseudo_variance_ratio,
-                shots.fft_size // 2,
-                line_grid.select(indices),
-                np.ascontiguousarray(
-                    mean_line_positions(shots, indices, spectra.first_bin + spectra.peak_index)
-                ),
+        no_probabilities = np.zeros(pfa_elsewhere.shape)
+        inputs = CountInputs(
+            threshold_ratio=threshold_ratio[indices],
+            line_noise_ratio=line_noise_ratio[indices],
+            bin_thresholds=shots.bin_thresholds.select(indices),
+            pfa=np.ascontiguousarray(pfa_elsewhere),
+            pd_otherwise=no_probabilities,
+            pd_if_condition=no_probabilities,
+            any_two=np.full(indices.size, shots.any_two),
+            mixing=mixing[:, indices].copy(),
+            ratio_row=speckle_table.ratio_row[:, indices].copy(),
+            line_grid=line_grid.select(indices),
+            line_centre=np.ascontiguousarray(
+                mean_line_positions(shots, indices, spectra.first_bin + spectra.peak_index)
             ),
-            shots.detection_rule.sidelobe_correlation,
         )
-        _count_draws(part_ranges, batch_edges, *kernel_arguments, counts)
+        config = CountConfig(
+            True,
+            make_echo_noise_filter(shots, spectra),
+            shots.detection_rule.sidelobe_correlation,
+            speckle_table.pseudo_variance_ratio,
+            shots.fft_size // 2,
+        )
+        part_ranges = DrawRanges(*(column[indices] for column in draw_ranges))
+        _count_draws(part_ranges, batch_edges, config, inputs, spectra, counts)
+
+
+class NoiseFilter(NamedTuple):
+    """Filter that makes the noise of adjacent bins from independent normal numbers."""
+
+    weights: np.ndarray
+    """(bins, NOISE_FILTER_TAPS): weights of the numbers of each bin; their squares sum to 1."""
+    first_number: np.ndarray
+    """(bins,) int64: index of the first number of each bin, relative to that at the first bin."""
+    real_fft_size: int
+    """FFT size N if the noise at DC and Nyquist is real, else 0."""
+
+
+class NoiseScratch(NamedTuple):
+    """Noise of adjacent bins over sigma, and the independent numbers that it is made of."""
+
+    in_phase: np.ndarray
+    """(k,): noise of each bin in phase with the signal."""
+    in_quadrature: np.ndarray
+    """(k,): noise of each bin in quadrature with the signal."""
+    number_in_phase: np.ndarray
+    """(k,): independent normal numbers that make ``in_phase``."""
+    number_in_quadrature: np.ndarray
+    """(k,): independent normal numbers that make ``in_quadrature``."""
+
+    @classmethod
+    def allocate(cls, n_bins: int) -> "NoiseScratch":
+        """Allocate arrays for the noise of ``n_bins`` bins."""
+        return cls(*np.empty((4, n_bins + NOISE_FILTER_TAPS)))
 
 
 def make_echo_noise_filter(
     shots: Shots, spectra: "NoiselessSpectra", bins_min: int = 0
-) -> tuple[np.ndarray, np.ndarray, int]:
+) -> NoiseFilter:
     """Return the filter that makes the noise of an echo's bins from independent numbers.
 
     Parameters
@@ -188,10 +264,8 @@ def make_echo_noise_filter(
 
     Returns
     -------
-    tuple
-        Weights (bins, taps), first number (bins,) int64 of each bin, and FFT size N if the noise at
-        DC and Nyquist is real, else 0. The filter has no bins if only the largest bin of an echo
-        detects it.
+    NoiseFilter
+        The filter. It has no bins if only the largest bin of an echo detects it.
     """
     n_echo_bins = (
         max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule.any_bin else 0
@@ -200,22 +274,24 @@ def make_echo_noise_filter(
     if shots.noise_bins == "independent":
         weights = np.zeros((n_filter_bins, NOISE_FILTER_TAPS))
         weights[:, NOISE_FILTER_TAPS // 2] = 1.0
-        return weights, np.arange(n_filter_bins) - NOISE_FILTER_TAPS // 2, 0
-    return *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_fft_size
+        return NoiseFilter(weights, np.arange(n_filter_bins) - NOISE_FILTER_TAPS // 2, 0)
+    return NoiseFilter(
+        *noise_filter(shots.window, shots.fft_size, n_filter_bins), shots.real_fft_size
+    )
 
 
 ROOT_BINS_MAX = 16
 """Largest number of adjacent bins whose noise is made from one independent number for each bin."""
 
 
-def noise_covariance_root(filter_rule: tuple[np.ndarray, np.ndarray, int]) -> np.ndarray:
+def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
     It is the Cholesky factor of the covariance under a filter of :func:`make_echo_noise_filter`,
     for at most ROOT_BINS_MAX bins. It is not valid at DC and Nyquist, for which
     :func:`draw_bin_noise` is.
     """
-    weights, start, _ = filter_rule
+    weights, start = filter_rule.weights, filter_rule.first_number
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)
     number_weights = np.zeros(
         (n_bins, int(start[n_bins - 1] - start[0]) + NOISE_FILTER_TAPS if n_bins else 0)
@@ -313,10 +389,11 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
         )
 
 
-def threshold_and_line_noise_ratios(shots: Shots) -> np.ndarray:
-    """Return threshold and noise under the lines, both over the noise of any other bin, (2, n)."""
+def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Return threshold and noise under the lines, over the noise of any other bin, (n,) each."""
     ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
-    return np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
+    ratios = np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
+    return ratios[0], ratios[1]
 
 
 ECHO_NOISE_FIRST_INDEX = 1 << 24
@@ -460,19 +537,7 @@ def iter_noiseless_spectra(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_draws(
-    draw_ranges,
-    batch_edges,
-    threshold_and_noise,
-    bin_thresholds,
-    probabilities,
-    config,
-    spectra,
-    mixing,
-    pseudo_variance_and_lines,
-    sidelobe_correlation,
-    counts,
-):
+def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
     """Add the detections and false alarms of each row's draws to the counts.
 
     Parameters
@@ -482,36 +547,23 @@ def _count_draws(
     batch_edges
         (batches + 1,): numbers of the draws at which batches begin, and the number after the last
         draw.
-    threshold_and_noise
-        (2, m): :func:`threshold_and_line_noise_ratios`.
-    bin_thresholds
-        (m,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds` of the rows, for echoes that
-        any bin may detect.
-    probabilities
-        (3, 3, m): probability of a false alarm in bins that are not evaluated one by one, and of a
-        detection without and with a condition (:func:`_draw_probabilities`). The last two are
-        unused if noise is drawn.
     config
-        True if noise is drawn; the three parts of :func:`make_echo_noise_filter`; and (m,) bool,
-        True if any two segments detect a shot.
+        :class:`CountConfig`.
+    inputs
+        :class:`CountInputs` of the rows.
     spectra
         :class:`NoiselessSpectra` of the rows.
-    mixing
-        (6, m): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`;
-        (0, m) without speckle.
-    pseudo_variance_and_lines
-        Rows (3, m) of the pseudo-variance ratios near DC and Nyquist, these ratios
-        (:class:`sweep.model.detection.pseudo_variance.SignalPseudoVariance`), N/2, the
-        :class:`SpeckleLineGrid` of the footprints in developed speckle, and the mean positions (m,
-        3) of their lines [bins].
-    sidelobe_correlation
-        Correlation of the noise of neighbouring bins in phase with the signal.
     counts
         (names, points, batches) int64, in the order of
         :data:`sweep.model.outputs.DRAW_COUNT_OUTPUTS`; the counts are added to it.
     """
-    in_noise, weights, start, real_ends, any_two = config
-    noise_scratch = np.empty((4, weights.shape[0] + weights.shape[1]))
+    n_filter_bins, n_taps = config.noise_filter.weights.shape
+    noise = NoiseScratch(
+        np.empty(n_filter_bins + n_taps),
+        np.empty(n_filter_bins + n_taps),
+        np.empty(n_filter_bins + n_taps),
+        np.empty(n_filter_bins + n_taps),
+    )
     random_words = np.empty((4, _DRAWS_PER_STEP), np.uint64)
     segment_factors, segment_amplitudes = (
         np.ones((3, _DRAWS_PER_STEP)),
@@ -521,18 +573,16 @@ def _count_draws(
     no_amplitudes = np.zeros((3, 0, 0), np.complex128)
     is_detected, has_alarm = np.empty((2, 3, _DRAWS_PER_STEP), np.bool_)
     for j in range(draw_ranges.point_index.size):
-        threshold_power, line_noise_ratio = (
-            threshold_and_noise[0, j] * threshold_and_noise[0, j],
-            threshold_and_noise[1, j],
-        )
+        threshold_ratio, line_noise_ratio = inputs.threshold_ratio[j], inputs.line_noise_ratio[j]
+        in_speckle = inputs.mixing.shape[0] > 0
         i, batch = draw_ranges.point_index[j], 0
         for first in range(draw_ranges.first_draw[j], draw_ranges.end_draw[j], _DRAWS_PER_STEP):
             n_draws = min(_DRAWS_PER_STEP, draw_ranges.end_draw[j] - first)
             address = draw_ranges.keys[j, 0], draw_ranges.keys[j, 1], first, n_draws
             is_detected[:], has_alarm[:] = False, False
-            for d in range(n_draws if mixing.shape[0] > 0 else 0):
+            for d in range(n_draws if in_speckle else 0):
                 one, amplitude_doppler, amplitude_down = speckle_amplitudes(
-                    address[:2], first + d, 0, mixing[:, j]
+                    address[:2], first + d, 0, inputs.mixing[:, j]
                 )
                 for component in range(2):
                     segment_amplitudes[0, component, d], segment_amplitudes[1, component, d] = (
@@ -545,9 +595,9 @@ def _count_draws(
                         segment_amplitudes[s, 0, d], segment_amplitudes[s, 1, d]
                     )
             echo_amplitudes = no_amplitudes
-            if mixing.shape[0] > 0 and weights.size > 0:
+            if in_speckle and n_filter_bins > 0:
                 echo_amplitudes = _draw_echo_amplitudes(
-                    address, j, spectra, pseudo_variance_and_lines, segment_factors
+                    address, j, spectra, inputs.line_grid, inputs.line_centre, segment_factors
                 )
             for s in (0, 2, 1):
                 stream, peak_ratio, peak_index = (
@@ -555,22 +605,22 @@ def _count_draws(
                     spectra.peak_ratio[j, s],
                     spectra.peak_index[j, s],
                 )
-                ratio_row = pseudo_variance_and_lines[0][s, j]
-                pseudo_variance_ratios = pseudo_variance_and_lines[1][
-                    ratio_row, : (pseudo_variance_and_lines[1].shape[1] if ratio_row > 0 else 0)
+                ratio_row = inputs.ratio_row[s, j]
+                pseudo_variance_ratios = config.pseudo_variance_ratio[
+                    ratio_row, : (config.pseudo_variance_ratio.shape[1] if ratio_row > 0 else 0)
                 ]
-                if in_noise and weights.size > 0:
+                if config.in_noise and n_filter_bins > 0:
                     _mark_any_bin_crossings(
                         address,
                         (j, s),
                         spectra,
-                        (weights, start, real_ends),
-                        bin_threshold_at(bin_thresholds, j),
+                        config.noise_filter,
+                        bin_threshold_at(inputs.bin_thresholds, j),
                         echo_amplitudes[s],
-                        noise_scratch,
+                        noise,
                         is_detected[s],
                     )
-                elif in_noise:
+                elif config.in_noise:
                     noise_deviations = line_noise_ratio, line_noise_ratio
                     if spectra.has_real_noise[j, s]:
                         noise_deviations = math.sqrt(2.0) * line_noise_ratio, 0.0
@@ -578,7 +628,7 @@ def _count_draws(
                     if ratio_row > 0:
                         bin_pseudo_variance = pseudo_variance_ratio_at(
                             spectra.first_bin[j, s] + peak_index,
-                            pseudo_variance_and_lines[2],
+                            config.nyquist_bin,
                             pseudo_variance_ratios,
                         )
                         along[:] = math.sqrt(1.0 + bin_pseudo_variance) * segment_amplitudes[s, 0]
@@ -586,19 +636,27 @@ def _count_draws(
                             math.sqrt(max(1.0 - bin_pseudo_variance, 0.0))
                             * segment_amplitudes[s, 1]
                         )
-                    crossing = peak_ratio, noise_deviations, threshold_power, along, across
+                    crossing = (
+                        peak_ratio,
+                        noise_deviations,
+                        threshold_ratio * threshold_ratio,
+                        along,
+                        across,
+                    )
                     _mark_crossings(
                         address, stream, peak_index, crossing, random_words, is_detected[s]
                     )
                 else:
-                    pd_pair = probabilities[1, s, j], probabilities[2, s, j]
+                    pd_pair = inputs.pd_otherwise[s, j], inputs.pd_if_condition[s, j]
                     one = is_detected[0] if s == 2 else is_detected[0] ^ is_detected[2]
                     _mark_random_events(
                         address, STREAM_DETECTION[s], pd_pair, one, random_words, is_detected[s]
                     )
-                if probabilities[0, s, j] > 0.0:
-                    alarm_stream = STREAM_NOISE_MAXIMUM[s] if in_noise else STREAM_FALSE_ALARM[s]
-                    alarm_pair = probabilities[0, s, j], probabilities[0, s, j]
+                if inputs.pfa[s, j] > 0.0:
+                    alarm_stream = (
+                        STREAM_NOISE_MAXIMUM[s] if config.in_noise else STREAM_FALSE_ALARM[s]
+                    )
+                    alarm_pair = inputs.pfa[s, j], inputs.pfa[s, j]
                     _mark_random_events(
                         address,
                         alarm_stream,
@@ -611,8 +669,8 @@ def _count_draws(
                     address,
                     (j, s),
                     spectra,
-                    threshold_and_noise[0, j],
-                    sidelobe_correlation,
+                    threshold_ratio,
+                    config.sidelobe_correlation,
                     segment_factors[s],
                     random_words,
                     has_alarm[s],
@@ -624,7 +682,7 @@ def _count_draws(
                 counts[1, i, batch] += is_detected[2, d]
                 counts[2, i, batch] += is_detected[1, d]
                 by_doppler = (
-                    any_two[j] & is_detected[1, d] & (is_detected[0, d] | is_detected[2, d])
+                    inputs.any_two[j] & is_detected[1, d] & (is_detected[0, d] | is_detected[2, d])
                 )
                 counts[3, i, batch] += (is_detected[0, d] & is_detected[2, d]) | by_doppler
                 counts[4, i, batch] += has_alarm[0, d]
@@ -814,29 +872,26 @@ def _echo_end_indices(point_and_segment, spectra):
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_echo_amplitudes(address, column, spectra, pseudo_variance_and_lines, segment_factors):
+def _draw_echo_amplitudes(address, row, spectra, line_grid, line_centres, segment_factors):
     """Draw complex amplitudes (3, draws, bins) of an echo's bins in developed speckle.
 
     The amplitudes have mean power 1 and follow from the lines of the footprint. Bins that no line
     reaches have the amplitude of the strongest bin. ``segment_factors`` (3, draws) is set to the
-    magnitude of the strongest bin's amplitude. ``pseudo_variance_and_lines`` is as in
-    :func:`_count_draws`.
+    magnitude of the strongest bin's amplitude. ``line_grid`` and ``line_centres`` are those of
+    :class:`CountInputs`.
     """
-    line_grid, line_centre = (
-        pseudo_variance_and_lines[3],
-        pseudo_variance_and_lines[4][column].copy(),
-    )
+    line_centre = line_centres[row].copy()
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
     first_index = np.zeros(3, np.int64)
     for s in range(3):
-        begin_index, end_index = _echo_end_indices((column, s), spectra)
-        first_bin[s], first_index[s] = spectra.first_bin[column, s] + begin_index, begin_index
+        begin_index, end_index = _echo_end_indices((row, s), spectra)
+        first_bin[s], first_index[s] = spectra.first_bin[row, s] + begin_index, begin_index
         n_bins_max = max(n_bins_max, end_index - begin_index + 1)
         if end_index < begin_index:
             line_centre[s] = np.nan
     mean_power, pseudo_variance = np.zeros((3, n_bins_max)), np.zeros((3, n_bins_max))
     has_images = mean_bin_powers(
-        line_grid, column, line_centre, first_bin, mean_power, pseudo_variance
+        line_grid, row, line_centre, first_bin, mean_power, pseudo_variance
     )
     n_rows_max, factor_rank = 3 * n_bins_max, 0
     factor = np.empty(
@@ -844,7 +899,7 @@ def _draw_echo_amplitudes(address, column, spectra, pseudo_variance_and_lines, s
     )
     if factor.shape[0] > 0 and not has_images:
         factor_rank = factor_bin_covariance(
-            line_grid, column, line_centre, first_bin, mean_power, factor
+            line_grid, row, line_centre, first_bin, mean_power, factor
         )
     amplitudes, drawn_amplitudes = (
         np.zeros((3, address[3], n_bins_max), np.complex128),
@@ -859,14 +914,14 @@ def _draw_echo_amplitudes(address, column, spectra, pseudo_variance_and_lines, s
                 address_of_draw,
                 0,
                 line_grid,
-                column,
+                row,
                 line_centre,
                 first_bin,
                 mean_power,
                 drawn_amplitudes,
             )
         for s in range(3):
-            peak_index = spectra.peak_index[column, s] - first_index[s]
+            peak_index = spectra.peak_index[row, s] - first_index[s]
             if not 0 <= peak_index < n_bins_max:
                 continue
             segment_factors[s, d] = abs(drawn_amplitudes[s, peak_index])
@@ -887,7 +942,7 @@ def _mark_any_bin_crossings(
     filter_rule,
     bin_threshold,
     echo_amplitudes,
-    noise_scratch,
+    noise,
     is_marked,
 ):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
@@ -919,7 +974,7 @@ def _mark_any_bin_crossings(
             spectra.first_bin[point_and_segment] + first_index,
             last_index - first_index + 1,
             filter_rule,
-            noise_scratch,
+            noise,
         )
         for i in range(first_index, last_index + 1):
             amplitude = (
@@ -928,17 +983,16 @@ def _mark_any_bin_crossings(
                 else complex(1.0, 0.0)
             )
             noise_deviation = math.sqrt(1.0 + pedestal_power[i] * abs(amplitude) ** 2)
-            re = (
-                noise_deviation * noise_scratch[0, i - first_index] + bin_ratios[i] * amplitude.real
-            )
+            re = noise_deviation * noise.in_phase[i - first_index] + bin_ratios[i] * amplitude.real
             im = (
-                noise_deviation * noise_scratch[1, i - first_index] + bin_ratios[i] * amplitude.imag
+                noise_deviation * noise.in_quadrature[i - first_index]
+                + bin_ratios[i] * amplitude.imag
             )
             is_marked[d] |= is_echo[i] and re * re + im * im >= threshold_ratio * threshold_ratio
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch):
+def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
     """Draw the noise of adjacent bins over sigma, correlated as window and padding make it.
 
     Parameters
@@ -950,17 +1004,17 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch
     first_bin, n_bins
         First bin and number of bins.
     filter_rule
-        Result of :func:`make_echo_noise_filter`.
-    scratch
-        (4, >= n_bins + taps): rows 0 and 1 are set to the noise in phase with the signal and in
-        quadrature; rows 2 and 3 hold the independent numbers.
+        :class:`NoiseFilter` of at least as many bins.
+    noise
+        :class:`NoiseScratch` of at least as many bins, the result.
 
     Notes
     -----
     At DC and Nyquist of a real record the noise is real, and bins on either side are complex
     conjugates.
     """
-    weights, start, real_fft_size = filter_rule
+    weights, start = filter_rule.weights, filter_rule.first_number
+    real_fft_size = filter_rule.real_fft_size
     n_taps = weights.shape[1]
     is_from_nyquist = (
         real_fft_size > 0 and 2 * (first_bin + n_bins - 1) == real_fft_size
@@ -971,39 +1025,39 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, scratch
         re, im = philox.normal_pair(address[0], address[1], address[2], address[3], first_index + j)
         if is_symmetric and j == 0:
             re, im = math.sqrt(2.0) * re, 0.0
-        scratch[2, j], scratch[3, j] = re, im
+        noise.number_in_phase[j], noise.number_in_quadrature[j] = re, im
     for k in range(n_bins):
         re, im = 0.0, 0.0
         for m in range(n_taps):
             j = start[k] + m - first_number
             sign = -1.0 if is_symmetric and j < 0 else 1.0  # conjugate in a real record
-            re += weights[k, m] * scratch[2, abs(j)]
-            im += weights[k, m] * sign * scratch[3, abs(j)]
+            re += weights[k, m] * noise.number_in_phase[abs(j)]
+            im += weights[k, m] * sign * noise.number_in_quadrature[abs(j)]
         i = n_bins - 1 - k if is_from_nyquist else k
-        scratch[0, i], scratch[1, i] = re, im
+        noise.in_phase[i], noise.in_quadrature[i] = re, im
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def draw_bin_noise_by_root(address, first_index, n_bins, root, scratch):
+def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
     """Draw the noise of ``n_bins`` adjacent bins over sigma, by a root of its covariance.
 
     ``address`` and ``first_index``, which is even, are as in :func:`draw_bin_noise`. ``root`` is
-    the result of :func:`noise_covariance_root`. Rows 0 and 1 of ``scratch`` (4, >= n_bins) are set
-    to the noise in phase with the signal and in quadrature.
+    the result of :func:`noise_covariance_root`. ``noise``, a :class:`NoiseScratch`, is the result.
     """
+    re_numbers, im_numbers = noise.number_in_phase, noise.number_in_quadrature
     for k in range(0, n_bins, 2):
         words = philox.four_words(
             address[0], address[1], address[2], address[3], (first_index + k) >> 1
         )
-        scratch[2, k], scratch[3, k] = philox.to_normals(words[0], words[1])
+        re_numbers[k], im_numbers[k] = philox.to_normals(words[0], words[1])
         if k + 1 < n_bins:
-            scratch[2, k + 1], scratch[3, k + 1] = philox.to_normals(words[2], words[3])
+            re_numbers[k + 1], im_numbers[k + 1] = philox.to_normals(words[2], words[3])
     for k in range(n_bins):
         re, im = 0.0, 0.0
         for j in range(k + 1):
-            re += root[k, j] * scratch[2, j]
-            im += root[k, j] * scratch[3, j]
-        scratch[0, k], scratch[1, k] = re, im
+            re += root[k, j] * re_numbers[j]
+            im += root[k, j] * im_numbers[j]
+        noise.in_phase[k], noise.in_quadrature[k] = re, im
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

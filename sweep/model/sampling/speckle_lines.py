@@ -465,7 +465,11 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
     first_quadrature, second_quadrature = grid.quadrature_index[point]
     n_segments, n_bins = mean_power.shape
     line_weights = np.empty(grid.n_nodes[first_quadrature] * grid.n_nodes[second_quadrature])
-    line_amplitudes = np.zeros((n_segments, n_bins, line_weights.size), np.complex128)
+    # Real and imaginary parts by line, so that the bins of a line are summed together.
+    line_re = np.zeros((line_weights.size, n_segments * n_bins))
+    line_im = np.zeros((line_weights.size, n_segments * n_bins))
+    covariance_re, covariance_im = np.empty(n_segments * n_bins), np.empty(n_segments * n_bins)
+    root_power = np.sqrt(mean_power)
     n_lines = 0
     for a in range(grid.n_nodes[first_quadrature]):
         for c in range(grid.n_nodes[second_quadrature]):
@@ -490,10 +494,11 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
                 )
                 for k in range(n_bins):
                     if mean_power[s, k] > 0.0 and abs(k - position) <= grid.transform_reach_bins:
-                        transform_value = interpolate_transform(k - position, grid) / math.sqrt(
-                            mean_power[s, k]
+                        transform_value = (
+                            interpolate_transform(k - position, grid) / root_power[s, k]
                         )
-                        line_amplitudes[s, k, n_lines] = phased_amplitude * transform_value
+                        line_re[n_lines, s * n_bins + k] = phased_amplitude.real * transform_value
+                        line_im[n_lines, s * n_bins + k] = phased_amplitude.imag * transform_value
             n_lines += 1
     residual = np.where(mean_power > 0.0, 1.0, 0.0)
     for rank in range(factor.shape[0]):
@@ -504,16 +509,19 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
                     pivot_segment, pivot_bin, residual_max = s, k, residual[s, k]
         if residual_max == _RESIDUAL_POWER_MAX:
             return rank
-        pivot_amplitudes = line_amplitudes[pivot_segment, pivot_bin]
-        scale = 1.0 / math.sqrt(residual_max)
+        scale, pivot_column = 1.0 / math.sqrt(residual_max), pivot_segment * n_bins + pivot_bin
+        covariance_re[:], covariance_im[:] = 0.0, 0.0
+        for line in range(n_lines):
+            re, im = line_re[line, pivot_column], line_im[line, pivot_column]
+            for column in range(n_segments * n_bins):
+                covariance_re[column] += line_re[line, column] * re + line_im[line, column] * im
+                covariance_im[column] += line_im[line, column] * re - line_re[line, column] * im
         for s in range(n_segments):
             for k in range(n_bins):
                 if not residual[s, k] > 0.0:
                     factor[rank, s, k] = 0.0
                     continue
-                covariance = complex(0.0, 0.0)
-                for line in range(n_lines):
-                    covariance += line_amplitudes[s, k, line] * pivot_amplitudes[line].conjugate()
+                covariance = complex(covariance_re[s * n_bins + k], covariance_im[s * n_bins + k])
                 for r in range(rank):
                     covariance -= (
                         factor[r, s, k] * factor[r, pivot_segment, pivot_bin].conjugate() * 2.0
