@@ -98,7 +98,7 @@ NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
 lines; the bins of the span that exceed a level."""
 
 
-NO_ROOM = np.int64(-1)
+SPAN_DOES_NOT_FIT = np.int64(-1)
 """Result of :func:`_evaluate_segment` if a span does not fit."""
 
 
@@ -1049,7 +1049,7 @@ def _evaluate_segment(
     Returns
     -------
     next_start
-        Index of the next span's first bin; NO_ROOM if this span does not fit.
+        Index of the next span's first bin; SPAN_DOES_NOT_FIT if this span does not fit.
     """
     point, rule, span = spans.point_numbers[i], settings.rule, workspace.span
     leakage_method = settings.leakage_methods[s]
@@ -1143,7 +1143,7 @@ def _evaluate_segment(
         )
     if spans.magnitudes.size > 0:
         if next_start + n_bins > spans.magnitudes.size:
-            return NO_ROOM
+            return SPAN_DOES_NOT_FIT
         spans.span_start[s, i] = next_start
         next_start = _store_span(next_start, n_bins, span, spans.magnitudes, spans.is_exempt)
     detection = Detection(np.nan, np.nan)
@@ -1278,6 +1278,6 @@ def _evaluate_points(
                     speckle_rates,
                     spans,
                 )
-                if next_start == NO_ROOM:
+                if next_start == SPAN_DOES_NOT_FIT:
                     return i
     return spans.point_numbers.size

@@ -1,8 +1,9 @@
 """Probabilities that the strongest peak of a segment is that of the echo, or another one.
 
 A peak elsewhere that is larger than the echo's takes its place: it is reported as a detection with
-a wrong range. Let Z be the largest |X| of the searched bins that the echo does not occupy, b the
-threshold, and P_z the probability that the echo crosses a level z, by the same law as at b. Then
+a wrong range. Let Z be the largest |X| of the searched bins that the echo does not occupy, and b
+the threshold. Let P_z be the probability that the echo crosses a level z, by the same law as at b.
+Then
 
     P(right) = P_b - L,    P(wrong) = P(Z >= b) (1 - P_b) + L,
     L = int_b^inf (P_b - P_z) dP(Z < z),    P(none) = P(Z < b) (1 - P_b)
