@@ -1,6 +1,7 @@
 """Shots of one category, keys of points, and bins and lines as detection and leakage see them."""
 
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -9,8 +10,16 @@ from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import prepare_shots
 from sweep.model.sampling import philox
 from sweep.model.spectrum import line_shape
-from sweep.model.spectrum.bin_spectrum import REAL_WITH_IMAGES
-from sweep.model.spectrum.lines import BLOCK, IM, PLACE, RE, compute_lines
+from sweep.model.spectrum.lines import (
+    REAL_WITH_IMAGES,
+    LineArrays,
+    SpectrumLayout,
+    beamlet_arrays,
+    beat_parameters_at,
+    compute_lines,
+    point_parameters,
+    segment_parameters,
+)
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 DRAWS = 10_000
@@ -85,50 +94,50 @@ def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
 def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
     n, row = shots.relative_range_offset.shape[1], int(shots.footprint_row[i])
-    scratch = np.empty((BLOCK + 1, n))
-    sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
-    point = np.ascontiguousarray(shots.point_parameter_table()[:, i])
-    origin = compute_lines(point, segment, shots.beamlet_table, row, sizes, scratch)
-    return origin, scratch[PLACE], scratch[RE] + 1j * scratch[IM]
+    layout = SpectrumLayout(shots.fft_size, shots.window.length, 0, 0, False, False, 0)
+    table, lines = shots.point_parameter_table(), LineArrays(*np.empty((3, n)))
+    beat = beat_parameters_at(point_parameters(table), segment_parameters(table), segment, i)
+    origin = compute_lines(
+        beat, segment, beamlet_arrays(shots.beamlet_table), row, layout, lines, *np.empty((2, n))
+    )
+    return origin, lines.position, lines.re + 1j * lines.im
+
+
+class PreparedShape(NamedTuple):
+    """Line shape of a window with a phase error."""
+
+    shape: line_shape.LineShape
+    layout: SpectrumLayout
+    shift: float
+    """Shift of the line [bins of fs/N]."""
+    n_modes: int
+    """Number of modes; 0 if the table holds all bins."""
 
 
 def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=REAL_WITH_IMAGES):
-    """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1.
-
-    Its table; envelope and ends, as `spectrum` takes them; sizes; shift of the line [bins]; and
-    modes, 0 of a table of all bins.
-    """
-    phase, table, n_modes = phase or np.zeros_like, None, 0
+    """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1."""
+    phase, n_modes, shift = phase or np.zeros_like, 0, 0.0
     for tier, (modes_max, _, _) in enumerate(line_shape.MODE_TIERS):
         if not line_shape.window_has_modes(window, fft_size):
             break
-        centre, modes = np.zeros((1, 1)), np.zeros((1, 1, 2, modes_max))
-        mode_counts = np.zeros((1, 1), np.int64)
+        modes = line_shape.zero_modes(1, 1, modes_max)
         phase_at_nodes = phase(line_shape.chebyshev_nodes(2 * modes_max))[None, None]
         line_shape.decompose_phase_errors(
             phase_at_nodes,
             np.empty((0, 0, 0)),
             line_shape.chebyshev_coefficient_matrix(2 * modes_max),
-            centre,
             modes,
-            mode_counts,
         )
-        n_modes = int(mode_counts[0, 0])
+        n_modes = int(modes.n_modes[0, 0])
         if n_modes:
-            shapes = line_shape.line_shape_tables(window, fft_size, power, tier)
-            table = np.empty((2, line_shape.table_row_size(shapes.layout)))
-            outline = np.zeros((7, shapes.envelope_distances.shape[1]))
-            mode_parts = centre, modes, mode_counts, np.empty((1, 2, 0))
-            line_shape.build_line_shape(0, (0, -1), mode_parts, shapes, table, outline)
+            tables = line_shape.line_shape_tables(window, fft_size, power, tier)
+            shift = modes.line_shift[0, 0] * fft_size / window.length
             break
-    if table is None:
+    if not n_modes:
         x = 2 * np.arange(window.length) / window.length - 1
-        shapes, centre = (
-            line_shape.full_line_shape_tables(window, fft_size, power, phase(x)[None]),
-            None,
-        )
-        table, outline = shapes.full_tables[0], np.zeros((7, shapes.envelope_distances.shape[1]))
-        outline[1:3] = shapes.full_envelopes[0]
-    outline[0] = shapes.envelope_distances[0]
-    shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
-    return table, outline, np.append(shapes.layout, (view, 0)), shift, n_modes
+        tables = line_shape.full_line_shape_tables(window, fft_size, power, phase(x)[None])
+        modes = line_shape.zero_modes(1, 1, 1)
+    shape = line_shape.select_segment(line_shape.allocate_line_shapes(tables, 1), 0)
+    line_shape.build_line_shape(0, np.int64(0), np.int64(-1), modes, tables, shape)
+    layout = tables.layout._replace(spectrum_type=view)
+    return PreparedShape(shape, layout, shift, n_modes)

@@ -928,14 +928,13 @@ class Shots:
         return self.waveform_settings.look_period
 
     def point_parameter_table(self) -> np.ndarray:
-        """Return the numbers of each point that compiled code takes, as rows.
+        """Return the parameters of each point that kernels take.
 
         Returns
         -------
-        ndarray (N_SHARED_COLUMNS + 3 N_SEGMENT_COLUMNS, n)
-            First the properties that all segments share. Then for each segment the signed chirp
-            rate [Hz/s], the carrier [Hz], the whitening gain, the decrease of range [m], the
-            Doppler ratio, and the start time [s].
+        ndarray (rows, n)
+            First the fields of :class:`sweep.model.spectrum.lines.PointParameters`, then for each
+            segment those of :class:`sweep.model.spectrum.lines.SegmentParameters`.
         """
         shared_columns = (
             self.range,

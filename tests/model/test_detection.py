@@ -24,8 +24,8 @@ from sweep.model.detection.echo_detection import (
 from sweep.model.detection.marcum import marcum_q1, marcum_q1_excess
 from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
 from sweep.model.error_budget import AUTOMATIC
-from sweep.model.spectrum.bin_spectrum import N_SCRATCH_ROWS, OUT
-from sweep.model.spectrum.leakage import leakage_of_bins
+from sweep.model.spectrum.bin_spectrum import SpanArrays
+from sweep.model.spectrum.leakage import LeakageLimits, leakage_of_bins
 from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
 from sweep.model.window import window_samples
 
@@ -71,14 +71,14 @@ def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_ran
 def assess(magnitude, sigma, level, floor, correlation=0.0):
     """Peak, exempt bins and leakage of a run of bins, as the model has them one by one."""
     count = magnitude.size
-    room, exempt = np.empty((N_SCRATCH_ROWS, count + 16)), np.empty(count, np.bool_)
-    room[OUT, :count], series = magnitude, np.empty(SERIES_TERMS_MAX)
+    exempt, series = np.empty(count, np.bool_), np.empty(SERIES_TERMS_MAX)
+    span = SpanArrays(np.array(magnitude), exempt, *np.empty((2, count + 16)))
     fill_crossing_series(level / sigma, series)
-    peak, exempted = mark_exempt_bins(room[OUT], count, level, exempt, 0)
+    peak, exempted = mark_exempt_bins(span.magnitude, count, level, exempt, 0)
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
-    noise = sigma, level, 0.0, correlation
-    return peak, marked, leakage_of_bins(count, noise, floor, room, exempt, series)
+    limits = LeakageLimits(sigma, level, 0.0, correlation)
+    return peak, marked, leakage_of_bins(count, limits, floor, span, series)
 
 
 def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):

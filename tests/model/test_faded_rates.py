@@ -21,7 +21,7 @@ from sweep.model.detection.speckle_crossing_rates import (
     tabulate_crossing_rates,
 )
 from sweep.model.spectrum import leakage
-from sweep.model.spectrum.bin_spectrum import N_SCRATCH_ROWS, OUT
+from sweep.model.spectrum.bin_spectrum import SpanArrays
 
 CERTAIN = 25.0
 """Rate from which on only it matters that bins cross."""
@@ -75,10 +75,10 @@ def run_at_random(seed, level):
 def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
     level, correlation = float([4.5, 6.55, 9.0][seed % 3]), [-0.5, 0.0, 0.6][seed % 2]
     magnitude, exempt = run_at_random(seed, level)
-    room = np.zeros((N_SCRATCH_ROWS, magnitude.size + 8))
-    room[OUT, : magnitude.size] = magnitude
+    span = SpanArrays(magnitude.copy(), exempt, *np.zeros((2, magnitude.size + 8)))
+    limits = leakage.LeakageLimits(1.0, level, 0.0, correlation)
     told = leakage.leakage_of_bins_in_speckle(
-        np.int64(magnitude.size), (1.0, level, 0.0, correlation), 0.0, room, exempt, table_of(level)
+        np.int64(magnitude.size), limits, 0.0, span, table_of(level)
     )
 
     def log_rates(per_octave):

@@ -19,12 +19,12 @@ from sweep.model.evaluation import evaluate_segments, prepare_ray_traced_shots, 
 from sweep.model.ground import BeamletTable, RayTracedGround
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.spectrum.bin_spectrum import (
-    N_SCRATCH_ROWS,
     SOURCE_LOG_ACCURACY,
+    LineBundle,
+    allocate_workspace,
     compute_sources,
     far_line_weight,
 )
-from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
 from sweep.model.spectrum.segment_spectra import segment_spectrum
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, direct_transform, get_window
 
@@ -78,19 +78,23 @@ def strengths_without_moments(places, degree, generator):
 def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(name, half):
     """Against the transforms of all of them, from the table's end to the record's other end."""
     generator, shape = np.random.default_rng(5), get_window(name, 4096)
-    _, form, sizes, _, _ = line_shape_of_window(shape, 4096)
-    room, gained = np.zeros((N_SCRATCH_ROWS, SCRATCH_WIDTH_MIN)), []
+    prepared = line_shape_of_window(shape, 4096)
+    layout, tabulated = prepared.layout, prepared.shape.envelope
+    field, gained = allocate_workspace(16).field, []
     for degree in (0, 1, 2, 4, 6):
         places = np.append(generator.uniform(-half, half, 10), [-half, half])
         s = strengths_without_moments(places / half, degree, generator)
         n, total = places.size, abs(s).sum()
-        room[PLACE, :n], room[RE, :n], room[IM, :n] = places, s.real, s.imag
-        sources = compute_sources(n, -half, half, float(sizes[6]), SOURCE_LOG_ACCURACY, sizes, room)
-        bound = far_line_weight(total, sources, sizes, room)
-        away = np.geomspace(sizes[6] + 1, 2000, 24) + generator.uniform(0, 1)
+        lines, bundle = field.lines, LineBundle(0, n, -half, half, total)
+        lines.position[:n], lines.re[:n], lines.im[:n] = places, s.real, s.imag
+        clearance = float(layout.clearance_bins)
+        n_sources = compute_sources(bundle, clearance, SOURCE_LOG_ACCURACY, layout, field)
+        bound = far_line_weight(total, n_sources, layout, field.sources)
+        away = np.geomspace(layout.clearance_bins + 1, 2000, 24) + generator.uniform(0, 1)
         y = half + away[:, None] - places
         kernel = direct_transform(shape, y.ravel()).reshape(y.shape) * np.exp(1j * np.pi * y)
-        envelope = form[1, np.searchsorted(form[0], away - 1.5, "right") - 1]
+        index = np.searchsorted(tabulated.distance, away - 1.5, "right") - 1
+        envelope = tabulated.magnitude[index]
         assert (abs(kernel @ s) <= bound * envelope * (1 + 1e-9) + 1e-12 * total).all()
         assert bound <= total
         gained.append(bound / total)

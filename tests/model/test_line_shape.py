@@ -7,14 +7,11 @@ import pytest
 from shot_helpers import line_shape_of_window, parametrize_product
 
 from sweep.model.spectrum.bin_spectrum import (
-    F_IM,
-    F_RE,
-    LINE_BATCH_CELLS_MAX,
-    N_SCRATCH_ROWS,
+    LineBundle,
+    allocate_workspace,
     compute_field,
     distance_below_level,
 )
-from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
 from sweep.model.spectrum.segment_spectra import bin_tangents
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
@@ -42,13 +39,14 @@ def transform(name, sizes, phase, y):
 
 def seen(sizes, power, places, weights, first, count, shape):
     """F of some bins as the model has it, (count,)."""
-    table, form, numbers, shift, _ = shape
-    n, places = places.size, places + shift
-    room = np.empty((N_SCRATCH_ROWS, max(count, SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
-    room[PLACE, :n], room[RE, :n], room[IM, :n] = places, weights.real, weights.imag
-    lines = n, places.min(), places.max(), 0.0
-    compute_field(first, count, lines, table, form, numbers, bin_tangents(sizes[0]), room)
-    return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
+    n, places = places.size, places + shape.shift
+    field = allocate_workspace(count + 16).field
+    field.lines.position[:n] = places
+    field.lines.re[:n], field.lines.im[:n] = weights.real, weights.imag
+    bundle = LineBundle(0, n, places.min(), places.max(), 0.0)
+    tangents = bin_tangents(sizes[0])
+    compute_field(first, count, bundle, 0.0, shape.shape, shape.layout, tangents, field)
+    return field.re[:count] + (0 if power else 1j * field.im[:count])
 
 
 @pytest.mark.parametrize(
@@ -72,9 +70,10 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
         first = -(fft_size // 2)
         found = seen(sizes, power, places, weights, first, fft_size, shape)[bins - first]
         assert abs(found - exact).max() < ACCURACY * whole * abs(weights).sum(), drift
-        away = (bins[:, None] - places - shape[3] + fft_size / 2) % fft_size - fft_size / 2
-        form = shape[1]
-        envelope = form[1, np.searchsorted(form[0], abs(away), "right").clip(1) - 1]
+        away = (bins[:, None] - places - shape.shift + fft_size / 2) % fft_size - fft_size / 2
+        tabulated = shape.shape.envelope
+        index = np.searchsorted(tabulated.distance, abs(away), "right").clip(1) - 1
+        envelope = tabulated.magnitude[index]
         assert (abs(lines) <= envelope * (1 + 1e-9) + 1e-12 * whole ** (1 / (1 + power))).all()
 
 
@@ -83,7 +82,7 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
 def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
     size = 4096
     phase = partial(wandering, drift)
-    _, form, _, shift, _ = line_shape_of_window(get_window(name, size), size, phase=phase)
+    shape = line_shape_of_window(get_window(name, size), size, phase=phase)
     y = np.linspace(-2048, 2048, 2 * 4096 + 1)
     exact = abs(
         np.fft.fft(
@@ -93,5 +92,5 @@ def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
     )
     magnitude = exact[np.rint(2 * y).astype(int) % (2 * size)]
     for level in 10.0 ** np.arange(-1, -8, -0.5) * magnitude.max():
-        reach = distance_below_level(level, 1.0, form)
-        assert magnitude[abs(y - shift) >= reach].max(initial=0.0) <= level
+        reach = distance_below_level(level, 1.0, shape.shape.envelope)
+        assert magnitude[abs(y - shape.shift) >= reach].max(initial=0.0) <= level

@@ -42,8 +42,9 @@ def drawn(table_4_1, number=12, **changes):
 def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
     """Bins around a point's lines, and |X| there, without noise."""
     (cells,) = oversampled_grid.cells_per_point(shots)[[i]].tolist()
+    options = oversampled_grid.GridOptions(degree, real, folded)
     low, magnitude = oversampled_grid.grid_magnitudes(
-        shots, shots.point_parameter_table(), np.array([i]), segment, cells, (degree, real, folded)
+        shots, shots.point_parameter_table(), np.array([i]), segment, cells, options
     )
     bins = low[0] + np.arange(magnitude.shape[1])
     within = (bins >= 0) & (bins <= shots.fft_size // 2)

@@ -8,16 +8,11 @@ import pytest
 from shot_helpers import line_shape_of_window, parametrize_product
 
 from sweep.model.evaluation import prepare_shots
-from sweep.model.spectrum.bin_spectrum import A_IM, A_RE, LINE_BATCH_CELLS_MAX, N_SCRATCH_ROWS, OUT
+from sweep.model.spectrum.bin_spectrum import AveragingShifts, LineBundle, allocate_workspace
 from sweep.model.spectrum.bin_spectrum import compute_magnitudes as magnitudes_of
 from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
-    IM,
     NODES_MAX,
-    PLACE,
-    RE,
-    SCRATCH_WIDTH_MIN,
-    X,
     count_nodes,
     node_phase_limits,
     replace_lines_by_nodes,
@@ -37,17 +32,17 @@ def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=
     fft_size, length = sizes
     high = fft_size // 2 if high is None else high
     n, count, delta = len(delta), high - low + 1, np.asarray(delta, float)
-    table, form, numbers, _, _ = line_shape_of_window(
-        get_window(name, length), fft_size, power=power
-    )
-    room = np.empty((N_SCRATCH_ROWS, max(count, n, SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
-    room[PLACE, :n], room[IM, :n] = delta, 0.0 if power else np.imag(weights)
-    room[RE, :n] = np.abs(weights) ** 2 if power else np.real(weights)
+    prepared = line_shape_of_window(get_window(name, length), fft_size, power=power)
+    workspace = allocate_workspace(max(count, n) + 16)
+    lines = workspace.field.lines
+    lines.position[:n], lines.im[:n] = delta, 0.0 if power else np.imag(weights)
+    lines.re[:n] = np.abs(weights) ** 2 if power else np.real(weights)
     magnitudes_of(
-        low, count, origin, (n, delta.min(), delta.max(), 0.0), np.empty((2, 0)), table, form,
-        numbers, bin_tangents(fft_size), room,
+        low, count, LineBundle(origin, n, delta.min(), delta.max(), 0.0), 0.0,
+        AveragingShifts(np.empty(0), np.empty(0)), prepared.shape, prepared.layout,
+        bin_tangents(fft_size), workspace,
     )  # fmt: skip
-    return room[OUT, :count].copy()
+    return workspace.span.magnitude[:count].copy()
 
 
 def record_of(sizes, origin, delta, weights):
@@ -105,11 +100,14 @@ def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
 def few_for(delta, weights, tolerance, limits):
     """Places and weights of as few lines as stand for many."""
     n, middle, half = delta.size, (delta.max() + delta.min()) / 2, np.ptp(delta) / 2
-    room = np.zeros((N_SCRATCH_ROWS, SCRATCH_WIDTH_MIN))
-    room[PLACE, :n], room[RE, :n], room[IM, :n] = delta, np.real(weights), np.imag(weights)
-    nodes = count_nodes(np.pi * half, tolerance, limits)
-    number = replace_lines_by_nodes(room, RE, IM, n, nodes, (middle, half), A_RE, A_IM)
-    return room[X, :number].copy(), room[A_RE, :number] + 1j * room[A_IM, :number]
+    workspace = allocate_workspace(n + 16)
+    lines, nodes = workspace.field.lines, workspace.nodes
+    lines.position[:n], lines.re[:n], lines.im[:n] = delta, np.real(weights), np.imag(weights)
+    wanted = count_nodes(np.pi * half, tolerance, limits)
+    number = replace_lines_by_nodes(
+        lines, n, wanted, middle, half, workspace.field.line_scratch, nodes
+    )
+    return nodes.position[:number].copy(), nodes.re[:number] + 1j * nodes.im[:number]
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 3e-9, 1e-5])

@@ -15,14 +15,11 @@ from table_4_1_shots import prepare_shot
 
 from sweep.model.evaluation import evaluate_segments
 from sweep.model.spectrum.bin_spectrum import (
-    F_IM,
-    F_RE,
-    LINE_BATCH_CELLS_MAX,
-    N_SCRATCH_ROWS,
+    LineBundle,
+    allocate_workspace,
     compute_field,
 )
 from sweep.model.spectrum.line_shape import SHARED_TABLE_BINS
-from sweep.model.spectrum.lines import IM, PLACE, RE, SCRATCH_WIDTH_MIN
 from sweep.model.spectrum.segment_spectra import bin_tangents
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, get_window, window_samples
 
@@ -43,21 +40,22 @@ def window_magnitudes(
     window_name: str, size: int, line_offset: float, bins: Iterable[int]
 ) -> Iterator[float]:
     """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
-    table, outline, sizes, _, _ = line_shape_of_window(get_window(window_name, size), size)
-    scratch = np.empty((N_SCRATCH_ROWS, max(SCRATCH_WIDTH_MIN, LINE_BATCH_CELLS_MAX) + 16))
-    scratch[PLACE, 0], scratch[RE, 0], scratch[IM, 0] = line_offset, 1.0, 0.0
+    prepared = line_shape_of_window(get_window(window_name, size), size)
+    field = allocate_workspace(16).field
+    field.lines.position[0], field.lines.re[0], field.lines.im[0] = line_offset, 1.0, 0.0
+    bundle = LineBundle(0, 1, line_offset, line_offset, 1.0)
     for k in bins:
         compute_field(
             k,
             1,
-            (1, line_offset, line_offset, 0.0),
-            table,
-            outline,
-            sizes,
+            bundle,
+            0.0,
+            prepared.shape,
+            prepared.layout,
             bin_tangents(size),
-            scratch,
+            field,
         )
-        yield float(np.hypot(scratch[F_RE, 0], scratch[F_IM, 0]))
+        yield float(np.hypot(field.re[0], field.im[0]))
 
 
 def far_bins(size: int) -> list[int]:

@@ -1,34 +1,34 @@
-"""The line shape of a record: what one line shows in the bins around it.
+"""Line shape: the spectrum of one line of amplitude 1 in the bins around it.
 
-All lines of a segment share the window and what befalls the record, a phase error psi(t), so they
-share one shape. With x = -1 .. 1 over the record of L samples, r = L/N, and y bins of fs/N,
+All lines of a segment share the window and the phase error psi(t) of the record, so they share one
+shape. With x = -1 .. 1 over the record of L samples, r = L/N, and a distance of y bins of fs/N,
 
     G(y) = sum_n w(x_n) exp(2 pi i psi(x_n)) exp(-i pi r y x_n)
 
-whose phase counts from the middle of the record. G is kept in three forms:
+whose phase counts from the middle of the record. G has three representations:
 
-- **A table** of G, or of |G|^2 where lines add as powers, at cells of 1/2 (1/4) bin out to some
-  bins on either side. Lines are shared out among the fourteen cells around them, by a kernel that
-  all but vanishes beyond; the table has divided out what that does. It is a Kaiser-Bessel kernel,
-  as of non-uniform FFTs [Fessler and Sutton 2003], and right to 1e-12 of the peak.
-- **Beyond the table** by the record's two ends alone. With c = cot(pi y / N),
+- **A table** of G, or of |G|^2 if powers of lines add, at cells of 1/2 (1/4) bin, out to some bins
+  on either side. Each line is spread over the fourteen cells around it by a Kaiser-Bessel kernel,
+  as in non-uniform FFTs [Fessler and Sutton 2003]. The table is divided by the kernel's transform.
+  The error is 1e-12 of the peak.
+- **Beyond the table** the two ends of the record alone. With c = cot(pi y / N),
 
       G(y) = e^{i pi r y} A(c) - e^{-i pi r y} B(c)
 
-  where A and B are polynomials made of the derivatives of w exp(2 pi i psi) at either end, because
-  sum_n n^j e^{-i theta n} is a polynomial in cot(theta / 2).
-- **An envelope**: the most that |G| comes to at any distance from there on.
+  where the polynomials A and B follow from the derivatives of w exp(2 pi i psi) at the start and at
+  the end, because sum_n n^j e^{-i theta n} is a polynomial in cot(theta / 2).
+- **An envelope**: the largest |G| from each distance on.
 
-A phase error is taken apart into a shift of the line, by its mean slope, and few Chebyshev modes:
+A phase error is the sum of a shift of the line, by its mean slope, and of a few Chebyshev modes:
 exp(2 pi i psi) = sum_j a_j T_j(x). All of the above is linear in a_j, so each shape is a sum over
-modes of tables that are made once for a window. Phases that need too many modes, windows that are
-no sum of cosines, and short or much padded records have a table of all bins, by one FFT.
+modes of tables that are computed once for a window. Phase errors with too many modes, windows that
+are no sum of cosines, and short or heavily padded records have a table of all bins, by one FFT.
 
-An echo that arrives after the record has begun has the last L' of its samples. They are a record of
-their own, with a window that is the rest of the whole one. In the place x' = -1 .. 1 within it,
-w exp(2 pi i psi) is smooth and has few Chebyshev modes, each with a transform that depends on the
-product of y and L' alone. These are tabulated once for all windows and lengths; a shape is their
-sum, interpolated at its own places. Its far sidelobes fall as 1/y, as its window begins with a step
+An echo that arrives after the start of the record (a late echo) has only the last L' samples. They
+form a record of their own, whose window is the end of the full window. With the position x' = -1 ..
+1 in this record, w exp(2 pi i psi) is smooth and has few Chebyshev modes. The transform of a mode
+depends on the product of y and L' alone. It is tabulated once for all windows and lengths, and
+interpolated. The far sidelobes fall as 1/y, as the window begins with a step
 (:func:`build_late_line_shape`).
 """
 
@@ -43,16 +43,17 @@ from scipy.special import i0
 
 from sweep.kernel_cache import njit
 from sweep.model.elementary_functions import sincos_cycles
+from sweep.model.spectrum.lines import SpectrumLayout
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, window_samples
 
 CELLS_PER_BIN = (2, 4)
-"""Cells of the table in a bin of fs/N, for amplitudes and for powers."""
+"""Number of table cells in a bin of fs/N if amplitudes add, and if powers add."""
 
 KERNEL_CELLS = 14
-"""Cells among which a line is shared out: -6 .. 7 beside its place between 0 and 1."""
+"""Number of cells over which a line is spread: cells -6 .. 7 for a line between cells 0 and 1."""
 
 KERNEL_BETA = 32.32432
-"""Parameter of the kernel I_0(b sqrt(1 - (2 z / POINTS)^2)) / I_0(b) over z cells."""
+"""Parameter b of the kernel I_0(b sqrt(1 - (2 z / KERNEL_CELLS)^2)) / I_0(b) at z cells."""
 
 DECONVOLUTION_TAPS = np.array([
     27.059814524108916, -24.069297462538476, 18.21886188994693, -12.301303141361002,
@@ -61,94 +62,180 @@ DECONVOLUTION_TAPS = np.array([
     0.007388544649665242, -0.0018900276225103194, 0.0004085782830266439, -7.179287548481712e-05,
     9.634021822884657e-06, -8.798393952475983e-07, 4.1136322681806606e-08,
 ])  # fmt: skip
-"""Even filter over cells whose transform is 1 over the kernel's, to 1e-13 below pi / 2."""
+"""Even filter over cells whose transform is 1 over that of the kernel, to 1e-13 below pi / 2."""
 
 MODE_TIERS = ((24, 20, 64), (48, 56, 96), (128, 200, 256))
-"""Modes at the most; bins of fs/L beyond which the record's ends then tell a shape; bins that its
-table holds on either side, where few points share it."""
+"""Accuracy tiers: maximum number of modes; distance [bins of fs/L] beyond which the record's ends
+determine a shape; bins that its table holds on either side, if few points share it."""
 
 SHARED_TABLE_BINS = 256
-"""Bins that it holds where many do: wide footprints are then served by it."""
+"""Number of bins of fs/L that a table holds on either side if many points share it. It then serves
+wide footprints."""
 
 END_DERIVATIVES_MAX = 12
-"""Derivatives at the record's ends."""
+"""Highest order of the derivatives at the record's ends."""
+
+N_END_COEFFICIENTS = END_DERIVATIVES_MAX + 2
+"""Number of coefficients of the polynomials A and B."""
 
 MODE_SIZE_MIN = 1e-13
-"""Size below which modes are left out, relative to the record."""
+"""Size of a mode, relative to the record, below which it is left out."""
 
 _RECORD_LENGTH_MIN, _PADDING_MAX = 4096, 8
-"""Samples of a record, and its padding N/L, between which sums over it are integrals."""
+"""Least number of samples, and largest padding N/L, for which sums over a record are computed as
+integrals."""
 
 _N_FAR_DISTANCES = 48
-"""Distances at which the envelope is known beyond the table."""
+"""Number of distances beyond the table at which the envelope is tabulated."""
 
 _ENVELOPE_MARGIN = 1.05
-"""On the envelope, for what happens between cells."""
+"""Factor on the envelope that covers what happens between cells."""
 
 _TAP_REACH_CELLS = DECONVOLUTION_TAPS.size - 1
-"""Cells on either side of a table that its filter looks at."""
+"""Number of cells beyond either side of a table that its filter needs."""
 
 KERNEL_DEGREE = 13
+"""Degree of the polynomials that represent the kernel in a cell."""
 
 ZERO_WEIGHT_CELLS = 2
-"""Cells of no weight beyond those among which a line is shared out, for whole vectors."""
+"""Number of cells of weight 0 beyond those over which a line is spread, for whole vectors."""
 
 LENGTH_CLASS_RATIO = math.sqrt(2.0)
-"""Most to least samples of the echoes whose shapes share a table's width."""
+"""Ratio of the largest to the smallest number of samples of late echoes that share a table."""
 
 _LATE_SAMPLES_PER_BIN_MIN = 16
-"""Least samples of an echo to the bins of fs/L' in its table: sums over it are then integrals and
-six of Euler and Maclaurin's corrections."""
+"""Least number of samples of a late echo per bin of fs/L' in its table. Sums over the samples are
+then integrals with six Euler-Maclaurin corrections."""
 
 _LATE_TABLE_MARGIN_BINS = 16
-"""Bins of fs/L' by which the table of such an echo holds more than those that its ends do not tell:
-as many as lines that are shared out together need."""
+"""Bins of fs/L' that the table of a late echo holds beyond the distance from which on the record's
+ends determine the shape. Lines that are spread together need them."""
 
 _LATE_PADDING_MAX = 16
-"""Most padding N/L' of an echo whose shape is made of modes."""
+"""Largest padding N/L' of a late echo whose shape is a sum of modes."""
 
 _LATE_VALUES_PER_BIN = 2
-"""Tabulated values in a bin of fs/L'."""
+"""Number of tabulated values in a bin of fs/L'."""
 
 EULER_MACLAURIN_COEFFICIENTS = {
     1: 1 / 12, 3: -1 / 720, 5: 1 / 30240, 7: -1 / 1209600, 9: 1 / 47900160,
     11: -691 / 1307674368000,
 }  # fmt: skip
-"""B_(m+1) / (m+1)! by the order m of the derivatives at the ends."""
+"""Coefficients B_(m+1) / (m+1)! of the derivatives of order m at the ends, by m."""
 
 _EULER_MACLAURIN_ORDER_MAX = max(EULER_MACLAURIN_COEFFICIENTS)
 
 
+class EndPolynomials(NamedTuple):
+    """Coefficients of the polynomials A and B in cot(pi y / N), lowest power first."""
+
+    start_re: np.ndarray
+    """(..., N_END_COEFFICIENTS): real part of A, of the record's start."""
+    start_im: np.ndarray
+    """Imaginary part of A."""
+    end_re: np.ndarray
+    """Real part of B, of the record's end."""
+    end_im: np.ndarray
+    """Imaginary part of B."""
+
+
+class LineEnvelope(NamedTuple):
+    """Largest |G| from each of m distances on."""
+
+    distance: np.ndarray
+    """(m,): distance d from the line [bins of fs/N]; the same for all segments."""
+    magnitude: np.ndarray
+    """(..., m): largest |G| at any distance of d or more."""
+    square_integral: np.ndarray
+    """(..., m): upper bound of the integral of |G|^2 over distances of d or more [bins]."""
+
+
+class LineShape(NamedTuple):
+    """Line shape of one segment, or of all segments with a leading dimension."""
+
+    table_re: np.ndarray
+    """(..., cells * columns): real part of G, divided by the kernel's transform, by cell of a bin
+    and bin; |G|^2 if powers add."""
+    table_im: np.ndarray
+    """(..., cells * columns): imaginary part; 0 if powers add."""
+    envelope: LineEnvelope
+    """Envelope of |G|."""
+    ends: EndPolynomials
+    """Polynomials A and B; unused if the table holds all bins."""
+
+
+class ShapeModes(NamedTuple):
+    """Chebyshev modes of the phase errors of all segments and shapes."""
+
+    line_shift: np.ndarray
+    """(segments, shapes): shift of the line [bins of fs/L]."""
+    re: np.ndarray
+    """(segments, shapes, modes): real part of the coefficients a_j."""
+    im: np.ndarray
+    """(segments, shapes, modes): imaginary part of the coefficients a_j."""
+    n_modes: np.ndarray
+    """(segments, shapes) int64: number of modes that are not negligible; 0 if there are too many.
+    """
+
+    def select(self, is_selected: np.ndarray) -> "ShapeModes":
+        """Select some of the shapes."""
+        return ShapeModes(*(np.ascontiguousarray(values[:, is_selected]) for values in self))
+
+
+def zero_modes(segments: int, n_shapes: int, n_modes_max: int) -> ShapeModes:
+    """Allocate :class:`ShapeModes` of zeros."""
+    shape = segments, n_shapes
+    return ShapeModes(
+        np.zeros(shape),
+        np.zeros((*shape, n_modes_max)),
+        np.zeros((*shape, n_modes_max)),
+        np.zeros(shape, np.int64),
+    )
+
+
 class LineShapeTables(NamedTuple):
-    """Line shapes of one window and FFT, as the compiled code takes them; see `segments`."""
+    """Tables of one window and FFT from which line shapes are built."""
 
-    layout: np.ndarray
-    """(7,) int64: FFT size N, window length L, bins T of the table on either side, cells a bin,
-    whether the table is of powers, whether it holds all bins; bins beyond which ends tell."""
+    layout: SpectrumLayout
+    """Sizes of the spectrum and of the table of a shape."""
     mode_transforms: np.ndarray
-    """(modes, places): of each mode the real (even modes) or imaginary part (odd ones), by cell,
-    that does not come from the record's first sample. Of amplitudes then, in further places, what
-    this comes to in a table."""
-    first_sample_terms: np.ndarray
-    """(2, places): the window's first sample times cos and sin of pi r y, and likewise."""
-    end_polynomials: np.ndarray
-    """(modes, 4, DERIVATIVES + 2): real and imaginary parts of A and of B, lowest power first."""
-    envelope_distances: np.ndarray
-    """(2, m): distances d [bins of fs/N] at which the envelope is known; cot(pi d / N)."""
-    full_tables: np.ndarray
-    """(segments, 2, cells * columns): tables that hold all bins; else empty."""
-    full_envelopes: np.ndarray
-    """(segments, 2, m): their envelopes, as of :func:`build_line_shape`; else empty."""
+    """(modes, places): transform of each mode without the record's first sample: the real part of
+    even modes, the imaginary part of odd ones. Places are the cells at :func:`_cell_distances`. If
+    amplitudes add, the values of a shape's table follow in further places. For late echoes places
+    are u = -U .. U in steps of half a bin of fs/L', and the kernel's transform is divided out."""
+    first_sample_cosine: np.ndarray
+    """(places,): the window's first sample times cos(pi r y); empty for late echoes."""
+    first_sample_sine: np.ndarray
+    """(places,): the window's first sample times sin(pi r y)."""
+    mode_ends: EndPolynomials
+    """Polynomials A and B of each mode, (modes, N_END_COEFFICIENTS)."""
+    envelope_distance: np.ndarray
+    """(m,): distances d of the envelope [bins of fs/N]."""
+    envelope_cotangent: np.ndarray
+    """(m,): cot(pi d / N)."""
+    full_table_re: np.ndarray
+    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins; else
+    empty."""
+    full_table_im: np.ndarray
+    """(segments, cells * columns): :attr:`LineShape.table_im` of such tables."""
+    full_envelope: LineEnvelope
+    """Envelopes of such tables, (segments, m); else empty."""
     echo_lengths: np.ndarray
-    """(segments, shapes) int64: samples of the record that the echo has, where these are not all
-    and shapes are made of modes; else empty. ``mode_transforms`` then are transforms over u = -U ..
-    U, in steps of half a bin of fs/L', with the kernel divided out."""
+    """(segments, shapes) int64: number of samples of late echoes whose shapes are sums of modes;
+    else empty."""
     taylor_coefficients: np.ndarray
-    """(modes, DERIVATIVES + 1): Taylor's coefficients of such modes at x = 1; else empty."""
+    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of such modes at x = 1; else empty."""
 
 
-_NO_LATE_TABLES = np.empty((0, 0), np.int64), np.empty((0, 0))
-"""Of shapes of echoes that have all samples of the record."""
+_NO_ENDS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))
+_NO_TABLE = np.empty((0, 0))
+_NO_LENGTHS = np.empty((0, 0), np.int64)
+
+
+def _no_full_envelope(distance: np.ndarray) -> LineEnvelope:
+    """Return the full envelopes of tables that do not hold all bins."""
+    return LineEnvelope(distance, _NO_TABLE, _NO_TABLE)
+
 
 _gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
 
@@ -157,12 +244,29 @@ _gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
 def line_shape_tables(
     window: Window, fft_size: int, adds_powers: bool, tier: int, *, shared: bool = True
 ) -> LineShapeTables:
-    """Prepare the tables from which shapes of up to some modes (:data:`MODE_TIERS`) are built."""
+    """Prepare the tables for shapes that are sums of modes.
+
+    Parameters
+    ----------
+    window
+        Window of the record.
+    fft_size
+        FFT size N.
+    adds_powers
+        True if the powers of lines add, False if their amplitudes do.
+    tier
+        Index in :data:`MODE_TIERS`.
+    shared
+        True if many points share a shape, which then has a wide table.
+    """
     n_modes, clearance_bins, table_half_width = MODE_TIERS[tier]
     table_half_width = SHARED_TABLE_BINS if shared else table_half_width
     ratio, length = window.length / fft_size, window.length
     table_bins = math.ceil(table_half_width / ratio)
-    cell_distances = _cell_distances(table_bins, adds_powers)
+    cell_density, cell_distances = (
+        CELLS_PER_BIN[adds_powers],
+        _cell_distances(table_bins, adds_powers),
+    )
     n_nodes = 4 * ((math.ceil(math.pi * table_half_width) + n_modes) // 4) + 64
     node, weight = _gauss_legendre(n_nodes)
     cosine_coefficients = np.array(
@@ -179,42 +283,45 @@ def line_shape_tables(
     mode_transforms += _euler_maclaurin_corrections(
         taylor_coefficients, ratio * cell_distances, length
     )
-    first_sample_terms = taylor_coefficients[0, 0] * np.array(
-        [np.cos(np.pi * ratio * cell_distances), np.sin(np.pi * ratio * cell_distances)]
+    first_sample_cosine, first_sample_sine = (
+        taylor_coefficients[0, 0] * circular_function(np.pi * ratio * cell_distances)
+        for circular_function in (np.cos, np.sin)
     )
     if not adds_powers:
-        mode_transforms, first_sample_terms = (
-            np.hstack([values, _deconvolve_into_rows(values, CELLS_PER_BIN[adds_powers])])
-            for values in (mode_transforms, first_sample_terms)
+        mode_transforms, first_sample_cosine, first_sample_sine = (
+            np.concatenate([values, _deconvolve_into_rows(values, cell_density)], axis=-1)
+            for values in (mode_transforms, first_sample_cosine, first_sample_sine)
         )
-    layout = [
-        fft_size,
-        length,
-        table_bins,
-        CELLS_PER_BIN[adds_powers],
-        adds_powers,
-        False,
-        math.ceil(clearance_bins / ratio),
-    ]
-    end_polynomials, envelope_distances, no_tables = (
-        _end_polynomials(taylor_coefficients, length),
-        _envelope_distances(table_bins, fft_size),
-        np.empty((0, 2, 0)),
-    )
+    distance = _envelope_distances(table_bins, fft_size)
     return LineShapeTables(
-        np.array(layout),
-        mode_transforms,
-        first_sample_terms,
-        end_polynomials,
-        envelope_distances,
-        no_tables,
-        no_tables,
-        *_NO_LATE_TABLES,
+        layout=SpectrumLayout(
+            fft_size=fft_size,
+            record_length=length,
+            table_bins=table_bins,
+            cells_per_bin=cell_density,
+            adds_powers=adds_powers,
+            holds_all_bins=False,
+            clearance_bins=math.ceil(clearance_bins / ratio),
+        ),
+        mode_transforms=mode_transforms,
+        first_sample_cosine=first_sample_cosine,
+        first_sample_sine=first_sample_sine,
+        mode_ends=_end_polynomials(taylor_coefficients, length),
+        envelope_distance=distance,
+        envelope_cotangent=_cotangents(distance, fft_size),
+        full_table_re=_NO_TABLE,
+        full_table_im=_NO_TABLE,
+        full_envelope=_no_full_envelope(distance),
+        echo_lengths=_NO_LENGTHS,
+        taylor_coefficients=_NO_TABLE,
     )
 
 
 def late_length_class(window: Window, length_min: np.ndarray) -> np.ndarray:
-    """Class of a late echo's length: powers of :data:`LENGTH_CLASS_RATIO` below all samples."""
+    """Return the length classes of late echoes of ``length_min`` samples, (n,) int64.
+
+    Class c has at most L / :data:`LENGTH_CLASS_RATIO` ** (c - 1) samples, and shares a table.
+    """
     ratio = window.length / np.maximum(length_min, 1)
     return np.ceil(np.log(ratio) / math.log(LENGTH_CLASS_RATIO) - 1e-9).astype(np.int64)
 
@@ -222,9 +329,10 @@ def late_length_class(window: Window, length_min: np.ndarray) -> np.ndarray:
 def late_echo_has_modes(
     window: Window, fft_size: int, tier: int, length_min: np.ndarray, length_max: np.ndarray
 ) -> np.ndarray:
-    """Return true for echoes of some samples whose shapes may be made of modes, (n,).
+    """Return true for late echoes whose shapes may be sums of modes, (n,) bool.
 
-    ``length_min`` and ``length_max`` are the samples of the segments that have fewest and most.
+    ``length_min`` and ``length_max`` are the least and the largest number of samples of a segment,
+    (n,); ``tier`` is an index in :data:`MODE_TIERS`.
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)
@@ -241,7 +349,10 @@ def late_echo_has_modes(
 def late_window_samples(
     window: Window, late_position: np.ndarray, n_samples: np.ndarray
 ) -> np.ndarray:
-    """Window (*length, x) at positions x, -1 .. 1, of the record's last ``n_samples`` samples."""
+    """Return the window at positions x = -1 .. 1 of the last ``n_samples`` samples of the record.
+
+    The shape of the result is that of ``n_samples``, followed by that of ``late_position``.
+    """
     fraction = np.asarray(n_samples)[..., None] / window.length
     record_position = 1.0 - fraction * (1.0 - late_position)
     coefficients = [float(coefficient) for coefficient in COSINE_SUM_COEFFICIENTS[window.name]]
@@ -257,39 +368,54 @@ def late_window_samples(
 def late_line_shape_tables(
     window: Window, fft_size: int, adds_powers: bool, tier: int, length_class: int
 ) -> LineShapeTables:
-    """Prepare the tables for echoes that have part of a record's samples, of a class of them."""
+    """Prepare the tables for late echoes of one length class whose shapes are sums of modes.
+
+    Parameters are those of :func:`line_shape_tables`, with the class
+    (:func:`late_length_class`).
+    """
     clearance_bins = MODE_TIERS[tier][1]
     table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
     filled_fraction = window.length * LENGTH_CLASS_RATIO ** (-float(length_class)) / fft_size
     table_bins = math.ceil(table_half_width / filled_fraction)
-    layout = [
-        fft_size,
-        window.length,
-        table_bins,
-        CELLS_PER_BIN[adds_powers],
-        adds_powers,
-        False,
-        math.ceil(clearance_bins / filled_fraction),
-    ]
-    mode_transforms, taylor_coefficients = _late_mode_transforms(tier)
-    no_tables, no_polynomials = np.empty((0, 2, 0)), np.empty((0, 4, 1))
-    envelope_distances = _envelope_distances(table_bins, fft_size)
+    transforms = _late_mode_transforms(tier)
+    distance = _envelope_distances(table_bins, fft_size)
     return LineShapeTables(
-        np.array(layout),
-        mode_transforms,
-        np.empty((2, 0)),
-        no_polynomials,
-        envelope_distances,
-        no_tables,
-        no_tables,
-        np.empty((0, 0), np.int64),
-        taylor_coefficients,
+        layout=SpectrumLayout(
+            fft_size=fft_size,
+            record_length=window.length,
+            table_bins=table_bins,
+            cells_per_bin=CELLS_PER_BIN[adds_powers],
+            adds_powers=adds_powers,
+            holds_all_bins=False,
+            clearance_bins=math.ceil(clearance_bins / filled_fraction),
+        ),
+        mode_transforms=transforms.mode_transforms,
+        first_sample_cosine=np.empty(0),
+        first_sample_sine=np.empty(0),
+        mode_ends=_NO_ENDS,
+        envelope_distance=distance,
+        envelope_cotangent=_cotangents(distance, fft_size),
+        full_table_re=_NO_TABLE,
+        full_table_im=_NO_TABLE,
+        full_envelope=_no_full_envelope(distance),
+        echo_lengths=_NO_LENGTHS,
+        taylor_coefficients=transforms.taylor_coefficients,
     )
 
 
+class LateModeTransforms(NamedTuple):
+    """Transforms of the modes of late echoes."""
+
+    mode_transforms: np.ndarray
+    """(modes, places): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1, divided by the
+    kernel's transform."""
+    taylor_coefficients: np.ndarray
+    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of the modes at x = 1."""
+
+
 @lru_cache(maxsize=len(MODE_TIERS))
-def _late_mode_transforms(tier: int) -> tuple[np.ndarray, np.ndarray]:
-    """Half the integrals of T_j(x) exp(-i pi u x) with the kernel divided out; their Taylor."""
+def _late_mode_transforms(tier: int) -> LateModeTransforms:
+    """Compute the transforms of the modes of a tier of :data:`MODE_TIERS`."""
     n_modes, clearance_bins, _ = MODE_TIERS[tier]
     half_count = math.ceil(
         (1.02 * LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
@@ -300,15 +426,18 @@ def _late_mode_transforms(tier: int) -> tuple[np.ndarray, np.ndarray]:
     n_nodes = 4 * ((math.ceil(math.pi * frequency[-1]) + n_modes) // 4) + 96
     node, weight = _gauss_legendre(n_nodes)
     weighted_modes = np.cos(np.outer(np.arange(n_modes), np.arccos(node))) * weight / 2
-    return _mode_integrals(
-        weighted_modes / spreading_kernel_transform(np.pi / _LATE_VALUES_PER_BIN * node),
-        node,
-        frequency,
-    ), _taylor_coefficients(("1",), n_modes)
+    return LateModeTransforms(
+        _mode_integrals(
+            weighted_modes / spreading_kernel_transform(np.pi / _LATE_VALUES_PER_BIN * node),
+            node,
+            frequency,
+        ),
+        _taylor_coefficients(("1",), n_modes),
+    )
 
 
 def window_has_modes(window: Window, fft_size: int) -> bool:
-    """Return true if a window's shapes are made of modes; else they have tables of all bins."""
+    """Return true if shapes of a window are sums of modes; else their tables hold all bins."""
     is_long_enough = (
         window.length >= _RECORD_LENGTH_MIN and window.length * _PADDING_MAX >= fft_size
     )
@@ -322,9 +451,20 @@ def full_line_shape_tables(
     phase: np.ndarray,
     first_sample: np.ndarray | None = None,
 ) -> LineShapeTables:
-    """Shapes that have tables of all bins, of phase errors [cycles] by segment, (segments, L).
+    """Compute line shapes whose tables hold all bins, one per segment.
 
-    ``first_sample`` (segments,) is the first sample that the echo has, by default 0.
+    Parameters
+    ----------
+    window
+        Window of the record.
+    fft_size
+        FFT size N.
+    adds_powers
+        True if the powers of lines add, False if their amplitudes do.
+    phase
+        (segments, L): phase error of each sample [cycles].
+    first_sample
+        (segments,): index of the first sample with the echo, by default 0.
     """
     cells_per_bin, nyquist_bin, length = CELLS_PER_BIN[adds_powers], fft_size // 2, window.length
     n_cells = cells_per_bin * fft_size
@@ -332,44 +472,64 @@ def full_line_shape_tables(
         :, None
     ]
     phase_factor = np.exp(1j * np.pi * (length / fft_size / cells_per_bin) * cell_index)
-    full_tables = np.empty((len(phase), 2, n_cells))
-    envelope_distances = _envelope_distances(nyquist_bin, fft_size)
-    full_envelopes = np.zeros((len(phase), 2, envelope_distances.shape[1]))
+    distance, segments = _envelope_distances(nyquist_bin, fft_size), len(phase)
+    table_re, table_im = np.empty((segments, n_cells)), np.zeros((segments, n_cells))
+    envelope = LineEnvelope(
+        distance, np.zeros((segments, distance.size)), np.zeros((segments, distance.size))
+    )
     w, record_position = window_samples(window.name, length), 2 * np.arange(length) / length - 1
-    first_samples = np.zeros(len(phase), np.int64) if first_sample is None else first_sample
-    for table, envelope, psi, begin_sample in zip(
-        full_tables, full_envelopes, phase, first_samples, strict=True
-    ):
+    first_samples = np.zeros(segments, np.int64) if first_sample is None else first_sample
+    for s, psi in enumerate(phase):
         record = w * np.exp(2j * np.pi * (psi - np.rint(psi)))
-        record[:begin_sample] = 0.0
+        record[: first_samples[s]] = 0.0
         squared_magnitude = np.abs(np.fft.fft(record, n_cells)) ** 2
-        _fill_full_envelope(squared_magnitude, cells_per_bin, envelope)
+        _fill_full_envelope(
+            squared_magnitude, cells_per_bin, envelope.magnitude[s], envelope.square_integral[s]
+        )
         if adds_powers:
             deconvolved = DECONVOLUTION_TAPS[0] * squared_magnitude
             for k in range(1, DECONVOLUTION_TAPS.size):
                 deconvolved += DECONVOLUTION_TAPS[k] * (
                     np.roll(squared_magnitude, k) + np.roll(squared_magnitude, -k)
                 )
-            table[0], table[1] = deconvolved[cell_index % n_cells].ravel(), 0.0
+            table_re[s] = deconvolved[cell_index % n_cells].ravel()
         else:
             record /= spreading_kernel_transform(
                 np.pi * (length / fft_size / cells_per_bin) * record_position
             )
             deconvolved = (np.fft.fft(record, n_cells)[cell_index % n_cells] * phase_factor).ravel()
-            table[0], table[1] = deconvolved.real, deconvolved.imag
-    layout = np.array(
-        [fft_size, length, nyquist_bin, cells_per_bin, adds_powers, True, nyquist_bin]
-    )
-    no_tables = np.empty((0, 0)), np.empty((2, 0)), np.empty((0, 4, 1))
+            table_re[s], table_im[s] = deconvolved.real, deconvolved.imag
     return LineShapeTables(
-        layout, *no_tables, envelope_distances, full_tables, full_envelopes, *_NO_LATE_TABLES
+        layout=SpectrumLayout(
+            fft_size=fft_size,
+            record_length=length,
+            table_bins=nyquist_bin,
+            cells_per_bin=cells_per_bin,
+            adds_powers=adds_powers,
+            holds_all_bins=True,
+            clearance_bins=nyquist_bin,
+        ),
+        mode_transforms=_NO_TABLE,
+        first_sample_cosine=np.empty(0),
+        first_sample_sine=np.empty(0),
+        mode_ends=_NO_ENDS,
+        envelope_distance=distance,
+        envelope_cotangent=_cotangents(distance, fft_size),
+        full_table_re=table_re,
+        full_table_im=table_im,
+        full_envelope=envelope,
+        echo_lengths=_NO_LENGTHS,
+        taylor_coefficients=_NO_TABLE,
     )
 
 
 def _fill_full_envelope(
-    squared_magnitude: np.ndarray, cells_per_bin: int, envelope: np.ndarray
+    squared_magnitude: np.ndarray,
+    cells_per_bin: int,
+    envelope_magnitude: np.ndarray,
+    square_integral: np.ndarray,
 ) -> None:
-    """Envelope of |G|^2 at all cells of the circle."""
+    """Fill the arrays (m,) of a :class:`LineEnvelope` from |G|^2 at all cells of the circle."""
     paired = squared_magnitude + np.maximum(
         np.roll(squared_magnitude, cells_per_bin // 2),
         np.roll(squared_magnitude, -(cells_per_bin // 2)),
@@ -381,20 +541,20 @@ def _fill_full_envelope(
         np.maximum(np.arange(0, half_count + 1, cells_per_bin) - 1, 0)
     ]  # from the cell before on
     maximum_beyond *= _ENVELOPE_MARGIN**2
-    envelope[0, : maximum_beyond.size] = np.sqrt(maximum_beyond)
+    envelope_magnitude[: maximum_beyond.size] = np.sqrt(maximum_beyond)
     step_areas = 0.5 * (maximum_beyond + np.append(maximum_beyond[1:], 0.0))
-    envelope[1, : maximum_beyond.size] = np.cumsum(step_areas[::-1])[::-1]
+    square_integral[: maximum_beyond.size] = np.cumsum(step_areas[::-1])[::-1]
 
 
 def spreading_kernel(cell_distance: np.ndarray) -> np.ndarray:
-    """Evaluate the kernel that shares lines out among cells, at z cells, |z| <= POINTS / 2."""
+    """Evaluate the kernel that spreads lines over cells, at z cells, |z| <= KERNEL_CELLS / 2."""
     root = np.sqrt(np.maximum(1 - (2 * cell_distance / KERNEL_CELLS) ** 2, 0.0))
     return np.asarray(i0(KERNEL_BETA * root) / i0(KERNEL_BETA))
 
 
 _kernel_coordinate = np.cos(np.pi * (np.arange(KERNEL_DEGREE + 1) + 0.5) / (KERNEL_DEGREE + 1))
 KERNEL_BASIS = np.zeros((KERNEL_DEGREE + 1, KERNEL_CELLS + ZERO_WEIGHT_CELLS))
-"""Polynomials of the kernel, by power of s = -1 .. 1 across a cell and by cell."""
+"""Polynomial coefficients of the kernel in s = -1 .. 1 across a cell, (powers, cells)."""
 
 for _j in range(KERNEL_CELLS):
     KERNEL_BASIS[:, _j] = cheb2poly(
@@ -407,31 +567,81 @@ for _j in range(KERNEL_CELLS):
 
 
 def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
-    """Its transform at theta radians a cell, |theta| <= pi."""
+    """Evaluate the Fourier transform of the kernel at theta [rad/cell], |theta| <= pi."""
     root = np.sqrt(KERNEL_BETA**2 - (KERNEL_CELLS * theta / 2) ** 2)
     return np.asarray(KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
 
 
-def table_row_size(layout: np.ndarray) -> int:
-    """Numbers in a row of a table of these sizes."""
-    return int(layout[3] * (layout[0] if layout[5] else 2 * layout[2] + 1))
+def table_size(layout: SpectrumLayout) -> int:
+    """Return the number of cells times columns in the table of a line shape."""
+    columns = layout.fft_size if layout.holds_all_bins else 2 * layout.table_bins + 1
+    return layout.cells_per_bin * columns
+
+
+def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
+    """Allocate the line shapes of all segments, (segments, ...), with the envelope's distances."""
+    distance, n_cells = tables.envelope_distance, table_size(tables.layout)
+    return LineShape(
+        np.empty((segments, n_cells)),
+        np.empty((segments, n_cells)),
+        LineEnvelope(
+            distance, np.zeros((segments, distance.size)), np.zeros((segments, distance.size))
+        ),
+        EndPolynomials(*(np.zeros((segments, N_END_COEFFICIENTS)) for _ in EndPolynomials._fields)),
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def select_segment(shapes, segment):
+    """Select the :class:`LineShape` of one segment; its arrays are views."""
+    envelope, ends = shapes.envelope, shapes.ends
+    return LineShape(
+        shapes.table_re[segment],
+        shapes.table_im[segment],
+        LineEnvelope(
+            envelope.distance, envelope.magnitude[segment], envelope.square_integral[segment]
+        ),
+        EndPolynomials(
+            ends.start_re[segment],
+            ends.start_im[segment],
+            ends.end_re[segment],
+            ends.end_im[segment],
+        ),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def copy_line_shape(shapes, from_segment, to_segment):
+    """Copy the line shape of one segment to another segment."""
+    source, target = select_segment(shapes, from_segment), select_segment(shapes, to_segment)
+    target.table_re[:], target.table_im[:] = source.table_re, source.table_im
+    target.envelope.magnitude[:] = source.envelope.magnitude
+    target.envelope.square_integral[:] = source.envelope.square_integral
+    target.ends.start_re[:], target.ends.start_im[:] = source.ends.start_re, source.ends.start_im
+    target.ends.end_re[:], target.ends.end_im[:] = source.ends.end_re, source.ends.end_im
 
 
 def chebyshev_nodes(n_nodes: int) -> np.ndarray:
-    """Places in the record, -1 .. 1, at which phase errors are taken to find modes, (nodes,)."""
+    """Return the positions in the record, -1 .. 1, at which phase errors are sampled, (nodes,)."""
     return np.cos(np.pi * (np.arange(n_nodes) + 0.5) / n_nodes)
 
 
 @lru_cache(maxsize=8)
 def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
-    """Chebyshev coefficients from values at :func:`chebyshev_nodes`, (nodes, coefficients)."""
+    """Return the matrix from values at Chebyshev nodes to Chebyshev coefficients.
+
+    (nodes, coefficients), for values at :func:`chebyshev_nodes`.
+    """
     matrix = 2 / n_nodes * np.cos(np.outer(np.arccos(chebyshev_nodes(n_nodes)), np.arange(n_nodes)))
     matrix[:, 0] /= 2
     return matrix
 
 
 def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
-    """Distances y of a table's cells from their line, and of those that its filter looks at."""
+    """Return the distances y from the line of a table's cells and of those that its filter needs.
+
+    In bins of fs/N, in steps of one cell.
+    """
     cells_per_bin = CELLS_PER_BIN[adds_powers]
     return (
         np.arange(
@@ -443,29 +653,44 @@ def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
 
 
 def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
-    """Values at :func:`_cell_distances` with the kernel divided out, in rows by cell of a bin."""
-    n_inner = values.shape[1] - 2 * _TAP_REACH_CELLS
-    filtered = DECONVOLUTION_TAPS[0] * values[:, _TAP_REACH_CELLS : _TAP_REACH_CELLS + n_inner]
+    """Divide values by the kernel's transform, and sort them by cell of a bin and by bin.
+
+    ``values`` (..., places) are at :func:`_cell_distances`.
+    """
+    n_inner = values.shape[-1] - 2 * _TAP_REACH_CELLS
+    filtered = DECONVOLUTION_TAPS[0] * values[..., _TAP_REACH_CELLS : _TAP_REACH_CELLS + n_inner]
     for k in range(1, DECONVOLUTION_TAPS.size):
         for start in (_TAP_REACH_CELLS - k, _TAP_REACH_CELLS + k):
-            filtered += DECONVOLUTION_TAPS[k] * values[:, start : start + n_inner]
-    rows = [filtered[:, cells_per_bin - 1 - m :: cells_per_bin] for m in range(cells_per_bin)]
-    return np.hstack(rows)
+            filtered += DECONVOLUTION_TAPS[k] * values[..., start : start + n_inner]
+    rows = [filtered[..., cells_per_bin - 1 - m :: cells_per_bin] for m in range(cells_per_bin)]
+    return np.concatenate(rows, axis=-1)
 
 
 def _envelope_distances(table_bins: int, fft_size: int) -> np.ndarray:
-    """Distances at which envelopes are known: each bin of the table, then in even ratios."""
+    """Return the distances at which envelopes are tabulated [bins of fs/N].
+
+    One distance per bin of the table, then a geometric progression up to N/2.
+    """
     far_distances = np.geomspace(
         table_bins + 1, max(fft_size / 2, table_bins + 2), _N_FAR_DISTANCES
     )
-    distances = np.append(np.arange(table_bins + 1.0), far_distances)
+    return np.append(np.arange(table_bins + 1.0), far_distances)
+
+
+def _cotangents(distance: np.ndarray, fft_size: int) -> np.ndarray:
+    """Return cot(pi d / N) of distances d [bins of fs/N]."""
     with np.errstate(divide="ignore"):
-        return np.array([distances, 1 / np.tan(np.pi * distances / fft_size)])
+        return np.asarray(1 / np.tan(np.pi * distance / fft_size))
 
 
 @njit(cache=True, error_model="numpy")
 def _mode_integrals(weighted_modes, node, distance):
-    """Real (even modes) or imaginary part (odd ones) of sums over nodes x, (modes, places)."""
+    """Integrate modes times exp(-i pi y x) by a quadrature over x, (modes, places).
+
+    ``weighted_modes`` (modes, nodes) are values times quadrature weights at the positions ``node``;
+    ``distance`` (places,) is y [bins of fs/L]. Even modes have real integrals, odd modes imaginary
+    ones.
+    """
     integrals = np.zeros((weighted_modes.shape[0], distance.size))
     cosine, sine = np.empty(distance.size), np.empty(distance.size)
     for k in range(node.size):
@@ -480,9 +705,11 @@ def _mode_integrals(weighted_modes, node, distance):
 
 
 def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np.ndarray:
-    """Taylor's coefficients of w T_j at the record's end x = 1, (modes, DERIVATIVES + 1).
+    """Compute the Taylor coefficients of w T_j at the record's end x = 1.
 
-    What the cosines add up to there may be next to nothing: their sums are exact.
+    The window w is the sum of cosines with the coefficients ``coefficient_texts``. At x = 1 the
+    cosines may almost cancel, so their sums are exact fractions. The result is
+    (modes, END_DERIVATIVES_MAX + 1).
     """
     order = np.arange(END_DERIVATIVES_MAX + 1)
     even = np.where(order % 2 == 0, (-1.0) ** (order // 2), 0.0)
@@ -512,7 +739,11 @@ def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np
 def _euler_maclaurin_corrections(
     taylor_coefficients: np.ndarray, distance: np.ndarray, length: int
 ) -> np.ndarray:
-    """Compute the excess of sums over integrals (Euler and Maclaurin), (modes, places)."""
+    """Compute the difference between sums over samples and integrals, (modes, places).
+
+    By the Euler-Maclaurin formula, from the Taylor coefficients of modes at x = 1, at distances y
+    [bins of fs/L], for a record of ``length`` samples.
+    """
     bernoulli = {1: 1 / 12, 3: -1 / 720, 5: 1 / 30240}
     phase_factor = np.exp(-1j * np.pi * distance)
     parity = (-1.0) ** np.arange(len(taylor_coefficients))[:, None]
@@ -535,8 +766,11 @@ def _euler_maclaurin_corrections(
 
 
 def _power_sum_polynomials() -> np.ndarray:
-    """Compute sums of n^j e^{-i theta n} as polynomials in cot(theta / 2), by j and power."""
-    n_coefficients = END_DERIVATIVES_MAX + 2
+    """Return the coefficients of sum_n n^j e^{-i theta n} as a polynomial in cot(theta / 2).
+
+    (END_DERIVATIVES_MAX + 1, N_END_COEFFICIENTS), by j and by power of the cotangent.
+    """
+    n_coefficients = N_END_COEFFICIENTS
     sums = np.zeros((END_DERIVATIVES_MAX + 1, n_coefficients), complex)
     sums[0, :2] = 0.5, -0.5j
     for j in range(END_DERIVATIVES_MAX):
@@ -553,15 +787,21 @@ _POWER_SUMS_RE, _POWER_SUMS_IM = (
 )
 
 _CORRECTION_FACTORS = np.zeros((_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1))
-"""Factors of Taylor's coefficients i at an end in the power d of -i theta of its correction."""
+"""Factors in the Euler-Maclaurin correction of one end, (d, i).
+
+The correction is a polynomial in -i theta. Its coefficient of power d is a sum over Taylor
+coefficients i."""
 
 for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
     for _i in range(_m + 1):
         _CORRECTION_FACTORS[_m - _i, _i] += _coefficient * math.comb(_m, _i) * math.factorial(_i)
 
 
-def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> np.ndarray:
-    """Polynomials A and B of modes, (modes, 4, DERIVATIVES + 2)."""
+def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynomials:
+    """Compute the polynomials A and B of modes, (modes, N_END_COEFFICIENTS).
+
+    ``taylor_coefficients`` are those of the modes at x = 1; ``length`` is the number of samples.
+    """
     power_sums = _POWER_SUMS
     step_powers = (2 / length) ** np.arange(END_DERIVATIVES_MAX + 1)
     polynomial_last = ((taylor_coefficients * step_powers)[:, :, None] * power_sums).sum(axis=1)
@@ -571,25 +811,34 @@ def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> np.ndarray
     polynomial_first = ((taylor_coefficients * step_powers * parity)[:, :, None] * power_sums).sum(
         axis=1
     )
-    return np.stack(
-        [polynomial_first.real, polynomial_first.imag, polynomial_last.real, polynomial_last.imag],
-        axis=1,
+    return EndPolynomials(
+        *map(
+            np.ascontiguousarray,
+            (
+                polynomial_first.real,
+                polynomial_first.imag,
+                polynomial_last.real,
+                polynomial_last.imag,
+            ),
+        )
     )
 
 
 @njit(cache=True, error_model="numpy")
-def decompose_phase_errors(
-    phase, window_values, coefficient_matrix, line_shift, mode_coefficients, n_modes
-):
-    """Take phase errors, and a window beside them, apart.
+def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
+    """Decompose phase errors into a shift of the line and Chebyshev modes.
 
-    ``phase`` (segments, n, nodes) [cycles] is at :func:`chebyshev_nodes`, and so is the window
-    ``window_values``, of the same shape or empty where it is not among the modes;
-    ``coefficient_matrix`` is
-    :func:`chebyshev_coefficient_matrix`. Results: ``line_shift`` (segments, n), shift of the line
-    [bins of fs/L]. ``mode_coefficients``
-    (segments, n, 2, >= nodes // 2), real and imaginary parts of the modes. ``n_modes`` (segments,
-    n), modes that count, 0 where half as many as there are nodes are too few.
+    Parameters
+    ----------
+    phase
+        (segments, n, nodes): phase error at :func:`chebyshev_nodes` [cycles].
+    window_values
+        (segments, n, nodes): window at the same positions, by which the modes are multiplied; empty
+        if the modes do not include the window.
+    coefficient_matrix
+        :func:`chebyshev_coefficient_matrix`.
+    modes
+        Result, :class:`ShapeModes` for up to nodes / 2 modes. ``n_modes`` is 0 if more are needed.
     """
     n_nodes = coefficient_matrix.shape[0]
     coefficients_re, coefficients_im = np.empty(n_nodes), np.empty(n_nodes)
@@ -598,7 +847,7 @@ def decompose_phase_errors(
             slope = 0.0
             for k in range(n_nodes):
                 slope += coefficient_matrix[k, 1] * phase[s, i, k]
-            line_shift[s, i] = 2.0 * slope
+            modes.line_shift[s, i] = 2.0 * slope
             coefficients_re[:] = 0.0
             coefficients_im[:] = 0.0
             for k in range(n_nodes):
@@ -616,57 +865,61 @@ def decompose_phase_errors(
                 < MODE_SIZE_MIN
             ):
                 count -= 1
-            n_modes[s, i] = count if count <= n_nodes // 2 else 0
+            modes.n_modes[s, i] = count if count <= n_nodes // 2 else 0
             for j in range(min(count, n_nodes // 2)):
-                mode_coefficients[s, i, 0, j], mode_coefficients[s, i, 1, j] = (
-                    coefficients_re[j],
-                    coefficients_im[j],
-                )
+                modes.re[s, i, j], modes.im[s, i, j] = coefficients_re[j], coefficients_im[j]
 
 
 @njit(cache=True, error_model="numpy")
-def build_line_shape(segment, shape_and_previous, shape_modes, tables, table, outline):
-    """Build a shape from its modes, or take it from a table that holds all bins.
+def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
+    """Compute the line shape of one segment as a sum of modes, or copy a table of all bins.
 
-    ``shape_and_previous``: the shape's, and that of the one that stands in the results, or -1.
-    ``shape_modes``:
-    modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
-    ``tables``: tables to build from. Results: ``table`` (2, cells * columns), G, or |G|^2 in the
-    first row. ``outline`` (7, >= m), in rows 1 and 2 the most that |G| comes to from each of m
-    distances on, and the integral of its square. The other rows have A and B of DERIVATIVES + 2
-    terms.
+    Parameters
+    ----------
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    shape_index
+        Index of the shape in ``modes``.
+    previous_index
+        Index of the shape that is in ``shape`` already, or -1. If both are equal, ``shape`` stays.
+    modes
+        :class:`ShapeModes`.
+    tables
+        :class:`LineShapeTables`.
+    shape
+        Result, :class:`LineShape` of the segment.
+
+    Notes
+    -----
+    With f = w exp(2 pi i psi), the modes a_j and their tabulated transforms M_j,
+
+        G(y) = sum_j a_j M_j(y) + (f(-1) e^{i pi r y} - f(1) e^{-i pi r y}) / 2.
+
+    The transforms count both ends of the record half, but it has the sample at its start and not
+    that at its end.
     """
-    layout, mode_transforms, first_sample_terms, mode_end_polynomials, envelope_distances = (
-        tables[0],
-        tables[1],
-        tables[2],
-        tables[3],
-        tables[4],
-    )
-    shape_index, previous_index = shape_and_previous
-    mode_re, mode_im = (
-        shape_modes[1][segment, shape_index, 0],
-        shape_modes[1][segment, shape_index, 1],
-    )
-    count = shape_modes[2][segment, shape_index]
-    if previous_index >= 0 and count == 1 and shape_modes[2][segment, previous_index] == 1:
-        previous_mode = shape_modes[1][segment, previous_index]
-        if previous_mode[0, 0] == mode_re[0] and previous_mode[1, 0] == mode_im[0]:
-            return
-    envelope, end_polynomials = outline[1:3], outline[3:7, : END_DERIVATIVES_MAX + 2]
-    adds_powers = layout[4] != 0
-    if layout[5]:
-        for i in range(2):
-            for k in range(table.shape[1]):
-                table[i, k] = tables[5][segment, i, k]
-            for k in range(envelope.shape[1]):
-                envelope[i, k] = tables[6][segment, i, k]
+    layout, mode_transforms, mode_ends = tables.layout, tables.mode_transforms, tables.mode_ends
+    mode_re, mode_im = modes.re[segment, shape_index], modes.im[segment, shape_index]
+    n_modes = modes.n_modes[segment, shape_index]
+    if (
+        previous_index >= 0
+        and n_modes == 1
+        and modes.n_modes[segment, previous_index] == 1
+        and modes.re[segment, previous_index, 0] == mode_re[0]
+        and modes.im[segment, previous_index, 0] == mode_im[0]
+    ):
+        return
+    if layout.holds_all_bins:
+        shape.table_re[:] = tables.full_table_re[segment]
+        shape.table_im[:] = tables.full_table_im[segment]
+        shape.envelope.magnitude[:] = tables.full_envelope.magnitude[segment]
+        shape.envelope.square_integral[:] = tables.full_envelope.square_integral[segment]
         return
     even_re, even_im, odd_re, odd_im = 0.0, 0.0, 0.0, 0.0  # T_j is 1 at the end, +-1 at the start
-    n_values = mode_transforms.shape[1]
-    transform = np.zeros((2, n_values))
-    end_polynomials[:] = 0.0
-    for j in range(count):
+    n_values, ends = mode_transforms.shape[1], shape.ends
+    transform_re, transform_im = np.zeros(n_values), np.zeros(n_values)
+    _clear_end_polynomials(ends)
+    for j in range(n_modes):
         a, b = mode_re[j], mode_im[j]
         if j & 1:
             odd_re, odd_im = odd_re + a, odd_im + b
@@ -674,142 +927,142 @@ def build_line_shape(segment, shape_and_previous, shape_modes, tables, table, ou
         else:
             even_re, even_im = even_re + a, even_im + b
         for i in range(n_values):
-            transform[0, i] += a * mode_transforms[j, i]
-            transform[1, i] += b * mode_transforms[j, i]
-        for k in range(0, 4, 2):
-            for d in range(end_polynomials.shape[1]):
-                previous_mode, polynomial_im = (
-                    mode_end_polynomials[j, k, d],
-                    mode_end_polynomials[j, k + 1, d],
-                )
-                end_polynomials[k, d] += mode_re[j] * previous_mode - mode_im[j] * polynomial_im
-                end_polynomials[k + 1, d] += mode_re[j] * polynomial_im + mode_im[j] * previous_mode
+            transform_re[i] += a * mode_transforms[j, i]
+            transform_im[i] += b * mode_transforms[j, i]
+        for d in range(N_END_COEFFICIENTS):
+            re, im = mode_ends.start_re[j, d], mode_ends.start_im[j, d]
+            ends.start_re[d] += mode_re[j] * re - mode_im[j] * im
+            ends.start_im[d] += mode_re[j] * im + mode_im[j] * re
+        for d in range(N_END_COEFFICIENTS):
+            re, im = mode_ends.end_re[j, d], mode_ends.end_im[j, d]
+            ends.end_re[d] += mode_re[j] * re - mode_im[j] * im
+            ends.end_im[d] += mode_re[j] * im + mode_im[j] * re
     # The record's first sample counts whole, its end not at all.
     for i in range(n_values):
-        cosine, sine = first_sample_terms[0, i], first_sample_terms[1, i]
-        transform[0, i] -= odd_re * cosine + even_im * sine
-        transform[1, i] += even_re * sine - odd_im * cosine
-    count = (
-        n_values if adds_powers else n_values - table.shape[1]
-    )  # places on either side of the line
-    for i in range(table.shape[1] * (not adds_powers)):
-        table[0, i], table[1, i] = transform[0, count + i], transform[1, count + i]
-    for i in range(count):
-        transform[0, i] = transform[0, i] * transform[0, i] + transform[1, i] * transform[1, i]
-    if adds_powers:
-        _fill_table_row(transform[0], layout, table[0])
-    _fill_envelope(transform[0, :count], end_polynomials, layout, envelope_distances, envelope)
+        cosine, sine = tables.first_sample_cosine[i], tables.first_sample_sine[i]
+        transform_re[i] -= odd_re * cosine + even_im * sine
+        transform_im[i] += even_re * sine - odd_im * cosine
+    n_table = shape.table_re.size
+    n_cells = n_values if layout.adds_powers else n_values - n_table  # on both sides of the line
+    if not layout.adds_powers:
+        for i in range(n_table):
+            shape.table_re[i], shape.table_im[i] = (
+                transform_re[n_cells + i],
+                transform_im[n_cells + i],
+            )
+    squared_magnitude = transform_re[:n_cells]
+    for i in range(n_cells):
+        squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
+    if layout.adds_powers:
+        _fill_table(squared_magnitude, layout, shape.table_re)
+    _fill_envelope(squared_magnitude, layout, tables.envelope_cotangent, shape)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def first_segment_of_same_shape(segment, shape_index, shape_modes, echo_lengths, segment_exists):
-    """First earlier segment whose shape is the same, -1 for none."""
-    n_modes = shape_modes[2][segment, shape_index]
+def _clear_end_polynomials(ends):
+    """Set all coefficients of :class:`EndPolynomials` to 0."""
+    for d in range(N_END_COEFFICIENTS):
+        ends.start_re[d], ends.start_im[d], ends.end_re[d], ends.end_im[d] = 0.0, 0.0, 0.0, 0.0
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segment_exists):
+    """Return the first segment before ``segment`` with the same line shape; -1 if there is none.
+
+    Shapes are equal if their modes (:class:`ShapeModes`) and echo lengths (segments, shapes) are.
+    """
+    n_modes = modes.n_modes[segment, shape_index]
     for s in range(segment):
         if (
             not segment_exists[s]
             or echo_lengths[s, shape_index] != echo_lengths[segment, shape_index]
         ):
             continue
-        is_same = shape_modes[2][s, shape_index] == n_modes
+        is_same = modes.n_modes[s, shape_index] == n_modes
         for j in range(n_modes):
-            is_same &= (
-                shape_modes[1][s, shape_index, 0, j] == shape_modes[1][segment, shape_index, 0, j]
-            )
-            is_same &= (
-                shape_modes[1][s, shape_index, 1, j] == shape_modes[1][segment, shape_index, 1, j]
-            )
+            is_same &= modes.re[s, shape_index, j] == modes.re[segment, shape_index, j]
+            is_same &= modes.im[s, shape_index, j] == modes.im[segment, shape_index, j]
         if is_same:
             return s
     return -1
 
 
 @njit(cache=True, error_model="numpy")
-def build_late_line_shape(segment, shape_index, shape_modes, tables, table, outline):
-    """Build the shape of an echo that has the last ``sizes[1]`` samples of the record.
+def build_late_line_shape(segment, shape_index, modes, tables, shape):
+    """Compute the line shape of a late echo, of ``tables.echo_lengths`` samples L'.
 
-    Arguments and results as of :func:`build_line_shape`. With f = w exp(2 pi i psi) over these
-    samples and theta = 2 pi y / N,
+    Parameters are those of :func:`build_line_shape`.
+
+    Notes
+    -----
+    With f = w exp(2 pi i psi) over the echo's samples, r' = L'/N and theta = 2 pi y / N,
 
         G(y) = L'/2 int f(x) e^{-i pi r' y x} dx + (f(-1) e^{i pi r' y} - f(1) e^{-i pi r' y}) / 2
                + sum_m B_{m+1} / (m+1)! [ d^m / dn^m (f e^{-i theta n}) ] at the ends,
 
     whose derivatives are polynomials in theta.
     """
-    layout, mode_transforms, taylor_coefficients, envelope_distances = (
-        tables.layout,
-        tables.mode_transforms,
-        tables.taylor_coefficients,
-        tables.envelope_distances,
-    )
-    mode_re, mode_im = (
-        shape_modes[1][segment, shape_index, 0],
-        shape_modes[1][segment, shape_index, 1],
-    )
-    n_modes, adds_powers = shape_modes[2][segment, shape_index], layout[4] != 0
-    envelope, end_polynomials = outline[1:3], outline[3:7, : END_DERIVATIVES_MAX + 2]
-    half_length, sample_step, length_ratio = 0.5 * layout[1], 2.0 / layout[1], layout[1] / layout[0]
-    mode_sum = np.zeros((2, mode_transforms.shape[1]))
-    derivatives_first, derivatives_last = (
-        np.zeros((2, END_DERIVATIVES_MAX + 1)),
-        np.zeros((2, END_DERIVATIVES_MAX + 1)),
-    )
+    layout, mode_transforms = tables.layout, tables.mode_transforms
+    taylor_coefficients = tables.taylor_coefficients
+    record_length = tables.echo_lengths[segment, shape_index]
+    mode_re, mode_im = modes.re[segment, shape_index], modes.im[segment, shape_index]
+    n_modes, ends = modes.n_modes[segment, shape_index], shape.ends
+    half_length, sample_step = 0.5 * record_length, 2.0 / record_length
+    length_ratio = record_length / layout.fft_size
+    n_values, n_derivatives = mode_transforms.shape[1], END_DERIVATIVES_MAX + 1
+    mode_sum_re, mode_sum_im = np.zeros(n_values), np.zeros(n_values)
+    # Taylor coefficients of f at the start and at the end, by order of the derivative.
+    start_re, start_im = np.zeros(n_derivatives), np.zeros(n_derivatives)
+    end_re, end_im = np.zeros(n_derivatives), np.zeros(n_derivatives)
     for j in range(n_modes):
         a, b = mode_re[j], mode_im[j]
-        for i in range(END_DERIVATIVES_MAX + 1):
+        for i in range(n_derivatives):
             value = taylor_coefficients[j, i]
             sign = -1.0 if (i + j) & 1 else 1.0
-            derivatives_last[0, i], derivatives_last[1, i] = (
-                derivatives_last[0, i] + a * value,
-                derivatives_last[1, i] + b * value,
-            )
-            derivatives_first[0, i] += sign * a * value
-            derivatives_first[1, i] += sign * b * value
+            end_re[i], end_im[i] = end_re[i] + a * value, end_im[i] + b * value
+            start_re[i] += sign * a * value
+            start_im[i] += sign * b * value
         if j & 1:
             a, b = -b, a
-        for i in range(mode_transforms.shape[1]):
-            mode_sum[0, i] += a * mode_transforms[j, i]
-            mode_sum[1, i] += b * mode_transforms[j, i]
+        for i in range(n_values):
+            mode_sum_re[i] += a * mode_transforms[j, i]
+            mode_sum_im[i] += b * mode_transforms[j, i]
     scale = 1.0
-    for i in range(END_DERIVATIVES_MAX + 1):
-        for k in range(2):
-            derivatives_first[k, i], derivatives_last[k, i] = (
-                derivatives_first[k, i] * scale,
-                derivatives_last[k, i] * scale,
-            )
+    for i in range(n_derivatives):
+        start_re[i], end_re[i] = start_re[i] * scale, end_re[i] * scale
+        start_im[i], end_im[i] = start_im[i] * scale, end_im[i] * scale
         scale *= sample_step
-    end_polynomials[:] = 0.0
-    for i in range(END_DERIVATIVES_MAX + 1):
-        for d in range(END_DERIVATIVES_MAX + 2):
+    _clear_end_polynomials(ends)
+    for i in range(n_derivatives):
+        for d in range(N_END_COEFFICIENTS):
             p, q = _POWER_SUMS_RE[i, d], _POWER_SUMS_IM[i, d]
-            end_polynomials[0, d] += derivatives_first[0, i] * p - derivatives_first[1, i] * q
-            end_polynomials[1, d] += derivatives_first[0, i] * q + derivatives_first[1, i] * p
-            end_polynomials[2, d] += derivatives_last[0, i] * p - derivatives_last[1, i] * q
-            end_polynomials[3, d] += derivatives_last[0, i] * q + derivatives_last[1, i] * p
-    # Corrections of the two ends by power of theta: (-i)^d turns real and imaginary parts about.
-    end_corrections = np.zeros((4, _EULER_MACLAURIN_ORDER_MAX + 1))
-    for d in range(_EULER_MACLAURIN_ORDER_MAX + 1):
+            ends.start_re[d] += start_re[i] * p - start_im[i] * q
+            ends.start_im[d] += start_re[i] * q + start_im[i] * p
+            ends.end_re[d] += end_re[i] * p - end_im[i] * q
+            ends.end_im[d] += end_re[i] * q + end_im[i] * p
+    # Corrections of the two ends, by power of theta. (-i)^d exchanges real and imaginary parts.
+    n_corrections = _EULER_MACLAURIN_ORDER_MAX + 1
+    start_correction_re, start_correction_im = np.zeros(n_corrections), np.zeros(n_corrections)
+    end_correction_re, end_correction_im = np.zeros(n_corrections), np.zeros(n_corrections)
+    for d in range(n_corrections):
         a, b, c, e = 0.0, 0.0, 0.0, 0.0
-        for i in range(_EULER_MACLAURIN_ORDER_MAX + 1 - d):
+        for i in range(n_corrections - d):
             factor = _CORRECTION_FACTORS[d, i]
-            a, b = a - factor * derivatives_first[0, i], b - factor * derivatives_first[1, i]
-            c, e = c + factor * derivatives_last[0, i], e + factor * derivatives_last[1, i]
+            a, b = a - factor * start_re[i], b - factor * start_im[i]
+            c, e = c + factor * end_re[i], e + factor * end_im[i]
         if d == 0:  # the first sample counts whole, the end not at all
-            a, b = a + 0.5 * derivatives_first[0, 0], b + 0.5 * derivatives_first[1, 0]
-            c, e = c - 0.5 * derivatives_last[0, 0], e - 0.5 * derivatives_last[1, 0]
+            a, b = a + 0.5 * start_re[0], b + 0.5 * start_im[0]
+            c, e = c - 0.5 * end_re[0], e - 0.5 * end_im[0]
         for _ in range(d % 4):
             a, b, c, e = b, -a, e, -c
-        (
-            end_corrections[0, d],
-            end_corrections[1, d],
-            end_corrections[2, d],
-            end_corrections[3, d],
-        ) = a, b, c, e
-    cells_per_bin, table_bins = layout[3], layout[2]
+        start_correction_re[d], start_correction_im[d] = a, b
+        end_correction_re[d], end_correction_im[d] = c, e
+    cells_per_bin, table_bins = layout.cells_per_bin, layout.table_bins
     n_cells = 2 * table_bins * cells_per_bin + cells_per_bin + 2 * _TAP_REACH_CELLS
     first_cell = -table_bins * cells_per_bin - cells_per_bin + 1 - _TAP_REACH_CELLS
-    transform, kernel_weights = np.empty((2, n_cells)), np.empty(KERNEL_CELLS + ZERO_WEIGHT_CELLS)
-    middle = mode_transforms.shape[1] // 2
+    transform_re, transform_im = np.empty(n_cells), np.empty(n_cells)
+    kernel_weights = np.empty(KERNEL_CELLS + ZERO_WEIGHT_CELLS)
+    middle = n_values // 2
     for i in range(n_cells):
         y = (first_cell + i) / cells_per_bin
         u = length_ratio * y
@@ -823,34 +1076,38 @@ def build_late_line_shape(segment, shape_index, shape_modes, tables, table, outl
         sum_re, sum_im = 0.0, 0.0
         first_value = np.uint64(cell - KERNEL_CELLS // 2 + 1)
         for j in range(np.uint64(KERNEL_CELLS)):
-            sum_re += kernel_weights[j] * mode_sum[0, first_value + j]
-            sum_im += kernel_weights[j] * mode_sum[1, first_value + j]
-        theta = 2.0 * np.pi * y / layout[0]
+            sum_re += kernel_weights[j] * mode_sum_re[first_value + j]
+            sum_im += kernel_weights[j] * mode_sum_im[first_value + j]
+        theta = 2.0 * np.pi * y / layout.fft_size
         a, b, c, e = 0.0, 0.0, 0.0, 0.0
         for d in range(_EULER_MACLAURIN_ORDER_MAX, -1, -1):
-            a, b = a * theta + end_corrections[0, d], b * theta + end_corrections[1, d]
-            c, e = c * theta + end_corrections[2, d], e * theta + end_corrections[3, d]
+            a, b = a * theta + start_correction_re[d], b * theta + start_correction_im[d]
+            c, e = c * theta + end_correction_re[d], e * theta + end_correction_im[d]
         sine, cosine = sincos_cycles(0.5 * u)
-        transform[0, i] = (
+        transform_re[i] = (
             2.0 * half_length * sum_re + (a * cosine - b * sine) + (c * cosine + e * sine)
         )
-        transform[1, i] = (
+        transform_im[i] = (
             2.0 * half_length * sum_im + (a * sine + b * cosine) + (e * cosine - c * sine)
         )
-    if not adds_powers:
-        _fill_table_row(transform[0], layout, table[0])
-        _fill_table_row(transform[1], layout, table[1])
+    if not layout.adds_powers:
+        _fill_table(transform_re, layout, shape.table_re)
+        _fill_table(transform_im, layout, shape.table_im)
+    squared_magnitude = transform_re
     for i in range(n_cells):
-        transform[0, i] = transform[0, i] * transform[0, i] + transform[1, i] * transform[1, i]
-    if adds_powers:
-        _fill_table_row(transform[0], layout, table[0])
-    _fill_envelope(transform[0], end_polynomials, layout, envelope_distances, envelope)
+        squared_magnitude[i] = transform_re[i] * transform_re[i] + transform_im[i] * transform_im[i]
+    if layout.adds_powers:
+        _fill_table(squared_magnitude, layout, shape.table_re)
+    _fill_envelope(squared_magnitude, layout, tables.envelope_cotangent, shape)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_table_row(values, layout, table_row):
-    """Values at cells with the kernel divided out of them, in rows by cell of a bin."""
-    cells_per_bin, columns = layout[3], 2 * layout[2] + 1
+def _fill_table(values, layout, table):
+    """Divide values at cells by the kernel's transform, and sort them by cell of a bin and by bin.
+
+    ``values`` are at :func:`_cell_distances`, ``table`` is the result.
+    """
+    cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_bins + 1
     n_values = np.uint64(cells_per_bin * columns)
     filtered = np.empty(cells_per_bin * columns)
     for i in range(n_values):
@@ -861,34 +1118,31 @@ def _fill_table_row(values, layout, table_row):
             filtered[i] += DECONVOLUTION_TAPS[k] * (values[i + low] + values[i + high])
     for m in range(cells_per_bin):
         for q in range(columns):
-            table_row[m * columns + q] = filtered[q * cells_per_bin + cells_per_bin - 1 - m]
+            table[m * columns + q] = filtered[q * cells_per_bin + cells_per_bin - 1 - m]
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_envelope(squared_magnitude, end_polynomials, layout, envelope_distances, envelope):
-    """Envelope of |G|^2 at cells, and of what is beyond them; as of :func:`build_line_shape`.
+def _fill_envelope(squared_magnitude, layout, envelope_cotangent, shape):
+    """Fill the envelope of a shape from |G|^2 at cells, and beyond them from its end polynomials.
 
-    |G|^2 goes as a sine of y with a period of a bin, so that it is nowhere more than two values
-    half a bin apart have together.
+    |G|^2 varies with y as a sine with a period of one bin. It is therefore nowhere larger than the
+    sum of two values that are half a bin apart.
     """
-    table_bins, cells_per_bin = layout[2], layout[3]
-    line_cell, half_bin_cells = (
-        table_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS,
-        cells_per_bin // 2,
-    )
-    for i in range(np.uint64(table_bins + 1), np.uint64(envelope_distances.shape[1])):
-        c, a, b, p, q = envelope_distances[1, i], 0.0, 0.0, 0.0, 0.0
-        for k in range(END_DERIVATIVES_MAX + 2):
-            d = END_DERIVATIVES_MAX + 1 - k
-            a, b = a * c + end_polynomials[0, d], b * c + end_polynomials[1, d]
-            p, q = p * c + end_polynomials[2, d], q * c + end_polynomials[3, d]
+    table_bins, cells_per_bin = layout.table_bins, layout.cells_per_bin
+    distance, ends = shape.envelope.distance, shape.ends
+    magnitude, square_integral = shape.envelope.magnitude, shape.envelope.square_integral
+    line_cell = table_bins * cells_per_bin + cells_per_bin - 1 + _TAP_REACH_CELLS
+    half_bin_cells = cells_per_bin // 2
+    for i in range(np.uint64(table_bins + 1), np.uint64(distance.size)):
+        c, a, b, p, q = envelope_cotangent[i], 0.0, 0.0, 0.0, 0.0
+        for k in range(N_END_COEFFICIENTS):
+            d = N_END_COEFFICIENTS - 1 - k
+            a, b = a * c + ends.start_re[d], b * c + ends.start_im[d]
+            p, q = p * c + ends.end_re[d], q * c + ends.end_im[d]
         squared_first, squared_last = a * a + b * b, p * p + q * q
-        envelope[0, i] = (
-            squared_first + squared_last + 2.0 * math.sqrt(squared_first * squared_last)
-        )
-    half_bin_sums = np.empty(
-        table_bins * cells_per_bin + cells_per_bin + 1
-    )  # from the cell before the line on
+        magnitude[i] = squared_first + squared_last + 2.0 * math.sqrt(squared_first * squared_last)
+    # Sums of two values half a bin apart, from the cell before the line on.
+    half_bin_sums = np.empty(table_bins * cells_per_bin + cells_per_bin + 1)
     for i in range(half_bin_sums.size):
         cell_above, cell_below = np.uint64(line_cell - 1 + i), np.uint64(line_cell + 1 - i)
         sum_above = (
@@ -900,22 +1154,17 @@ def _fill_envelope(squared_magnitude, end_polynomials, layout, envelope_distance
             + squared_magnitude[cell_below - np.uint64(half_bin_cells)]
         )
         half_bin_sums[i] = _ENVELOPE_MARGIN * _ENVELOPE_MARGIN * max(sum_above, sum_below)
-    maximum_beyond, area, previous_maximum = 0.0, 0.0, 0.0  # of the square
-    for i in range(envelope_distances.shape[1] - 1, -1, -1):
+    maximum_beyond, area, previous_maximum = 0.0, 0.0, 0.0  # of |G|^2
+    for i in range(distance.size - 1, -1, -1):
         if i > table_bins:
-            maximum_beyond = max(maximum_beyond, envelope[0, i])
+            maximum_beyond = max(maximum_beyond, magnitude[i])
         else:
             for k in range(i * cells_per_bin, (i + 1) * cells_per_bin + 1):
                 maximum_beyond = max(maximum_beyond, half_bin_sums[k])
-        width = (
-            envelope_distances[0, i + 1] - envelope_distances[0, i]
-            if i + 1 < envelope_distances.shape[1]
-            else 0.0
-        )
-        area += (
-            width * 0.5 * (maximum_beyond + previous_maximum)
-        )  # an upper sum, where it falls ever slower
+        width = distance[i + 1] - distance[i] if i + 1 < distance.size else 0.0
+        # An upper sum, where |G|^2 falls ever more slowly.
+        area += width * 0.5 * (maximum_beyond + previous_maximum)
         previous_maximum = maximum_beyond
-        envelope[0, i], envelope[1, i] = maximum_beyond, area
-    for i in range(envelope_distances.shape[1]):
-        envelope[0, i] = math.sqrt(envelope[0, i])
+        magnitude[i], square_integral[i] = maximum_beyond, area
+    for i in range(distance.size):
+        magnitude[i] = math.sqrt(magnitude[i])

@@ -1,15 +1,19 @@
-"""The lines of one segment: where each beamlet's beat lies, how strong, in what phase.
+"""Lines of one segment: frequency, strength and phase of each beamlet's beat.
 
-A beamlet's beat is a tone of nu bins of fs/N. It is seen at nu less whole FFT lengths, within -N/2
-.. N/2; a real record shows the line and its image at the opposite frequency. Close lines are
-replaced by few. As a function of a line's place the spectrum is band-limited, so lines within +-h
-bins are equivalent to J lines at Chebyshev nodes, J = 8 + some 1.3 pi h. The error of a series of J
-terms in a sample of the record at t, -1 .. 1, is some 2 J_J(pi h t): next to nothing but at the
-record's ends, where most windows are small; the window weighs it.
+The beat of a beamlet is a tone at nu bins of fs/N. Its line appears at nu minus a whole number of
+FFT lengths, within -N/2 .. N/2. A real record shows the line and its image at the opposite
+frequency.
+
+Many close lines are replaced by a few. The spectrum is band-limited as a function of a line's
+position. Lines within +-h bins are therefore equivalent to J lines at Chebyshev nodes, with J about
+8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has an error of about
+2 J_J(pi h t). This is negligible except at the record's ends, where most windows are small. The
+window weighs the error.
 """
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -27,50 +31,269 @@ AMPLITUDE_TOLERANCES = (
     1e-13, 3e-13, 1e-12, 3e-12, 1e-11, 3e-11, 1e-10, 3e-10, 1e-9, 3e-9, 1e-8, 3e-8, 1e-7, 3e-7,
     1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2,
 )  # fmt: skip
-"""Errors of an equivalent sum of amplitudes, relative to the sum of their magnitudes."""
+"""Tabulated errors of a sum of amplitudes over equivalent lines, relative to the sum of |C_b|."""
 
 POWER_TOLERANCES = (
     1e-18, 1e-15, 1e-13, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3
 )  # fmt: skip
-"""The same of powers: the root of the first is what a null of |X| shows."""
+"""Tabulated errors of a sum of powers over equivalent lines, relative to the sum of |C_b|^2.
+
+A null of |X| shows the square root of the error."""
 
 NODES_MAX = 128
-"""Equivalent lines at the most; wider bundles are left as they are."""
-
-PLACE, RE, IM, X, BLOCK, MOMENT_RE, MOMENT_IM = np.arange(7)
-"""Rows of scratch: places [bins from the origin] and C_b (powers: |C_b|^2 and 0); places of nodes;
-blocks of lines; moments. They are NumPy's integers, as numba compiles a function anew for each of
-Python's that is written in a call."""
+"""Maximum number of equivalent lines. Lines that would need more are not replaced."""
 
 NODES_PER_BATCH = 128
-"""Nodes that are done together; constant, so that compiled loops need no tests of what overlaps."""
+"""Size of each section of :attr:`LineScratch.batch`. It is a constant, so that the compiler knows
+that sections do not overlap."""
 
 LINES_PER_BATCH = 32
-"""Lines that are summed together: many echoes have few."""
+"""Number of lines that are summed together; many echoes have few lines."""
 
-_X, _EVEN, _ODD, _RE, _IM, _LANES = (NODES_PER_BATCH * k for k in range(6))
+_X, _EVEN, _ODD, _RE, _IM, _LANES = (NODES_PER_BATCH * section for section in range(6))
+"""First elements of the sections of :attr:`LineScratch.batch`: positions x of lines or nodes,
+-1 .. 1; Chebyshev polynomials of even and of odd order at x; real and imaginary parts of weights;
+partial sums."""
 
-SCRATCH_WIDTH_MIN = 6 * NODES_PER_BATCH
-"""Of scratch."""
+BATCH_SCRATCH_SIZE = 6 * NODES_PER_BATCH
+"""Number of elements of :attr:`LineScratch.batch`."""
 
-N_SHARED_COLUMNS = 21
-"""Numbers of a point that its segments share; of each segment OWN follow."""
-
-N_SEGMENT_COLUMNS = 6
-"""Signed chirp rate [Hz/s]; carrier [Hz]; gain of the whitened spectrum; range by which it is
-nearer [m]; Doppler ratio; start [s]."""
+N_SUM_LANES = 8
+"""Number of partial sums that are added side by side. Their order does not depend on the machine.
+"""
 
 CHEBYSHEV_NODES = np.zeros((NODES_MAX + 1, NODES_MAX))
 for _n in range(1, NODES_MAX + 1):
     CHEBYSHEV_NODES[_n, :_n] = np.cos(np.pi * (np.arange(_n) + 0.5) / _n)
 
 
+REAL_WITHOUT_IMAGES, REAL_WITH_IMAGES, COMPLEX_RECORD = range(3)
+"""Types of spectra: bins 0 .. N/2 of a real record, without or with the images of lines; all N bins
+of a complex record, whose numbers may continue below 0 and above N."""
+
+
+class SpectrumLayout(NamedTuple):
+    """Sizes of a spectrum and of the line-shape table from which it is computed."""
+
+    fft_size: int
+    """FFT size N."""
+    record_length: int
+    """Number of samples L of the record; of an echo that arrives late, number of its samples L'."""
+    table_bins: int
+    """Number of bins T that the table holds on either side of a line."""
+    cells_per_bin: int
+    """Number of table cells in a bin of fs/N."""
+    adds_powers: bool
+    """True if the powers of lines add, False if their amplitudes do."""
+    holds_all_bins: bool
+    """True if the table holds all bins of the spectrum."""
+    clearance_bins: int
+    """Distance from a line [bins of fs/N] beyond which the record's ends determine its shape."""
+    spectrum_type: int = REAL_WITH_IMAGES
+    """REAL_WITHOUT_IMAGES, REAL_WITH_IMAGES or COMPLEX_RECORD."""
+
+
+class LineArrays(NamedTuple):
+    """Positions and weights of lines, one element per line; arrays may be longer."""
+
+    position: np.ndarray
+    """Position nu of each line [bins of fs/N], counted from the origin bin."""
+    re: np.ndarray
+    """Real part of the weight C_b; |C_b|^2 if powers add."""
+    im: np.ndarray
+    """Imaginary part of the weight C_b; 0 if powers add."""
+
+
+class LineScratch(NamedTuple):
+    """Scratch arrays of sums over lines."""
+
+    batch: np.ndarray
+    """(BATCH_SCRATCH_SIZE,): sections for a batch of lines, or for nodes."""
+    moment_re: np.ndarray
+    """(NODES_MAX + 1,) or more: real parts of the Chebyshev moments of the weights."""
+    moment_im: np.ndarray
+    """(NODES_MAX + 1,) or more: imaginary parts of the Chebyshev moments of the weights."""
+
+
+class LineSummary(NamedTuple):
+    """Sums of the weights of lines, and the range of their positions."""
+
+    magnitude_sum: float
+    """Sum of |C_b|, or an upper bound of it; sum of |C_b|^2 if powers add."""
+    power_sum: float
+    """Sum of |C_b|^2; sum of |C_b|^4 if powers add."""
+    lowest_position: float
+    """Lowest position [bins]."""
+    highest_position: float
+    """Highest position [bins]."""
+
+
+class BeamletArrays(NamedTuple):
+    """Beamlets of all footprints, relative to the beam's axis."""
+
+    relative_range_offset: np.ndarray
+    """(footprints, beamlets): relative difference of range, (R_b - R_0) / R_0."""
+    doppler_ratio_offset: np.ndarray
+    """(footprints, beamlets): difference of Doppler ratio, beta_b - beta_0."""
+    relative_amplitude: np.ndarray
+    """(footprints, beamlets): amplitude, relative to that of a single line on the axis."""
+    phase_cycles: np.ndarray
+    """(segments, footprints, beamlets): random phases [cycles]; (0, footprints, beamlets) if there
+    are none."""
+
+
+def beamlet_arrays(beamlet_table: np.ndarray) -> BeamletArrays:
+    """Name the rows of :attr:`sweep.model.preparation.Shots.beamlet_table`."""
+    range_offset, doppler_offset, amplitude = beamlet_table[:3]
+    return BeamletArrays(range_offset, doppler_offset, amplitude, beamlet_table[3:])
+
+
+class PointParameters(NamedTuple):
+    """Parameters of points that all segments share, (n,) each.
+
+    The fields are the first rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    """
+
+    range: np.ndarray
+    """Range R_0 along the beam's axis at the start of the shot [m]."""
+    doppler_ratio: np.ndarray
+    """Doppler ratio 2 v / c at the start of the shot."""
+    chirp_rate: np.ndarray
+    """Chirp rate [Hz/s], positive."""
+    beat_amplitude_scale: np.ndarray
+    """Amplitude of the beat of a line of relative amplitude 1 [V]."""
+    detector_bandwidth: np.ndarray
+    """Bandwidth of the detector's pole [Hz]."""
+    amplifier_bandwidth: np.ndarray
+    """Bandwidth of the amplifier's pole [Hz]."""
+    sample_rate: np.ndarray
+    """Sample rate fs [Hz]."""
+    record_start: np.ndarray
+    """Time from the start of a segment to the first sample of its record [s]."""
+    up_carrier: np.ndarray
+    """Carrier of the up segment [Hz]."""
+    down_carrier: np.ndarray
+    """Carrier of the down segment [Hz]."""
+    noise_sigma: np.ndarray
+    """Noise per quadrature in a bin [V, summed over the record]."""
+    threshold: np.ndarray
+    """Threshold on |X| [V, summed over the record]."""
+    negligible_signal_ratio: np.ndarray
+    """Signal |X| over ``noise_sigma`` below which a bin counts as noise alone."""
+    line_noise: np.ndarray
+    """Noise per quadrature in bins that lines fill, with the part of the phase-noise pedestal that
+    changes |X| [V, summed over the record]."""
+    leakage_tolerance: np.ndarray
+    """Probability of leakage that may be neglected."""
+    line_error_tolerance: np.ndarray
+    """Error of |X| over ``noise_sigma`` that approximations of the lines may make in a bin."""
+    image_gain: np.ndarray
+    """Amplitude of the I/Q image of a line over that of the line; 0 if there is none."""
+    side_noise: np.ndarray
+    """Noise per quadrature in bins beside the lines, with the whole pedestal [V]."""
+    pedestal_reach_bins: np.ndarray
+    """Distance from the lines up to which the pedestal widens the echo [bins of fs/N]."""
+    pedestal_line_width_bins: np.ndarray
+    """Line width of the laser [bins of fs/N]."""
+    pedestal_delay: np.ndarray
+    """Delay of the echo, at most the duration of the record [N/fs]."""
+
+
+class SegmentParameters(NamedTuple):
+    """Parameters of the segments of points, (segments, n) each.
+
+    The fields are the last rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    """
+
+    chirp_rate: np.ndarray
+    """Signed chirp rate [Hz/s]."""
+    carrier: np.ndarray
+    """Carrier [Hz]."""
+    whitening_gain: np.ndarray
+    """Gain of the signal in the whitened spectrum."""
+    range_decrease: np.ndarray
+    """Decrease of the range from the start of the shot to that of the segment [m]."""
+    doppler_ratio: np.ndarray
+    """Doppler ratio beta at the start of the segment."""
+    start_time: np.ndarray
+    """Start of the segment, from that of the shot [s]."""
+
+
+def point_parameters(point_table: np.ndarray) -> PointParameters:
+    """Name the shared rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`."""
+    return PointParameters(*point_table[: len(PointParameters._fields)])
+
+
+def segment_parameters(point_table: np.ndarray) -> SegmentParameters:
+    """Name the rows by segment of :meth:`sweep.model.preparation.Shots.point_parameter_table`."""
+    n_fields, n_points = len(SegmentParameters._fields), point_table.shape[1]
+    rows_by_segment = point_table[len(PointParameters._fields) :].reshape(-1, n_fields, n_points)
+    return SegmentParameters(*np.ascontiguousarray(rows_by_segment.swapaxes(0, 1)))
+
+
+class BeatParameters(NamedTuple):
+    """Parameters on which the beats of one segment at one point depend."""
+
+    range: float
+    """Range R_0 along the beam's axis at the start of the shot [m]."""
+    range_decrease: float
+    """Decrease of the range from the start of the shot to that of the segment [m]."""
+    doppler_ratio: float
+    """Doppler ratio beta at the start of the segment."""
+    start_time: float
+    """Start of the segment, from that of the shot [s]."""
+    chirp_rate: float
+    """Signed chirp rate [Hz/s]."""
+    carrier: float
+    """Carrier [Hz]."""
+    amplitude: float
+    """Amplitude of the beat of a line of relative amplitude 1, in the whitened spectrum [V]."""
+    detector_bandwidth: float
+    """Bandwidth of the detector's pole [Hz]."""
+    amplifier_bandwidth: float
+    """Bandwidth of the amplifier's pole [Hz]."""
+    sample_rate: float
+    """Sample rate fs [Hz]."""
+    record_start: float
+    """Time from the start of the segment to the first sample with the echo [s]."""
+
+
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+def beat_parameters_at(point_parameters, segment_parameters, segment, point):
+    """Select the :class:`BeatParameters` of one segment of one point."""
+    return BeatParameters(
+        point_parameters.range[point],
+        segment_parameters.range_decrease[segment, point],
+        segment_parameters.doppler_ratio[segment, point],
+        segment_parameters.start_time[segment, point],
+        segment_parameters.chirp_rate[segment, point],
+        segment_parameters.carrier[segment, point],
+        point_parameters.beat_amplitude_scale[point]
+        * segment_parameters.whitening_gain[segment, point],
+        point_parameters.detector_bandwidth[point],
+        point_parameters.amplifier_bandwidth[point],
+        point_parameters.sample_rate[point],
+        point_parameters.record_start[point],
+    )
+
+
 @lru_cache(maxsize=32)
 def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...]) -> np.ndarray:
-    """Largest pi h that J equivalent lines serve to each tolerance, (tolerances, MOST_NODES + 1).
+    """Tabulate the largest pi h [rad] at which J equivalent lines meet each tolerance.
 
-    From J = 1; the tolerances, rising, at J = 0. The weights, of sum 1, are those of places evenly
-    spaced from the middle of the band to its end, both included.
+    Parameters
+    ----------
+    weights
+        Weights, of sum 1, of equidistant positions t in the record, from its middle (0) to its
+        end (1), both included.
+    tolerances
+        Errors of the sum over lines, relative to the sum of their magnitudes, in rising order.
+
+    Returns
+    -------
+    numpy.ndarray
+        (tolerances, NODES_MAX + 1): pi h by number of nodes J = 1 .. NODES_MAX. Column 0 holds the
+        tolerances.
     """
     n_nodes, targets = np.arange(1, NODES_MAX + 1), np.array(tolerances)[:, None]
     low, high = np.full((len(tolerances), n_nodes.size), -60.0), np.log(2.0 * n_nodes) + 0 * targets
@@ -82,9 +305,10 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
 
 
 def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Bound on what the first J terms of a Chebyshev series leave out, (n, J), for ln z < ln 2 J.
+    """Bound the remainder of a Chebyshev series after J terms, (tolerances, J), for ln z < ln 2 J.
 
-    2 sum_{m >= J} |J_m(z t)|, the mean over t, from J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
+    The remainder is the weighted mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from
+    J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):
@@ -98,189 +322,222 @@ def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarra
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def compute_lines(point, segment, footprint, footprint_row, layout, scratch):
-    """Lines of a segment: places and complex weights C_b, into rows PLACE, RE and IM.
+def compute_lines(
+    beat, segment, beamlets, footprint_row, layout, lines, inverse_gain_re, inverse_gain_im
+):
+    """Compute the positions nu_b and the complex weights C_b of a segment's lines.
 
-    C_b is half the amplitude, with the receiver's gain and the phase in the record's middle, in a
-    spectrum whose noise is white. Returns the origin: the bin nearest to the beam's centre, -N/2 ..
-    N/2. ``point`` is a column of :meth:`sweep.model.preparation.Shots.point_parameter_table`,
-    ``footprint`` and ``footprint_row`` of :attr:`~sweep.model.preparation.Shots.beamlet_table`.
+    Parameters
+    ----------
+    beat
+        :class:`BeatParameters` of the segment.
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    beamlets
+        :class:`BeamletArrays`.
+    footprint_row
+        Row of the footprint in ``beamlets``.
+    layout
+        :class:`SpectrumLayout`.
+    lines
+        Result, :class:`LineArrays`.
+    inverse_gain_re, inverse_gain_im
+        Scratch arrays, (lines,): the receiver's gain is 1 / (re + i im).
+
+    Returns
+    -------
+    origin_bin
+        Bin nearest to the line on the beam's axis, -N/2 .. N/2, from which positions count.
+
+    Notes
+    -----
+    A beamlet of range R and Doppler ratio beta has the beat
+
+        f = carrier beta - S (2 R / c) (1 + beta)
+
+    with the signed chirp rate S. C_b is half the amplitude of the beat, in a spectrum whose noise
+    is white. It includes the two poles of the receiver, and the phase in the middle of the record.
     """
-    adds_powers, fft_size, record_length = layout[4] != 0, layout[0], layout[1]
-    segment_column, record_start = N_SHARED_COLUMNS + N_SEGMENT_COLUMNS * segment, point[7]
-    chirp_rate, carrier, beat_scale, range_decrease = (
-        point[segment_column],
-        point[segment_column + 1],
-        point[3] * point[segment_column + 2],
-        point[segment_column + 3],
+    fft_size, record_length = layout.fft_size, layout.record_length
+    range_0 = beat.range - beat.range_decrease
+    range_per_doppler = 0.5 * SPEED_OF_LIGHT * beat.start_time
+    bins_per_hertz = fft_size / beat.sample_rate
+    hertz_per_metre = beat.chirp_rate * (2.0 / SPEED_OF_LIGHT)
+    centre_frequency = beat.carrier * beat.doppler_ratio - (
+        hertz_per_metre * (1.0 + beat.doppler_ratio) * range_0
     )
-    range_0, beta, range_per_doppler = (
-        point[0] - range_decrease,
-        point[segment_column + 4],
-        0.5 * SPEED_OF_LIGHT * point[segment_column + 5],
-    )
-    bins_per_hertz = fft_size / point[6]
-    hertz_per_metre = chirp_rate * (2.0 / SPEED_OF_LIGHT)
-    centre_frequency = carrier * beta - hertz_per_metre * (1.0 + beta) * range_0
     centre_position = centre_frequency * bins_per_hertz
     folding_shift = math.floor(centre_position / fft_size + 0.5) * fft_size
     origin_bin = math.floor(centre_position - folding_shift + 0.5)
     centre_offset = centre_position - folding_shift - origin_bin
-    pole_product, pole_sum = 1.0 / (point[4] * point[5]), 1.0 / point[4] + 1.0 / point[5]
-    cycles_per_metre_high, cycles_per_metre_low = exact_quotient(2.0 * carrier, SPEED_OF_LIGHT)
+    pole_product = 1.0 / (beat.detector_bandwidth * beat.amplifier_bandwidth)
+    pole_sum = 1.0 / beat.detector_bandwidth + 1.0 / beat.amplifier_bandwidth
+    cycles_per_metre_high, cycles_per_metre_low = exact_quotient(2.0 * beat.carrier, SPEED_OF_LIGHT)
     axis_phase = -product_cycle_fraction(
-        cycles_per_metre_high, cycles_per_metre_low, point[0]
-    ) + fraction_of_cycle(centre_frequency * record_start)
+        cycles_per_metre_high, cycles_per_metre_low, beat.range
+    ) + fraction_of_cycle(centre_frequency * beat.record_start)
     axis_phase += product_cycle_fraction(
-        cycles_per_metre_high, cycles_per_metre_low, range_decrease
+        cycles_per_metre_high, cycles_per_metre_low, beat.range_decrease
     )
     half_record_ratio = 0.5 * (record_length / fft_size)
     origin_phase = (record_length * origin_bin % (2 * fft_size)) / (2.0 * fft_size)
-    n_lines = footprint.shape[2]
-    for line in range(n_lines):  # bins from the origin; the receiver's gain is 1 / (X + i BLOCK)
-        doppler_offset = footprint[1, footprint_row, line]
-        range_offset = (
-            point[0] * footprint[0, footprint_row, line] - range_per_doppler * doppler_offset
-        )
-        doppler_path = (1.0 + beta) * range_offset + (range_0 + range_offset) * doppler_offset
-        beat_offset = carrier * doppler_offset - hertz_per_metre * doppler_path
-        frequency = centre_frequency + beat_offset
-        scratch[PLACE, line] = centre_offset + beat_offset * bins_per_hertz
-        scratch[X, line] = 1.0 - frequency * frequency * pole_product
-        scratch[BLOCK, line] = frequency * pole_sum
-    if adds_powers:
-        for line in range(n_lines):
-            weight, gain_re, gain_im = (
-                0.5 * beat_scale * footprint[2, footprint_row, line],
-                scratch[X, line],
-                scratch[BLOCK, line],
-            )
-            scratch[RE, line] = weight * weight / (gain_re * gain_re + gain_im * gain_im)
-            scratch[IM, line] = 0.0
-        return origin_bin
-    half_chirp_rate, cycles_per_bin = 0.5 * chirp_rate, record_start / bins_per_hertz
+    n_lines = beamlets.relative_range_offset.shape[1]
     for line in range(n_lines):
+        doppler_offset = beamlets.doppler_ratio_offset[footprint_row, line]
         range_offset = (
-            point[0] * footprint[0, footprint_row, line]
-            - range_per_doppler * footprint[1, footprint_row, line]
+            beat.range * beamlets.relative_range_offset[footprint_row, line]
+            - range_per_doppler * doppler_offset
+        )
+        doppler_path = (1.0 + beat.doppler_ratio) * range_offset + (
+            range_0 + range_offset
+        ) * doppler_offset
+        beat_offset = beat.carrier * doppler_offset - hertz_per_metre * doppler_path
+        frequency = centre_frequency + beat_offset
+        lines.position[line] = centre_offset + beat_offset * bins_per_hertz
+        inverse_gain_re[line] = 1.0 - frequency * frequency * pole_product
+        inverse_gain_im[line] = frequency * pole_sum
+    if layout.adds_powers:
+        for line in range(n_lines):
+            gain_re, gain_im = inverse_gain_re[line], inverse_gain_im[line]
+            weight = 0.5 * beat.amplitude * beamlets.relative_amplitude[footprint_row, line]
+            lines.re[line] = weight * weight / (gain_re * gain_re + gain_im * gain_im)
+            lines.im[line] = 0.0
+        return origin_bin
+    half_chirp_rate, cycles_per_bin = 0.5 * beat.chirp_rate, beat.record_start / bins_per_hertz
+    for line in range(n_lines):  # phases in the middle of the record [cycles], stored in lines.re
+        range_offset = (
+            beat.range * beamlets.relative_range_offset[footprint_row, line]
+            - range_per_doppler * beamlets.doppler_ratio_offset[footprint_row, line]
         )
         delay = (range_0 + range_offset) * (2.0 / SPEED_OF_LIGHT)
         phase = axis_phase - product_cycle_fraction(
             cycles_per_metre_high, cycles_per_metre_low, range_offset
         )
         phase += fraction_of_cycle(half_chirp_rate * delay * delay)
-        scratch[RE, line] = (
+        lines.re[line] = (
             phase
-            + (scratch[PLACE, line] - centre_offset) * cycles_per_bin
-            + half_record_ratio * scratch[PLACE, line]
+            + (lines.position[line] - centre_offset) * cycles_per_bin
+            + half_record_ratio * lines.position[line]
         )
-    if footprint.shape[0] > 3:
+    if beamlets.phase_cycles.shape[0] > 0:
         for line in range(n_lines):
-            scratch[RE, line] += footprint[3 + segment, footprint_row, line]
+            lines.re[line] += beamlets.phase_cycles[segment, footprint_row, line]
     for line in range(n_lines):
-        sine, cosine = sincos_cycles(scratch[RE, line] + origin_phase)
-        gain_re, gain_im = scratch[X, line], scratch[BLOCK, line]
+        sine, cosine = sincos_cycles(lines.re[line] + origin_phase)
+        gain_re, gain_im = inverse_gain_re[line], inverse_gain_im[line]
         weight = (
             0.5
-            * beat_scale
-            * footprint[2, footprint_row, line]
+            * beat.amplitude
+            * beamlets.relative_amplitude[footprint_row, line]
             / (gain_re * gain_re + gain_im * gain_im)
         )
-        scratch[RE, line] = weight * (cosine * gain_re + sine * gain_im)
-        scratch[IM, line] = weight * (sine * gain_re - cosine * gain_im)
+        lines.re[line] = weight * (cosine * gain_re + sine * gain_im)
+        lines.im[line] = weight * (sine * gain_re - cosine * gain_im)
     return origin_bin
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def add_image_lines(scratch, n_lines, origin_bin, image_gain, adds_powers):
-    """Add the lines' images at negative frequencies, times ``image_gain``. Return the new count."""
+def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
+    """Append the images of lines at the opposite frequencies; return the number of all lines.
+
+    ``image_gain`` is the amplitude of an image over that of its line.
+    """
     for line in range(n_lines):
-        scratch[PLACE, n_lines + line] = -2.0 * origin_bin - scratch[PLACE, line]
-        scratch[RE, n_lines + line] = scratch[RE, line] * (
+        lines.position[n_lines + line] = -2.0 * origin_bin - lines.position[line]
+        lines.re[n_lines + line] = lines.re[line] * (
             image_gain * image_gain if adds_powers else image_gain
         )
-        scratch[IM, n_lines + line] = -scratch[IM, line] * image_gain
+        lines.im[n_lines + line] = -lines.im[line] * image_gain
     return 2 * n_lines
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def fold_lines(scratch, n_lines, layout):
-    """Move n lines by whole FFT lengths to within half of one from the origin."""
+def fold_lines(lines, n_lines, layout):
+    """Shift lines by whole FFT lengths to positions within N/2 bins of the origin."""
     for line in range(n_lines):
-        n_folds = math.floor(scratch[PLACE, line] / layout[0] + 0.5)
-        scratch[PLACE, line] -= n_folds * layout[0]
-        if n_folds & 1 and layout[1] & 1 and not layout[4]:  # phases count from the record's middle
-            scratch[RE, line], scratch[IM, line] = -scratch[RE, line], -scratch[IM, line]
+        n_folds = math.floor(lines.position[line] / layout.fft_size + 0.5)
+        lines.position[line] -= n_folds * layout.fft_size
+        # Phases count from the middle of the record.
+        if n_folds & 1 and layout.record_length & 1 and not layout.adds_powers:
+            lines.re[line], lines.im[line] = -lines.re[line], -lines.im[line]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def summarise_lines(scratch, n_lines, adds_powers):
-    """Sum of n lines' magnitudes, or a little more, and of their squares; the ends of their places.
+def summarise_lines(lines, n_lines, adds_powers, batch):
+    """Compute the :class:`LineSummary` of lines.
 
-    Of amplitudes the sum is root n times the root of their squares, of powers their own.
+    If amplitudes add, ``magnitude_sum`` is its upper bound by Cauchy and Schwarz,
+    sqrt(n sum |C_b|^2). ``batch`` is the scratch array of :class:`LineScratch`.
     """
-    lowest_position, highest_position, magnitude_sum, power_sum = (
-        scratch[PLACE, 0],
-        scratch[PLACE, 0],
-        0.0,
-        0.0,
-    )
+    lowest_position, highest_position = lines.position[0], lines.position[0]
+    magnitude_sum, power_sum = 0.0, 0.0
     for start in range(0, n_lines, LINES_PER_BATCH):
         n_batch = min(LINES_PER_BATCH, n_lines - start)
         for i in range(n_batch):
-            re, im = scratch[RE, start + i], scratch[IM, start + i]
-            scratch[BLOCK, _X + i], scratch[BLOCK, _RE + i] = (
-                scratch[PLACE, start + i],
-                re * re + im * im,
-            )
-            scratch[BLOCK, _IM + i] = abs(re) + abs(im)
+            re, im = lines.re[start + i], lines.im[start + i]
+            batch[_X + i], batch[_RE + i] = lines.position[start + i], re * re + im * im
+            batch[_IM + i] = abs(re) + abs(im)
         for i in range(n_batch, LINES_PER_BATCH):
-            scratch[BLOCK, _X + i] = scratch[PLACE, start]
-            scratch[BLOCK, _RE + i], scratch[BLOCK, _IM + i] = 0.0, 0.0
-        for i in range(8):  # eight side by side, in an order that no machine changes
+            batch[_X + i] = lines.position[start]
+            batch[_RE + i], batch[_IM + i] = 0.0, 0.0
+        for i in range(N_SUM_LANES):
             a, b = 0.0, 0.0
-            for k in range(LINES_PER_BATCH // 8):
-                a += scratch[BLOCK, _IM + 8 * k + i]
-                b += scratch[BLOCK, _RE + 8 * k + i]
-            scratch[BLOCK, _LANES + i], scratch[BLOCK, _LANES + 8 + i] = a, b
-        for i in range(8):
-            magnitude_sum += scratch[BLOCK, _LANES + i]
-            power_sum += scratch[BLOCK, _LANES + 8 + i]
-        for i in range(8):
-            c, d = scratch[BLOCK, _X + i], scratch[BLOCK, _X + i]
-            for k in range(LINES_PER_BATCH // 8):
-                c = min(c, scratch[BLOCK, _X + 8 * k + i])
-                d = max(d, scratch[BLOCK, _X + 8 * k + i])
-            scratch[BLOCK, _LANES + 16 + i], scratch[BLOCK, _LANES + 24 + i] = c, d
-        for i in range(8):
-            lowest_position = min(lowest_position, scratch[BLOCK, _LANES + 16 + i])
-            highest_position = max(highest_position, scratch[BLOCK, _LANES + 24 + i])
-    if not adds_powers and power_sum > 1e-250:  # else too small to be squared
+            for k in range(LINES_PER_BATCH // N_SUM_LANES):
+                a += batch[_IM + N_SUM_LANES * k + i]
+                b += batch[_RE + N_SUM_LANES * k + i]
+            batch[_LANES + i], batch[_LANES + N_SUM_LANES + i] = a, b
+        for i in range(N_SUM_LANES):
+            magnitude_sum += batch[_LANES + i]
+            power_sum += batch[_LANES + N_SUM_LANES + i]
+        for i in range(N_SUM_LANES):
+            c, d = batch[_X + i], batch[_X + i]
+            for k in range(LINES_PER_BATCH // N_SUM_LANES):
+                c = min(c, batch[_X + N_SUM_LANES * k + i])
+                d = max(d, batch[_X + N_SUM_LANES * k + i])
+            batch[_LANES + 2 * N_SUM_LANES + i], batch[_LANES + 3 * N_SUM_LANES + i] = c, d
+        for i in range(N_SUM_LANES):
+            lowest_position = min(lowest_position, batch[_LANES + 2 * N_SUM_LANES + i])
+            highest_position = max(highest_position, batch[_LANES + 3 * N_SUM_LANES + i])
+    if not adds_powers and power_sum > 1e-250:  # smaller sums lose their digits when squared
         magnitude_sum = math.sqrt(n_lines * power_sum)
-    return magnitude_sum, power_sum, lowest_position, highest_position
+    return LineSummary(magnitude_sum, power_sum, lowest_position, highest_position)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def allowed_relative_error(
-    magnitude_sum, power_sum, n_lines, adds_powers, window_sum, bin_error_allowed, threshold
-):
-    """Error that few lines for n may make, over what the peak of all of them may come to.
+def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_allowed, threshold):
+    """Return the error that equivalent lines may make, relative to the largest possible peak.
 
-    Of powers the peak is at most the root of n times their squares, some 1.3 times the sum of a
-    beam's profile. Amplitudes add as their phases have it: three times the root of their squares
-    is exceeded by one random sum of 10^4, and lines in phase stay within a tenth of their sum.
+    Parameters
+    ----------
+    summary
+        :class:`LineSummary` of the lines.
+    n_lines
+        Number n of lines.
+    adds_powers
+        True if powers of lines add, False if amplitudes do.
+    window_sum
+        Sum of the window's samples.
+    bin_error_allowed
+        Error allowed of |X| in a bin [V, summed over the record].
+    threshold
+        Threshold on |X| [V, summed over the record].
 
-    ``magnitude_sum`` and ``power_sum`` are of :func:`summarise_lines`; ``bin_error_allowed`` is the
-    error of a bin, ``threshold``
-    the threshold. Powers of bins at the threshold, or of half the largest there can be where that
-    is less, are as far off as makes this much of the bin. Those of larger bins may be further off,
-    and in smaller ones nothing is decided.
+    Notes
+    -----
+    If powers add, the peak is at most sqrt(n sum |C_b|^4), which is about 1.3 times the sum of
+    |C_b|^2 over the profile of a beam. If amplitudes add, the peak depends on their phases.
+    3 sqrt(sum |C_b|^2) is exceeded by one of 10^4 random sums, and lines in phase exceed a tenth of
+    their sum.
+
+    If powers add, the error of |X|^2 follows from that of |X| in a bin at the threshold, or at half
+    the largest possible |X| if that is less. Larger bins may have larger errors, and smaller bins
+    decide nothing.
     """
     root_n_lines = math.sqrt(n_lines)
-    line_sum = magnitude_sum
-    if power_sum > 1e-250:  # else too small to be squared
+    line_sum = summary.magnitude_sum
+    if summary.power_sum > 1e-250:  # smaller sums lose their digits when squared
         growth = root_n_lines if adds_powers else min(root_n_lines, max(3.0, 0.1 * root_n_lines))
-        line_sum = math.sqrt(power_sum) * growth
+        line_sum = math.sqrt(summary.power_sum) * growth
     if not adds_powers:
         return bin_error_allowed / max(window_sum * line_sum, 1e-300)
     peak_power = max(window_sum * window_sum * line_sum, 1e-300)
@@ -289,10 +546,11 @@ def allowed_relative_error(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def count_nodes(phase_span, tolerance, phase_limits):
-    """Nodes that serve lines within +-``phase_span`` radians of the band, or one more than any.
+    """Return the number of nodes that represent lines within a phase span to a tolerance.
 
-    ``phase_limits`` are :func:`node_phase_limits`; the least tolerance is taken where all are
-    larger.
+    ``phase_span`` is pi h [rad] of lines within +-h bins. ``phase_limits`` is the table of
+    :func:`node_phase_limits`; if all its tolerances are larger than ``tolerance``, its smallest one
+    is used. If no number of nodes is sufficient, the result is NODES_MAX + 1.
     """
     limit_row = phase_limits.shape[0] - 1
     while limit_row > 0 and phase_limits[limit_row, 0] > tolerance:
@@ -304,84 +562,96 @@ def count_nodes(phase_span, tolerance, phase_limits):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def replace_lines_by_nodes(
-    scratch, re_row, im_row, n_lines, n_nodes, middle_and_half_width, out_re, out_im
-):
-    """Move n weights onto Chebyshev nodes of an interval, if these are fewer.
+def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch, nodes):
+    """Replace lines by equivalent lines at Chebyshev nodes, if these are fewer.
 
-    Places are in row PLACE, weights in rows ``re_row`` and ``im_row``; the nodes' go to row X,
-    ``out_re`` and ``out_im``. Returns the number of nodes, or n with the weights themselves.
+    Parameters
+    ----------
+    lines
+        :class:`LineArrays` with ``n_lines`` lines.
+    n_nodes
+        Number of nodes; with ``n_lines`` or more, or more than NODES_MAX, lines are copied as they
+        are.
+    middle, half_width
+        Middle and half-width of the interval that contains the lines [bins].
+    scratch
+        :class:`LineScratch`.
+    nodes
+        Result, :class:`LineArrays`.
+
+    Returns
+    -------
+    n_nodes
+        Number of lines in ``nodes``.
     """
     if n_nodes >= n_lines or n_nodes > NODES_MAX:
         for line in range(n_lines):
-            scratch[X, line] = scratch[PLACE, line]
-            scratch[out_re, line], scratch[out_im, line] = (
-                scratch[re_row, line],
-                scratch[im_row, line],
-            )
+            nodes.position[line] = lines.position[line]
+            nodes.re[line], nodes.im[line] = lines.re[line], lines.im[line]
         return n_lines
-    middle, half_width = middle_and_half_width
+    batch = scratch.batch
     inverse_half_width = 1.0 / half_width if half_width > 0.0 else 0.0
     for j in range(n_nodes + 1):
-        scratch[MOMENT_RE, j], scratch[MOMENT_IM, j] = 0.0, 0.0
+        scratch.moment_re[j], scratch.moment_im[j] = 0.0, 0.0
     for start in range(0, n_lines, LINES_PER_BATCH):
         n_batch = min(LINES_PER_BATCH, n_lines - start)
         for i in range(n_batch):
-            scratch[BLOCK, _X + i] = (scratch[PLACE, start + i] - middle) * inverse_half_width
-            scratch[BLOCK, _RE + i] = scratch[re_row, start + i]
-            scratch[BLOCK, _IM + i] = scratch[im_row, start + i]
+            batch[_X + i] = (lines.position[start + i] - middle) * inverse_half_width
+            batch[_RE + i] = lines.re[start + i]
+            batch[_IM + i] = lines.im[start + i]
         for i in range(n_batch, LINES_PER_BATCH):
-            scratch[BLOCK, _X + i], scratch[BLOCK, _RE + i], scratch[BLOCK, _IM + i] = 0.0, 0.0, 0.0
+            batch[_X + i], batch[_RE + i], batch[_IM + i] = 0.0, 0.0, 0.0
         _add_chebyshev_moments(scratch, n_nodes)
     for i in range(n_nodes):
-        scratch[BLOCK, _X + i] = CHEBYSHEV_NODES[n_nodes, i]
-        scratch[BLOCK, _EVEN + i], scratch[BLOCK, _ODD + i] = 1.0, CHEBYSHEV_NODES[n_nodes, i]
-        scratch[BLOCK, _RE + i], scratch[BLOCK, _IM + i] = 0.0, 0.0
+        batch[_X + i] = CHEBYSHEV_NODES[n_nodes, i]
+        batch[_EVEN + i], batch[_ODD + i] = 1.0, CHEBYSHEV_NODES[n_nodes, i]
+        batch[_RE + i], batch[_IM + i] = 0.0, 0.0
     for j in range(n_nodes):
         factor = (1.0 if j == 0 else 2.0) / n_nodes
-        moment_re, moment_im = factor * scratch[MOMENT_RE, j], factor * scratch[MOMENT_IM, j]
+        moment_re, moment_im = factor * scratch.moment_re[j], factor * scratch.moment_im[j]
         for i in range(n_nodes):
-            polynomial, next_polynomial = scratch[BLOCK, _EVEN + i], scratch[BLOCK, _ODD + i]
-            scratch[BLOCK, _RE + i] += polynomial * moment_re
-            scratch[BLOCK, _IM + i] += polynomial * moment_im
-            scratch[BLOCK, _EVEN + i] = next_polynomial
-            scratch[BLOCK, _ODD + i] = 2.0 * scratch[BLOCK, _X + i] * next_polynomial - polynomial
+            polynomial, next_polynomial = batch[_EVEN + i], batch[_ODD + i]
+            batch[_RE + i] += polynomial * moment_re
+            batch[_IM + i] += polynomial * moment_im
+            batch[_EVEN + i] = next_polynomial
+            batch[_ODD + i] = 2.0 * batch[_X + i] * next_polynomial - polynomial
     for i in range(n_nodes):
-        scratch[X, i] = middle + half_width * scratch[BLOCK, _X + i]
-        scratch[out_re, i], scratch[out_im, i] = scratch[BLOCK, _RE + i], scratch[BLOCK, _IM + i]
+        nodes.position[i] = middle + half_width * batch[_X + i]
+        nodes.re[i], nodes.im[i] = batch[_RE + i], batch[_IM + i]
     return n_nodes
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _add_chebyshev_moments(scratch, n_nodes):
-    """Add sums over a block of lines of their weights times T_0(x) .. T_nodes(x)."""
+    """Add the moments sum_b C_b T_j(x_b), j = 0 .. n_nodes, of one batch of lines."""
+    batch = scratch.batch
     for i in range(LINES_PER_BATCH):
-        scratch[BLOCK, _EVEN + i] = 1.0
-        scratch[BLOCK, _ODD + i] = scratch[BLOCK, _X + i]
+        batch[_EVEN + i] = 1.0
+        batch[_ODD + i] = batch[_X + i]
     for j in range(0, n_nodes, 2):
-        for i in range(8):  # eight sums side by side, in an order that no machine changes
+        for i in range(N_SUM_LANES):
             a, b, c, d = 0.0, 0.0, 0.0, 0.0
-            for k in range(LINES_PER_BATCH // 8):
-                re, im = scratch[BLOCK, _RE + 8 * k + i], scratch[BLOCK, _IM + 8 * k + i]
-                even, odd = scratch[BLOCK, _EVEN + 8 * k + i], scratch[BLOCK, _ODD + 8 * k + i]
+            for k in range(LINES_PER_BATCH // N_SUM_LANES):
+                re, im = batch[_RE + N_SUM_LANES * k + i], batch[_IM + N_SUM_LANES * k + i]
+                even, odd = batch[_EVEN + N_SUM_LANES * k + i], batch[_ODD + N_SUM_LANES * k + i]
                 a += re * even
                 b += re * odd
                 c += im * even
                 d += im * odd
-            scratch[BLOCK, _LANES + i], scratch[BLOCK, _LANES + 8 + i] = a, b
-            scratch[BLOCK, _LANES + 16 + i], scratch[BLOCK, _LANES + 24 + i] = c, d
+            batch[_LANES + i], batch[_LANES + N_SUM_LANES + i] = a, b
+            batch[_LANES + 2 * N_SUM_LANES + i], batch[_LANES + 3 * N_SUM_LANES + i] = c, d
         a, b, c, d = 0.0, 0.0, 0.0, 0.0
-        for i in range(8):
-            a += scratch[BLOCK, _LANES + i]
-            b += scratch[BLOCK, _LANES + 8 + i]
-            c += scratch[BLOCK, _LANES + 16 + i]
-            d += scratch[BLOCK, _LANES + 24 + i]
-        scratch[MOMENT_RE, j] += a
-        scratch[MOMENT_RE, j + 1] += b
-        scratch[MOMENT_IM, j] += c
-        scratch[MOMENT_IM, j + 1] += d
+        for i in range(N_SUM_LANES):
+            a += batch[_LANES + i]
+            b += batch[_LANES + N_SUM_LANES + i]
+            c += batch[_LANES + 2 * N_SUM_LANES + i]
+            d += batch[_LANES + 3 * N_SUM_LANES + i]
+        scratch.moment_re[j] += a
+        scratch.moment_re[j + 1] += b
+        scratch.moment_im[j] += c
+        scratch.moment_im[j + 1] += d
         for i in range(LINES_PER_BATCH):
-            twice = 2.0 * scratch[BLOCK, _X + i]
-            even = twice * scratch[BLOCK, _ODD + i] - scratch[BLOCK, _EVEN + i]
-            scratch[BLOCK, _EVEN + i] = even
-            scratch[BLOCK, _ODD + i] = twice * even - scratch[BLOCK, _ODD + i]
+            twice = 2.0 * batch[_X + i]
+            even = twice * batch[_ODD + i] - batch[_EVEN + i]
+            batch[_EVEN + i] = even
+            batch[_ODD + i] = twice * even - batch[_ODD + i]

@@ -1,4 +1,6 @@
-"""Spectra by an FFT on an oversampled grid of frequencies, as in the thesis; not used by studies.
+"""Spectra by an FFT on an oversampled grid of frequencies, as in the thesis.
+
+Studies do not use them.
 
 `sweep accuracy` compares its time and error with those of the closed form
 (:mod:`sweep.model.spectrum.segment_spectra`).
@@ -15,6 +17,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
@@ -25,13 +28,15 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.echo_detection import detect_in_spectra
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.lines import (
-    BLOCK,
-    IM,
-    PLACE,
-    RE,
+    LineArrays,
+    SpectrumLayout,
     add_image_lines,
+    beamlet_arrays,
+    beat_parameters_at,
     compute_lines,
     fold_lines,
+    point_parameters,
+    segment_parameters,
 )
 
 CELLS_PER_BIN = 16
@@ -45,6 +50,26 @@ CLEARANCE_BINS = 16
 
 _SPECTRA_PER_TRANSFORM = 32
 """Number of spectra per call of the FFT: as many as the processor's cache holds."""
+
+
+class GridOptions(NamedTuple):
+    """Options of the transform, as of :func:`find_peaks_on_grid`."""
+
+    degree: int
+    """Degree of the polynomial that spreads each line over cells."""
+    real: bool
+    """True to transform powers as real numbers, if the powers of the lines add."""
+    folded: bool
+    """True to transform back to the bins alone, not to all cells."""
+
+
+class GridSpectra(NamedTuple):
+    """Spectra of m points around their lines, without noise."""
+
+    first_bin: np.ndarray
+    """(m,): first bin of each spectrum."""
+    magnitude: np.ndarray
+    """(m, cells / CELLS_PER_BIN): |X| [V, summed over the record]."""
 
 
 def find_peaks_on_grid(
@@ -83,7 +108,7 @@ def find_peaks_on_grid(
     point_table, n_cells_of_point, grid_options = (
         shots.point_parameter_table(),
         cells_per_point(shots, size),
-        (degree, real, folded),
+        GridOptions(degree, real, folded),
     )
     segments = np.flatnonzero(shots.has_segment).tolist()
     for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
@@ -91,21 +116,18 @@ def find_peaks_on_grid(
         for points in np.split(
             members, range(_SPECTRA_PER_TRANSFORM, members.size, _SPECTRA_PER_TRANSFORM)
         ):
-            first_bin, magnitude = grid_magnitudes(
-                shots, point_table, points, segment, cells, grid_options
-            )
+            spectra = grid_magnitudes(shots, point_table, points, segment, cells, grid_options)
             detections = detect_in_spectra(
-                magnitude,
-                first_bin,
+                spectra.magnitude,
+                spectra.first_bin,
                 shots.fft_size // 2,
                 1.0 / shots.fft_size,
                 shots.detection_rule,
                 shots.bin_thresholds.select(points),
                 shots.speckle_table.select(segment, points),
             )
-            detections.frequency[:] *= point_table[6, points]
-            peak_rows = np.array(detections)
-            peaks[segment][:, points] = peak_rows
+            detections.frequency[:] *= np.broadcast_to(shots.sample_rate, shots.size)[points]
+            peaks[segment][:, points] = np.array(detections)
     return peaks
 
 
@@ -131,9 +153,9 @@ def grid_magnitudes(
     points: np.ndarray,
     segment: int,
     n_cells: int,
-    grid_options: tuple[int, bool, bool],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return |X| of m points' spectra around their lines in a segment, without noise.
+    grid_options: GridOptions,
+) -> GridSpectra:
+    """Return the spectra of one segment of m points around their lines, without noise.
 
     Parameters
     ----------
@@ -144,12 +166,7 @@ def grid_magnitudes(
     segment
         Index of the segment: 0 up, 1 Doppler, 2 down.
     grid_options
-        `degree`, `real` and `folded` of :func:`find_peaks_on_grid`.
-
-    Returns
-    -------
-    first_bin, magnitude
-        First bin of each spectrum (m,), and |X| (m, n_cells / CELLS_PER_BIN) from there on.
+        Options of :func:`find_peaks_on_grid`.
     """
     degree, real, folded = grid_options
     adds_powers, record_length = shots.adds_powers, shots.window.length
@@ -157,11 +174,21 @@ def grid_magnitudes(
     grid = np.zeros((points.size, n_cells), float if real else complex)
     centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
     _deposit_lines(
-        np.ascontiguousarray(point_table[:, points]),
+        points,
+        point_parameters(point_table),
+        segment_parameters(point_table),
         shots.footprint_row[points],
-        shots.beamlet_table,
+        beamlet_arrays(shots.beamlet_table),
         segment,
-        np.array([shots.fft_size, record_length, 0, 0, adds_powers, 0]),
+        SpectrumLayout(
+            fft_size=shots.fft_size,
+            record_length=record_length,
+            table_bins=0,
+            cells_per_bin=0,
+            adds_powers=adds_powers,
+            holds_all_bins=False,
+            clearance_bins=0,
+        ),
         shots.sums_images,
         np.array(
             [
@@ -176,9 +203,9 @@ def grid_magnitudes(
         shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, real
     )
     convolved = _convolve_with_window(grid, window_transform, real, folded)
-    # Rounding takes a sum of squares that is all but nothing below it.
+    # Rounding may make a small sum of squares negative.
     magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if adds_powers else np.abs(convolved)
-    return centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude
+    return GridSpectra(centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude)
 
 
 def _convolve_with_window(
@@ -230,48 +257,82 @@ def _window_transform(
 
 @njit(cache=True, error_model="numpy")
 def _deposit_lines(
-    point_table, footprint_row, footprint, segment, sizes, image, node_weights, centre_bin, grid
+    points,
+    parameters,
+    parameters_by_segment,
+    footprint_row,
+    beamlets,
+    segment,
+    layout,
+    image,
+    node_weights,
+    centre_bin,
+    grid,
 ):
-    """Add the lines of m points to their grids (m, cells, 2 or 1): amplitudes or powers.
+    """Add the lines of m points to their grids: amplitudes or powers.
 
-    Each line is shared among `node_weights.size` cells. Lines are at bins 0 .. N/2. If `image`, the
-    images of the lines about DC or Nyquist, whichever is nearer, are added too. `centre_bin` (m,)
-    receives the bin in the middle of each grid.
+    Parameters
+    ----------
+    points
+        (m,): indices of the points.
+    parameters, parameters_by_segment
+        :class:`sweep.model.spectrum.lines.PointParameters` and
+        :class:`sweep.model.spectrum.lines.SegmentParameters` of all points.
+    footprint_row
+        (m,): row of each point's footprint in ``beamlets``.
+    beamlets
+        :class:`sweep.model.spectrum.lines.BeamletArrays`.
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    layout
+        :class:`sweep.model.spectrum.lines.SpectrumLayout`.
+    image
+        True to add the images of the lines about DC or Nyquist, whichever is nearer.
+    node_weights
+        Weights of Lagrange interpolation among the cells over which each line is spread; of size 1
+        if a line goes into the nearest cell.
+    centre_bin
+        (m,): result, bin in the middle of each grid, 0 .. N/2.
+    grid
+        (m, cells, 2 or 1): result, real and imaginary parts, or powers.
     """
-    n_beamlets, n_cells = footprint.shape[2], grid.shape[1]
+    n_beamlets, n_cells = beamlets.relative_range_offset.shape[1], grid.shape[1]
     n_lines = 2 * n_beamlets if image else n_beamlets
-    line_scratch, cell_weights = np.empty((BLOCK + 1, n_lines)), np.empty(node_weights.size)
+    lines = LineArrays(np.empty(n_lines), np.empty(n_lines), np.empty(n_lines))
+    inverse_gain_re, inverse_gain_im = np.empty(n_beamlets), np.empty(n_beamlets)
+    images = LineArrays(lines.position[n_beamlets:], lines.re[n_beamlets:], lines.im[n_beamlets:])
+    cell_weights = np.empty(node_weights.size)
     lowest_cell, highest_cell = (
         (-0.5, n_cells - 1.0) if node_weights.size == 1 else (5.0, n_cells - 6.0)
     )
-    for point in range(footprint_row.size):
+    for i in range(points.size):
         signed_centre_bin = compute_lines(
-            point_table[:, point].copy(),
+            beat_parameters_at(parameters, parameters_by_segment, segment, points[i]),
             segment,
-            footprint,
-            footprint_row[point],
-            sizes,
-            line_scratch,
+            beamlets,
+            footprint_row[i],
+            layout,
+            lines,
+            inverse_gain_re,
+            inverse_gain_im,
         )
-        centre_bin[point] = abs(signed_centre_bin)
+        centre_bin[i] = abs(signed_centre_bin)
         if signed_centre_bin < 0:
             for beamlet in range(n_beamlets):
-                line_scratch[PLACE, beamlet], line_scratch[IM, beamlet] = (
-                    -line_scratch[PLACE, beamlet],
-                    -line_scratch[IM, beamlet],
-                )
+                lines.position[beamlet] = -lines.position[beamlet]
+                lines.im[beamlet] = -lines.im[beamlet]
         if image:
-            add_image_lines(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
-            fold_lines(line_scratch[:, n_beamlets:], n_beamlets, sizes)
+            add_image_lines(lines, n_beamlets, centre_bin[i], 1.0, layout.adds_powers)
+            fold_lines(images, n_beamlets, layout)
         for beamlet in range(n_beamlets):
             for line in range(beamlet, n_lines, n_beamlets):
-                cell_position = n_cells // 2 + CELLS_PER_BIN * line_scratch[PLACE, line]
+                cell_position = n_cells // 2 + CELLS_PER_BIN * lines.position[line]
                 if lowest_cell < cell_position < highest_cell:
                     _deposit_line(
-                        grid[point],
+                        grid[i],
                         cell_position,
-                        line_scratch[RE, line],
-                        line_scratch[IM, line],
+                        lines.re[line],
+                        lines.im[line],
                         node_weights,
                         cell_weights,
                     )
@@ -279,7 +340,7 @@ def _deposit_lines(
 
 @njit(cache=True, error_model="numpy")
 def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
-    """Add a line to the nearest cell, or share it among ten by Lagrange interpolation."""
+    """Add a line to the nearest cell, or spread it over several by Lagrange interpolation."""
     first_cell = (
         int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
     )

@@ -1,14 +1,15 @@
-"""Bins into which the ranges and radial velocities of a search band put a beat.
+"""Bins in which targets of a search band, given by ranges and radial velocities, may appear.
 
-A target of the band, range R0 .. R1 as a segment starts and velocity v0 .. v1, has its beat
+A target of the band, of range R0 .. R1 at the start of a segment and velocity v0 .. v1, has a beat
 
     f_seg beta - s S (2 R / c) (1 + beta),    beta = 2 v / c
 
-(:mod:`sweep.model.waveform`) between the least and the largest at the band's four corners, as it is
-monotonic in R and in v. The bins searched are those nearest to all these beats; real records fold
-this interval, complex ones take it round the circle of signed bins (docs/physics.md, *Search
-band*). An echo is in the band where its strongest bin is, and is then detected by those of its bins
-that are searched. Else it is not detected, and what it shows in searched bins is leakage.
+(:mod:`sweep.model.waveform`). The beat is monotonic in R and in v, so it lies between the least and
+the largest beat at the four corners of the band. The bins nearest to all these beats are searched.
+Real records fold this interval, complex records wrap it around the circle of signed bins
+(docs/physics.md, *Search band*). An echo is in the band if its strongest bin is. It is then
+detected by those of its bins that are searched. Otherwise it is not detected, and its signal in
+searched bins is leakage.
 """
 
 from collections.abc import Mapping
@@ -24,11 +25,22 @@ from sweep.model.waveform import SEARCH_RANGE_PATHS, SEARCH_VELOCITY_PATHS
 def search_band_bins(
     parameters: Mapping[str, Any], n_points: int | None = None
 ) -> np.ndarray | None:
-    """First bin and number of bins that are searched, (3, 2, points) int64; None for all.
+    """Return the first bin and the number of bins that are searched, or None if all bins are.
 
-    By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1. Points
-    share their words and sizes, and have all or none of :data:`ENDS`. Without ``n_points``: (3, 2,
-    ...).
+    Parameters
+    ----------
+    parameters
+        Parameters by path. Points share their strings and FFT sizes, and have all or none of the
+        search band's limits.
+    n_points
+        Number of points to which the result is broadcast.
+
+    Returns
+    -------
+    numpy.ndarray
+        (3, 2, n_points) int64: by segment (up, Doppler, down), first bin and number of bins. Bins
+        are 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record. Without ``n_points``, the last
+        dimensions are those of the parameters.
     """
     if SEARCH_RANGE_PATHS[0] not in parameters:
         return None
@@ -60,7 +72,10 @@ def search_band_bins(
 def _nearest_bins(
     beat_min: np.ndarray, beat_max: np.ndarray, fft_size: int, is_signed: bool
 ) -> np.ndarray:
-    """First bin and number of bins, (2, ...), of beats from ``beat_min`` to ``beat_max`` [bins]."""
+    """Return the first bin and the number of bins nearest to beats in an interval, (2, ...).
+
+    The interval is ``beat_min`` to ``beat_max`` [bins]; ``is_signed`` is true for complex records.
+    """
     if is_signed:
         first_bin, last_bin = np.floor(beat_min + 0.5), np.floor(beat_max + 0.5)
         first_bin, n_bins = (
@@ -85,9 +100,10 @@ def _nearest_bins(
 def n_alarm_bins(
     band_bins: np.ndarray, fft_size: int, first_alarm_bin: int, *, is_signed: bool
 ) -> np.ndarray:
-    """Count the bins of a band (3, 2, ...) that may raise an alarm, (3, ...).
+    """Return the number of bins of a band that may raise a false alarm, (3, ...).
 
-    Of a real record those from ``first_alarm_bin`` on, counted from DC and from Nyquist.
+    ``band_bins`` (3, 2, ...) is that of :func:`search_band_bins`. In real records (not
+    ``is_signed``) bins nearer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
     """
     if is_signed:
         return band_bins[:, 1].astype(float)
@@ -99,7 +115,7 @@ def n_alarm_bins(
 
 
 def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.ndarray:
-    """Tell which bins of a segment of point i are searched."""
+    """Return true for those of ``bins`` that are searched in one segment of one point."""
     if shots.search_band is None:
         return np.ones(np.shape(bins), bool)
     first_bin, n_bins = shots.search_band[segment, :, point]

@@ -1,11 +1,10 @@
-"""Segments of shots: from lines to runs of bins, detections and leakage, point by point.
+"""Spectra of segments: spans of bins around the lines, detections and leakage, point by point.
 
-A run holds |X| without noise in every bin around a segment's lines that may matter. Whoever looks
-at spectra (detection, groups, draws, pictures) looks at runs.
+A span holds |X| without noise in all bins around a segment's lines that may matter. Detection,
+groups of bins, draws and pictures of spectra all use spans.
 """
 
 import math
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -27,8 +26,10 @@ from sweep.model.detection.detection_probability import (
 from sweep.model.detection.echo_detection import (
     BinThreshold,
     Detection,
+    DetectionRule,
     EchoBins,
     PedestalShape,
+    SpeckleTable,
     any_crossing_of_chain,
     bin_speckle_at,
     clear_image_exemptions,
@@ -45,123 +46,176 @@ from sweep.model.ground import distinct_rows
 from sweep.model.preparation import LINE_APPROXIMATIONS_MAX, Shots
 from sweep.model.spectrum import line_shape
 from sweep.model.spectrum.bin_spectrum import (
-    A_IM,
-    A_RE,
-    CHANCE,
-    COMPLEX_RECORD,
-    LINE_BATCH_CELLS_MAX,
-    N_SCRATCH_ROWS,
-    OUT,
-    REAL_WITH_IMAGES,
-    REAL_WITHOUT_IMAGES,
+    AveragingShifts,
+    LineBundle,
+    allocate_workspace,
     detect_in_span,
 )
 from sweep.model.spectrum.leakage import (
     GAUSS_POINTS_MAX,
     SPECKLE_POWER_MAX,
+    LeakageLimits,
     detect_with_leakage,
     leakage_of_bins,
     leakage_of_bins_in_speckle,
 )
-from sweep.model.spectrum.line_shape import LineShapeTables
+from sweep.model.spectrum.line_shape import LineShapeTables, ShapeModes
 from sweep.model.spectrum.lines import (
     AMPLITUDE_TOLERANCES,
-    IM,
+    COMPLEX_RECORD,
     NODES_MAX,
-    PLACE,
     POWER_TOLERANCES,
-    RE,
-    SCRATCH_WIDTH_MIN,
-    X,
+    REAL_WITH_IMAGES,
+    REAL_WITHOUT_IMAGES,
+    BeatParameters,
+    SpectrumLayout,
     add_image_lines,
     allowed_relative_error,
+    beamlet_arrays,
+    beat_parameters_at,
     compute_lines,
     count_nodes,
     fold_lines,
     node_phase_limits,
+    point_parameters,
     replace_lines_by_nodes,
+    segment_parameters,
     summarise_lines,
 )
 from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
 POINTS_PER_BATCH = 256
-"""Points that are prepared together; 16 times as many where few line shapes serve them all."""
+"""Number of points that are prepared together; 16 times as many if few line shapes serve them."""
 
 SPAN_BINS_PER_BATCH = 1 << 21
-"""Bins of runs that are kept at a time, at least."""
+"""Least number of bins of spans for which memory is allocated at a time."""
 
 THRESHOLD_RATIO_STEP = 1e-7
-"""Step to which thresholds [sigma] are rounded for rates of leakage in developed speckle."""
+"""Step [sigma] to which thresholds are rounded for rates of leakage in developed speckle."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
-"""Values found for each segment's spectrum."""
+"""Names of the values that :func:`evaluate_segments` returns for each segment's spectrum."""
 
 NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
-"""Ways to look at leakage: not at all; all bins, those far away as an integral; those of the run
-that stand above a floor."""
+"""Methods for leakage: none; all bins of the spectrum, with an integral over those far from the
+lines; the bins of the span that exceed a level."""
+
+
+SPAN_DOES_NOT_FIT = np.int64(-1)
+"""Result of :func:`_evaluate_segment` if a span does not fit."""
 
 
 class BinSpans(NamedTuple):
-    """Runs of bins around the lines of some points' segments, and what stands in them.
+    """Spans of bins around the lines of the segments of m points, and the echoes in them.
 
-    Arrays are (segments, m) for m points; count is 0 in segments that there are not.
+    Arrays are (segments, m) unless another shape is stated. Segments that do not exist have no
+    bins.
     """
 
     point_numbers: np.ndarray
-    """(m,): which points of the shots these are."""
+    """(m,): indices of the points in the shots."""
     first_bin: np.ndarray
-    """First bin; of complex records N more than its frequency says, or twice as many, so that no
-    bin of a run is below 0."""
+    """First bin of the span. In spectra of complex records it is N or 2 N larger than its frequency
+    says, so that no bin of a span is below 0."""
     n_bins: np.ndarray
-    """Bins in the run."""
+    """Number of bins in the span."""
     peak_index: np.ndarray
-    """Place of the largest bin in the run."""
+    """Index in the span of the largest bin."""
     n_exempt: np.ndarray
-    """Bins that can't raise a false alarm."""
+    """Number of bins that cannot raise a false alarm."""
     pd: np.ndarray
+    """Probability that the echo is detected."""
     miss: np.ndarray
+    """Probability that the echo is missed, 1 - pd with all its digits."""
     peak_magnitude: np.ndarray
-    """|X| of the largest bin."""
+    """|X| of the largest bin [V, summed over the record]."""
     leakage: np.ndarray
-    """Probability that leaked signal raises at least one extra group, over noise alone."""
+    """Probability that leaked signal raises at least one extra group of bins, over noise alone."""
     span_start: np.ndarray
-    """Begin of each run in the arrays that follow."""
+    """Index of the first bin of the span in ``magnitudes`` and ``is_exempt``."""
     magnitudes: np.ndarray
-    """|X| of all runs, one after the other."""
+    """(bins,): |X| of all spans, one after the other [V, summed over the record]."""
     is_exempt: np.ndarray
-    """Bins of them that can't raise a false alarm, bool."""
+    """(bins,) bool: true in bins of all spans that cannot raise a false alarm."""
     peak_is_searched: np.ndarray
-    """True where the largest bin of all is searched, bool; else it is in no run."""
+    """Bool: true if the largest bin of the echo is searched; else it is in no span."""
 
     def span_magnitudes(self, segment: int, column: int) -> np.ndarray:
-        """|X| of one run, (count,)."""
+        """Return |X| of the span of one segment of point ``point_numbers[column]``, (bins,)."""
         span_begin = self.span_start[segment, column]
         return self.magnitudes[span_begin : span_begin + self.n_bins[segment, column]]
 
 
+class SegmentSpectrum(NamedTuple):
+    """Bins of one segment's spectrum, and |X| there without noise."""
+
+    bins: np.ndarray
+    """(bins,): consecutive bin numbers. Those of a complex record continue past Nyquist;
+    :meth:`sweep.model.preparation.Shots.to_signed_bins` returns their frequencies."""
+    magnitude: np.ndarray
+    """(bins,): |X| [V, summed over the record]."""
+
+
 class ShapeGroup(NamedTuple):
-    """Points whose line shapes are made of the same modes."""
+    """Points whose line shapes are computed from the same tables."""
 
     point_numbers: np.ndarray
-    """(m,): which points."""
+    """(m,): indices of the points in the shots."""
     shape_index: np.ndarray
-    """(m,): shape of each."""
+    """(m,): index of each point's shape in ``modes``."""
     tables: LineShapeTables
-    line_shift: np.ndarray
-    """(segments, u): shift of the lines [bins of fs/L]."""
-    mode_coefficients: np.ndarray
-    """(segments, u, 2, k): real and imaginary parts."""
-    n_modes: np.ndarray
-    """(segments, u): modes that count."""
+    """Tables from which the shapes are computed."""
+    modes: ShapeModes
+    """Modes of the shapes' phase errors."""
     is_late: bool = False
-    """True where echoes have part of the record's samples."""
+    """True if some echoes have only part of the record's samples."""
+
+
+class DistinctShapes(NamedTuple):
+    """Points that represent all line shapes of a batch of points."""
+
+    point_numbers: np.ndarray
+    """(shapes,): indices in the shots of one point of each shape."""
+    shape_index: np.ndarray
+    """(m,): index of each point's shape."""
+
+
+class EvaluationSettings(NamedTuple):
+    """Settings of :func:`_evaluate_points` that all points share."""
+
+    segment_exists: np.ndarray
+    """(segments,) bool: existence of up, Doppler and down segment."""
+    leakage_methods: np.ndarray
+    """(segments,): NO_LEAKAGE, LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN."""
+    window_sum: float
+    """Sum of the window's samples."""
+    rule: DetectionRule
+    """Rule by which the bins of an echo detect it."""
+    speckle_table: SpeckleTable
+    """Speckle of all points."""
+    with_pd: bool
+    """True if probabilities of detection are computed; else they are nan."""
+    phase_limits: np.ndarray
+    """:func:`sweep.model.spectrum.lines.node_phase_limits` of the record's window."""
+    tangents: np.ndarray
+    """(N // 2 + 1,): :func:`bin_tangents`."""
 
 
 def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
-    """Evaluate each segment's spectrum: (3, fields, n) by segment and SEGMENT_FIELDS.
+    """Compute the detection and leakage in each segment's spectrum.
 
-    ``bin_by_bin``: look at each bin by itself where leakage could be summed as an integral.
+    Parameters
+    ----------
+    shots : Shots
+        n prepared shots.
+    bin_by_bin : bool
+        True to compute the leakage of each bin, even if an integral over bins is accurate.
+
+    Returns
+    -------
+    ndarray (3, fields, n)
+        Values by segment and by SEGMENT_FIELDS; nan for segments that do not exist.
     """
     results = np.full((3, len(SEGMENT_FIELDS), shots.size), np.nan)
     bin_width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
@@ -193,22 +247,46 @@ def iter_spans(
     ignores_band: bool = False,
     with_pd: bool = True,
 ) -> Iterator[BinSpans]:
-    """Yield runs of all points, or of those in ``points``, some points at a time, in any order.
+    """Yield the spans of all points, some points at a time, in any order.
 
-    Bins below ``level_min`` (n,) [V, summed over the record], by default the threshold, may be left
-    out. With ``bin_by_bin`` each bin is looked at by itself where leakage could be summed as an
-    integral; ``keeps_magnitudes`` hands magnitudes on; ``ignores_band`` has bins that are not
-    searched as well. Without ``with_pd`` the probabilities of a detection are nan.
+    Parameters
+    ----------
+    shots : Shots
+        n prepared shots.
+    points : ndarray (m,), optional
+        Indices of the points; by default all.
+    level_min : ndarray (n,), optional
+        |X| [V, summed over the record] below which bins may be left out; by default the threshold.
+    leakage : bool
+        True to compute leakage.
+    bin_by_bin : bool
+        True to compute the leakage of each bin, even if an integral over bins is accurate.
+    keeps_magnitudes : bool
+        False if magnitudes are not needed.
+    ignores_band : bool
+        True to include bins that are not searched.
+    with_pd : bool
+        False if probabilities of detection are not needed; they are then nan.
+
+    Yields
+    ------
+    BinSpans
+        Spans of some points.
     """
-    point_rows = shots.point_parameter_table()
+    point_table = shots.point_parameter_table()
+    parameters = point_parameters(point_table)
     # Else probabilities are set from the final spans.
     computes_pd_at_once = with_pd and pd_follows_from_computed_spans(shots)
-    point_levels = point_rows[11] if level_min is None else np.broadcast_to(level_min, shots.size)
+    point_levels = (
+        parameters.threshold if level_min is None else np.broadcast_to(level_min, shots.size)
+    )
     chosen_points = np.arange(shots.size) if points is None else points
     for group in _iter_shape_groups(shots, chosen_points):
         leakage_method = _leakage_method(shots, group, bin_by_bin) if leakage else NO_LEAKAGE
         negligible_magnitude = (
-            point_rows[12] * point_rows[10] if leakage_method == LEAKAGE_BIN_BY_BIN else np.inf
+            parameters.negligible_signal_ratio * parameters.noise_sigma
+            if leakage_method == LEAKAGE_BIN_BY_BIN
+            else np.inf
         )
         if shots.segment_correlations is not None:  # faint leakage of bright speckle counts
             negligible_magnitude = negligible_magnitude / math.sqrt(SPECKLE_POWER_MAX)
@@ -218,9 +296,9 @@ def iter_spans(
             must_keep |= (
                 shots.circulator_leak_amplitude is not None or shots.search_band is not None
             )
-            spans, n_computed = _evaluate_batch(
+            spans = _evaluate_batch(
                 shots,
-                point_rows,
+                point_table,
                 lowest_levels,
                 group,
                 leakage_method,
@@ -228,6 +306,7 @@ def iter_spans(
                 must_keep,
                 computes_pd_at_once,
             )
+            n_done += spans.point_numbers.size
             spans = (
                 spans
                 if ignores_band
@@ -240,11 +319,10 @@ def iter_spans(
             yield (
                 spans if shots.circulator_leak_amplitude is None else apply_leak_line(shots, spans)
             )
-            n_done += n_computed
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Empty the spans of segments whose echo has no sample in the record; nothing is searched."""
+    """Empty the spans of segments whose echo arrives after the record: nothing is searched."""
     if shots.n_samples_before_echo is None:
         return spans
     lacks_echo = (shots.n_samples_before_echo[:, spans.point_numbers] >= shots.window.length) & (
@@ -316,12 +394,13 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
     return spans._replace(leakage=leakage_in_looks)
 
 
-def segment_spectrum(shots: Shots, point: int, segment: int, *, level_min: float = 0.0) -> tuple:
-    """Bins of a segment in which the echo stands above a level, and |X| there, without noise.
+def segment_spectrum(
+    shots: Shots, point: int, segment: int, *, level_min: float = 0.0
+) -> SegmentSpectrum:
+    """Return the spectrum of one point's segment around its lines, without noise.
 
-    Bins rise from one to the next. Those of a complex record go on past Nyquist:
-    :meth:`sweep.model.preparation.Shots.to_signed_bins` tells their frequencies. Bins below the
-    level [V, summed over the record] may be left out; 0 gives all.
+    Bins whose |X| is below ``level_min`` [V, summed over the record] may be left out; 0 returns all
+    bins.
     """
     shots = replace(shots, circulator_leak_amplitude=None)
     (spans,) = iter_spans(
@@ -334,11 +413,11 @@ def segment_spectrum(shots: Shots, point: int, segment: int, *, level_min: float
     )
     first_bin = int(spans.first_bin[segment, 0])
     magnitude = spans.span_magnitudes(segment, 0).copy()
-    return np.arange(first_bin, first_bin + magnitude.size), magnitude
+    return SegmentSpectrum(np.arange(first_bin, first_bin + magnitude.size), magnitude)
 
 
 def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
-    """|X| of all bins of a segment without noise [V], (bins,), in the order of their frequencies.
+    """Return |X| of all bins of a segment without noise [V], (bins,), by rising frequency.
 
     Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
     """
@@ -349,7 +428,7 @@ def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
 
 
 def spectrum_type(shots: Shots) -> int:
-    """Return the view of a spectrum that shots have: FOLDED, IMAGED or COMPLEX."""
+    """Return the type of the shots' spectra, as in :class:`SpectrumLayout`."""
     return (
         COMPLEX_RECORD
         if shots.complex_record
@@ -360,14 +439,18 @@ def spectrum_type(shots: Shots) -> int:
 
 
 def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
-    tables = group.tables
+    """Return the method by which the leakage of a group is computed, such as NO_LEAKAGE.
+
+    ``bin_by_bin`` excludes LEAKAGE_BY_INTEGRAL.
+    """
+    layout = group.tables.layout
     if not shots.includes_leakage:
         return NO_LEAKAGE
     is_averaged = shots.gaussian_line_width is not None and not shots.adds_powers
     is_averaged |= (
         shots.looks.is_noncoherent or bin_by_bin or shots.search_band is not None or group.is_late
     )
-    is_smooth = tables.layout[0] == tables.layout[1] and not tables.layout[5]
+    is_smooth = layout.fft_size == layout.record_length and not layout.holds_all_bins
     if is_smooth and not is_averaged and spectrum_type(shots) != COMPLEX_RECORD:
         return LEAKAGE_BY_INTEGRAL
     return LEAKAGE_BIN_BY_BIN
@@ -389,13 +472,11 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
     if not shots.phase_errors:
         make_tables = line_shape.line_shape_tables if has_modes else _tables_without_phase_error
         tables = make_tables(window, fft_size, adds_powers, 0 if has_modes else segments)
-        mode_coefficients = np.zeros((segments, 1, 2, 1))
-        mode_coefficients[:, :, 0] = 1.0
-        n_modes = np.ones((segments, 1), np.int64)
-        line_shift = np.zeros((segments, 1))
+        modes = line_shape.zero_modes(segments, 1, 1)
+        modes.re[:], modes.n_modes[:] = 1.0, 1
         for batch_begin in range(0, points.size, batch_size):
             batch = points[batch_begin : batch_begin + batch_size]
-            yield ShapeGroup(batch, 0 * batch, tables, line_shift, mode_coefficients, n_modes)
+            yield ShapeGroup(batch, 0 * batch, tables, modes)
         return
     for batch_begin in range(0, points.size, batch_size):
         batch = points[batch_begin : batch_begin + batch_size]
@@ -406,18 +487,11 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
             phase = _phase_errors(
                 shots, distinct_points[remaining], line_shape.chebyshev_nodes(n_nodes)
             )
-            line_shift = np.zeros(phase.shape[:2])
-            n_modes = np.zeros(phase.shape[:2], np.int64)
-            mode_coefficients = np.zeros((*phase.shape[:2], 2, n_nodes // 2))
+            modes = line_shape.zero_modes(segments, phase.shape[1], n_nodes // 2)
             line_shape.decompose_phase_errors(
-                phase,
-                _NO_WEIGHT,
-                line_shape.chebyshev_coefficient_matrix(n_nodes),
-                line_shift,
-                mode_coefficients,
-                n_modes,
+                phase, _NO_WINDOW, line_shape.chebyshev_coefficient_matrix(n_nodes), modes
             )
-            is_resolved = (n_modes > 0).all(axis=0)
+            is_resolved = np.asarray((modes.n_modes > 0).all(axis=0))
             table_index = np.full(distinct_points.size, -1)
             table_index[remaining[is_resolved]] = np.arange(np.count_nonzero(is_resolved))
             members = table_index[shape_index] >= 0
@@ -428,14 +502,12 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
                     line_shape.line_shape_tables(
                         window, fft_size, adds_powers, tier, shared=shots.shares_phase_errors
                     ),
-                    line_shift[:, is_resolved],
-                    mode_coefficients[:, is_resolved],
-                    n_modes[:, is_resolved],
+                    modes.select(is_resolved),
                 )
             remaining = remaining[~is_resolved]
             if not remaining.size:
                 break
-        for distinct in remaining:  # tables of all bins, one after the other
+        for distinct in remaining:  # shapes whose tables hold all bins, one after the other
             record_positions = 2 * np.arange(window.length) / window.length - 1
             phase = _phase_errors(
                 shots, distinct_points[distinct : distinct + 1], record_positions
@@ -445,17 +517,26 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
                 members,
                 0 * members,
                 line_shape.full_line_shape_tables(window, fft_size, adds_powers, phase),
-                np.zeros((segments, 1)),
-                np.zeros((segments, 1, 2, 1)),
-                np.ones((segments, 1), np.int64),
+                _unused_modes(segments),
             )
 
 
-_NO_WEIGHT = np.empty((0, 0, 0))
+_NO_WINDOW = np.empty((0, 0, 0))
+"""Window values of modes that do not include the window."""
+
+
+def _unused_modes(segments: int) -> ShapeModes:
+    """Return the modes of a shape that is not a sum of modes: one of amplitude 0."""
+    modes = line_shape.zero_modes(segments, 1, 1)
+    modes.n_modes[:] = 1
+    return modes
 
 
 def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
-    """Yield groups of points whose echoes have part of the record's samples, in any order."""
+    """Yield groups of points with late echoes, in any order.
+
+    A late echo has only the last samples of the record of at least one segment.
+    """
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
     assert shots.n_samples_before_echo is not None
@@ -464,11 +545,8 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
     )
     if lacks_echo.any():
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
-        no_modes = np.zeros((segments, 1)), np.zeros((segments, 1, 2, 1))
         batch = points[lacks_echo]
-        yield ShapeGroup(
-            batch, 0 * batch, tables, *no_modes, np.ones((segments, 1), np.int64), True
-        )
+        yield ShapeGroup(batch, 0 * batch, tables, _unused_modes(segments), is_late=True)
         points = points[~lacks_echo]
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
         batch = points[batch_begin : batch_begin + POINTS_PER_BATCH]
@@ -490,18 +568,11 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                 window_values = line_shape.late_window_samples(
                     window, record_positions, echo_lengths[:, selected]
                 )
-                line_shift = np.zeros(phase.shape[:2])
-                n_modes = np.zeros(phase.shape[:2], np.int64)
-                mode_coefficients = np.zeros((*phase.shape[:2], 2, n_nodes // 2))
+                modes = line_shape.zero_modes(segments, phase.shape[1], n_nodes // 2)
                 line_shape.decompose_phase_errors(
-                    phase,
-                    window_values,
-                    line_shape.chebyshev_coefficient_matrix(n_nodes),
-                    line_shift,
-                    mode_coefficients,
-                    n_modes,
+                    phase, window_values, line_shape.chebyshev_coefficient_matrix(n_nodes), modes
                 )
-                is_resolved = (n_modes > 0).all(axis=0)
+                is_resolved = np.asarray((modes.n_modes > 0).all(axis=0))
                 table_index = np.full(distinct_points.size, -1)
                 table_index[selected[is_resolved]] = np.arange(np.count_nonzero(is_resolved))
                 is_remaining[selected[is_resolved]] = False
@@ -517,12 +588,10 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                         batch[members],
                         table_index[shape_index[members]],
                         tables,
-                        line_shift[:, is_resolved],
-                        mode_coefficients[:, is_resolved],
-                        n_modes[:, is_resolved],
+                        modes.select(is_resolved),
                     )
                     yield group._replace(is_late=True)
-        for distinct in np.flatnonzero(is_remaining):  # tables of all bins, one after the other
+        for distinct in np.flatnonzero(is_remaining):  # shapes whose tables hold all bins
             selected = batch[shape_index == distinct]
             first_sample = window.length - echo_lengths[:, distinct]
             phase = np.zeros((segments, window.length))
@@ -539,9 +608,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
                 line_shape.full_line_shape_tables(
                     window, fft_size, adds_powers, phase, first_sample
                 ),
-                np.zeros((segments, 1)),
-                np.zeros((segments, 1, 2, 1)),
-                np.ones((segments, 1), np.int64),
+                _unused_modes(segments),
                 is_late=True,
             )
 
@@ -550,7 +617,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
 def _tables_without_phase_error(
     window: Window, fft_size: int, adds_powers: bool, segments: int
 ) -> LineShapeTables:
-    """Tables of all bins of lines without a phase error."""
+    """Return the tables of shapes without a phase error, which hold all bins."""
     return line_shape.full_line_shape_tables(
         window, fft_size, adds_powers, np.zeros((segments, window.length))
     )
@@ -560,7 +627,7 @@ def _tables_without_phase_error(
 def _tables_without_echo(
     window: Window, fft_size: int, adds_powers: bool, segments: int
 ) -> LineShapeTables:
-    """Tables of all bins of echoes that have no sample of the record."""
+    """Return the tables of shapes of echoes that arrive after the record: all values are 0."""
     phase, first_sample = np.zeros((segments, window.length)), np.full(segments, window.length)
     return line_shape.full_line_shape_tables(window, fft_size, adds_powers, phase, first_sample)
 
@@ -569,25 +636,15 @@ def _sort_by_shape(
     points: np.ndarray,
     shape_index: np.ndarray,
     tables: LineShapeTables,
-    line_shift: np.ndarray,
-    mode_coefficients: np.ndarray,
-    n_modes: np.ndarray,
+    modes: ShapeModes,
 ) -> ShapeGroup:
-    """Points by their shapes, so that each of these is made once."""
+    """Sort the points of a group by their shapes, so that each shape is computed once."""
     order = np.argsort(shape_index, kind="stable")
-    mode_arrays = map(np.ascontiguousarray, (line_shift, mode_coefficients, n_modes))
-    return ShapeGroup(
-        points[order],
-        shape_index[order],
-        tables,
-        next(mode_arrays),
-        next(mode_arrays),
-        next(mode_arrays),
-    )
+    return ShapeGroup(points[order], shape_index[order], tables, modes)
 
 
-def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of which no two have the same line shapes; which of these each of some points has."""
+def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
+    """Find the distinct line shapes of a batch of points."""
     first_samples = (
         ()
         if shots.n_samples_before_echo is None
@@ -610,17 +667,18 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> tuple[np.ndarray, 
     )
     first_varying = next(varying, None)
     if first_varying is None:
-        return batch[:1], np.zeros(batch.size, np.int64)
+        return DistinctShapes(batch[:1], np.zeros(batch.size, np.int64))
     if not shots.shares_phase_errors:
-        return batch, np.arange(batch.size)
+        return DistinctShapes(batch, np.arange(batch.size))
     first_of_shape, shape_index = distinct_rows([first_varying, *varying])
-    return batch[first_of_shape], shape_index
+    return DistinctShapes(batch[first_of_shape], shape_index)
 
 
 def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray) -> np.ndarray:
-    """Phase errors [cycles] of points at places x of the record, (segments, points, places).
+    """Return the phase errors [cycles] of points at positions x of the record.
 
-    Of the part of it that the echo has, where it has not all.
+    (segments, points, positions). Positions -1 .. 1 cover the samples of the record that the echo
+    has.
     """
     phase = np.zeros((len(shots.waveform_segments), points.size, record_positions.size))
     for segment in np.flatnonzero(shots.has_segment):
@@ -634,88 +692,88 @@ def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray
 
 def _evaluate_batch(
     shots: Shots,
-    point_rows: np.ndarray,
+    point_table: np.ndarray,
     lowest_levels: np.ndarray,
     group: ShapeGroup,
     leakage_method: int,
     batch_begin: int,
     keeps_magnitudes: bool,
     with_pd: bool,
-) -> tuple[BinSpans, int]:
-    """Compute spans of as many points from ``batch_begin`` on as fit in. Return their number."""
-    points = group.point_numbers[batch_begin:]
+) -> BinSpans:
+    """Compute the spans of a group's points from number ``batch_begin`` on.
+
+    The result has as many points as fit into SPAN_BINS_PER_BATCH bins, at least one.
+    ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`;
+    ``lowest_levels`` (n,) is |X| [V] below which bins may be left out.
+    """
+    points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
-    spectrum_bins = shots.n_bins
     shifts = _averaging_shifts(shots, points)
-    n_lines_max = max(2 * shots.relative_range_offset.shape[1], NODES_MAX) * max(shifts.shape[3], 1)
-    scratch_width = (
-        max(
-            n_lines_max,
-            spectrum_bins,
-            2 * GAUSS_POINTS_MAX,
-            SCRATCH_WIDTH_MIN,
-            LINE_BATCH_CELLS_MAX,
-        )
-        + 16
+    n_lines_max = max(2 * shots.relative_range_offset.shape[1], NODES_MAX) * max(
+        shifts.offset.shape[2], 1
     )
-    n_kept = max(SPAN_BINS_PER_BATCH, segments * spectrum_bins) if keeps_magnitudes else 0
-    span_numbers = np.zeros((5, segments, n_points), np.int64)
-    span_values = np.full((4, segments, n_points), np.nan)
-    magnitudes, is_exempt = np.empty(n_kept), np.empty(n_kept, np.bool_)
-    tables = group.tables
-    table_size = line_shape.table_row_size(tables.layout)
-    outlines = np.zeros((segments, 7, tables.envelope_distances.shape[1]))
-    outlines[:, 0] = tables.envelope_distances[0]
-    rule = shots.detection_rule
+    width = max(n_lines_max, shots.n_bins, 2 * GAUSS_POINTS_MAX) + 16
+    n_kept = max(SPAN_BINS_PER_BATCH, segments * shots.n_bins) if keeps_magnitudes else 0
+    shape = segments, n_points
+    spans = BinSpans(
+        point_numbers=points,
+        first_bin=np.zeros(shape, np.int64),
+        n_bins=np.zeros(shape, np.int64),
+        peak_index=np.zeros(shape, np.int64),
+        n_exempt=np.zeros(shape, np.int64),
+        pd=np.full(shape, np.nan),
+        miss=np.full(shape, np.nan),
+        peak_magnitude=np.full(shape, np.nan),
+        leakage=np.full(shape, np.nan),
+        span_start=np.zeros(shape, np.int64),
+        magnitudes=np.empty(n_kept),
+        is_exempt=np.empty(n_kept, np.bool_),
+        peak_is_searched=np.ones(shape, np.bool_),
+    )
     n_done = _evaluate_points(
-        np.ascontiguousarray(point_rows[:, points].T),
-        np.stack([shots.footprint_row[points], group.shape_index[batch_begin:], points]),
-        shots.beamlet_table,
-        (group.line_shift, group.mode_coefficients, group.n_modes, shifts),
-        tables._replace(
-            layout=np.append(tables.layout, (spectrum_type(shots), rule.lobe_half_width))
-        ),
-        (_group_node_limits(shots, group), bin_tangents(shots.fft_size)),
-        (
-            shots.has_segment,
-            lowest_levels[points],
-            np.array(
+        point_parameters(point_table),
+        segment_parameters(point_table),
+        lowest_levels,
+        beamlet_arrays(shots.beamlet_table),
+        np.ascontiguousarray(shots.footprint_row, np.int64),
+        np.ascontiguousarray(group.shape_index[batch_begin:]),
+        shifts,
+        group.modes,
+        tables._replace(layout=tables.layout._replace(spectrum_type=spectrum_type(shots))),
+        EvaluationSettings(
+            segment_exists=shots.has_segment,
+            leakage_methods=np.array(
                 [leakage_method * segment.includes_leakage for segment in shots.waveform_segments]
             ),
-            shots.window.sum,
-            rule,
-            shots.speckle_table,
-            with_pd,
+            window_sum=shots.window.sum,
+            rule=shots.detection_rule,
+            speckle_table=shots.speckle_table,
+            with_pd=with_pd,
+            phase_limits=_group_node_limits(shots, group),
+            tangents=bin_tangents(shots.fft_size),
         ),
-        (np.empty((segments, 2, table_size)), outlines),
-        (
-            _scratch_rows(scratch_width),
-            np.empty(scratch_width, np.bool_),
-            np.empty(SERIES_TERMS_MAX),
-        ),
-        (span_numbers, span_values, magnitudes, is_exempt),
+        line_shape.allocate_line_shapes(tables, segments),
+        allocate_workspace(width),
+        np.empty(SERIES_TERMS_MAX),
+        spans,
     )
-    first_bin, n_bins, peak_index, n_exempt, span_start = span_numbers[:, :, :n_done]
-    pd, miss, peak_magnitude, leakage = span_values[:, :, :n_done]
-    return BinSpans(
-        points[:n_done],
-        first_bin,
-        n_bins,
-        peak_index,
-        n_exempt,
-        pd,
-        miss,
-        peak_magnitude,
-        leakage,
-        span_start,
-        magnitudes,
-        is_exempt,
-        np.ones(first_bin.shape, np.bool_),
-    ), n_done
+    if n_done == n_points:
+        return spans
+    return spans._replace(
+        point_numbers=points[:n_done],
+        **{
+            name: np.ascontiguousarray(values[:, :n_done])
+            for name, values in spans._asdict().items()
+            if values.ndim == 2
+        },
+    )
 
 
 def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
-    """Limits of nodes of the record's window; of part of it, as if all were at the record's end."""
+    """Return the table of :func:`sweep.model.spectrum.lines.node_phase_limits` of a group.
+
+    For late echoes it is that of a window which is all at the record's end.
+    """
     if not group.is_late:
         return shots.window.node_phase_limits(shots.adds_powers)
     tolerances = POWER_TOLERANCES if shots.adds_powers else AMPLITUDE_TOLERANCES
@@ -724,336 +782,499 @@ def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def bin_tangents(fft_size: int) -> np.ndarray:
-    """tan(pi k / N) for k = 0 .. N/2, (N // 2 + 1,)."""
+    """Return tan(pi k / N) of bins k = 0 .. N/2, (N // 2 + 1,)."""
     return np.tan(np.pi * np.arange(fft_size // 2 + 1) / fft_size)
 
 
-def _averaging_shifts(shots: Shots, points: np.ndarray) -> np.ndarray:
-    """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, segments, 2, k)."""
+def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
+    """Return the shifts over which |X|^2 is averaged, (points, segments, shifts).
+
+    They come from the laser's line width, and from the drift of lines over looks. Shifts of weight
+    0 are the last ones.
+    """
     segments = len(shots.waveform_segments)
     if shots.gaussian_line_width is None:
-        shift_rows = np.empty((points.size, 2, 0))
+        offset_rows, weight_rows = np.empty((points.size, 0)), np.empty((points.size, 0))
     else:
         duration = np.broadcast_to(shots.record_duration, shots.size)[points]
         shifts = gaussian_frequency_shifts(
             fwhm=shots.gaussian_line_width[points], duration=duration
         )
         padding_factor = shots.fft_size / shots.window.length
-        shift_rows = np.stack([padding_factor * shifts.offset_window_bins, shifts.weight], axis=1)
-        # Those of no weight, which wider lines beside a point bring, go to the end.
-        order = np.argsort(shift_rows[:, 1:] == 0, axis=2, kind="stable")
-        shift_rows = np.take_along_axis(
-            shift_rows, np.broadcast_to(order, shift_rows.shape), axis=2
+        offset_rows, weight_rows = padding_factor * shifts.offset_window_bins, shifts.weight
+        # A point has shifts of weight 0 if another point has a wider line.
+        order = np.argsort(weight_rows == 0, axis=1, kind="stable")
+        offset_rows, weight_rows = (
+            np.take_along_axis(rows, order, axis=1) for rows in (offset_rows, weight_rows)
         )
-    by_segment = np.repeat(shift_rows[:, None], segments, axis=1)
+    offset, weight = (
+        np.repeat(rows[:, None], segments, axis=1) for rows in (offset_rows, weight_rows)
+    )
     drift = np.broadcast_to(shots.line_drift_per_look, (segments, shots.size))[:, points].T
     if shots.looks.n_power_averaged == 1 or not drift.any():
-        return by_segment
-    if not by_segment.shape[3]:
-        by_segment = np.tile([[0.0], [1.0]], (*drift.shape, 1, 1))
-    # Of looks that follow each other closely some stand for all, of the same mean square.
+        return AveragingShifts(offset, weight)
+    if not offset.shape[2]:
+        offset, weight = np.zeros((*drift.shape, 1)), np.ones((*drift.shape, 1))
+    # Looks that follow each other closely are replaced by a few with the same mean square.
     n_looks = shots.looks.number
     n_positions = min(n_looks, DRIFT_POSITIONS_MAX)
     positions = (np.arange(n_positions) - (n_positions - 1) / 2) * math.sqrt(
         (n_looks**2 - 1) / (n_positions**2 - 1)
     )
-    moved_shifts = (
-        by_segment[..., :1, :, None] + drift[..., None, None, None] * positions
-    ).reshape(*drift.shape, 1, -1)
-    weight = np.repeat(by_segment[..., 1:, :] / n_positions, n_positions, axis=3)
-    return np.concatenate([moved_shifts, weight], axis=2)
+    return AveragingShifts(
+        (offset[..., None] + drift[..., None, None] * positions).reshape(*drift.shape, -1),
+        np.repeat(weight / n_positions, n_positions, axis=2),
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
+def _copy_lines(lines, n_lines, shifts):
+    """Replace lines whose powers add by shifted and weighted copies; return their number.
+
+    ``shifts`` are :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts`.
+    """
+    for copy in range(shifts.offset.size - 1, -1, -1):  # the lines themselves are the first copy
+        for line in range(n_lines):
+            lines.position[copy * n_lines + line] = lines.position[line] + shifts.offset[copy]
+            lines.re[copy * n_lines + line] = lines.re[line] * shifts.weight[copy]
+            lines.im[copy * n_lines + line] = 0.0
+    return n_lines * shifts.offset.size
+
+
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def _prepare_lines(
-    point,
-    segment_and_row,
-    footprint,
+    beat,
+    segment,
+    footprint_row,
+    beamlets,
     line_shift,
-    averaging_shifts,
+    shifts,
+    image_gain,
     window_sum,
+    bin_error_allowed,
+    threshold,
     phase_limits,
     layout,
-    scratch,
+    workspace,
 ):
-    """Lines of a point's segment into rows PLACE .., few for many; origin, number, survey."""
-    segment, footprint_row = segment_and_row
-    adds_powers = layout[4] != 0
-    origin_bin = compute_lines(point, segment, footprint, footprint_row, layout, scratch)
-    n_lines = footprint.shape[2]
-    shift_bins = line_shift * layout[0] / layout[1]
-    for line in range(n_lines):
-        scratch[PLACE, line] += shift_bins
-    if point[16] > 0.0:
-        n_lines = add_image_lines(scratch, n_lines, origin_bin, point[16], adds_powers)
-    magnitude_sum, power_sum, lowest_position, highest_position = summarise_lines(
-        scratch, n_lines, adds_powers
+    """Compute the lines of one segment, and replace them by fewer equivalent lines.
+
+    Parameters
+    ----------
+    beat
+        :class:`sweep.model.spectrum.lines.BeatParameters` of the segment.
+    segment
+        Index of the segment: 0 up, 1 Doppler, 2 down.
+    footprint_row
+        Row of the footprint in ``beamlets``.
+    beamlets
+        :class:`sweep.model.spectrum.lines.BeamletArrays`.
+    line_shift
+        Shift of all lines by the phase error [bins of fs/L].
+    shifts
+        :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts`; lines whose powers add are
+        copied at each shift.
+    image_gain
+        Amplitude of the I/Q image of a line over that of the line; 0 if there is none.
+    window_sum
+        Sum of the window's samples.
+    bin_error_allowed
+        Error that the equivalent lines may make in |X| [V, summed over the record]; 0 if lines are
+        not to be replaced.
+    threshold
+        Threshold on |X| [V, summed over the record].
+    phase_limits
+        :func:`sweep.model.spectrum.lines.node_phase_limits`.
+    layout
+        :class:`sweep.model.spectrum.lines.SpectrumLayout`.
+    workspace
+        :class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`; the lines go to
+        ``field.lines``.
+
+    Returns
+    -------
+    LineBundle
+        Number, extent and weight of the lines.
+    """
+    lines, nodes, scratch = workspace.field.lines, workspace.nodes, workspace.field.line_scratch
+    adds_powers = layout.adds_powers
+    origin_bin = compute_lines(
+        beat,
+        segment,
+        beamlets,
+        footprint_row,
+        layout,
+        lines,
+        workspace.inverse_gain_re,
+        workspace.inverse_gain_im,
     )
-    if (
-        max(-lowest_position, highest_position) > 0.5 * layout[0]
-    ):  # lines further apart than there are bins
-        fold_lines(scratch, n_lines, layout)
-        magnitude_sum, power_sum, lowest_position, highest_position = summarise_lines(
-            scratch, n_lines, adds_powers
-        )
-    weight_sum = math.sqrt(magnitude_sum) if adds_powers else magnitude_sum
-    n_copies = averaging_shifts.shape[1] if adds_powers else 0
+    n_lines = beamlets.relative_range_offset.shape[1]
+    shift_bins = line_shift * layout.fft_size / layout.record_length
+    for line in range(n_lines):
+        lines.position[line] += shift_bins
+    if image_gain > 0.0:
+        n_lines = add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers)
+    summary = summarise_lines(lines, n_lines, adds_powers, scratch.batch)
+    if max(-summary.lowest_position, summary.highest_position) > 0.5 * layout.fft_size:
+        fold_lines(lines, n_lines, layout)  # lines are farther apart than there are bins
+        summary = summarise_lines(lines, n_lines, adds_powers, scratch.batch)
+    weight_sum = math.sqrt(summary.magnitude_sum) if adds_powers else summary.magnitude_sum
+    n_copies = shifts.offset.size if adds_powers else 0
     for copy_pass in range(2 if n_copies else 1):
-        if copy_pass == 1:  # copies of the lines at each shift
-            for copy in range(n_copies - 1, -1, -1):
-                for line in range(n_lines):
-                    scratch[PLACE, copy * n_lines + line] = (
-                        scratch[PLACE, line] + averaging_shifts[0, copy]
-                    )
-                    scratch[RE, copy * n_lines + line] = (
-                        scratch[RE, line] * averaging_shifts[1, copy]
-                    )
-                    scratch[IM, copy * n_lines + line] = 0.0
-            n_lines *= n_copies
-            magnitude_sum, power_sum, lowest_position, highest_position = summarise_lines(
-                scratch, n_lines, adds_powers
-            )
-        half_width = 0.5 * (highest_position - lowest_position)
-        if n_lines > 2 and point[15] > 0.0:
+        if copy_pass == 1:
+            n_lines = _copy_lines(lines, n_lines, shifts)
+            summary = summarise_lines(lines, n_lines, adds_powers, scratch.batch)
+        half_width = 0.5 * (summary.highest_position - summary.lowest_position)
+        if n_lines > 2 and bin_error_allowed > 0.0:
             error_allowed = allowed_relative_error(
-                magnitude_sum,
-                power_sum,
-                n_lines,
-                adds_powers,
-                window_sum,
-                point[15] * point[10] / LINE_APPROXIMATIONS_MAX,
-                point[11],
+                summary, n_lines, adds_powers, window_sum, bin_error_allowed, threshold
             )
-            phase_per_bin = np.pi * layout[1] / layout[0] * (2.0 if adds_powers else 1.0)
+            phase_per_bin = (
+                np.pi * layout.record_length / layout.fft_size * (2.0 if adds_powers else 1.0)
+            )
             n_nodes = count_nodes(phase_per_bin * half_width, error_allowed, phase_limits)
             if 4 * n_nodes < 3 * n_lines and n_nodes <= NODES_MAX:
-                middle = 0.5 * (lowest_position + highest_position)
+                middle = 0.5 * (summary.lowest_position + summary.highest_position)
                 n_lines = replace_lines_by_nodes(
-                    scratch, RE, IM, n_lines, n_nodes, (middle, half_width), A_RE, A_IM
+                    lines, n_lines, n_nodes, middle, half_width, scratch, nodes
                 )
                 for line in range(n_lines):
-                    scratch[PLACE, line] = scratch[X, line]
-                    scratch[RE, line], scratch[IM, line] = scratch[A_RE, line], scratch[A_IM, line]
-    return origin_bin, n_lines, weight_sum, lowest_position, highest_position
+                    lines.position[line] = nodes.position[line]
+                    lines.re[line], lines.im[line] = nodes.re[line], nodes.im[line]
+    return LineBundle(
+        origin_bin, n_lines, summary.lowest_position, summary.highest_position, weight_sum
+    )
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _store_span(start, n_bins, scratch, is_exempt, all_magnitudes, all_is_exempt):
-    """Hands a run on, from ``start`` on; where the next one begins."""
+def _store_span(start, n_bins, span, magnitudes, is_exempt):
+    """Append a span to those of earlier points at index ``start``; return the next index.
+
+    ``span`` are the :class:`sweep.model.spectrum.bin_spectrum.SpanArrays`; ``magnitudes`` and
+    ``is_exempt`` hold all spans.
+    """
     for k in range(n_bins):
-        all_magnitudes[start + k], all_is_exempt[start + k] = scratch[OUT, k], is_exempt[k]
+        magnitudes[start + k], is_exempt[start + k] = span.magnitude[k], span.is_exempt[k]
     return start + n_bins
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _late_beat(beat, n_missing_samples):
+    """Return the beat parameters of an echo that lacks the first samples of the record."""
+    return BeatParameters(
+        beat.range,
+        beat.range_decrease,
+        beat.doppler_ratio,
+        beat.start_time,
+        beat.chirp_rate,
+        beat.carrier,
+        beat.amplitude,
+        beat.detector_bandwidth,
+        beat.amplifier_bandwidth,
+        beat.sample_rate,
+        beat.record_start + n_missing_samples / beat.sample_rate,
+    )
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _late_layout(layout, n_samples):
+    """Return the layout of a spectrum whose record has ``n_samples`` samples."""
+    return SpectrumLayout(
+        layout.fft_size,
+        n_samples,
+        layout.table_bins,
+        layout.cells_per_bin,
+        layout.adds_powers,
+        layout.holds_all_bins,
+        layout.clearance_bins,
+        layout.spectrum_type,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _build_shapes(shape_index, built_index, modes, tables, segment_exists, shapes):
+    """Compute the line shapes of all segments of a point into ``shapes``.
+
+    ``shape_index`` is the shape in ``modes``; ``built_index`` is the one that is in ``shapes``
+    already, or -1.
+    """
+    is_late = tables.echo_lengths.size > 0
+    for s in range(segment_exists.size):
+        if not segment_exists[s]:
+            continue
+        shape = line_shape.select_segment(shapes, s)
+        if not is_late:
+            line_shape.build_line_shape(s, shape_index, built_index, modes, tables, shape)
+            continue
+        same_segment = line_shape.first_segment_of_same_shape(
+            s, shape_index, modes, tables.echo_lengths, segment_exists
+        )
+        if same_segment >= 0:
+            line_shape.copy_line_shape(shapes, same_segment, s)
+        else:
+            line_shape.build_late_line_shape(s, shape_index, modes, tables, shape)
+
+
+@njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
+def _evaluate_segment(
+    s,
+    i,
+    next_start,
+    parameters,
+    parameters_by_segment,
+    lowest_levels,
+    beamlets,
+    footprint_row,
+    shape_index,
+    averaging_shifts,
+    modes,
+    tables,
+    settings,
+    shape,
+    bin_speckle,
+    workspace,
+    crossing_series,
+    speckle_rates,
+    spans,
+):
+    """Compute the span of segment ``s`` of point ``spans.point_numbers[i]``.
+
+    Parameters are those of :func:`_evaluate_points`, with the line shape, the speckle and the
+    crossing rates of the segment. ``next_start`` is the index in ``spans.magnitudes`` of the span's
+    first bin.
+
+    Returns
+    -------
+    next_start
+        Index of the next span's first bin; SPAN_DOES_NOT_FIT if this span does not fit.
+    """
+    point, rule, span = spans.point_numbers[i], settings.rule, workspace.span
+    leakage_method = settings.leakage_methods[s]
+    noise_sigma, threshold = parameters.noise_sigma[point], parameters.threshold[point]
+    image_gain = parameters.image_gain[point]
+    negligible_signal_ratio = parameters.negligible_signal_ratio[point]
+    bin_error_allowed = (
+        parameters.line_error_tolerance[point] * noise_sigma / LINE_APPROXIMATIONS_MAX
+    )
+    bin_threshold = BinThreshold(
+        parameters.line_noise[point],
+        threshold,
+        noise_sigma,
+        parameters.side_noise[point],
+        PedestalShape(
+            parameters.pedestal_reach_bins[point],
+            parameters.pedestal_line_width_bins[point],
+            parameters.pedestal_delay[point],
+        ),
+    )
+    limits = LeakageLimits(
+        noise_sigma, threshold, parameters.leakage_tolerance[point], rule.sidelobe_correlation
+    )
+    lobe_half_width = max(rule.lobe_half_width, int(bin_threshold.pedestal.reach_bins))
+    beat = beat_parameters_at(parameters, parameters_by_segment, s, point)
+    layout = tables.layout
+    if tables.echo_lengths.size > 0:  # the samples that a late echo has are a record of their own
+        n_samples = tables.echo_lengths[s, shape_index[i]]
+        beat = _late_beat(beat, layout.record_length - n_samples)
+        layout = _late_layout(layout, n_samples)
+    n_shifts = 0
+    while (
+        n_shifts < averaging_shifts.weight.shape[2] and averaging_shifts.weight[i, s, n_shifts] != 0
+    ):
+        n_shifts += 1
+    shifts = AveragingShifts(
+        averaging_shifts.offset[i, s, :n_shifts], averaging_shifts.weight[i, s, :n_shifts]
+    )
+    bundle = _prepare_lines(
+        beat,
+        s,
+        footprint_row[point],
+        beamlets,
+        modes.line_shift[s, shape_index[i]],
+        shifts,
+        image_gain,
+        settings.window_sum,
+        bin_error_allowed,
+        threshold,
+        settings.phase_limits,
+        layout,
+        workspace,
+    )
+    if leakage_method == LEAKAGE_BY_INTEGRAL:
+        detected = detect_with_leakage(
+            bundle,
+            bin_error_allowed,
+            limits,
+            SPECKLE_POWER_MAX if rule.in_speckle else 1.0,
+            lobe_half_width,
+            shape,
+            layout,
+            settings.tangents,
+            workspace,
+            crossing_series,
+            speckle_rates,
+        )
+    else:
+        n_averaged = 0 if layout.adds_powers else n_shifts  # else the lines are copied
+        detected = detect_in_span(
+            bundle,
+            bin_error_allowed,
+            threshold,
+            lowest_levels[point],
+            lobe_half_width,
+            AveragingShifts(shifts.offset[:n_averaged], shifts.weight[:n_averaged]),
+            shape,
+            layout,
+            settings.tangents,
+            workspace,
+        )
+    first_bin, n_bins = detected.first_bin, detected.n_bins
+    n_exempt, leakage = detected.n_exempt, detected.leakage
+    if image_gain > 0.0:
+        n_exempt = clear_image_exemptions(
+            span.magnitude[:n_bins],
+            span.is_exempt[:n_bins],
+            first_bin,
+            layout.fft_size,
+            image_gain,
+        )
+    if spans.magnitudes.size > 0:
+        if next_start + n_bins > spans.magnitudes.size:
+            return SPAN_DOES_NOT_FIT
+        spans.span_start[s, i] = next_start
+        next_start = _store_span(next_start, n_bins, span, spans.magnitudes, spans.is_exempt)
+    detection = Detection(np.nan, np.nan)
+    if settings.with_pd:
+        detection = pd_and_miss(
+            EchoBins(span.magnitude[:n_bins], span.is_exempt[:n_bins], first_bin),
+            detected.peak_index,
+            rule,
+            bin_threshold,
+            bin_speckle,
+        )
+    if leakage_method == LEAKAGE_BIN_BY_BIN:
+        if rule.in_speckle:
+            leakage = leakage_of_bins_in_speckle(
+                n_bins,
+                limits,
+                negligible_signal_ratio / math.sqrt(SPECKLE_POWER_MAX),
+                span,
+                speckle_rates,
+            )
+        else:
+            leakage = leakage_of_bins(
+                n_bins, limits, negligible_signal_ratio, span, crossing_series
+            )
+            if image_gain > 0.0 and rule.joint_tail_rule.sine.size > 0:
+                leakage = any_crossing_of_chain(
+                    span.crossing_probability, n_bins, rule.joint_tail_rule
+                )
+    if layout.spectrum_type == COMPLEX_RECORD:  # no bin of a span is below 0
+        first_bin += layout.fft_size
+    spans.first_bin[s, i], spans.n_bins[s, i] = first_bin, n_bins
+    spans.peak_index[s, i], spans.n_exempt[s, i] = detected.peak_index, n_exempt
+    spans.pd[s, i], spans.miss[s, i] = detection.pd, detection.miss
+    spans.peak_magnitude[s, i] = span.magnitude[detected.peak_index]
+    spans.leakage[s, i] = leakage
+    return next_start
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate_points(
-    point_rows,
-    point_index,
-    footprint,
-    shape_modes,
+    parameters,
+    parameters_by_segment,
+    lowest_levels,
+    beamlets,
+    footprint_row,
+    shape_index,
+    averaging_shifts,
+    modes,
     tables,
-    limits_and_tangents,
-    config,
-    shape_workspace,
+    settings,
+    shapes,
     workspace,
-    results,
+    crossing_series,
+    spans,
 ):
-    """Compute runs of points; return the number of points that there was room for.
+    """Compute the spans of m points, as many as fit; return the number of these points.
 
-    ``point_rows`` are rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`;
-    ``point_index`` (3, m) rows
-    in the footprints, shapes, and numbers of the points; ``shape_modes`` and ``tables`` those of
-    :class:`ShapeGroup`, with shifts (m, segments, 2, k) and with sizes that end in the view and
-    half
-    of the echo's main lobe, in whose place a wider pedestal's reach comes; ``limits_and_tangents``
-    limits of
-    nodes, and tangents; ``config`` segments that there are, levels below which bins may be left
-    out,
-    each segment's way to look at leakage, the window's sum, the rule of detection, the speckle of
-    all points, and true if probabilities of a detection are asked for. ``shape_workspace`` and
-    ``workspace`` are
-    room for shapes and for spectra. Results (``results``): low, count, peak, exempted and start (5,
-    segments, m); pd, miss, magnitude and leakage (4, segments, m); magnitudes and exempt bins of
-    runs, which may have no room at all.
+    Parameters
+    ----------
+    parameters
+        :class:`sweep.model.spectrum.lines.PointParameters` of all n points.
+    parameters_by_segment
+        :class:`sweep.model.spectrum.lines.SegmentParameters` of all n points.
+    lowest_levels
+        (n,): |X| [V, summed over the record] below which bins may be left out.
+    beamlets
+        :class:`sweep.model.spectrum.lines.BeamletArrays` of all footprints.
+    footprint_row
+        (n,): row of each point's footprint in ``beamlets``.
+    shape_index
+        (m,): index of each point's line shape in ``modes``.
+    averaging_shifts
+        :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts` (m, segments, shifts). Shifts of
+        weight 0 are the last ones.
+    modes
+        :class:`sweep.model.spectrum.line_shape.ShapeModes`.
+    tables
+        :class:`sweep.model.spectrum.line_shape.LineShapeTables`, whose layout has the type of the
+        spectra.
+    settings
+        :class:`EvaluationSettings`.
+    shapes
+        :class:`sweep.model.spectrum.line_shape.LineShape` (segments, ...), overwritten.
+    workspace
+        :class:`sweep.model.spectrum.bin_spectrum.SpectrumWorkspace`, overwritten.
+    crossing_series
+        (SERIES_TERMS_MAX,): scratch.
+    spans
+        :class:`BinSpans` of the m points in ``spans.point_numbers``; the other fields are results.
+        If ``spans.magnitudes`` is empty, no magnitudes are stored.
     """
-    line_shift, shifts = shape_modes[0], shape_modes[3]
-    layout, phase_limits, tangents = tables[0], limits_and_tangents[0], limits_and_tangents[1]
-    (
-        (segment_exists, lowest_levels, leakage_methods, window_sum, rule, speckle_table, with_pd),
-        (table, outlines),
-    ) = config, shape_workspace
-    scratch, is_exempt, crossing_series = workspace
-    span_numbers, span_values, all_magnitudes, all_is_exempt = results
-    keeps_magnitudes, next_start = all_magnitudes.size > 0, np.int64(0)
+    next_start, rule = np.int64(0), settings.rule
     speckle_rates = empty_crossing_rates()
-    previous_ratio, built_shape = (
-        -1.0,
-        np.int64(-1),
-    )  # a literal would compile what takes it once more
-    echo_lengths, record_length = tables.echo_lengths, layout[1]
-    is_late = echo_lengths.size > 0
-    for i in range(point_rows.shape[0]):
-        point, footprint_row, shape_index = point_rows[i], point_index[0, i], point_index[1, i]
-        record_start = point[7]
-        if shape_index != built_shape:
-            for s in range(segment_exists.size):
-                if segment_exists[s] and is_late:
-                    same_segment = line_shape.first_segment_of_same_shape(
-                        s, shape_index, shape_modes, echo_lengths, segment_exists
-                    )
-                    if same_segment >= 0:
-                        table[s], outlines[s, 1:] = table[same_segment], outlines[same_segment, 1:]
-                    else:
-                        layout[1] = echo_lengths[s, shape_index]
-                        line_shape.build_late_line_shape(
-                            s, shape_index, shape_modes, tables, table[s], outlines[s]
-                        )
-                elif segment_exists[s]:
-                    line_shape.build_line_shape(
-                        s, (shape_index, built_shape), shape_modes, tables, table[s], outlines[s]
-                    )
-            built_shape = shape_index
-        noise_sigma, threshold = point[10], point[11]
-        pedestal = PedestalShape(point[18], point[19], point[20])
-        layout[8] = max(rule.lobe_half_width, int(pedestal.reach_bins))
-        threshold_ratio = threshold / noise_sigma
+    previous_ratio, built_index = -1.0, np.int64(-1)  # numba would compile anew for a literal -1
+    for i in range(spans.point_numbers.size):
+        point = spans.point_numbers[i]
+        if shape_index[i] != built_index:
+            _build_shapes(
+                shape_index[i], built_index, modes, tables, settings.segment_exists, shapes
+            )
+            built_index = shape_index[i]
+        threshold_ratio = parameters.threshold[point] / parameters.noise_sigma[point]
         if rule.in_speckle:  # one table serves thresholds that differ by light's shot noise
             threshold_ratio = (
                 math.floor(threshold_ratio / THRESHOLD_RATIO_STEP + 0.5) * THRESHOLD_RATIO_STEP
             )
-        if leakage_methods.any() and threshold_ratio != previous_ratio:
+        if settings.leakage_methods.any() and threshold_ratio != previous_ratio:
             previous_ratio = threshold_ratio
             fill_crossing_series(previous_ratio, crossing_series)
             if rule.in_speckle:
                 speckle_rates = tabulate_crossing_rates(previous_ratio, crossing_series)
-        for s in range(segment_exists.size):
-            if not segment_exists[s]:
-                continue
-            if is_late:  # what the echo has of the record is a record of its own
-                layout[1] = echo_lengths[s, shape_index]
-                point[7] = record_start + (record_length - echo_lengths[s, shape_index]) / point[6]
-            averaging_shifts = shifts[i, s][
-                :, : np.count_nonzero(shifts[i, s, 1])
-            ]  # zeros are last
-            origin_bin, n_lines, weight_sum, lowest_position, highest_position = _prepare_lines(
-                point,
-                (s, footprint_row),
-                footprint,
-                line_shift[s, shape_index],
-                averaging_shifts,
-                window_sum,
-                phase_limits,
-                layout,
-                scratch,
-            )
-            lines = (
-                n_lines,
-                lowest_position,
-                highest_position,
-                weight_sum,
-                point[15] * noise_sigma / LINE_APPROXIMATIONS_MAX,
-            )
-            speckle_power_max, leakage = SPECKLE_POWER_MAX if rule.in_speckle else 1.0, 0.0
-            leakage_limits = (
-                noise_sigma,
-                threshold,
-                point[14],
-                speckle_power_max,
-                rule.sidelobe_correlation,
-            )
-            if leakage_methods[s] == LEAKAGE_BY_INTEGRAL:
-                first_bin, n_bins, peak_index, n_exempt, leakage = detect_with_leakage(
-                    origin_bin,
-                    lines,
-                    leakage_limits,
-                    table[s],
-                    outlines[s],
-                    layout,
-                    tangents,
-                    scratch,
-                    is_exempt,
+        for s in range(settings.segment_exists.size):
+            if settings.segment_exists[s]:
+                next_start = _evaluate_segment(
+                    s,
+                    i,
+                    next_start,
+                    parameters,
+                    parameters_by_segment,
+                    lowest_levels,
+                    beamlets,
+                    footprint_row,
+                    shape_index,
+                    averaging_shifts,
+                    modes,
+                    tables,
+                    settings,
+                    line_shape.select_segment(shapes, s),
+                    bin_speckle_at(settings.speckle_table, s, point),
+                    workspace,
                     crossing_series,
                     speckle_rates,
+                    spans,
                 )
-            else:
-                first_bin, n_bins, peak_index, n_exempt = detect_in_span(
-                    origin_bin,
-                    lines,
-                    (threshold, lowest_levels[i]),
-                    averaging_shifts[:, : (1 - layout[4]) * averaging_shifts.shape[1]],
-                    table[s],
-                    outlines[s],
-                    layout,
-                    tangents,
-                    scratch,
-                    is_exempt,
-                )
-            if point[16] > 0.0:
-                n_exempt = clear_image_exemptions(
-                    scratch[OUT, :n_bins], is_exempt[:n_bins], first_bin, layout[0], point[16]
-                )
-            if keeps_magnitudes:
-                if next_start + n_bins > all_magnitudes.size:
+                if next_start == SPAN_DOES_NOT_FIT:
                     return i
-                span_numbers[4, s, i] = next_start
-                next_start = _store_span(
-                    next_start, n_bins, scratch, is_exempt, all_magnitudes, all_is_exempt
-                )
-            detection = Detection(np.nan, np.nan)
-            if with_pd:
-                detection = pd_and_miss(
-                    EchoBins(scratch[OUT, :n_bins], is_exempt[:n_bins], first_bin),
-                    peak_index,
-                    rule,
-                    BinThreshold(point[13], threshold, noise_sigma, point[17], pedestal),
-                    bin_speckle_at(speckle_table, s, point_index[2, i]),
-                )
-            if leakage_methods[s] == LEAKAGE_BIN_BY_BIN:
-                bin_limits = noise_sigma, threshold, point[14], rule.sidelobe_correlation
-                if rule.in_speckle:
-                    negligible_signal_ratio = point[12] / math.sqrt(SPECKLE_POWER_MAX)
-                    leakage = leakage_of_bins_in_speckle(
-                        n_bins,
-                        bin_limits,
-                        negligible_signal_ratio,
-                        scratch,
-                        is_exempt,
-                        speckle_rates,
-                    )
-                else:
-                    leakage = leakage_of_bins(
-                        n_bins, bin_limits, point[12], scratch, is_exempt, crossing_series
-                    )
-                    if point[16] > 0.0 and rule.joint_tail_rule.sine.size > 0:
-                        leakage = any_crossing_of_chain(
-                            scratch[CHANCE], n_bins, rule.joint_tail_rule
-                        )
-            first_bin += layout[0] * (layout[7] == COMPLEX_RECORD)  # never below 0
-            span_numbers[0, s, i], span_numbers[1, s, i], span_numbers[2, s, i] = (
-                first_bin,
-                n_bins,
-                peak_index,
-            )
-            span_numbers[3, s, i] = n_exempt
-            span_values[0, s, i], span_values[1, s, i] = detection.pd, detection.miss
-            span_values[2, s, i], span_values[3, s, i] = scratch[OUT, peak_index], leakage
-    return point_rows.shape[0]
-
-
-_SCRATCH_BYTES_KEPT_MAX = 1 << 26
-"""Largest scratch [bytes] that a thread keeps for its next batch."""
-
-_thread_scratch = threading.local()
-
-
-def _scratch_rows(width: int) -> np.ndarray:
-    """Return scratch (N_SCRATCH_ROWS, width), the same array for each batch of a thread.
-
-    Of a new array the operating system clears every page that a batch touches. With wide spectra
-    this takes an eighth of the time of a flight, as few numbers in each row are used.
-    """
-    rows: np.ndarray | None = getattr(_thread_scratch, "rows", None)
-    if rows is None or rows.shape[1] != width:
-        rows = np.empty((N_SCRATCH_ROWS, width))
-        _thread_scratch.rows = rows if rows.nbytes <= _SCRATCH_BYTES_KEPT_MAX else None
-    return rows
+    return spans.point_numbers.size

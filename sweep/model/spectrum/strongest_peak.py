@@ -1,7 +1,7 @@
-"""Probabilities that the strongest peak of a segment is the echo's, or another's.
+"""Probabilities that the strongest peak of a segment is that of the echo, or another one.
 
-A peak elsewhere that is larger than the echo's takes its place: what is reported is detected, with
-a wrong range. Let Z be the largest |X| of the bins searched that the echo does not occupy, and b
+A peak elsewhere that is larger than the echo's takes its place: it is reported as a detection with
+a wrong range. Let Z be the largest |X| of the searched bins that the echo does not occupy, and b
 the threshold. Let P_z be the probability that the echo crosses a level z, by the same law as at b.
 Then
 
@@ -9,21 +9,22 @@ Then
     L = int_b^inf (P_b - P_z) dP(Z < z),    P(none) = P(Z < b) (1 - P_b)
 
 and these three add to 1. All terms are positive, so that small ones keep their digits. P(Z < z) is
-that no bin of noise crosses z, n independent ones at each level
-(:mod:`sweep.model.detection.bin_noise`), and
-that no bin of leaked signal does either. With y = z^2 / (2 sigma^2), -ln P(Z < z) is very nearly
-proportional to e^-y. The integral over y is Gauss's in intervals, and its mass is made exact.
+the probability that no bin crosses z: neither one of noise, of which n independent ones are
+equivalent to all bins at each level (:mod:`sweep.model.detection.bin_noise`), nor one of leaked
+signal. With y = z^2 / (2 sigma^2), -ln P(Z < z) is very nearly proportional to e^-y. The integral
+over y is computed by Gauss's rule in intervals, and its total weight is made exact.
 
-Noise is independent from segment to segment, and so are right peaks of a steady echo. If speckle is
-shared, the probability of both is that of two correlated Rayleigh magnitudes which cross their own
-levels, max(b, Z), averaged over both Z. An echo of many bins counts at each level as the one bin
-that crosses it as often. It is within 0.01 of drawn records at any threshold.
+Noise is independent from segment to segment, and so are right peaks of a steady echo. If segments
+share their speckle, the probability that both peaks are right is that of two correlated Rayleigh
+magnitudes which cross their own levels, max(b, Z), averaged over both Z. An echo of many bins
+counts at each level as the one bin that crosses it with the same probability. Drawn records agree
+within 0.01 at any threshold.
 
-A shot is wrong where both chirps report a peak, and not both of the echo.
+A shot is wrong if both chirps report a peak, and not both peaks are the echo's.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,12 +41,17 @@ from sweep.model.detection.echo_detection import (
 )
 from sweep.model.detection.marcum import marcum_q1_tails
 from sweep.model.spectrum.search_restriction import span_leakage
-from sweep.model.spectrum.segment_spectra import iter_spans
+from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 GAUSS_ORDER = 4
-"""Gauss points of each stretch of y."""
+"""Number of Gauss points in each interval of y."""
 INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
-"""Ends of the stretches, from the threshold or from 4 below ln n on, where noise surely alarms."""
+"""Edges of the intervals of y. They count from the threshold, or from ln n - 4 if that is larger:
+below it n bins of noise certainly cross."""
+UP, DOPPLER, DOWN = range(3)
+"""Indices of the segments."""
+THRESHOLD_LEVEL = 0
+"""Index of the threshold among the levels z."""
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(GAUSS_ORDER)
 _DERIVATIVE_MATRIX = np.array(
@@ -54,15 +60,51 @@ _DERIVATIVE_MATRIX = np.array(
         for row in np.eye(GAUSS_ORDER)
     ]
 ).T
-"""Derivative at the points of the polynomial through values at them."""
+"""Matrix from values at the Gauss points to the derivatives of their polynomial there."""
+
+
+class SpanProbabilities(NamedTuple):
+    """Probabilities of larger peaks than the echo's at m points."""
+
+    pd_loss: np.ndarray
+    """(segments, m): probability L that the echo is detected, but that a larger peak takes its
+    place."""
+    p_alarm: np.ndarray
+    """(segments, m): probability P(Z >= b) that a bin without the echo crosses the threshold."""
+    shared_gain: np.ndarray
+    """(m,): increase, by shared speckle, of the probability that both chirps report the echo's peak
+    although other bins cross."""
+
+
+class LevelProbabilities(NamedTuple):
+    """Levels that the echo of one segment has to cross, (m, levels); the threshold is first."""
+
+    probability: np.ndarray
+    """Probability of the level: that max(b, Z) is this level."""
+    exponent: np.ndarray
+    """-ln P_z of the echo."""
+    echo_fraction: np.ndarray
+    """Fraction of the echo in the power of the bin that is equivalent to it at this level."""
 
 
 def strongest_peak_probabilities(
     shots: Any, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``.
+    """Compute the outputs of shots whose strongest peak is reported.
 
-    By those of all peaks and |X| [V] of the strongest bin, by segment, (3, n) each.
+    Parameters
+    ----------
+    shots : Shots
+        n prepared shots.
+    pd, miss : ndarray (3, n)
+        Probabilities, by segment, that any peak of the echo is detected, or not.
+    magnitude : ndarray (3, n)
+        |X| of the strongest bin [V, summed over the record].
+
+    Returns
+    -------
+    dict of str to ndarray (n,)
+        ``pd_``, ``miss_`` and ``p_wrong_range_`` of each segment and of the shot.
     """
     pd_loss, p_alarm, shared_gain = (
         np.zeros((3, shots.size)),
@@ -70,11 +112,10 @@ def strongest_peak_probabilities(
         np.zeros(shots.size),
     )
     for spans in iter_spans(shots, bin_by_bin=True):
-        (
-            pd_loss[:, spans.point_numbers],
-            p_alarm[:, spans.point_numbers],
-            shared_gain[spans.point_numbers],
-        ) = _span_probabilities(shots, spans, pd)
+        probabilities = _span_probabilities(shots, spans, pd)
+        pd_loss[:, spans.point_numbers] = probabilities.pd_loss
+        p_alarm[:, spans.point_numbers] = probabilities.p_alarm
+        shared_gain[spans.point_numbers] = probabilities.shared_gain
     pd_right, miss_right = np.maximum(pd - pd_loss, 0.0), np.minimum(miss + pd_loss, 1.0)
     p_wrong = np.minimum(p_alarm * miss + pd_loss, 1.0)
     results = {
@@ -82,28 +123,31 @@ def strongest_peak_probabilities(
         for name, values in {"pd": pd_right, "miss": miss_right, "p_wrong_range": p_wrong}.items()
         for s, segment in enumerate(waveform.SEGMENT_NAMES)
     }
-    p_no_alarm = (1 - p_alarm[0]) * (1 - p_alarm[2])
-    p_both_right = pd_right[0] * pd_right[2] + shared_gain
+    p_no_alarm = (1 - p_alarm[UP]) * (1 - p_alarm[DOWN])
+    p_both_right = pd_right[UP] * pd_right[DOWN] + shared_gain
     if shots.segment_correlations is not None:
         speckle_covariance = (
-            shots.joint_detection_probability(pd[0], pd[2], (magnitude[0], magnitude[2]))
-            - pd[0] * pd[2]
+            shots.joint_detection_probability(pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
+            - pd[UP] * pd[DOWN]
         )
         p_both_right = np.minimum(
-            p_both_right + p_no_alarm * speckle_covariance, np.minimum(pd_right[0], pd_right[2])
+            p_both_right + p_no_alarm * speckle_covariance,
+            np.minimum(pd_right[UP], pd_right[DOWN]),
         )
-    p_reported_wrong = p_wrong[0] * (pd_right[2] + p_wrong[2]) + pd_right[0] * p_wrong[2]
+    p_reported_wrong = p_wrong[UP] * (pd_right[DOWN] + p_wrong[DOWN]) + pd_right[UP] * p_wrong[DOWN]
+    miss_shot = miss_right[UP] + np.maximum(pd_right[UP] - p_both_right, 0.0)
     return results | {
         "pd_shot": p_both_right,
-        "miss_shot": np.minimum(miss_right[0] + np.maximum(pd_right[0] - p_both_right, 0.0), 1.0),
+        "miss_shot": np.minimum(miss_shot, 1.0),
         "p_wrong_range_shot": np.maximum(p_reported_wrong - shared_gain, 0.0),
     }
 
 
-def _span_probabilities(
-    shots: Any, spans: Any, pd: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """L and P(Z >= b) by segment, (3, m); by how much shared speckle adds to both, (m,)."""
+def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
+    """Compute the :class:`SpanProbabilities` of the points of some spans.
+
+    ``pd`` (3, n) is the probability that the echo is detected, of all n shots by segment.
+    """
     points = spans.point_numbers
     deviation, noise_sigma, threshold, negligible_signal_ratio = (
         np.broadcast_to(value, shots.size)[points]
@@ -120,16 +164,14 @@ def _span_probabilities(
         _noise_exponents(shots, spans, half_squares),
     )
     pd_loss = np.zeros(levels.shape)
-    span_numbers = np.array([spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start])
     _evaluate_levels(
-        span_numbers,
-        spans.peak_is_searched,
-        (spans.magnitudes, spans.is_exempt),
+        spans,
         levels,
         shots.bin_thresholds.select(points),
         negligible_signal_ratio,
-        (shots.detection_rule, shots.includes_leakage),
-        (points, shots.speckle_table),
+        shots.detection_rule,
+        shots.includes_leakage,
+        shots.speckle_table,
         pd_loss,
         exponents,
     )
@@ -148,15 +190,13 @@ def _span_probabilities(
             1 - level_exponents / (0.5 * np.square(levels / deviation[:, None])), 0.0
         )
         level_probabilities = np.concatenate([1 - p_alarm[..., None], weight], axis=-1)
-        _shared_excess(
-            (level_probabilities[0], level_probabilities[2]),
-            (level_exponents[0], level_exponents[2]),
-            (echo_fractions[0], echo_fractions[2]),
-            squared_correlation,
-            joint_excess,
+        up, down = (
+            LevelProbabilities(level_probabilities[s], level_exponents[s], echo_fractions[s])
+            for s in (UP, DOWN)
         )
+        _fill_joint_excess(up, down, squared_correlation, joint_excess)
     total_loss = (weight * pd_loss[..., 1:]).sum(axis=-1)
-    return (
+    return SpanProbabilities(
         np.where(segment_exists, total_loss, np.nan),
         np.where(segment_exists, p_alarm, np.nan),
         joint_excess,
@@ -164,7 +204,10 @@ def _span_probabilities(
 
 
 def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> np.ndarray:
-    """Places y, (3, m, 1 + points), that of the threshold first."""
+    """Return y = z^2 / (2 sigma^2) of all levels, (3, m, levels), the threshold first.
+
+    ``threshold_ratio`` (m,) is the threshold over sigma.
+    """
     threshold_half_square = 0.5 * np.square(threshold_ratio)
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)
     first_half_square = np.maximum(threshold_half_square, np.log(np.maximum(n_bins, 1.0)) - 4)
@@ -176,7 +219,10 @@ def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> 
 
 
 def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.ndarray:
-    """-ln P(no bin of noise is at or above y), of the shape of y."""
+    """Return -ln of the probability that no bin of noise crosses a level.
+
+    ``half_squares`` (3, m, levels) is y of the levels; the result has the same shape.
+    """
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)[..., None]
     if shots.noise_bins == "correlated":
         n_bins = bin_noise.alarm_equivalent_bins(
@@ -192,7 +238,11 @@ def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.nda
 
 
 def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
-    """Weights of the points, their sum P(Z >= b), of the shape of ``exponents`` (3, m, points)."""
+    """Return the weights dP(Z < z) of the Gauss points, whose sum is P(Z >= b).
+
+    ``exponents`` (3, m, points) is -ln P(Z < z); the result has the same shape. ``p_alarm`` (3, m)
+    is P(Z >= b).
+    """
     by_interval = exponents.reshape(*exponents.shape[:2], -1, GAUSS_ORDER)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_slopes = -(np.log(by_interval) @ _DERIVATIVE_MATRIX.T)
@@ -204,7 +254,12 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _joint_excess(exponent_first, exponent_second, squared_correlation):
-    """P(both) - e^-a e^-b of two Rayleigh magnitudes (:func:`.detection.fading_together`)."""
+    """Return P(both) - e^-a e^-b of two correlated Rayleigh magnitudes.
+
+    Alone, the first crosses its level with the probability e^-a, the second with e^-b
+    (:func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`). ``squared_correlation`` is
+    the square of the correlation of their complex amplitudes.
+    """
     if squared_correlation <= 0.0 or exponent_first + exponent_second > 700.0:
         return 0.0
     inverse_remainder = 2.0 / (1.0 - squared_correlation)
@@ -227,100 +282,117 @@ def _joint_excess(exponent_first, exponent_second, squared_correlation):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate_levels(
-    span_numbers,
-    peak_is_searched,
-    span_bins,
+    spans,
     levels,
     bin_thresholds,
     negligible_signal_ratio,
-    rule_and_leakage,
-    points_and_speckle,
+    rule,
+    includes_leakage,
+    speckle_table,
     pd_loss,
     exponents,
 ):
-    """Evaluate runs at all levels: what the echo loses there, and what leaked signal adds.
+    """Compute, at all levels, how much pd the echo loses and how much leaked signal adds.
 
-    ``span_numbers`` (4, segments, m) are low, count, peak and start of runs; ``span_bins`` |X| [V]
-    of all
-    runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
-    ``bin_thresholds`` (m,) :class:`sweep.model.detection.echo_detection.BinThresholds`;
-    ``negligible_signal_ratio`` (m,) the floor of leakage over the noise;
-    ``rule_and_leakage`` the rule of detection, and whether leakage is
-    looked at;
-    ``points_and_speckle`` points (m,) and the speckle of all. Results, of the levels' shape:
-    ``pd_loss`` P_b - P_z; ``exponents`` -ln P(Z < z), to which that of leaked signal is added.
+    Parameters
+    ----------
+    spans
+        :class:`sweep.model.spectrum.segment_spectra.BinSpans` of m points.
+    levels
+        (segments, m, levels): levels z of |X| [V, summed over the record], the threshold first.
+    bin_thresholds
+        (m,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`.
+    negligible_signal_ratio
+        (m,): |X| over sigma below which a bin counts as noise alone.
+    rule
+        :class:`sweep.model.detection.echo_detection.DetectionRule`.
+    includes_leakage
+        True if leaked signal counts.
+    speckle_table
+        :class:`sweep.model.detection.echo_detection.SpeckleTable` of all points.
+    pd_loss
+        (segments, m, levels): result, P_b - P_z.
+    exponents
+        (segments, m, levels): -ln P(Z < z) of noise alone, to which that of leaked signal is added.
     """
-    first_bin, n_bins, peak_index, span_start = span_numbers
-    for s in range(first_bin.shape[0]):
-        for j in range(first_bin.shape[1]):
-            if n_bins[s, j] == 0:
+    for s in range(spans.first_bin.shape[0]):
+        for j in range(spans.first_bin.shape[1]):
+            n_bins = spans.n_bins[s, j]
+            if n_bins == 0:
                 continue
-            magnitudes = span_bins[0][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
-            is_echo = span_bins[1][span_start[s, j] : span_start[s, j] + n_bins[s, j]]
-            at_threshold, bin_threshold = Detection(0.0, 1.0), bin_threshold_at(bin_thresholds, j)
+            span_begin, first_bin = spans.span_start[s, j], spans.first_bin[s, j]
+            magnitudes = spans.magnitudes[span_begin : span_begin + n_bins]
+            is_echo = spans.is_exempt[span_begin : span_begin + n_bins]
+            at_threshold, bin_threshold = (
+                Detection(0.0, 1.0),
+                bin_threshold_at(bin_thresholds, j),
+            )
             for k in range(levels.shape[2]):
-                threshold = levels[s, j, k]
-                if peak_is_searched[s, j]:
+                level = levels[s, j, k]
+                if spans.peak_is_searched[s, j]:
                     at_level = pd_and_miss(
-                        EchoBins(magnitudes, is_echo, first_bin[s, j]),
-                        peak_index[s, j],
-                        rule_and_leakage[0],
+                        EchoBins(magnitudes, is_echo, first_bin),
+                        spans.peak_index[s, j],
+                        rule,
                         BinThreshold(
                             bin_threshold.line_noise,
-                            threshold,
+                            level,
                             bin_threshold.noise_without_pedestal,
                             bin_threshold.side_noise,
                             bin_threshold.pedestal,
                         ),
-                        bin_speckle_at(points_and_speckle[1], s, points_and_speckle[0][j]),
+                        bin_speckle_at(speckle_table, s, spans.point_numbers[j]),
                     )
-                    if k == 0:
+                    if k == THRESHOLD_LEVEL:
                         at_threshold = at_level
                     # The difference of the smaller probabilities keeps its digits.
                     loss_at_level = at_threshold.pd - at_level.pd
                     if at_level.miss < 0.5:
                         loss_at_level = at_level.miss - at_threshold.miss
                     pd_loss[s, j, k] = max(loss_at_level, 0.0)
-                if rule_and_leakage[1]:
+                if includes_leakage:
                     p_leak = span_leakage(
                         magnitudes,
                         is_echo,
-                        threshold,
+                        level,
                         bin_threshold.noise_without_pedestal,
                         negligible_signal_ratio[j],
-                        levels[s, j, 0],
-                        rule_and_leakage[0].sidelobe_correlation,
+                        levels[s, j, THRESHOLD_LEVEL],
+                        rule.sidelobe_correlation,
                     )
                     p_leak = min(p_leak, 1.0 - 1e-16)
                     exponents[s, j, k] -= math.log1p(-p_leak)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shared_excess(
-    level_probabilities, level_exponents, echo_fractions, squared_correlation, excess
-):
-    """Excess probability that both peaks are right if noise crosses in either, (m,) in place.
+def _fill_joint_excess(up, down, squared_correlation, joint_excess):
+    """Compute by how much shared speckle raises the probability that both peaks are right.
 
-    ``level_probabilities``, ``level_exponents`` and ``echo_fractions`` are of up and down segment,
-    (m, 1 + k) each, the threshold
-    first: probabilities of levels that the echo has to cross; -ln P_z; share of signal in the power
-    of the bin detected as often. ``squared_correlation`` is the square of the correlation of the
-    signals' amplitudes.
+    Only combinations of levels count in which bins without the echo cross in either segment.
+
+    Parameters
+    ----------
+    up, down
+        :class:`LevelProbabilities` of the up and the down segment.
+    squared_correlation
+        (m,): square of the correlation of the echo's complex amplitudes in both segments.
+    joint_excess
+        (m,): result.
     """
-    for j in range(excess.size):
-        up, down, total = level_probabilities[0][j], level_probabilities[1][j], 0.0
-        up_alarm, down_alarm = 1.0 - up[0], 1.0 - down[0]
-        for k in range(up.size):
-            for i in range(1 if k == 0 else 0, down.size):
-                probability = up[k] * down[i]
-                if probability > 1e-9 * (up_alarm if k > 0 else 1.0) * (
-                    down_alarm if i > 0 else 1.0
+    for j in range(joint_excess.size):
+        up_alarm = 1.0 - up.probability[j, THRESHOLD_LEVEL]
+        down_alarm, total = 1.0 - down.probability[j, THRESHOLD_LEVEL], 0.0
+        for k in range(up.probability.shape[1]):
+            for i in range(1 if k == THRESHOLD_LEVEL else 0, down.probability.shape[1]):
+                probability = up.probability[j, k] * down.probability[j, i]
+                if probability > 1e-9 * (up_alarm if k != THRESHOLD_LEVEL else 1.0) * (
+                    down_alarm if i != THRESHOLD_LEVEL else 1.0
                 ):
                     squared_product = min(
-                        squared_correlation[j] * echo_fractions[0][j, k] * echo_fractions[1][j, i],
+                        squared_correlation[j] * up.echo_fraction[j, k] * down.echo_fraction[j, i],
                         1.0 - 1e-12,
                     )
                     total += probability * _joint_excess(
-                        level_exponents[0][j, k], level_exponents[1][j, i], squared_product
+                        up.exponent[j, k], down.exponent[j, i], squared_product
                     )
-        excess[j] = total
+        joint_excess[j] = total
