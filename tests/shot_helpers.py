@@ -77,14 +77,14 @@ def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
     """
     peak = exact_magnitude.max() if peak is None else peak
     error = np.abs(magnitude - exact_magnitude) / peak
-    if shots.adds_powers:
+    if shots.footprint.adds_powers:
         error = np.minimum(error, 1e4 * np.abs(magnitude**2 - exact_magnitude**2) / peak**2)
     return error.max()
 
 
 def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
-    n, row = shots.relative_range_offset.shape[1], int(shots.footprint_row[i])
+    n, row = shots.footprint.relative_range_offset.shape[1], int(shots.footprint.row_of_point[i])
     scratch = np.empty((BLOCK + 1, n))
     sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
     point = np.ascontiguousarray(shots.point_parameter_table()[:, i])

@@ -62,6 +62,11 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
     return tuple(effect for effect in EFFECTS if effect.name in names)
 
 
+def use_beamlet_velocities(names: Collection[str]) -> bool:
+    """Return True if any of the named effects reads the radial velocities of single beamlets."""
+    return any(effect.uses_beamlet_velocities for effect in EFFECTS if effect.name in names)
+
+
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
@@ -86,10 +91,15 @@ def prepare_shots(
         PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_CATEGORY_PATHS
     ):
         ground = FlatGround(
-            category_parameters, point_indices.size, has_velocities="doppler_spread" in effects
+            category_parameters,
+            point_indices.size,
+            has_velocities=use_beamlet_velocities(effects),
         )
         shots = apply_effects(category_parameters, point_indices.size, ground, effects)
-        yield point_indices, replace(shots, shares_phase_errors=True)
+        yield (
+            point_indices,
+            replace(shots, echo_record=shots.echo_record._replace(shares_phase_errors=True)),
+        )
 
 
 def prepare_ray_traced_shots(
@@ -111,7 +121,7 @@ def prepare_ray_traced_shots(
         Names of the effects to simulate.
     effect_flags : ndarray (n,) uint32, optional
         Bit mask of each shot's enabled effects, if shots differ. They may differ in effects that do
-        not need a batch of their own (:attr:`~sweep.model.effects.effect.Effect.needs_own_batch`).
+        not need separate batches, as :class:`~sweep.model.effects.effect.Effect` states.
     """
     parameter_arrays = parameters_as_arrays(PARAMETER_DEFAULTS | dict(parameters))
     return apply_effects(
@@ -158,7 +168,7 @@ def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[st
     return {
         effect.name: (effect_flags >> k & 1).astype(float)
         for k, effect in enumerate(EFFECTS)
-        if effect.name in effects and not effect.needs_own_batch and missing_bits >> k & 1
+        if effect.name in effects and not effect.needs_separate_batches and missing_bits >> k & 1
     }
 
 
@@ -229,18 +239,18 @@ def shot_statistics(
         **false_alarms,
         "p_leakage_up": leakage[0],
         "p_leakage_down": leakage[2],
-        "beamlets": np.full(shots.size, float(shots.relative_range_offset.shape[1])),
-        "beamlets_error": shots.beamlets_error + np.zeros(shots.size),
+        "beamlets": np.full(shots.size, float(shots.footprint.relative_range_offset.shape[1])),
+        "beamlets_error": shots.footprint.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,
         "range_error": measured.range - shots.range,
-        "radial_velocity_error": measured.radial_velocity - shots.radial_velocity,
+        "radial_velocity_error": measured.radial_velocity - shots.target.radial_velocity,
         "misread": (is_range_misread | is_velocity_misread).astype(float),
     }
     if shots.any_two:
         results["pd_both_chirps"] = shots.joint_detection_probability(
             pd[0], pd[2], (magnitude[0], magnitude[2])
         )
-    if shots.reported_peaks == waveform.STRONGEST_PEAK:
+    if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
         results |= strongest_peak_probabilities(shots, pd, miss, magnitude)
         # Both peaks are the echo's, but they are resolved to another range.
         pd_misread = np.where(is_range_misread, results["pd_shot"], 0.0)
@@ -274,13 +284,13 @@ def shot_pd_and_miss(
         precision.
     """
     if shots.any_two:
-        if shots.segment_correlations is None:
+        if shots.speckle.segment_correlations is None:
             return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
         threshold_ratio = shots.threshold / shots.line_noise_sigma
         if shots.looks.is_noncoherent:
-            look_speckle = shots.look_speckle
+            look_speckle = shots.speckle.look_speckle
             correlations = (
-                np.abs(np.array(shots.segment_correlations))
+                np.abs(np.array(shots.speckle.segment_correlations))
                 if look_speckle is None
                 else look_speckle.segment_correlation
             )
@@ -288,7 +298,7 @@ def shot_pd_and_miss(
             return shots.looks.pd_and_miss_any_two(
                 signal_ratios, threshold_ratio, correlations, pd, look_speckle
             )
-        correlations = np.abs(np.array(shots.segment_correlations))
+        correlations = np.abs(np.array(shots.speckle.segment_correlations))
         pd_shot, miss_shot = pd_and_miss_any_two_in_speckle(pd, miss, threshold_ratio, correlations)
         speckle_table = shots.speckle_table
         near_ends = np.flatnonzero(speckle_table.ratio_row.any(axis=0))
@@ -305,7 +315,7 @@ def shot_pd_and_miss(
         return DetectionArrays(pd_shot, miss_shot)
     pd_both = shots.joint_detection_probability(pd[0], pd[2], (magnitudes[0], magnitudes[2]))
     miss_shot = miss[0] + pd[0] * miss[2]
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         miss_shot = miss[0] + np.maximum(pd[0] - pd_both, 0.0)
     return DetectionArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
 
@@ -313,7 +323,7 @@ def shot_pd_and_miss(
 def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
     """Return the range and radial velocity that the peaks of the segments report."""
     peak_frequencies, weights = segment_results[:, 3], segment_results[:, 2] ** 2
-    if shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
+    if shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
         return fit_peaks(
             shots, peak_frequencies, np.where(shots.has_segment[:, None], weights, 0.0)
         )
@@ -321,13 +331,13 @@ def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> wavefor
         up=peak_frequencies[0],
         doppler=peak_frequencies[1] if shots.has_segment[1] else None,
         down=peak_frequencies[2],
-        carrier=shots.carriers[0],
-        bandwidth=shots.chirp_bandwidth,
-        duration=shots.chirp_duration,
+        carrier=shots.waveform.carriers[0],
+        bandwidth=shots.waveform.chirp_bandwidth,
+        duration=shots.waveform.chirp_duration,
         sample_rate=shots.sample_rate,
         bin_width=shots.sample_rate / shots.fft_size,
         has_signs=shots.complex_record,
-        two_beat_assumption=shots.two_beat_assumption,
+        two_beat_assumption=shots.detection_settings.two_beat_assumption,
     )
 
 
@@ -358,25 +368,33 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     """
     frequency_tolerance = MISREAD_TOLERANCE_BINS * shots.sample_rate / shots.fft_size
     footprint_rows, last_start = (
-        shots.footprint_row,
-        max(float(np.max(start)) for start in shots.scheduled_segment_starts),
+        shots.footprint.row_of_point,
+        max(float(np.max(start)) for start in shots.waveform.segment_starts),
     )
-    shot_time = last_start + np.asarray(shots.chirp_duration) + np.abs(shots.range_walk_time)
-    range_change = (np.abs(shots.approach_speed) + np.abs(shots.radial_velocity)) * shot_time
-    range_change = range_change + np.abs(shots.acceleration) * shot_time * shot_time
+    shot_time = (
+        last_start
+        + np.asarray(shots.waveform.chirp_duration)
+        + np.abs(shots.motion.range_walk_time)
+    )
+    range_change = (
+        np.abs(shots.target.approach_speed) + np.abs(shots.target.radial_velocity)
+    ) * shot_time
+    range_change = range_change + np.abs(shots.target.acceleration) * shot_time * shot_time
     # An acceleration shifts beats between segments, which changes both measured range and velocity.
-    velocity_change = np.abs(shots.acceleration) * shot_time
-    carrier = np.asarray(shots.carriers[0])
-    beat_per_metre = shots.chirp_rate * 2 / SPEED_OF_LIGHT
+    velocity_change = np.abs(shots.target.acceleration) * shot_time
+    carrier = np.asarray(shots.waveform.carriers[0])
+    beat_per_metre = shots.waveform.chirp_rate * 2 / SPEED_OF_LIGHT
     range_tolerance = (
         frequency_tolerance + 2 * carrier / SPEED_OF_LIGHT * velocity_change
     ) / beat_per_metre + range_change
     range_tolerance = (
         range_tolerance
-        + np.abs(shots.relative_range_offset).max(axis=1)[footprint_rows] * shots.range
+        + np.abs(shots.footprint.relative_range_offset).max(axis=1)[footprint_rows] * shots.range
     )
     footprint_velocity = (
-        SPEED_OF_LIGHT / 2 * np.abs(shots.doppler_ratio_offset).max(axis=1)[footprint_rows]
+        SPEED_OF_LIGHT
+        / 2
+        * np.abs(shots.footprint.doppler_ratio_offset).max(axis=1)[footprint_rows]
     )
     range_tolerance = (
         range_tolerance + 2 * carrier / SPEED_OF_LIGHT * footprint_velocity / beat_per_metre
@@ -390,7 +408,7 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     )
     return np.array([
         np.abs(measured.range - shots.range) > range_tolerance,
-        np.abs(measured.radial_velocity - shots.radial_velocity) > velocity_tolerance,
+        np.abs(measured.radial_velocity - shots.target.radial_velocity) > velocity_tolerance,
     ])  # fmt: skip
 
 
@@ -423,7 +441,7 @@ def fit_peaks(
         sample_rate=sample_rate,
         bin_width=sample_rate / shots.fft_size,
         has_signs=shots.complex_record,
-        two_beat_assumption=shots.two_beat_assumption,
+        two_beat_assumption=shots.detection_settings.two_beat_assumption,
     )
 
 

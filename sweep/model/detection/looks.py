@@ -752,7 +752,7 @@ def coherent_gain(
 
     |mean exp(2 pi i f a t^2 / c)|, t the looks' times about their middle: what a velocity that is
     put right leaves. A laser's walking phase leaves the root of
-    :func:`sweep.model.effects.line_width.coherent_power_fraction` besides.
+    :func:`sweep.model.effects.laser_line.pure_line_power_fraction` besides.
     """
     look_index = np.arange(looks.n_coherent) - (looks.n_coherent - 1) / 2
     cycles_per_square_index = np.asarray(

@@ -28,7 +28,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     Of an echo whose strongest bin is not searched nothing is detected, but for other groups of
     bins about lines of its footprint; the magnitude stays that of its strongest bin.
     """
-    if shots.search_band is None:
+    if shots.detection_settings.search_band is None:
         return spans
     points = spans.point_numbers
     span_numbers = np.array(
@@ -36,7 +36,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     )
     probabilities = np.array([spans.pd, spans.miss, spans.leakage])
     period_bins = shots.fft_size if shots.complex_record else 0
-    band_bins = np.ascontiguousarray(shots.search_band[:, :, points])
+    band_bins = np.ascontiguousarray(shots.detection_settings.search_band[:, :, points])
     peak_distance = spans.first_bin + spans.peak_index - band_bins[:, 0]
     peak_distance = peak_distance % period_bins if period_bins else peak_distance
     peak_is_searched = (spans.n_bins == 0) | (
@@ -52,7 +52,10 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
         [shots.bin_threshold_table[:, points], negligible_signal_ratio[None]]
     )
     evaluates_leakage = np.array(
-        [shots.includes_leakage and segment.includes_leakage for segment in shots.waveform_segments]
+        [
+            shots.detection_settings.includes_leakage and segment.includes_leakage
+            for segment in shots.waveform_segments
+        ]
     )
     band_and_lines = band_bins, period_bins, line_positions, peak_is_searched
     points_and_speckle = points, shots.speckle_table
@@ -90,12 +93,12 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
     def by_point(values: np.ndarray | float) -> np.ndarray:
         return as_columns(shots, values)[points]
 
-    hertz_per_metre = by_point(shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
+    hertz_per_metre = by_point(shots.waveform.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     range_beat_and_factor = (
         hertz_per_metre * by_point(shots.range),
-        1 + shots.relative_range_offset[shots.footprint_row[points]],
+        1 + shots.footprint.relative_range_offset[shots.footprint.row_of_point[points]],
     )
-    beamlet_doppler = shots.doppler_ratio_offset[shots.footprint_row[points]]
+    beamlet_doppler = shots.footprint.doppler_ratio_offset[shots.footprint.row_of_point[points]]
     positions = np.empty((beamlet_doppler.shape[0], 3, beamlet_doppler.shape[1]))
     for s, segment in enumerate(shots.waveform_segments):
         beta = by_point(segment.doppler_ratio) + beamlet_doppler
@@ -118,7 +121,9 @@ def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarr
     line_offsets = beamlet_line_positions(shots, points) - strongest_bins[..., None]
     if shots.complex_record:
         line_offsets -= shots.fft_size * np.rint(line_offsets / shots.fft_size)
-    line_power = shots.relative_amplitude[shots.footprint_row[points]][:, None] ** 2
+    line_power = (
+        shots.footprint.relative_amplitude[shots.footprint.row_of_point[points]][:, None] ** 2
+    )
     return np.asarray(
         strongest_bins + (line_power * line_offsets).sum(axis=-1) / line_power.sum(axis=-1)
     )

@@ -34,9 +34,8 @@ from sweep.model.detection.speckle_crossing_rates import (
     empty_crossing_rates,
     tabulate_crossing_rates,
 )
-from sweep.model.effects.circulator_leak import apply_leak_line
-from sweep.model.effects.line_width import gaussian_frequency_shifts
 from sweep.model.ground import distinct_rows
+from sweep.model.laser_line import gaussian_frequency_shifts
 from sweep.model.preparation import LINE_APPROXIMATIONS_MAX, Shots
 from sweep.model.spectrum import line_shape
 from sweep.model.spectrum.bin_spectrum import (
@@ -77,6 +76,7 @@ from sweep.model.spectrum.lines import (
     replace_lines_by_nodes,
     summarise_lines,
 )
+from sweep.model.spectrum.permanent_line import apply_permanent_line
 from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
@@ -203,13 +203,13 @@ def iter_spans(
         negligible_magnitude = (
             point_rows[12] * point_rows[10] if leakage_method == LEAKAGE_BIN_BY_BIN else np.inf
         )
-        if shots.segment_correlations is not None:  # faint leakage of bright speckle counts
+        if shots.speckle.segment_correlations is not None:  # faint leakage of bright speckle counts
             negligible_magnitude = negligible_magnitude / math.sqrt(SPECKLE_POWER_MAX)
         lowest_levels, n_done = np.minimum(point_levels, negligible_magnitude), 0
         while n_done < group.point_numbers.size:
             must_keep = keeps_magnitudes or (shots.looks.is_noncoherent and bool(leakage_method))
             must_keep |= (
-                shots.circulator_leak_amplitude is not None or shots.search_band is not None
+                shots.permanent_line is not None or shots.detection_settings.search_band is not None
             )
             spans, n_computed = _evaluate_batch(
                 shots, point_rows, lowest_levels, group, leakage_method, n_done, must_keep, with_pd
@@ -224,19 +224,17 @@ def iter_spans(
                 if shots.looks.is_noncoherent
                 else spans
             )
-            yield (
-                spans if shots.circulator_leak_amplitude is None else apply_leak_line(shots, spans)
-            )
+            yield (spans if shots.permanent_line is None else apply_permanent_line(shots, spans))
             n_done += n_computed
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
     """Empty the runs of segments whose echo has no sample of the record: nothing is detected."""
-    if shots.n_samples_before_echo is None:
+    if shots.echo_record.n_samples_before is None:
         return spans
-    lacks_echo = (shots.n_samples_before_echo[:, spans.point_numbers] >= shots.window.length) & (
-        spans.n_bins > 0
-    )
+    lacks_echo = (
+        shots.echo_record.n_samples_before[:, spans.point_numbers] >= shots.window.length
+    ) & (spans.n_bins > 0)
     if not lacks_echo.any():
         return spans
     return spans._replace(
@@ -257,7 +255,11 @@ def _apply_looks(shots: Shots, spans: BinSpans, leakage: bool) -> BinSpans:
         for value in (shots.negligible_signal_ratio, shots.bin_noise_sigma, shots.threshold)
     )
     leakage_in_looks, looks = spans.leakage.copy(), shots.looks
-    for s, column in np.argwhere(spans.n_bins > 0) if leakage and shots.includes_leakage else ():
+    for s, column in (
+        np.argwhere(spans.n_bins > 0)
+        if leakage and shots.detection_settings.includes_leakage
+        else ()
+    ):
         if not shots.waveform_segments[s].includes_leakage:
             continue
         span_slice = slice(
@@ -269,9 +271,9 @@ def _apply_looks(shots: Shots, spans: BinSpans, leakage: bool) -> BinSpans:
         )
         signal_ratio_min = negligible_signal_ratio[column]
         powers, weights = np.ones(1), np.ones(1)
-        if shots.segment_correlations is not None:
+        if shots.speckle.segment_correlations is not None:
             powers, weights = looks.speckle_power_quadrature(
-                shots.look_speckle, s, int(spans.point_numbers[column])
+                shots.speckle.look_speckle, s, int(spans.point_numbers[column])
             )
             signal_ratio_min = negligible_signal_ratio[column] / math.sqrt(SPECKLE_POWER_MAX)
         is_counted = ~is_exempt & (signal >= signal_ratio_min)
@@ -322,7 +324,7 @@ def segment_spectrum(shots: Shots, point: int, segment: int, *, level_min: float
     :meth:`sweep.model.preparation.Shots.to_signed_bins` tells their frequencies. Bins below the
     level [V, summed over the record] may be left out; 0 gives all.
     """
-    shots = replace(shots, circulator_leak_amplitude=None)
+    shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
         shots,
         points=np.array([point]),
@@ -353,18 +355,21 @@ def spectrum_type(shots: Shots) -> int:
         COMPLEX_RECORD
         if shots.complex_record
         else REAL_WITH_IMAGES
-        if shots.sums_images
+        if shots.images.are_summed
         else REAL_WITHOUT_IMAGES
     )
 
 
 def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
     tables = group.tables
-    if not shots.includes_leakage:
+    if not shots.detection_settings.includes_leakage:
         return NO_LEAKAGE
-    is_averaged = shots.gaussian_line_width is not None and not shots.adds_powers
+    is_averaged = shots.laser_line.gaussian_width is not None and not shots.footprint.adds_powers
     is_averaged |= (
-        shots.looks.is_noncoherent or bin_by_bin or shots.search_band is not None or group.is_late
+        shots.looks.is_noncoherent
+        or bin_by_bin
+        or shots.detection_settings.search_band is not None
+        or group.is_late
     )
     is_smooth = tables.layout[0] == tables.layout[1] and not tables.layout[5]
     if is_smooth and not is_averaged and spectrum_type(shots) != COMPLEX_RECORD:
@@ -374,18 +379,22 @@ def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
 
 def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
     """Yield groups of points whose line shapes can be computed together, in any order."""
-    if shots.n_samples_before_echo is not None:
+    if shots.echo_record.n_samples_before is not None:
         segment_exists = shots.has_segment
-        is_late = (shots.n_samples_before_echo[segment_exists][:, points] > 0).any(axis=0)
+        is_late = (shots.echo_record.n_samples_before[segment_exists][:, points] > 0).any(axis=0)
         yield from _iter_late_shape_groups(shots, points[is_late])
         points = points[~is_late]
-    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.adds_powers
+    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     has_modes = line_shape.window_has_modes(window, fft_size)
     segments = len(shots.waveform_segments)
-    lines_stand_still = shots.gaussian_line_width is None and not np.any(shots.line_drift_per_look)
-    has_few_shapes = lines_stand_still and (shots.shares_phase_errors or not shots.phase_errors)
+    lines_stand_still = shots.laser_line.gaussian_width is None and not np.any(
+        shots.motion.line_drift_per_look
+    )
+    has_few_shapes = lines_stand_still and (
+        shots.echo_record.shares_phase_errors or not shots.echo_record.phase_errors
+    )
     batch_size = 16 * POINTS_PER_BATCH if has_few_shapes else POINTS_PER_BATCH
-    if not shots.phase_errors:
+    if not shots.echo_record.phase_errors:
         make_tables = line_shape.line_shape_tables if has_modes else _tables_without_phase_error
         tables = make_tables(window, fft_size, adds_powers, 0 if has_modes else segments)
         mode_coefficients = np.zeros((segments, 1, 2, 1))
@@ -425,7 +434,11 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
                     batch[members],
                     table_index[shape_index[members]],
                     line_shape.line_shape_tables(
-                        window, fft_size, adds_powers, tier, shared=shots.shares_phase_errors
+                        window,
+                        fft_size,
+                        adds_powers,
+                        tier,
+                        shared=shots.echo_record.shares_phase_errors,
                     ),
                     line_shift[:, is_resolved],
                     mode_coefficients[:, is_resolved],
@@ -455,12 +468,12 @@ _NO_WEIGHT = np.empty((0, 0, 0))
 
 def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
     """Yield groups of points whose echoes have part of the record's samples, in any order."""
-    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.adds_powers
+    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
-    assert shots.n_samples_before_echo is not None
-    lacks_echo = (shots.n_samples_before_echo[segment_exists][:, points] >= window.length).all(
-        axis=0
-    )
+    assert shots.echo_record.n_samples_before is not None
+    lacks_echo = (
+        shots.echo_record.n_samples_before[segment_exists][:, points] >= window.length
+    ).all(axis=0)
     if lacks_echo.any():
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
         no_modes = np.zeros((segments, 1)), np.zeros((segments, 1, 2, 1))
@@ -472,7 +485,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
         batch = points[batch_begin : batch_begin + POINTS_PER_BATCH]
         distinct_points, shape_index = _find_distinct_shapes(shots, batch)
-        echo_lengths = window.length - shots.n_samples_before_echo[:, distinct_points]
+        echo_lengths = window.length - shots.echo_record.n_samples_before[:, distinct_points]
         echo_lengths[~segment_exists] = echo_lengths[segment_exists][0]
         length_min, length_max = echo_lengths.min(axis=0), echo_lengths.max(axis=0)
         length_classes = line_shape.late_length_class(window, length_min)
@@ -589,8 +602,8 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> tuple[np.ndarray, 
     """Points of which no two have the same line shapes; which of these each of some points has."""
     first_samples = (
         ()
-        if shots.n_samples_before_echo is None
-        else shots.n_samples_before_echo[shots.has_segment]
+        if shots.echo_record.n_samples_before is None
+        else shots.echo_record.n_samples_before[shots.has_segment]
     )
     values_of_points = (
         np.broadcast_to(np.asarray(entry, float), shots.size)[batch]
@@ -598,7 +611,7 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> tuple[np.ndarray, 
             *first_samples,
             *(
                 error_value
-                for error in shots.phase_errors
+                for error in shots.echo_record.phase_errors
                 for error_value in error.arguments.values()
             ),
         )
@@ -610,7 +623,7 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> tuple[np.ndarray, 
     first_varying = next(varying, None)
     if first_varying is None:
         return batch[:1], np.zeros(batch.size, np.int64)
-    if not shots.shares_phase_errors:
+    if not shots.echo_record.shares_phase_errors:
         return batch, np.arange(batch.size)
     first_of_shape, shape_index = distinct_rows([first_varying, *varying])
     return batch[first_of_shape], shape_index
@@ -623,7 +636,7 @@ def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray
     """
     phase = np.zeros((len(shots.waveform_segments), points.size, record_positions.size))
     for segment in np.flatnonzero(shots.has_segment):
-        for error in shots.phase_errors:
+        for error in shots.echo_record.phase_errors:
             arguments = error.select_arguments(int(segment), points)
             phase[segment] += error.phase(
                 record_positions, sign=shots.waveform_segments[segment].chirp_slope, **arguments
@@ -646,7 +659,9 @@ def _evaluate_batch(
     segments, n_points = len(shots.waveform_segments), points.size
     spectrum_bins = shots.n_bins
     shifts = _averaging_shifts(shots, points)
-    n_lines_max = max(2 * shots.relative_range_offset.shape[1], NODES_MAX) * max(shifts.shape[3], 1)
+    n_lines_max = max(2 * shots.footprint.relative_range_offset.shape[1], NODES_MAX) * max(
+        shifts.shape[3], 1
+    )
     scratch_width = (
         max(
             n_lines_max,
@@ -668,7 +683,7 @@ def _evaluate_batch(
     rule = shots.detection_rule
     n_done = _evaluate_points(
         np.ascontiguousarray(point_rows[:, points].T),
-        np.stack([shots.footprint_row[points], group.shape_index[batch_begin:], points]),
+        np.stack([shots.footprint.row_of_point[points], group.shape_index[batch_begin:], points]),
         shots.beamlet_table,
         (group.line_shift, group.mode_coefficients, group.n_modes, shifts),
         tables._replace(
@@ -716,8 +731,8 @@ def _evaluate_batch(
 def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
     """Limits of nodes of the record's window; of part of it, as if all were at the record's end."""
     if not group.is_late:
-        return shots.window.node_phase_limits(shots.adds_powers)
-    tolerances = POWER_TOLERANCES if shots.adds_powers else AMPLITUDE_TOLERANCES
+        return shots.window.node_phase_limits(shots.footprint.adds_powers)
+    tolerances = POWER_TOLERANCES if shots.footprint.adds_powers else AMPLITUDE_TOLERANCES
     return node_phase_limits((0.0, 1.0), tolerances)
 
 
@@ -730,12 +745,12 @@ def bin_tangents(fft_size: int) -> np.ndarray:
 def _averaging_shifts(shots: Shots, points: np.ndarray) -> np.ndarray:
     """Shifts [bins of fs/N] over which |X|^2 is averaged, and weights, (points, segments, 2, k)."""
     segments = len(shots.waveform_segments)
-    if shots.gaussian_line_width is None:
+    if shots.laser_line.gaussian_width is None:
         shift_rows = np.empty((points.size, 2, 0))
     else:
-        duration = np.broadcast_to(shots.record_duration, shots.size)[points]
+        duration = np.broadcast_to(shots.record.duration, shots.size)[points]
         shifts = gaussian_frequency_shifts(
-            fwhm=shots.gaussian_line_width[points], duration=duration
+            fwhm=shots.laser_line.gaussian_width[points], duration=duration
         )
         padding_factor = shots.fft_size / shots.window.length
         shift_rows = np.stack([padding_factor * shifts.offset_window_bins, shifts.weight], axis=1)
@@ -745,7 +760,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> np.ndarray:
             shift_rows, np.broadcast_to(order, shift_rows.shape), axis=2
         )
     by_segment = np.repeat(shift_rows[:, None], segments, axis=1)
-    drift = np.broadcast_to(shots.line_drift_per_look, (segments, shots.size))[:, points].T
+    drift = np.broadcast_to(shots.motion.line_drift_per_look, (segments, shots.size))[:, points].T
     if shots.looks.n_power_averaged == 1 or not drift.any():
         return by_segment
     if not by_segment.shape[3]:

@@ -84,7 +84,7 @@ def strongest_peak_probabilities(
     }
     p_no_alarm = (1 - p_alarm[0]) * (1 - p_alarm[2])
     p_both_right = pd_right[0] * pd_right[2] + shared_gain
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
             shots.joint_detection_probability(pd[0], pd[2], (magnitude[0], magnitude[2]))
             - pd[0] * pd[2]
@@ -127,7 +127,7 @@ def _span_probabilities(
         (spans.magnitudes, spans.is_exempt),
         levels,
         np.concatenate([shots.bin_threshold_table[:, points], negligible_signal_ratio[None]]),
-        (shots.detection_rule, shots.includes_leakage),
+        (shots.detection_rule, shots.detection_settings.includes_leakage),
         (points, shots.speckle_table),
         pd_loss,
         exponents,
@@ -135,9 +135,9 @@ def _span_probabilities(
     p_alarm = -np.expm1(-exponents[..., 0])
     weight = _level_weights(exponents[..., 1:], p_alarm)
     segment_exists, joint_excess = shots.has_segment[:, None], np.zeros(points.size)
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         squared_correlation = np.broadcast_to(
-            np.abs(shots.segment_correlations.up_down) ** 2, shots.size
+            np.abs(shots.speckle.segment_correlations.up_down) ** 2, shots.size
         )[points]
         with np.errstate(divide="ignore"):
             level_exponents = np.minimum(
@@ -177,7 +177,7 @@ def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> 
 def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.ndarray:
     """-ln P(no bin of noise is at or above y), of the shape of y."""
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)[..., None]
-    if shots.noise_bins == "correlated":
+    if shots.detection_settings.noise_bins == "correlated":
         n_bins = bin_noise.alarm_equivalent_bins(
             n_bins,
             threshold_ratio=np.sqrt(2 * half_squares),
