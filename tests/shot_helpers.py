@@ -84,7 +84,7 @@ def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
 
 def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
-    n, row = shots.footprint.relative_range_offset.shape[1], int(shots.footprint.row_of_point[i])
+    n, row = shots.footprint.n_beamlets, int(shots.footprint.row_of_point[i])
     scratch = np.empty((BLOCK + 1, n))
     sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
     point = np.ascontiguousarray(shots.point_parameter_table()[:, i])

@@ -239,7 +239,7 @@ def shot_statistics(
         **false_alarms,
         "p_leakage_up": leakage[0],
         "p_leakage_down": leakage[2],
-        "beamlets": np.full(shots.size, float(shots.footprint.relative_range_offset.shape[1])),
+        "beamlets": np.full(shots.size, float(shots.footprint.n_beamlets)),
         "beamlets_error": shots.footprint.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,
         "range_error": measured.range - shots.range,

@@ -151,7 +151,7 @@ def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Freq
 def pure_line_power_fraction(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
 ) -> np.ndarray:
-    """Return the fraction of the beat's power in the pure line, exp(-2 pi dnu tau), 0..1.
+    """Return the fraction of the beat's power in the pure line of a Lorentzian laser, 0..1.
 
     Parameters
     ----------
@@ -161,6 +161,14 @@ def pure_line_power_fraction(
         Delay tau of the echo [s].
     duration : ndarray (n,)
         Length of the record [s], which replaces a longer delay.
+
+    Notes
+    -----
+    exp(-2 pi dnu tau) [1]_.
+
+    References
+    ----------
+    .. [1] Gallion and Debarge, 1984.
     """
     return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
 
@@ -274,9 +282,9 @@ def apparent_line_and_pedestal(
     window: Window,
     looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the line and the pedestal in the line's bin as |X| shows them.
+    """Return the power of the line and of the pedestal in the line's bin, as |X| shows them.
 
-    A phase common to the full record is excluded.
+    A phase common to the full record does not change |X| and is excluded.
 
     Parameters
     ----------

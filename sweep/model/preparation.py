@@ -86,7 +86,7 @@ among them."""
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shots:
-    """Points of one category, ready for the spectrum: a composition of records.
+    """Prepared shots of points of one category: all that their spectra depend on, as records.
 
     An effect replaces a record by a changed one. Records with a default stay neutral unless an
     effect sets them. Arrays are (n,) or scalars unless stated otherwise, in SI units. Segments are
@@ -111,7 +111,8 @@ class Shots:
     link_scales: LinkScales
     """Light and beat of a relative echo of one."""
     receiver_noise: ReceiverNoise
-    """Noise of the receiver alone, and the noise of a current and of light."""
+    """Noise variances at the ADC of the receiver's own sources, of 1 A^2 of current and of the shot
+    noise of 1 W of light."""
     noise: NoiseBudget
     """Noise at the ADC, by source."""
     footprint: FootprintLines
@@ -125,7 +126,7 @@ class Shots:
     motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
     """Motion of the target that the lines and the measurement include."""
     echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
-    """Samples of the record without echo, and phase errors over the record."""
+    """Samples of the record before the echo, and phase errors of the echo over the record."""
     images: LineImages = LineImages()  # noqa: RUF009
     """Images of lines at their negative frequencies."""
     laser_line: LaserLine = LaserLine()  # noqa: RUF009

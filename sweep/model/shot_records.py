@@ -160,7 +160,7 @@ class PhaseError(NamedTuple):
 
 
 class EchoRecord(NamedTuple):
-    """Echo over the samples of a record: samples without it, and errors of its phase."""
+    """Samples of a segment's record before the echo, and phase errors of the echo."""
 
     n_samples_before: np.ndarray | None = None
     """(3, n) int64: samples of the record before the echo arrives, up to all; None where echoes
@@ -168,7 +168,7 @@ class EchoRecord(NamedTuple):
     phase_errors: tuple[PhaseError, ...] = ()
     """Deterministic phase errors, which add."""
     shares_phase_errors: bool = False
-    """True if many shots have equal phase errors; False for those of a flight."""
+    """True if many shots have equal phase errors, as on a grid; False for those of a flight."""
 
 
 class LineImages(NamedTuple):
@@ -194,7 +194,7 @@ class PermanentLine(NamedTuple):
 
 
 class EchoSpeckle(NamedTuple):
-    """Speckle of an echo that fades; by default the echo does not fade."""
+    """Developed speckle of an echo, in which it fades; none by default."""
 
     segment_correlations: "SegmentCorrelations | None" = None
     """Correlations between segments of echoes in developed speckle; None without speckle."""

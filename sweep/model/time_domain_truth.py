@@ -54,7 +54,7 @@ def time_domain_spectrum(
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
     record_sum = np.zeros(shots.window.length, complex)
     power, image_gain = np.zeros(shots.n_bins), _value_at(shots.images.iq_gain, point)
-    for beamlet in range(shots.footprint.relative_range_offset.shape[1]):
+    for beamlet in range(shots.footprint.n_beamlets):
         beamlet_record = analytic_record(
             shots,
             point,

@@ -86,7 +86,7 @@ class Instrument(NamedTuple):
         random complex amplitude, one for all segments.
         """
         shots, rng = self.shots, np.random.default_rng(seed)
-        lines, level = shots.footprint.relative_range_offset.shape[1], float(shots.threshold[0])
+        lines, level = shots.footprint.n_beamlets, float(shots.threshold[0])
         lobe = int(np.ceil(main_lobe_half_width(shots.window) * self.size / shots.window.length))
         edge = first_circular_bin(shots.window, self.size)
         speckle = np.ones((DRAWS, lines), complex)

@@ -120,7 +120,7 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
 
 def axis_amplitude(shots):
     """Relative amplitude of the echo on the axis, (n,), alone without a footprint."""
-    assert shots.footprint.relative_amplitude.shape[1] == 1
+    assert shots.footprint.n_beamlets == 1
     return shots.footprint.relative_amplitude[shots.footprint.row_of_point, 0]
 
 

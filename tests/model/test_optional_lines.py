@@ -184,7 +184,7 @@ def exact(shots, i, segment, shifts):
         cycles = cycles + error.phase(x, sign=DEFAULT_CHIRP_SLOPES[segment], **values)[0]
     records = [
         time_domain_truth.analytic_record(shots, i, segment, b, with_range_walk=False)
-        for b in range(shots.footprint.relative_range_offset.shape[1])
+        for b in range(shots.footprint.n_beamlets)
     ]
     total = np.zeros(half)
     for shift, weight in zip(*shifts, strict=True):

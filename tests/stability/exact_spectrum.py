@@ -76,10 +76,7 @@ def exact_magnitudes(
 ) -> list[mp.mpf]:
     """|X[k]| of some bins: lines, and images if wanted, as amplitudes or as powers."""
     window, result = shots.window, []
-    lines = [
-        ExactLine(shots, point, segment, b)
-        for b in range(shots.footprint.relative_range_offset.shape[1])
-    ]
+    lines = [ExactLine(shots, point, segment, b) for b in range(shots.footprint.n_beamlets)]
     weights = (
         None
         if window.name in COSINE_SUM_COEFFICIENTS
@@ -111,10 +108,7 @@ def exact_magnitudes(
 
 def peak_magnitude(shots: Shots, point: int, segment: int) -> float:
     """Height on a bin of a line with the weight of all lines of a segment."""
-    lines = (
-        ExactLine(shots, point, segment, b)
-        for b in range(shots.footprint.relative_range_offset.shape[1])
-    )
+    lines = (ExactLine(shots, point, segment, b) for b in range(shots.footprint.n_beamlets))
     return float(mp.fsum(abs(line.weight) for line in lines)) * shots.window.sum
 
 

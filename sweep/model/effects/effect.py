@@ -74,7 +74,7 @@ class EffectContext(NamedTuple):
     """Masks (n,) of effects that not all points have: 1.0 where enabled, else 0.0."""
 
     def presence_factor(self, effect: str) -> np.ndarray | float:
-        """Return 1 for points with an effect and 0 for others: (n,), or one number for all."""
+        """Return 1 for points that have an effect and 0 for others: (n,), or one number for all."""
         return self.presence.get(effect, 1.0)
 
     def select_beamlets(

@@ -47,7 +47,7 @@ def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the reach of a Gaussian line; None for other lines."""
+    """Return the distance to which a Gaussian line moves light [bins]; None for other lines."""
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
     return PhaseErrorBound(

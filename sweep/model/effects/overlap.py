@@ -106,7 +106,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Bound the error of a common first sample, the axis's at the middle look, for all beamlets.
+    """Bound the error because all beamlets and looks share the first sample of the beam's axis.
 
     Returns
     -------
@@ -147,7 +147,7 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Count the samples of each segment's record before the echo, which hold noise alone.
+    """Leave out the echo in the first samples of each record, before the echo arrives.
 
     Notes
     -----

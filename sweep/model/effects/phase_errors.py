@@ -334,7 +334,7 @@ def range_walk_phase(
     duration: np.ndarray,
     slide: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Return the phase that range walk adds to the line's.
+    """Return the phase that range walk adds to the beat of a line.
 
     Parameters
     ----------

@@ -159,6 +159,16 @@ class PlannerInputs(LinkBudget):
         """Frequency that the delay turns into phase [Hz], by segment."""
         return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
+    @property
+    def noise_peak_ratio(self) -> float | None:
+        """Magnitude over sigma that any bin's noise exceeds with a probability of at most 0.001.
+
+        None if segments report all peaks that cross the threshold.
+        """
+        if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
+            return None
+        return float(np.sqrt(2 * np.log(1e3 * self.fft_size)))
+
     # The target
 
     @property

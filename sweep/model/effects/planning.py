@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect
 from sweep.model.effects.error_bounds import ErrorBound
@@ -264,10 +263,8 @@ def omission_errors(
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
-    if points.option(waveform.PEAKS_PATH) != waveform.ALL_PEAKS:
-        # An echo has to exceed the noise of any bin as well, up to a probability of 0.001.
-        noise_peak_ratio = float(np.sqrt(2 * np.log(1e3 * points.fft_size)))
-        threshold = np.maximum(threshold, np.minimum(signal_ratio_max, noise_peak_ratio))
+    if points.noise_peak_ratio is not None:  # an echo has to exceed the noise as well
+        threshold = np.maximum(threshold, np.minimum(signal_ratio_max, points.noise_peak_ratio))
     b = points.looks.equivalent_threshold_ratio(threshold)
     steepest_signal = 0.5 * (b + np.sqrt(b * b + 2))
     signal = np.minimum(np.maximum(steepest_signal, signal_ratio_min), signal_ratio_max)

@@ -213,10 +213,9 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     )
     magnitude, cycles = draw_speckle_factors(
         draw_addresses,
-        n_beamlets=shots.footprint.relative_amplitude.shape[1],
+        n_beamlets=shots.footprint.n_beamlets,
         coherent_fraction=coherent_fraction,
-        random_phases=shots.footprint.adds_powers
-        and shots.footprint.relative_amplitude.shape[1] > 1,
+        random_phases=shots.footprint.adds_powers and shots.footprint.n_beamlets > 1,
     )
     offset, doppler, mean_amplitude = (
         values[shots.footprint.row_of_point]

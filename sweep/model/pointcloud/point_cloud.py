@@ -164,7 +164,7 @@ def simulate_cloud(
                 bin_groups.magnitude[:, :, 0],
             )
         part_results = _statistics_before_draws(shots, bin_groups) | _cloud_points(
-            part_eyepoints, part_returns, shots.footprint.relative_range_offset.shape[1]
+            part_eyepoints, part_returns, shots.footprint.n_beamlets
         )
         part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
         part_results["beamlets"] = np.full(shots.size, part_eyepoints.weight.size)

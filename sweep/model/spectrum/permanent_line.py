@@ -225,7 +225,7 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return |X| of an echo alone whose bins cross as often as those of echo and line together.
+    """Return |X| of an echo that alone crosses the threshold as often as echo and line together.
 
     Parameters
     ----------

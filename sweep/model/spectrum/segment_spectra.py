@@ -659,9 +659,7 @@ def _evaluate_batch(
     segments, n_points = len(shots.waveform_segments), points.size
     spectrum_bins = shots.n_bins
     shifts = _averaging_shifts(shots, points)
-    n_lines_max = max(2 * shots.footprint.relative_range_offset.shape[1], NODES_MAX) * max(
-        shifts.shape[3], 1
-    )
+    n_lines_max = max(2 * shots.footprint.n_beamlets, NODES_MAX) * max(shifts.shape[3], 1)
     scratch_width = (
         max(
             n_lines_max,

@@ -52,7 +52,7 @@ def true_spectra(shots, segment):
             w * time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False),
             shots.fft_size,
         )
-        for b in range(shots.footprint.relative_range_offset.shape[1])
+        for b in range(shots.footprint.n_beamlets)
     ]
     return np.array([[x[half] / 2 for x in both], [x[-half].conj() / 2 for x in both]])
 
@@ -80,7 +80,7 @@ def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     """The same factors for all segments, conjugated where the beat folds."""
     parameters = table_4_1(**{"fft_size": 4096} | scene)
     shots, share = prepare_single_category(parameters, STILL[:-1]), 0.2
-    number = shots.footprint.relative_range_offset.shape[1]
+    number = shots.footprint.n_beamlets
     g = factors(20, number, share, random_phases=shots.footprint.adds_powers)
     (drawn,) = iter_realisations(
         with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20
