@@ -20,7 +20,7 @@ from scipy import stats
 
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.speckle import coherent_power_fraction
+from sweep.model.effects.speckle import coherent_echo_fraction
 from sweep.model.evaluation import evaluate_segments, prepare_shots
 from sweep.model.outputs import PD_OUTPUTS
 from sweep.spec import GridSpec, load
@@ -82,12 +82,12 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
     certain_effects = [effect.name for effect in EFFECTS if not effect.is_random]
     means, integral_error = np.full((4, grid.n_points), np.nan), 0.0
     for index, shots in prepare_shots(parameters, certain_effects):
-        if shots.relative_amplitude.shape[1] != 1 or np.any(shots.pedestal_variance_under_lines):
+        if shots.footprint.n_beamlets != 1 or np.any(shots.laser_line.pedestal_variance_under):
             raise ValueError("only of one beamlet, without a pedestal, the mean is known")
         signal = evaluate_segments(shots)[:, 2] / shots.line_noise_sigma
         level = shots.threshold / shots.line_noise_sigma
         kappa = np.broadcast_to(
-            coherent_power_fraction(
+            coherent_echo_fraction(
                 roughness=parameters["target.roughness"],
                 wavelength=parameters["instrument.laser.wavelength"],
             ),

@@ -89,11 +89,13 @@ def point_facet(parameters, shots) -> Facet:
         acquisition_delay=first_value(parameters["instrument.processing.acquisition_delay"]),
         radial_velocity=first_value(parameters["target.radial_velocity"]),
         transverse_velocity=first_value(parameters["target.transverse_velocity"]),
-        segments=shots.segment_order,
+        segments=shots.waveform.segment_order,
         gap=first_value(parameters.get("instrument.chirp.gap", 0.0)),
         complex_record=shots.complex_record,
         looks=shots.looks.number,
-        footprint_slide_speed=first_value(shots.approach_speed - shots.radial_velocity),
+        footprint_slide_speed=first_value(
+            shots.target.approach_speed - shots.target.radial_velocity
+        ),
     )
 
 
@@ -103,11 +105,11 @@ def segment_amplitudes(facet: Facet, shots) -> dict[str, float]:
     for segment in facet.segments:
         gain = receiver_chain.receiver_transfer(
             np.array(echo_beat(facet, segment)),
-            detector_bandwidth=shots.detector_bandwidth,
-            amplifier_bandwidth=shots.amplifier_bandwidth,
+            detector_bandwidth=shots.receiver_filter.detector_bandwidth,
+            amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
         )
         echo_amplitude = (
-            shots.beat_amplitude_scale * np.sqrt(shots.total_relative_echo) * np.abs(gain)
+            shots.link_scales.beat_amplitude * np.sqrt(shots.total_relative_echo) * np.abs(gain)
         )
         amplitude_by_segment[segment] = first_value(
             echo_amplitude * shots.whitening_gain[SEGMENTS.index(segment)]
@@ -197,7 +199,7 @@ def searched_bins(mean_power: np.ndarray, shots) -> np.ndarray:
     at or above the threshold, and their neighbours.
     """
     magnitude, positions = np.sqrt(mean_power), np.arange(mean_power.size)
-    if shots.detection == "peak_bin":
+    if shots.detection_settings.echo_bins == "peak_bin":
         return positions == strongest_bin(mean_power)
     half_lobe = math.ceil(main_lobe_half_width(shots.window) * shots.fft_size / shots.window.length)
     searched = np.zeros(positions.size, bool)

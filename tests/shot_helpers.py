@@ -86,14 +86,14 @@ def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
     """
     peak = exact_magnitude.max() if peak is None else peak
     error = np.abs(magnitude - exact_magnitude) / peak
-    if shots.adds_powers:
+    if shots.footprint.adds_powers:
         error = np.minimum(error, 1e4 * np.abs(magnitude**2 - exact_magnitude**2) / peak**2)
     return error.max()
 
 
 def segment_lines(shots, i, segment):
     """Origin of a segment's lines, places beside it [bins], weights C_b."""
-    n, row = shots.relative_range_offset.shape[1], int(shots.footprint_row[i])
+    n, row = shots.footprint.n_beamlets, int(shots.footprint.row_of_point[i])
     layout = SpectrumLayout(shots.fft_size, shots.window.length, 0, 0, False, False, 0)
     table, lines = shots.point_parameter_table(), LineArrays(*np.empty((3, n)))
     beat = beat_parameters_at(point_parameters(table), segment_parameters(table), segment, i)

@@ -314,7 +314,7 @@ def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
         if not shots.looks.has_moving_speckle:
             return STATED_ERRORS.alike_looks if quantity == "shot" else STATED_ERRORS.peak_bin
         return STATED_ERRORS.moving_looks if quantity == "shot" else STATED_ERRORS.moving_looks / 2
-    if shots.detection == "peak_bin":
+    if shots.detection_settings.echo_bins == "peak_bin":
         is_any_two_shot = quantity == "shot" and shots.any_two
         return STATED_ERRORS.peak_bin_any_two if is_any_two_shot else STATED_ERRORS.peak_bin
     line_deviation_bins, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
@@ -339,7 +339,7 @@ def is_near_end(facet: Facet, line_deviation_bins: float) -> bool:
 
 def detection_rule_text(shots: Shots) -> str:
     """Rule of detection in a few words."""
-    looks, rule = shots.looks, shots.detection
+    looks, rule = shots.looks, shots.detection_settings.echo_bins
     if looks.is_noncoherent:
         speckle = (
             "independent"

@@ -232,7 +232,7 @@ def _segment_spectrum(
     beat_frequency = waveform.beat_frequency(
         segment.chirp_slope,
         carrier=carrier_frequency,
-        chirp_rate=np.asarray(prepared_shot.chirp_rate),
+        chirp_rate=np.asarray(prepared_shot.waveform.chirp_rate),
         range=prepared_shot.range[0] - np.ravel(segment.range_decrease)[0],
         radial_velocity=np.ravel(segment.doppler_ratio)[0] * SPEED_OF_LIGHT / 2,
     )
@@ -331,10 +331,12 @@ def range_or_velocity_at(
     signed_frequency = fold_frequency + (-1.0 if is_mirrored else 1.0) * np.asarray(frequency)
     if segment.slope == 0:
         return signed_frequency * SPEED_OF_LIGHT / (2 * segment.carrier_frequency)
-    beta = float(np.asarray(prepared_shot.doppler_ratio).flat[0])
+    beta = float(np.asarray(prepared_shot.motion.doppler_ratio).flat[0])
     range_beat = (segment.carrier_frequency * beta - signed_frequency) / segment.slope
     return (
-        range_beat * SPEED_OF_LIGHT / (2 * np.asarray(prepared_shot.chirp_rate).item() * (1 + beta))
+        range_beat
+        * SPEED_OF_LIGHT
+        / (2 * np.asarray(prepared_shot.waveform.chirp_rate).item() * (1 + beta))
     )
 
 
@@ -563,7 +565,7 @@ def draw_scene_shot_sheet(
 def _noise_table(shot: SimulatedShot) -> PageTable:
     """Return a table of the noise at the ADC by source: volts, and shares of the noise variance."""
     variance_by_source = {
-        n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_variances.items()
+        n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise.variances.items()
     }
     total_variance = sum(variance_by_source.values())
     rows = [
@@ -620,7 +622,7 @@ def _measurement_table(shot: SimulatedShot) -> PageTable:
             (
                 "radial velocity (m/s)",
                 5,
-                float(prepared_shot.radial_velocity[0]),
+                float(prepared_shot.target.radial_velocity[0]),
                 shot.reported_radial_velocity,
             ),
         )

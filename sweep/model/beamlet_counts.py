@@ -54,11 +54,11 @@ from sweep.model.beamlets import (
     plane_offset_moment_bounds,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.window_response import WindowResponse, window_response
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.link_budget import LASER_PREFIX, LinkBudget, doppler_ratio
 from sweep.model.preparation import BEAMLETS_ERROR_PATH, Parameters, split_by_category
 from sweep.model.window import window_samples
+from sweep.model.window_response import WindowResponse, window_response
 
 BEAMLETS_PATH = "footprint.beamlets"
 """Path of the number of beamlets; 0 if it follows from the tolerance."""

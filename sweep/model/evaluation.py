@@ -60,6 +60,11 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
     return tuple(effect for effect in EFFECTS if effect.name in names)
 
 
+def use_beamlet_velocities(names: Collection[str]) -> bool:
+    """Return True if any of the named effects reads the radial velocities of single beamlets."""
+    return any(effect.uses_beamlet_velocities for effect in EFFECTS if effect.name in names)
+
+
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
@@ -84,10 +89,15 @@ def prepare_shots(
         PARAMETER_DEFAULTS | dict(parameters), effects, EFFECT_CATEGORY_PATHS
     ):
         ground = FlatGround(
-            category_parameters, point_indices.size, has_velocities="doppler_spread" in effects
+            category_parameters,
+            point_indices.size,
+            has_velocities=use_beamlet_velocities(effects),
         )
         shots = apply_effects(category_parameters, point_indices.size, ground, effects)
-        yield point_indices, replace(shots, shares_phase_errors=True)
+        yield (
+            point_indices,
+            replace(shots, echo_record=shots.echo_record._replace(shares_phase_errors=True)),
+        )
 
 
 def prepare_ray_traced_shots(
@@ -109,7 +119,7 @@ def prepare_ray_traced_shots(
         Names of the effects to simulate.
     effect_flags : ndarray (n,) uint32, optional
         Bit mask of each shot's enabled effects, if shots differ. They may differ in effects that do
-        not need a batch of their own (:attr:`~sweep.model.effects.effect.Effect.needs_own_batch`).
+        not need separate batches, as :class:`~sweep.model.effects.effect.Effect` states.
     """
     parameter_arrays = parameters_as_arrays(PARAMETER_DEFAULTS | dict(parameters))
     return apply_effects(
@@ -156,7 +166,7 @@ def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[st
     return {
         effect.name: (effect_flags >> k & 1).astype(float)
         for k, effect in enumerate(EFFECTS)
-        if effect.name in effects and not effect.needs_own_batch and missing_bits >> k & 1
+        if effect.name in effects and not effect.needs_separate_batches and missing_bits >> k & 1
     }
 
 
@@ -214,7 +224,7 @@ def shot_statistics(
     segment_results = evaluate_segments(shots) if segment_results is None else segment_results
     pd, miss, magnitude, frequency, n_exempt, leakage = np.moveaxis(segment_results, 1, 0)
     leakage_up, _, leakage_down = leakage
-    n_beamlets = shots.relative_range_offset.shape[1]
+    n_beamlets = shots.footprint.n_beamlets
     snr = shots.snr(magnitude)
     false_alarms = _false_alarm_probabilities(shots, n_exempt)
     measured = measure_range_velocity(shots, segment_results)
@@ -231,10 +241,10 @@ def shot_statistics(
         "p_leakage_up": leakage_up,
         "p_leakage_down": leakage_down,
         "beamlets": np.full(shots.size, float(n_beamlets)),
-        "beamlets_error": shots.beamlets_error + np.zeros(shots.size),
+        "beamlets_error": shots.footprint.beamlets_error + np.zeros(shots.size),
         "noise_variance": shots.noise_variance,
         "range_error": measured.range - shots.range,
-        "radial_velocity_error": measured.radial_velocity - shots.radial_velocity,
+        "radial_velocity_error": measured.radial_velocity - shots.target.radial_velocity,
         "misread": (is_range_misread | is_velocity_misread).astype(float),
     }
     if shots.any_two:
@@ -243,7 +253,7 @@ def shot_statistics(
         results["pd_both_chirps"] = shots.joint_detection_probability(
             pd_up, pd_down, (magnitude_up, magnitude_down)
         )
-    if shots.reported_peaks == waveform.STRONGEST_PEAK:
+    if shots.detection_settings.reported_peaks == waveform.STRONGEST_PEAK:
         results |= strongest_peak_probabilities(shots, pd, miss, magnitude)
         # Both peaks are the echo's, but they are resolved to another range.
         pd_misread = np.where(is_range_misread, results["pd_shot"], 0.0)
@@ -266,24 +276,24 @@ def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> wavefor
     """
     _, _, magnitudes, peak_frequencies, _, _ = np.moveaxis(segment_results, 1, 0)
     weights = magnitudes**2
-    if shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
+    if shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES:
         return fit_peaks(
             shots, peak_frequencies, np.where(shots.has_segment[:, None], weights, 0.0)
         )
     frequency_up, frequency_doppler, frequency_down = peak_frequencies
     _, has_doppler_segment, _ = shots.has_segment
-    carrier_up, _, _ = shots.carriers
+    carrier_up, _, _ = shots.waveform.carriers
     return waveform.resolve_range_velocity(
         up=frequency_up,
         doppler=frequency_doppler if has_doppler_segment else None,
         down=frequency_down,
         carrier=carrier_up,
-        bandwidth=shots.chirp_bandwidth,
-        duration=shots.chirp_duration,
+        bandwidth=shots.waveform.chirp_bandwidth,
+        duration=shots.waveform.chirp_duration,
         sample_rate=shots.sample_rate,
         bin_width=shots.sample_rate / shots.fft_size,
         has_signs=shots.complex_record,
-        two_beat_assumption=shots.two_beat_assumption,
+        two_beat_assumption=shots.detection_settings.two_beat_assumption,
     )
 
 
@@ -314,25 +324,33 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     tolerated.
     """
     frequency_tolerance = MISREAD_TOLERANCE_BINS * shots.sample_rate / shots.fft_size
-    footprint_rows = shots.footprint_row
-    last_start = max(float(np.max(start)) for start in shots.scheduled_segment_starts)
-    shot_time = last_start + np.asarray(shots.chirp_duration) + np.abs(shots.range_walk_time)
-    range_change = (np.abs(shots.approach_speed) + np.abs(shots.radial_velocity)) * shot_time
-    range_change = range_change + np.abs(shots.acceleration) * shot_time * shot_time
+    footprint_rows = shots.footprint.row_of_point
+    last_start = max(float(np.max(start)) for start in shots.waveform.segment_starts)
+    shot_time = (
+        last_start
+        + np.asarray(shots.waveform.chirp_duration)
+        + np.abs(shots.motion.range_walk_time)
+    )
+    range_change = (
+        np.abs(shots.target.approach_speed) + np.abs(shots.target.radial_velocity)
+    ) * shot_time
+    range_change = range_change + np.abs(shots.target.acceleration) * shot_time * shot_time
     # An acceleration shifts beats between segments, which changes both measured range and velocity.
-    velocity_change = np.abs(shots.acceleration) * shot_time
-    carrier_up, _, _ = shots.carriers
+    velocity_change = np.abs(shots.target.acceleration) * shot_time
+    carrier_up, _, _ = shots.waveform.carriers
     carrier = np.asarray(carrier_up)
-    beat_per_metre = shots.chirp_rate * 2 / SPEED_OF_LIGHT
+    beat_per_metre = shots.waveform.chirp_rate * 2 / SPEED_OF_LIGHT
     range_tolerance = (
         frequency_tolerance + 2 * carrier / SPEED_OF_LIGHT * velocity_change
     ) / beat_per_metre + range_change
     range_tolerance = (
         range_tolerance
-        + np.abs(shots.relative_range_offset).max(axis=1)[footprint_rows] * shots.range
+        + np.abs(shots.footprint.relative_range_offset).max(axis=1)[footprint_rows] * shots.range
     )
     footprint_velocity = (
-        SPEED_OF_LIGHT / 2 * np.abs(shots.doppler_ratio_offset).max(axis=1)[footprint_rows]
+        SPEED_OF_LIGHT
+        / 2
+        * np.abs(shots.footprint.doppler_ratio_offset).max(axis=1)[footprint_rows]
     )
     range_tolerance = (
         range_tolerance + 2 * carrier / SPEED_OF_LIGHT * footprint_velocity / beat_per_metre
@@ -346,7 +364,7 @@ def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
     )
     return np.array([
         np.abs(measured.range - shots.range) > range_tolerance,
-        np.abs(measured.radial_velocity - shots.radial_velocity) > velocity_tolerance,
+        np.abs(measured.radial_velocity - shots.target.radial_velocity) > velocity_tolerance,
     ])  # fmt: skip
 
 
@@ -380,7 +398,7 @@ def fit_peaks(
         sample_rate=sample_rate,
         bin_width=sample_rate / shots.fft_size,
         has_signs=shots.complex_record,
-        two_beat_assumption=shots.two_beat_assumption,
+        two_beat_assumption=shots.detection_settings.two_beat_assumption,
     )
 
 

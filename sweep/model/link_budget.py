@@ -29,6 +29,9 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
 RECORD_PATH = RECEIVER_PREFIX + "record"
 """Path of the kind of samples of a record: ``real``, or ``complex`` from I and Q."""
 
+BEAM_ELEVATION_PATH = "path.elevation"
+"""Path of the angle of the beam below the horizon [rad], by shot; present only in scenes."""
+
 APPROACH_SPEED_PATH = "target.approach"
 """Path of the speed [m/s] at which the range along the beam falls, present if it was found by ray
 tracing."""
@@ -75,13 +78,21 @@ class TargetState:
 
 
 class LineMotion(NamedTuple):
-    """Motion of the target that the lines of the spectrum include; none by default."""
+    """Motion of the target that lines and measurement include, (n,) or scalars; none by default."""
 
     doppler_ratio: np.ndarray | float = 0.0
     """Doppler ratio 2 v_r / c of the line on the axis at the shot's start."""
     segment_starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
     """Time [s] from the shot's start to the start of each segment, during which the target moves;
     0 if the target does not move between segments."""
+    line_drift_per_look: np.ndarray | float = 0.0
+    """(3, n): shift of the lines from look to look [bins of fs/N]."""
+    range_walk_time: np.ndarray | float = 0.0
+    """Time of closing [s] by which the beats' range is below the range at the shot's start."""
+    velocity_drift_time: np.ndarray | float = 0.0
+    """Time of acceleration [s] by which a beat's velocity is above that at its segment's start."""
+    velocity_bias_fraction: np.ndarray | float = 0.0
+    """Fractional underestimation of the radial velocity by the beats."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -430,12 +441,23 @@ class NoiseBudget:
 
 
 class LinkScales(NamedTuple):
-    """Light and beat of a relative echo of one."""
+    """Light and beat of a relative echo of one, and losses on the way from the ground."""
 
     echo_power: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_amplitude: np.ndarray
     """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, before the poles."""
+    ground_transmission: np.ndarray | float = 1.0
+    """Fraction of light from the ground, such as sunlight, that reaches the receiver."""
+
+    def scale_echo(
+        self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
+    ) -> "LinkScales":
+        """Return the scales with factors on the echo's power and on the beat's amplitude."""
+        return self._replace(
+            echo_power=self.echo_power * power_factor,
+            beat_amplitude=self.beat_amplitude * amplitude_factor,
+        )
 
 
 class LinkBudget:

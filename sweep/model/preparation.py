@@ -8,10 +8,11 @@ footprint's geometry is computed once for all points that share it, whatever the
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,12 +26,14 @@ from sweep.model.detection.looks import (
     DetectionArrays,
     Looks,
 )
-from sweep.model.error_budget import AUTOMATIC, ErrorBudget
+from sweep.model.error_budget import AUTOMATIC
 from sweep.model.ground import Ground
+from sweep.model.laser_line import LaserLine
 from sweep.model.link_budget import (
     PROCESSING_PREFIX,
     LineMotion,
     LinkBudget,
+    LinkScales,
     NoiseBudget,
     ReceiverFilter,
     RecordSettings,
@@ -39,20 +42,23 @@ from sweep.model.link_budget import (
     relative_amplitude,
     threshold,
 )
-from sweep.model.spectrum.search_band import n_alarm_bins, search_band_bins
+from sweep.model.receiver_chain import ReceiverNoise
+from sweep.model.shot_records import (
+    DetectionSettings,
+    EchoRecord,
+    EchoSpeckle,
+    ErrorTolerances,
+    FootprintLines,
+    LineImages,
+    PermanentLine,
+)
+from sweep.model.spectrum.search_band import n_alarm_bins
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import WaveformSegment
 from sweep.model.window import Window
 
 if TYPE_CHECKING:
-    from sweep.model.detection.echo_detection import (
-        BinThresholds,
-        DetectionRule,
-        SegmentCorrelations,
-        SpeckleTable,
-    )
-    from sweep.model.detection.look_speckle import LookSpeckle
-    from sweep.model.detection.speckle_correlation import LineGradients
+    from sweep.model.detection.echo_detection import BinThresholds, DetectionRule, SpeckleTable
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -78,242 +84,57 @@ LINE_APPROXIMATIONS_MAX = 2
 among them."""
 
 
-class PhaseError(NamedTuple):
-    """Deterministic phase error over the record, common to the lines of a footprint."""
-
-    phase: Callable[..., np.ndarray]
-    """Function of positions x (m,) in the record, ``sign`` and `arguments`; returns the phase
-    [cycles], (n, m)."""
-    arguments: dict[str, Any]
-    """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
-
-    def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the arguments of selected points in one segment, (points,) each.
-
-        Parameters
-        ----------
-        segment : int
-            Index of the segment.
-        point_indices : ndarray of int
-            Selected points.
-        """
-        selected = {}
-        for name, value in self.arguments.items():
-            value = value[segment] if isinstance(value, tuple) else value
-            selected[name] = (
-                value[point_indices]
-                if np.ndim(value)
-                else np.full(point_indices.size, float(value))
-            )
-        return selected
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shots:
-    """Points of one category, ready for the spectrum.
+    """Prepared shots of points of one category: all that their spectra depend on, as records.
 
-    Arrays are (n,) or scalars unless stated otherwise, in SI units. Segments are in the order up,
-    Doppler, down. The fields after ``relative_amplitude`` have their defaults unless an effect sets
-    them.
+    An effect replaces a record by a changed one. Records with a default stay neutral unless an
+    effect sets them. Arrays are (n,) or scalars unless stated otherwise, in SI units. Segments are
+    in the order up, Doppler, down.
+
+    Values are read from their records, such as ``shots.target.radial_velocity``. Only what nearly
+    every module reads has a property here as well: :attr:`size`, :attr:`range`, :attr:`window`,
+    :attr:`fft_size`, :attr:`sample_rate`, :attr:`complex_record` and :attr:`has_segment`. The other
+    properties and methods combine several records.
     """
 
-    waveform_settings: WaveformSettings
+    waveform: WaveformSettings
     """Segments of a shot: chirp rates, carriers and times; slopes are numbers, shared by all
     points."""
-    record_settings: RecordSettings
+    record: RecordSettings
     """Samples of a segment that are recorded, their window and FFT; sample rates are (n,)."""
     receiver_filter: ReceiverFilter
     """Poles and anti-alias filter of the receiver."""
     target: TargetState
     """Target on the beam's axis at the shot's start; range and radial velocity are (n,), and the
-    lines use ``doppler_ratio``."""
+    lines use the Doppler ratio of :attr:`motion`."""
+    link_scales: LinkScales
+    """Light and beat of a relative echo of one."""
+    receiver_noise: ReceiverNoise
+    """Noise variances at the ADC of the receiver's own sources, of 1 A^2 of current and of the shot
+    noise of 1 W of light."""
     noise: NoiseBudget
     """Noise at the ADC, by source."""
-    bins_counted: str
-    """Bins that count for false alarms: ``half``, those of the spectrum; ``all`` N of the FFT."""
-    search_band: np.ndarray | None
-    """(3, 2, n) int64: first bin and number of bins of the search band; None if all bins are
-    searched."""
-    noise_bins: str
-    """Noise of adjacent bins: ``correlated``, as the record makes it, or ``independent``, as in
-    [T]."""
-    detection: str
-    """Bins that detect an echo: ``any_bin`` of the echo, or ``peak_bin``, its largest alone, as in
-    [T]."""
-    shot_detection: str
-    """Rule of detection: ``both_chirps``, up and down segment; ``any_two`` of the segments."""
-    reported_peaks: str
-    """Peaks that a segment reports: ``all`` crossings, or only the ``strongest``."""
-    two_beat_assumption: str
-    """Assumption that resolves two beats of real records: ``far`` or ``fast``."""
-    tnr: np.ndarray
-    """Threshold-to-noise ratio."""
-    leakage_floor: np.ndarray
-    """Stated value of :attr:`negligible_signal_ratio`; :data:`AUTOMATIC` if it follows from the
-    tolerance."""
-    leakage_tolerance: np.ndarray
-    """Probability of leakage, over all bins far from the lines, that may be neglected."""
-    line_error_tolerance: np.ndarray
-    """Tolerated error of a bin, over sigma, due to few lines in place of one a beamlet."""
-    beamlets_error: np.ndarray
-    """Error of pd due to the number of beamlets; nan where it was not estimated."""
-    echo_power_scale: np.ndarray
-    """Echo power [W] for a relative echo of 1/sr."""
-    beat_amplitude_scale: np.ndarray
-    """Amplitude of the beat [V] for a relative amplitude of 1."""
-    noise_variance_per_square_ampere: np.ndarray
-    """Noise variance at the ADC [V^2] of a current variance of 1 A^2."""
-    shot_noise_variance_per_watt: np.ndarray
-    """Variance at the ADC [V^2] of the shot noise of 1 W of light."""
-    footprint_row: np.ndarray
-    """(n,) int64: row of each point in the three arrays that follow, (rows, beamlets)."""
-    relative_range_offset: np.ndarray
-    """(rows, beamlets): range of each beamlet relative to the axis's, (R_b - R_0) / R_0."""
-    doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): Doppler ratio minus the axis's, beta_b - beta_0, beta = 2 v_r / c."""
-    relative_amplitude: np.ndarray
-    """(rows, beamlets): square root of the relative echo; for direct detection the relative echo.
-    """
-
-    ground_transmission: np.ndarray | float = 1.0
-    """Fraction of light from the ground that reaches the receiver."""
-    doppler_ratio: np.ndarray | float = 0.0
-    """Doppler ratio 2 v_r / c of the line on the axis."""
-    adds_powers: bool = True
-    """True if beamlets add as powers, False if as amplitudes."""
-    beamlet_phase_cycles: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
-    """(3, rows, beamlets): additional phases [cycles] in up, Doppler and down segment; or empty."""
-    segment_starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
-    """Time [s] from the shot's start to each segment's, during which the target moves; 0 if it does
-    not."""
-    n_samples_before_echo: np.ndarray | None = None
-    """(3, n) int64: samples of the record before the echo arrives, up to all; None where echoes
-    fill records."""
-    phase_errors: tuple[PhaseError, ...] = ()
-    """Deterministic phase errors, which add."""
-    line_drift_per_look: np.ndarray | float = 0.0
-    """(3, n): bins by which lines move from look to look."""
-    range_walk_time: np.ndarray | float = 0.0
-    """(n,): time [s] of closing by which the beats' range is below the range at the shot's start.
-    """
-    velocity_drift_time: np.ndarray | float = 0.0
-    """Time [s] of acceleration by which a beat's velocity is above that at its segment's start."""
-    velocity_bias_fraction: np.ndarray | float = 0.0
-    """(n,): fractional underestimation of the radial velocity by the beats."""
-    shares_phase_errors: bool = False
-    """True if many shots have equal phase errors; False for those of a flight."""
-    gaussian_line_width: np.ndarray | None = None
-    """(n,): FWHM [Hz] of the beat's Gaussian line; None without one."""
-    lorentzian_line_width: np.ndarray | float = 0.0
-    """(n,): FWHM [Hz] of the Lorentzian line of a laser whose phase is a random walk."""
-    pedestal_variance_beside_lines: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
-    pedestal_variance_under_lines: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
-    image_gain: np.ndarray | float = 0.0
-    """(n,): amplitude, 0..1, of the image of a line at its negative frequency, due to imbalance of
-    I and Q."""
-    segment_correlations: "SegmentCorrelations | None" = None
-    """Correlations between segments of echoes in developed speckle; None without speckle."""
-    look_speckle: "LookSpeckle | None" = None
-    """Speckle of looks that share it partly; None if looks have equal or independent speckle."""
-    phase_cycles_per_look: np.ndarray | None = None
-    """(3, n): phase [cycles] by which a line turns from one look to the next."""
-    line_deviation_bins: np.ndarray | float = 0.0
-    """(3, n): standard deviation of the lines of an echo in developed speckle [bins of fs/N]."""
-    line_gradients: "LineGradients | None" = None
-    """Gradients across the footprint of the lines of an echo in speckle, for draws of speckle."""
-    circulator_leak_amplitude: np.ndarray | None = None
-    """Amplitude of the beat of light that leaks through the circulator [V], (n,) or scalar; None
-    without one."""
-    circulator_leak_delay: np.ndarray | float = 0.0
-    """Delay of the light that leaks through the circulator [s]."""
-    sums_images: bool = False
-    """True if the lines' images at negative frequencies are summed."""
-    includes_leakage: bool = False
-    """True if bins next to the detection are searched for groups of leaked signal."""
-    looks: Looks = Looks()  # noqa: RUF009  # a tuple
+    footprint: FootprintLines
+    """Lines of the beamlets, relative to the line on the beam's axis."""
+    detection_settings: DetectionSettings
+    """Threshold, searched bins, and rules of detection."""
+    looks: Looks
     """Number of records of each segment, and their combination."""
-
-    @property
-    def architecture(self) -> str:
-        """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
-        return self.waveform_settings.architecture
-
-    @property
-    def segment_order(self) -> tuple[str, ...]:
-        """Names of the segments that exist, in the order of time."""
-        return self.waveform_settings.segment_order
-
-    @property
-    def segment_gap(self) -> np.ndarray:
-        """Time from a segment's end to the next one's start [s]."""
-        return self.waveform_settings.segment_gap
-
-    @property
-    def chirp_bandwidth(self) -> np.ndarray:
-        """Bandwidth B of the up-chirp [Hz]."""
-        return self.waveform_settings.chirp_bandwidth
-
-    @property
-    def chirp_duration(self) -> np.ndarray:
-        """Duration T of each segment [s]."""
-        return self.waveform_settings.chirp_duration
-
-    @property
-    def chirp_slopes(self) -> tuple[float, ...]:
-        """Chirp rates of the three segments over :attr:`chirp_rate`, signed."""
-        return self.waveform_settings.chirp_slopes
-
-    @property
-    def carriers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Frequency of each segment that the delay turns into phase [Hz]."""
-        return self.waveform_settings.carriers
-
-    @property
-    def window(self) -> Window:
-        """Window of the record."""
-        return self.record_settings.window
-
-    @property
-    def fft_size(self) -> int:
-        """FFT size N."""
-        return self.record_settings.fft_size
-
-    @property
-    def sample_rate(self) -> np.ndarray:
-        """(n,): sample rate f_s [Hz]."""
-        return self.record_settings.sample_rate
-
-    @property
-    def acquisition_delay(self) -> np.ndarray:
-        """Time from a segment's start to the start of its record [s]."""
-        return self.record_settings.acquisition_delay
-
-    @property
-    def complex_record(self) -> bool:
-        """True if the record is I + iQ; its spectrum then has signed bins and no images."""
-        return self.record_settings.is_complex
-
-    @property
-    def detector_bandwidth(self) -> np.ndarray:
-        """Bandwidth of the detector's pole [Hz]."""
-        return self.receiver_filter.detector_bandwidth
-
-    @property
-    def amplifier_bandwidth(self) -> np.ndarray:
-        """Bandwidth of the amplifier's pole [Hz]."""
-        return self.receiver_filter.amplifier_bandwidth
-
-    @property
-    def antialias_filter(self) -> dict[str, np.ndarray]:
-        """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
-        return self.receiver_filter.antialias_filter
-
-    @property
-    def noise_shape(self) -> str:
-        """Shape of the noise: ``receiver`` or ``white``."""
-        return self.receiver_filter.noise_shape
+    tolerances: ErrorTolerances
+    """Errors that the evaluation of spectra may make."""
+    motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
+    """Motion of the target that the lines and the measurement include."""
+    echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
+    """Samples of the record before the echo, and phase errors of the echo over the record."""
+    images: LineImages = LineImages()  # noqa: RUF009
+    """Images of lines at their negative frequencies."""
+    laser_line: LaserLine = LaserLine()  # noqa: RUF009
+    """Line of the laser."""
+    speckle: EchoSpeckle = EchoSpeckle()  # noqa: RUF009
+    """Speckle of an echo that fades."""
+    permanent_line: PermanentLine | None = None
+    """Line of other light than the echo's that is in every record; None without one."""
 
     @property
     def range(self) -> np.ndarray:
@@ -321,24 +142,29 @@ class Shots:
         return self.target.range
 
     @property
-    def radial_velocity(self) -> np.ndarray:
-        """(n,): radial velocity of the target on the beam's axis [m/s]."""
-        return self.target.radial_velocity
+    def window(self) -> Window:
+        """Window of the record."""
+        return self.record.window
 
     @property
-    def acceleration(self) -> np.ndarray:
-        """Rate at which the radial velocity grows [m/s^2]."""
-        return self.target.acceleration
+    def fft_size(self) -> int:
+        """FFT size N."""
+        return self.record.fft_size
 
     @property
-    def approach_speed(self) -> np.ndarray:
-        """Speed [m/s] at which the range along the beam falls (:func:`approach_speed`)."""
-        return self.target.approach_speed
+    def sample_rate(self) -> np.ndarray:
+        """(n,): sample rate f_s [Hz]."""
+        return self.record.sample_rate
 
     @property
-    def noise_variances(self) -> dict[str, np.ndarray]:
-        """Noise variance at the ADC [V^2], by source."""
-        return self.noise.variances
+    def complex_record(self) -> bool:
+        """True if the record is I + iQ; its spectrum then has signed bins and no images."""
+        return self.record.is_complex
+
+    @property
+    def has_segment(self) -> np.ndarray:
+        """(3,) bool: existence of up, Doppler and down segment."""
+        return self.waveform.has_segment
 
     @property
     def size(self) -> int:
@@ -374,52 +200,46 @@ class Shots:
         return self.to_signed_bins(np.arange(self.n_bins) - self.bin_indices(np.zeros((), int)))
 
     @property
-    def chirp_rate(self) -> np.ndarray:
-        """Chirp rate S = B/T [Hz/s]."""
-        return self.waveform_settings.chirp_rate
-
-    @property
-    def record_duration(self) -> np.ndarray:
-        """Length of the record L/fs [s]."""
-        return self.record_settings.duration
-
-    @property
     def echo_record_times(self) -> dict[str, Any]:
         """Start and duration [s] of the part of the record that holds the echo.
 
         ``start`` counts from the segment's start. Both are (n,) or scalars; or tuples by segment,
         if the echo does not fill the record.
         """
-        if self.n_samples_before_echo is None:
-            return {"start": self.acquisition_delay, "duration": self.record_duration}
-        missing_times = [n_missing / self.sample_rate for n_missing in self.n_samples_before_echo]
+        if self.echo_record.n_samples_before is None:
+            return {"start": self.record.acquisition_delay, "duration": self.record.duration}
+        missing_times = [
+            n_missing / self.sample_rate for n_missing in self.echo_record.n_samples_before
+        ]
         echo_durations = [
             (self.window.length - n_missing) / self.sample_rate
-            for n_missing in self.n_samples_before_echo
+            for n_missing in self.echo_record.n_samples_before
         ]
         return {
-            "start": tuple(self.acquisition_delay + time for time in missing_times),
+            "start": tuple(self.record.acquisition_delay + time for time in missing_times),
             "duration": tuple(echo_durations),
         }
 
     def echo_window_energy(self, segment: int) -> np.ndarray:
         """Return the sum of w^2 over the samples that hold the echo in one segment, (n,)."""
-        if self.n_samples_before_echo is None:
+        if self.echo_record.n_samples_before is None:
             return np.full(self.size, self.window.energy)
-        return window_energy_from_sample(self.window)[self.n_samples_before_echo[segment]]
+        return window_energy_from_sample(self.window)[self.echo_record.n_samples_before[segment]]
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
         """Relative echo of all beamlets [1/sr], (n,)."""
         relative_echo = (
-            self.relative_amplitude if self.architecture == "direct" else self.relative_amplitude**2
+            self.footprint.relative_amplitude
+            if self.waveform.architecture == "direct"
+            else self.footprint.relative_amplitude**2
         )
-        return relative_echo.sum(axis=1)[self.footprint_row]
+        return relative_echo.sum(axis=1)[self.footprint.row_of_point]
 
     @property
     def echo_power(self) -> np.ndarray:
         """Echo power on the detector [W], (n,)."""
-        return self.echo_power_scale * self.total_relative_echo
+        return self.link_scales.echo_power * self.total_relative_echo
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
@@ -480,7 +300,7 @@ class Shots:
     @cached_property
     def line_noise_sigma(self) -> np.ndarray:
         """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
-        return self._noise_sigma_of(self.noise_variance + self.pedestal_variance_under_lines)
+        return self._noise_sigma_of(self.noise_variance + self.laser_line.pedestal_variance_under)
 
     @cached_property
     def bin_thresholds(self) -> "BinThresholds":
@@ -488,7 +308,7 @@ class Shots:
         from sweep.model.detection.echo_detection import BinThresholds
 
         side_noise_sigma = self._noise_sigma_of(
-            self.noise_variance + self.pedestal_variance_beside_lines
+            self.noise_variance + self.laser_line.pedestal_variance_beside
         )
         sigmas_and_threshold = (
             self.line_noise_sigma,
@@ -504,17 +324,17 @@ class Shots:
         """Shape of the phase-noise pedestal, (3, n); 0 where it adds no bins that detect."""
         shape_rows = np.zeros((3, self.size))
         if (
-            self.detection == "peak_bin"
+            self.detection_settings.echo_bins == "peak_bin"
             or self.looks.is_noncoherent
-            or not np.any(self.lorentzian_line_width)
+            or not np.any(self.laser_line.lorentzian_width)
         ):
             return shape_rows
         from sweep.model.detection.echo_detection import pedestal_reach_bins
 
-        line_width_bins = self.lorentzian_line_width * self.fft_size / self.sample_rate
-        delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record_duration)
+        line_width_bins = self.laser_line.lorentzian_width * self.fft_size / self.sample_rate
+        delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record.duration)
         delay = delay * self.sample_rate / self.fft_size
-        power_ratio = self.pedestal_variance_beside_lines / self.noise_variance
+        power_ratio = self.laser_line.pedestal_variance_beside / self.noise_variance
         power_ratio, *shape_rows[1:] = (
             np.broadcast_to(v, self.size) for v in (power_ratio, line_width_bins, delay)
         )
@@ -539,19 +359,21 @@ class Shots:
             noise counts as signal: it fades and is detected with the lines.
         """
         line_snr = np.square(magnitude / self.bin_noise_sigma) / 2
-        return np.asarray(line_snr + self.pedestal_variance_under_lines / self.noise_variance)
+        return np.asarray(line_snr + self.laser_line.pedestal_variance_under / self.noise_variance)
 
     @cached_property
     def threshold(self) -> np.ndarray:
         """Threshold on |X| [V], (n,)."""
-        return threshold(self.tnr, self._noise_sigma_of(self.noise_variance_without_echo))
+        return threshold(
+            self.detection_settings.tnr, self._noise_sigma_of(self.noise_variance_without_echo)
+        )
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
         """Leaked signal over sigma below which a singly evaluated bin counts as noise alone."""
         from sweep.model.detection import echo_detection
 
-        stated_floor, n_bins = self.leakage_floor, self.n_bins
+        stated_floor, n_bins = self.tolerances.leakage_floor, self.n_bins
         if not np.any(stated_floor == AUTOMATIC):
             return stated_floor
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
@@ -562,7 +384,7 @@ class Shots:
             else echo_detection.negligible_signal_ratio
         )
         automatic_floor = negligible_signal_law(
-            leakage_probability=self.leakage_tolerance,
+            leakage_probability=self.tolerances.leakage_probability,
             threshold_ratio=threshold_ratio,
             n_bins=n_bins,
         )
@@ -589,15 +411,15 @@ class Shots:
         from sweep.model.detection import echo_detection
         from sweep.model.detection.pseudo_variance import mean_over_phases
 
-        if self.segment_correlations is None:
+        if self.speckle.segment_correlations is None:
             return pd_up * pd_down
         threshold_ratio, correlation = (
             self.threshold / self.line_noise_sigma,
-            np.abs(self.segment_correlations.up_down),
+            np.abs(self.speckle.segment_correlations.up_down),
         )
         if self.looks.is_noncoherent:
             signal_up, signal_down = (magnitude / self.line_noise_sigma for magnitude in magnitudes)
-            look_speckle = self.look_speckle
+            look_speckle = self.speckle.look_speckle
             if look_speckle is not None:
                 correlation = look_speckle.segment_correlation[1]
             pd_both = self.looks.joint_pd_in_speckle(
@@ -661,7 +483,7 @@ class Shots:
         """
         from sweep.model.detection.echo_detection import detection_equivalent_bins
 
-        if self.detection == "peak_bin":
+        if self.detection_settings.echo_bins == "peak_bin":
             return 1.0
         noise_sigma = self.line_noise_sigma
         threshold_ratio = self.threshold / noise_sigma
@@ -675,7 +497,10 @@ class Shots:
     @property
     def any_two(self) -> bool:
         """True if a shot is detected by any two of three segments."""
-        return self.shot_detection == waveform.ANY_TWO and len(self.segment_order) == 3
+        return (
+            self.detection_settings.shot_rule == waveform.ANY_TWO
+            and len(self.waveform.segment_order) == 3
+        )
 
     def pd_and_miss_in_looks(
         self,
@@ -707,7 +532,7 @@ class Shots:
             np.broadcast_to(v, self.size)[point_indices] for v in sigma_and_threshold
         )
         signal_ratio = np.where(is_present, magnitude, 0.0) / noise_sigma
-        if self.segment_correlations is not None:
+        if self.speckle.segment_correlations is not None:
             pd_and_miss = self._pd_and_miss_in_speckle(
                 signal_ratio, threshold / noise_sigma, bins, point_indices
             )
@@ -727,7 +552,7 @@ class Shots:
         signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
         pd_up, _, pd_down = np.moveaxis(
             self.looks.pd_and_miss_in_speckle(
-                signals, threshold_ratio[..., None, :], self.look_speckle
+                signals, threshold_ratio[..., None, :], self.speckle.look_speckle
             ).pd,
             -2,
             0,
@@ -745,7 +570,9 @@ class Shots:
         from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
 
         look_speckle = (
-            None if self.look_speckle is None else self.look_speckle.select(point_indices)
+            None
+            if self.speckle.look_speckle is None
+            else self.speckle.look_speckle.select(point_indices)
         )
         pd, miss = self.looks.pd_and_miss_in_speckle(signal_ratio, threshold_ratio, look_speckle)
         rule, speckle_table = self.detection_rule, self.speckle_table
@@ -797,51 +624,53 @@ class Shots:
         )
         if self.looks.has_independent_speckle:
             correlation_by_lag[:, 1:] = 0.0
-        elif self.look_speckle is not None:
-            correlation_by_lag = self.look_speckle.correlation_by_lag[segment, point]
-            look_power = self.look_speckle.look_power[segment, point]
+        elif self.speckle.look_speckle is not None:
+            correlation_by_lag = self.speckle.look_speckle.correlation_by_lag[segment, point]
+            look_power = self.speckle.look_speckle.look_power[segment, point]
         cycles_per_look = (
             np.zeros(point.size)
-            if self.phase_cycles_per_look is None
-            else self.phase_cycles_per_look[segment, point]
+            if self.speckle.phase_cycles_per_look is None
+            else self.speckle.phase_cycles_per_look[segment, point]
         )
         return phase_rotated_look_covariances(correlation_by_lag, look_power, cycles_per_look)
 
     def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
         """Return a bin's noise sigma per quadrature [V] for a noise variance at the ADC [V^2]."""
-        return self.record_settings.bin_noise_sigma(variance, self.looks)
+        return self.record.bin_noise_sigma(variance, self.looks)
 
     @cached_property
     def beamlet_table(self) -> np.ndarray:
         """(R_b - R_0)/R_0, beta_b - beta_0, amplitude, phases if any: (3 or 6, rows, beamlets)."""
-        phases = self.beamlet_phase_cycles if self.beamlet_phase_cycles.size else ()
+        phases = self.footprint.phase_cycles if self.footprint.phase_cycles.size else ()
         return np.stack(
             [
-                self.relative_range_offset,
-                self.doppler_ratio_offset,
-                self.relative_amplitude,
+                self.footprint.relative_range_offset,
+                self.footprint.doppler_ratio_offset,
+                self.footprint.relative_amplitude,
                 *phases,
             ]
         )
 
     @cached_property
-    def waveform_segments(self) -> tuple[waveform.WaveformSegment, ...]:
+    def waveform_segments(self) -> tuple[WaveformSegment, ...]:
         """Segments of the waveform, with range and velocity of the target at their starts."""
-        motion = LineMotion(self.doppler_ratio, self.segment_starts)
-        return self.waveform_settings.segments(self.target, motion)
+        return self.waveform.segments(self.target, self.motion)
 
     @property
     def motion_by_segment(self) -> dict[str, Any]:
         """Range [m] and radial velocity [m/s], (n,); tuples by segment where segments differ."""
-        motion: dict[str, Any] = {"range": self.range, "radial_velocity": self.radial_velocity}
+        motion: dict[str, Any] = {
+            "range": self.range,
+            "radial_velocity": self.target.radial_velocity,
+        }
         if self.target_moves_between_segments:
             motion["range"] = tuple(
                 self.range - segment.range_decrease for segment in self.waveform_segments
             )
-            if np.any(self.acceleration):
+            if np.any(self.target.acceleration):
                 motion["radial_velocity"] = tuple(
-                    self.radial_velocity + self.acceleration * start
-                    for start in self.segment_starts
+                    self.target.radial_velocity + self.target.acceleration * start
+                    for start in self.motion.segment_starts
                 )
         return motion
 
@@ -849,7 +678,10 @@ class Shots:
     def record_middle_time(self) -> np.ndarray:
         """Time from a segment's start to its record's middle [s], (n,); 0 without range walk."""
         return (
-            np.asarray(self.range_walk_time - (self.segment_starts[0] + self.segment_starts[2]) / 2)
+            np.asarray(
+                self.motion.range_walk_time
+                - (self.motion.segment_starts[0] + self.motion.segment_starts[2]) / 2
+            )
             / 2
         )
 
@@ -857,14 +689,17 @@ class Shots:
     def mid_record_drifts(self) -> tuple[np.ndarray, ...]:
         """Drift [Hz] of each segment's lines at the middle of its record, (n,) each."""
         return tuple(
-            self._frequency_drift(segment, self.record_middle_time, self.velocity_drift_time)
+            self._frequency_drift(segment, self.record_middle_time, self.motion.velocity_drift_time)
             for segment in self.waveform_segments
         )
 
     @property
     def frequency_drift_rates(self) -> tuple[np.ndarray, ...]:
         """Drift rate [Hz/s] of each segment's lines within its record, (n,) each."""
-        walk_sign, drift_sign = np.sign(self.record_middle_time), np.sign(self.velocity_drift_time)
+        walk_sign, drift_sign = (
+            np.sign(self.record_middle_time),
+            np.sign(self.motion.velocity_drift_time),
+        )
         return tuple(
             self._frequency_drift(segment, walk_sign, drift_sign)
             for segment in self.waveform_segments
@@ -877,11 +712,11 @@ class Shots:
 
         `walk_time` is the time of range walk, `drift_time` that of acceleration.
         """
-        closing_speed = self.radial_velocity + self.approach_speed
-        closing_speed = closing_speed + self.acceleration * (
-            2 * segment.start_time + 1.5 * self.velocity_drift_time
+        closing_speed = self.target.radial_velocity + self.target.approach_speed
+        closing_speed = closing_speed + self.target.acceleration * (
+            2 * segment.start_time + 1.5 * self.motion.velocity_drift_time
         )
-        doppler_term = segment.carrier * self.acceleration * drift_time
+        doppler_term = segment.carrier * self.target.acceleration * drift_time
         return np.asarray(
             2 / SPEED_OF_LIGHT * (doppler_term + segment.chirp_rate * closing_speed * walk_time)
         )
@@ -897,35 +732,39 @@ class Shots:
         starts, chirp_slopes, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
             for values in (
-                self.segment_starts,
-                self.chirp_slopes,
-                self.carriers,
-                (self.range_walk_time,),
-                (self.chirp_rate,),
+                self.motion.segment_starts,
+                self.waveform.chirp_slopes,
+                self.waveform.carriers,
+                (self.motion.range_walk_time,),
+                (self.waveform.chirp_rate,),
             )
         )
         delay_times = starts + walk_time - (starts[0] + starts[2]) / 2
         return carriers + chirp_slopes * chirp_rate * delay_times, chirp_slopes * chirp_rate
 
+    def split_by_look(self) -> "list[Shots]":
+        """Return the shots as each look sees them; the same shots if lines do not drift."""
+        if not np.any(self.motion.line_drift_per_look):
+            return [self] * self.looks.number
+        looks_from_middle = np.arange(self.looks.number) - (self.looks.number - 1) / 2
+        return [
+            replace(
+                self,
+                motion=self.motion._replace(
+                    line_drift_per_look=0.0,
+                    segment_starts=tuple(
+                        start + look_offset * self.waveform.look_period
+                        for start in self.motion.segment_starts
+                    ),
+                ),
+            )
+            for look_offset in looks_from_middle
+        ]
+
     @property
     def target_moves_between_segments(self) -> bool:
         """True if the target moves between segments."""
-        return any(np.any(start) for start in self.segment_starts)
-
-    @property
-    def has_segment(self) -> np.ndarray:
-        """(3,) bool: existence of up, Doppler and down segment."""
-        return self.waveform_settings.has_segment
-
-    @property
-    def scheduled_segment_starts(self) -> tuple[np.ndarray, ...]:
-        """Times [s] from the shot's start to each segment's, by the waveform."""
-        return self.waveform_settings.segment_starts
-
-    @property
-    def look_period(self) -> np.ndarray:
-        """Time [s] from one look to the next: the duration of the full waveform."""
-        return self.waveform_settings.look_period
+        return any(np.any(start) for start in self.motion.segment_starts)
 
     def point_parameter_table(self) -> np.ndarray:
         """Return the parameters of each point that kernels take.
@@ -938,22 +777,22 @@ class Shots:
         """
         shared_columns = (
             self.range,
-            self.doppler_ratio,
-            self.chirp_rate,
-            self.beat_amplitude_scale,
-            self.detector_bandwidth,
-            self.amplifier_bandwidth,
+            self.motion.doppler_ratio,
+            self.waveform.chirp_rate,
+            self.link_scales.beat_amplitude,
+            self.receiver_filter.detector_bandwidth,
+            self.receiver_filter.amplifier_bandwidth,
             self.sample_rate,
-            self.acquisition_delay,
-            self.carriers[0],
-            self.carriers[2],
+            self.record.acquisition_delay,
+            self.waveform.carriers[0],
+            self.waveform.carriers[2],
             self.bin_noise_sigma,
             self.threshold,
             self.negligible_signal_ratio,
             self.line_noise_sigma,
-            self.leakage_tolerance,
-            self.line_error_tolerance,
-            self.image_gain,
+            self.tolerances.leakage_probability,
+            self.tolerances.line_error,
+            self.images.iq_gain,
             *self.bin_thresholds[3:],
         )
         segment_columns = (
@@ -973,7 +812,7 @@ class Shots:
     @property
     def real_fft_size(self) -> int:
         """FFT size if noise in bins 0 and N/2 is real, as in a real record; else 0."""
-        is_real = self.noise_bins == "correlated" and not self.complex_record
+        is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
 
     @property
@@ -984,7 +823,7 @@ class Shots:
     @property
     def noise_bin_correlation(self) -> float:
         """Correlation of the noise of adjacent bins, 0..1."""
-        if self.noise_bins == "independent":
+        if self.detection_settings.noise_bins == "independent":
             return 0.0
         return bin_noise.neighbour_noise_correlation(self.window, self.fft_size)
 
@@ -997,7 +836,10 @@ class Shots:
         from sweep.model.detection.speckle_modes import NO_MODES, mode_table
         from sweep.model.detection.sub_bin_interpolation import sidelobe_correlation
 
-        in_speckle, any_bin = self.segment_correlations is not None, self.detection != "peak_bin"
+        in_speckle, any_bin = (
+            self.speckle.segment_correlations is not None,
+            self.detection_settings.echo_bins != "peak_bin",
+        )
         real_record_in_speckle = in_speckle and not self.complex_record
         real_noise_at_ends = self.real_fft_size > 0
         noise_ratio, lobe_half_width, modes = np.empty(0), 0, NO_MODES
@@ -1031,11 +873,15 @@ class Shots:
 
         shape = (len(self.waveform_segments), self.size)
         line_deviation_bins = np.ascontiguousarray(
-            np.broadcast_to(self.line_deviation_bins, shape), float
+            np.broadcast_to(self.speckle.line_deviation_bins, shape), float
         )
         # Without images, bins near DC and Nyquist hold half of the echo, and their values are not
         # real.
-        if self.segment_correlations is None or self.complex_record or not self.sums_images:
+        if (
+            self.speckle.segment_correlations is None
+            or self.complex_record
+            or not self.images.are_summed
+        ):
             return SpeckleTable(
                 line_deviation_bins, np.zeros(shape, np.int64), np.zeros((1, 0)), np.ones((1, 1))
             )
@@ -1061,14 +907,20 @@ class Shots:
         n_searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_fft_size:
             n_searched += 1 - 2 * self.first_searched_bin
-        if self.search_band is not None:
+        if self.detection_settings.search_band is not None:
             fft_size, first_bin = self.fft_size, self.first_searched_bin
             n_in_band = n_alarm_bins(
-                self.search_band, fft_size, first_bin, is_signed=self.complex_record
+                self.detection_settings.search_band,
+                fft_size,
+                first_bin,
+                is_signed=self.complex_record,
             )
             n_searched = n_in_band[:, point_indices]
         n_bins = np.maximum(n_searched - n_exempt, 0.0)
-        if self.bins_counted == "all" and self.search_band is None:
+        if (
+            self.detection_settings.bins_counted == "all"
+            and self.detection_settings.search_band is None
+        ):
             n_bins = np.full(np.shape(n_exempt), float(self.fft_size))
         return np.asarray(n_bins)
 
@@ -1085,7 +937,7 @@ class Shots:
             Points to which the columns belong.
         """
         n_searched = self.n_searched_bins(n_exempt, point_indices)
-        if self.noise_bins == "independent":
+        if self.detection_settings.noise_bins == "independent":
             return n_searched
         threshold_ratio = np.broadcast_to(self.threshold / self.bin_noise_sigma, self.size)[
             point_indices
@@ -1175,45 +1027,34 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
         Ground that the beams meet.
     """
     budget = LinkBudget(parameters)
-    architecture, receiver_noise = budget.waveform.architecture, budget.receiver_noise
-    footprint_row, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_line(
+    row_of_point, relative_range_offset, doppler_ratio_offset, relative_echo = ground.axis_line(
         n_points
     )
-    zeros, error_budget = np.zeros(n_points), ErrorBudget.from_parameters(parameters)
+    zeros, architecture = np.zeros(n_points), budget.waveform.architecture
     sample_rate = budget.record.sample_rate + zeros
     return Shots(
-        waveform_settings=replace(budget.waveform, chirp_slopes=waveform.chirp_slopes(parameters)),
-        record_settings=replace(budget.record, sample_rate=sample_rate),
+        waveform=replace(budget.waveform, chirp_slopes=waveform.chirp_slopes(parameters)),
+        record=replace(budget.record, sample_rate=sample_rate),
         receiver_filter=replace(budget.receiver_filter, sample_rate=sample_rate),
         target=replace(
             budget.target,
             range=budget.target.range + zeros,
             radial_velocity=budget.target.radial_velocity + zeros,
         ),
+        link_scales=budget.link_scales,
+        receiver_noise=budget.receiver_noise,
         noise=budget.noise,
-        bins_counted=str(parameters[PROCESSING_PREFIX + "bins_counted"]),
-        search_band=search_band_bins(parameters, n_points),
-        noise_bins=str(parameters[PROCESSING_PREFIX + "noise_bins"]),
-        detection=str(parameters[PROCESSING_PREFIX + "detection"]),
-        shot_detection=str(parameters[waveform.SHOT_DETECTION_PATH]),
-        reported_peaks=str(parameters[waveform.PEAKS_PATH]),
-        two_beat_assumption=str(parameters[waveform.TWO_BEAT_ASSUMPTION_PATH]),
-        tnr=budget.tnr,
-        leakage_floor=np.asarray(error_budget.leakage_floor, float),
-        leakage_tolerance=error_budget.allowed_leakage,
-        beamlets_error=parameters.get(BEAMLETS_ERROR_PATH, np.asarray(np.nan)),
-        line_error_tolerance=error_budget.allowed_line_error
-        / math.sqrt(budget.looks.n_power_averaged),
-        echo_power_scale=budget.link_scales.echo_power,
-        beat_amplitude_scale=budget.link_scales.beat_amplitude,
-        noise_variance_per_square_ampere=receiver_noise.variance_per_square_ampere,
-        shot_noise_variance_per_watt=receiver_noise.shot_noise_variance_per_watt,
-        footprint_row=footprint_row,
-        relative_range_offset=relative_range_offset,
-        doppler_ratio_offset=doppler_ratio_offset,
-        relative_amplitude=relative_amplitude(architecture, relative_echo),
-        adds_powers=architecture != "direct",
+        footprint=FootprintLines(
+            row_of_point=row_of_point,
+            relative_range_offset=relative_range_offset,
+            doppler_ratio_offset=doppler_ratio_offset,
+            relative_amplitude=relative_amplitude(architecture, relative_echo),
+            adds_powers=architecture != "direct",
+            beamlets_error=parameters.get(BEAMLETS_ERROR_PATH, math.nan),
+        ),
+        detection_settings=DetectionSettings.from_parameters(parameters, budget.tnr, n_points),
         looks=budget.looks,
+        tolerances=ErrorTolerances.from_parameters(parameters, budget.looks),
     )
 
 
@@ -1224,20 +1065,20 @@ def window_energy_from_sample(window: Window) -> np.ndarray:
 
 
 _POINT_FIELD_LABELS = {
-    "range": "range",
-    "radial_velocity": "radial velocity",
-    "acceleration": "acceleration",
-    "doppler_ratio": "Doppler shift",
-    "echo_power_scale": "echo's power",
-    "beat_amplitude_scale": "beat's amplitude",
+    "target.range": "range",
+    "target.radial_velocity": "radial velocity",
+    "target.acceleration": "acceleration",
+    "motion.doppler_ratio": "Doppler shift",
+    "link_scales.echo_power": "echo's power",
+    "link_scales.beat_amplitude": "beat's amplitude",
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
 """Fields of `Shots`, one value a point, that have to be finite, and their names in messages."""
 _BEAMLET_FIELD_LABELS = {
-    "relative_range_offset": "beamlets' ranges",
-    "doppler_ratio_offset": "beamlets' velocities",
-    "relative_amplitude": "beamlets' echoes",
+    "footprint.relative_range_offset": "beamlets' ranges",
+    "footprint.doppler_ratio_offset": "beamlets' velocities",
+    "footprint.relative_amplitude": "beamlets' echoes",
 }
 """Fields of `Shots`, one value a beamlet, that have to be finite, and their names in messages."""
 
@@ -1251,7 +1092,7 @@ def require_finite(shots: Shots) -> None:
         Names the quantity that is not finite, and the shot.
     """
     for name, label in (_POINT_FIELD_LABELS | _BEAMLET_FIELD_LABELS).items():
-        values = np.asarray(getattr(shots, name))
+        values = np.asarray(attrgetter(name)(shots))
         if math.isfinite(float(values.sum())):  # the sum is not finite with any nan or inf
             continue
         is_not_finite = ~np.isfinite(values)
@@ -1259,9 +1100,9 @@ def require_finite(shots: Shots) -> None:
             continue
         if name in _BEAMLET_FIELD_LABELS:
             row_has_wrong = is_not_finite.any(axis=1)
-            point_index = int(row_has_wrong[shots.footprint_row].argmax())
-            value = values[shots.footprint_row[point_index]][
-                is_not_finite[shots.footprint_row[point_index]]
+            point_index = int(row_has_wrong[shots.footprint.row_of_point].argmax())
+            value = values[shots.footprint.row_of_point[point_index]][
+                is_not_finite[shots.footprint.row_of_point[point_index]]
             ][0]
         else:
             point_index = int(np.broadcast_to(is_not_finite, (shots.size,)).argmax())

@@ -16,7 +16,6 @@ import numpy as np
 from sweep.model import receiver_chain, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.echo_detection import detect_in_spectra
-from sweep.model.effects.segment_motion import split_looks
 from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import SEGMENT_FIELDS
 from sweep.model.waveform import SAMPLE_TIME_TOLERANCE
@@ -56,8 +55,8 @@ def time_domain_spectrum(
     w = window.window_samples(shots.window.name, shots.window.length)
     n_real_bins, is_complex = shots.fft_size // 2 + 1, shots.complex_record
     record_sum = np.zeros(shots.window.length, complex)
-    power, image_gain = np.zeros(shots.n_bins), _value_at(shots.image_gain, point)
-    for beamlet in range(shots.relative_range_offset.shape[1]):
+    power, image_gain = np.zeros(shots.n_bins), _value_at(shots.images.iq_gain, point)
+    for beamlet in range(shots.footprint.n_beamlets):
         beamlet_record = analytic_record(
             shots,
             point,
@@ -68,7 +67,7 @@ def time_domain_spectrum(
         )
         beamlet_record *= np.exp(1j * np.asarray(laser_phase))
         record_sum += beamlet_record
-        if shots.adds_powers:
+        if shots.footprint.adds_powers:
             power_spectrum = abs(np.fft.fft(w * beamlet_record, shots.fft_size) / 2) ** 2
             if is_complex:
                 power += np.fft.fftshift(
@@ -76,7 +75,7 @@ def time_domain_spectrum(
                 )
             else:
                 power += power_spectrum[:n_real_bins] + power_spectrum[-np.arange(n_real_bins)]
-    if shots.adds_powers:
+    if shots.footprint.adds_powers:
         return np.sqrt(power)
     if is_complex:
         record = w * (record_sum + image_gain * record_sum.conj()) / 2
@@ -112,7 +111,9 @@ def evaluate_segments_in_time_domain(shots: Shots, *, with_range_walk: bool = Tr
         for segment in map(int, np.flatnonzero(shots.has_segment)):
             look_magnitudes = [
                 time_domain_spectrum(look, point, segment, with_range_walk=with_range_walk)
-                for look in (split_looks(shots) if np.any(shots.line_drift_per_look) else [shots])
+                for look in (
+                    shots.split_by_look() if np.any(shots.motion.line_drift_per_look) else [shots]
+                )
             ]
             magnitude = np.sqrt(np.mean(np.square(look_magnitudes), axis=0))
             detections = detect_in_spectra(
@@ -169,39 +170,41 @@ def analytic_record(
     the ground. Scatterers then replace each other, and the beat has the delay of those in the beam.
     """
     chirp_slope, carrier = (
-        shots.chirp_slopes[segment],
-        float(_value_at(shots.carriers[segment], point)),
+        shots.waveform.chirp_slopes[segment],
+        float(_value_at(shots.waveform.carriers[segment], point)),
     )
     doppler_ratio_offset, segment_start = (
-        float(shots.doppler_ratio_offset[shots.footprint_row[point], beamlet]),
-        float(_value_at(shots.segment_starts[segment], point)),
+        float(shots.footprint.doppler_ratio_offset[shots.footprint.row_of_point[point], beamlet]),
+        float(_value_at(shots.motion.segment_starts[segment], point)),
     )
     approach_speed, acceleration_value = (
-        float(_value_at(shots.approach_speed, point)),
-        float(_value_at(shots.acceleration, point)),
+        float(_value_at(shots.target.approach_speed, point)),
+        float(_value_at(shots.target.acceleration, point)),
     )
     alpha = acceleration_value / SPEED_OF_LIGHT
     doppler_ratio = (
-        float(_value_at(shots.doppler_ratio, point))
+        float(_value_at(shots.motion.doppler_ratio, point))
         + 2 * alpha * segment_start
         + doppler_ratio_offset
     )
-    chirp_rate = float(_value_at(shots.chirp_rate, point))
+    chirp_rate = float(_value_at(shots.waveform.chirp_rate, point))
     axis_range = float(shots.range[point])
     range_offset = axis_range * float(
-        shots.relative_range_offset[shots.footprint_row[point], beamlet]
+        shots.footprint.relative_range_offset[shots.footprint.row_of_point[point], beamlet]
     )
     range_offset -= SPEED_OF_LIGHT / 2 * doppler_ratio_offset * segment_start
     range_decrease = approach_speed * segment_start + acceleration_value * segment_start**2 / 2
-    t = float(_value_at(shots.acquisition_delay, point)) + np.arange(shots.window.length) / float(
-        shots.sample_rate[point]
-    )
+    t = float(_value_at(shots.record.acquisition_delay, point)) + np.arange(
+        shots.window.length
+    ) / float(shots.sample_rate[point])
     start_delay = 2 * (axis_range - range_decrease + range_offset) / SPEED_OF_LIGHT
     delay_change = -doppler_ratio * t - with_acceleration * alpha * t**2  # tau(t) - tau_0
     chirp_phase = delay_change * (2 * start_delay + delay_change) / 2 - t * (
         start_delay + delay_change
     )
-    chirp_phase += (approach_speed - float(shots.radial_velocity[point])) / SPEED_OF_LIGHT * t**2
+    chirp_phase += (
+        (approach_speed - float(shots.target.radial_velocity[point])) / SPEED_OF_LIGHT * t**2
+    )
     if not with_range_walk:
         chirp_phase = start_delay * (delay_change - t)
     cycles = -carrier * delay_change + chirp_slope * chirp_rate * chirp_phase
@@ -211,20 +214,20 @@ def analytic_record(
     beat = carrier * doppler_ratio - chirp_slope * chirp_rate * start_delay * (1 + doppler_ratio)
     gain = receiver_chain.receiver_transfer(
         np.array(beat),
-        detector_bandwidth=_value_at(shots.detector_bandwidth, point),
-        amplifier_bandwidth=_value_at(shots.amplifier_bandwidth, point),
+        detector_bandwidth=_value_at(shots.receiver_filter.detector_bandwidth, point),
+        amplifier_bandwidth=_value_at(shots.receiver_filter.amplifier_bandwidth, point),
     )
     amplitude = (
-        _value_at(shots.beat_amplitude_scale, point)
-        * shots.relative_amplitude[shots.footprint_row[point], beamlet]
+        _value_at(shots.link_scales.beat_amplitude, point)
+        * shots.footprint.relative_amplitude[shots.footprint.row_of_point[point], beamlet]
     )
     amplitude = amplitude * shots.whitening_gain[segment][point]
     record = amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start_phase))
-    if shots.n_samples_before_echo is not None:
+    if shots.echo_record.n_samples_before is not None:
         has_arrived = (
             t >= start_delay + delay_change - SAMPLE_TIME_TOLERANCE / shots.sample_rate[point]
         )
-        record *= has_arrived & (t <= _value_at(shots.chirp_duration, point))
+        record *= has_arrived & (t <= _value_at(shots.waveform.chirp_duration, point))
     return np.asarray(record)
 
 

@@ -264,7 +264,7 @@ def noise_budget_of_grid(
                 name for name in unpack_effect_flags(int(flags)) if name not in _RANDOM_EFFECT_NAMES
             ]
             ((_, shots),) = prepare_shots(parameters, effects)
-            budgets.append(shots.noise_variances)
+            budgets.append(shots.noise.variances)
         if profile.coordinate is None:
             x_axis, x = ChartAxis(), indices
         else:

@@ -679,7 +679,7 @@ def _flight_noise_panel(results: SceneResults, labelled: LabelledRecording) -> P
     budgets = [
         prepare_eyepoint_shots(
             eyepoints.select(np.array([i])), parameters, surfaces, unpack_effect_flags(int(flag))
-        ).noise_variances
+        ).noise.variances
         for i, flag in zip(seen_indices, flags, strict=True)
     ]
     facet_choices = {"part": labelled.label}

@@ -12,9 +12,9 @@ from flight_checks import check_flight
 from study_checks import check_study, warnings_as_errors
 
 from sweep.cli import main
-from sweep.model.effects.line_width import LINE_DEVIATION_MAX_WINDOW_BINS, gaussian_frequency_shifts
 from sweep.model.effects.noise_sources import SUN_RADIUS, solar_irradiance
 from sweep.model.effects.saturation import FULL_SCALE_EXCESS_MAX
+from sweep.model.laser_line import LINE_DEVIATION_MAX_WINDOW_BINS, gaussian_frequency_shifts
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.terrain import Terrain, smooth_terrain

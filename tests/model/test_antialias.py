@@ -6,9 +6,8 @@ from scipy import signal
 
 from sweep.model import evaluation, receiver_chain, time_domain_truth
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import circulator_leak
-from sweep.model.effects.circulator_leak import leak_line_of_point
 from sweep.model.effects.saturation import total_beat_amplitude
+from sweep.model.spectrum import permanent_line
 
 RATE, OVER, BINS = 600e6, 16, 256
 BANDWIDTH, ORDER = (f"instrument.receiver.antialias_{name}" for name in ("bandwidth", "order"))
@@ -87,8 +86,8 @@ def test_a_filter_far_beyond_the_poles_changes_nothing():
 def test_the_noise_that_is_left_is_that_of_the_narrowest_stage(table_4_1):
     scene = table_4_1(**NATURE)
     wide, narrow = prepared(scene), prepared(scene | filtered(100e6))
-    for source, value in wide.noise_variances.items():
-        assert narrow.noise_variances[source] == pytest.approx(value / 4, rel=1e-13), source
+    for source, value in wide.noise.variances.items():
+        assert narrow.noise.variances[source] == pytest.approx(value / 4, rel=1e-13), source
 
 
 CASES = [
@@ -107,7 +106,7 @@ def drawn_spectra(scene, beat, bandwidth, order, draws, seed):
     """
     rng, plain = np.random.default_rng(seed), prepared(scene)
     taper = signal.windows.hann(BINS, sym=False)
-    own = sum(v for name, v in plain.noise_variances.items() if name != "quantisation")
+    own = sum(v for name, v in plain.noise.variances.items() if name != "quantisation")
     whole = OVER * 2 * BINS
     high = np.fft.rfftfreq(whole, 1 / (OVER * RATE))
     gain = poles(high) * butterworth(high, bandwidth, order)
@@ -116,7 +115,7 @@ def drawn_spectra(scene, beat, bandwidth, order, draws, seed):
     for _ in range(draws // 2000):
         white = rng.normal(size=(2000, whole)) * deviation
         record = np.fft.irfft(gain * np.fft.rfft(white), whole)[:, : OVER * BINS : OVER]
-        rounding = np.sqrt(plain.noise_variances.get("quantisation", 0.0))
+        rounding = np.sqrt(plain.noise.variances.get("quantisation", 0.0))
         record = record + rounding * rng.normal(size=record.shape)
         spectra.append(np.fft.rfft(taper * record))
     line = time_domain_truth.analytic_record(plain, 0, 1, 0) / plain.whitening_gain[1, 0]
@@ -164,20 +163,20 @@ def test_a_leaked_line_passes_the_filter_at_its_own_frequency(table_4_1):
     beat = 1e9 / 500e-6 * 3.0 / SPEED_OF_LIGHT
     aliases = beat + RATE * np.arange(-300, 301)
     density = (np.abs(poles(aliases) * butterworth(aliases, 100e6, 6)) ** 2).sum() * RATE / 2e8
-    scale, _ = leak_line_of_point(shots, 0, 0)
-    amplitude = float(np.broadcast_to(shots.circulator_leak_amplitude, 1)[0])
+    scale, _ = permanent_line.line_of_point(shots, 0, 0)
+    amplitude = float(np.broadcast_to(shots.permanent_line.amplitude, 1)[0])
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-6)
 
 
 def test_skirts_at_an_echo_are_whitened_as_the_echo_is(table_4_1, monkeypatch):
     """Their share of it is that of a spectrum that is not whitened; a bin's density is 1 % off."""
-    shares, raised = [], circulator_leak.raised_magnitude
+    shares, raised = [], permanent_line.raised_magnitude
 
     def seen(magnitudes, skirts, **given):
         shares.append(skirts[magnitudes.argmax()] / magnitudes.max())
         return raised(magnitudes, skirts, **given)
 
-    monkeypatch.setattr(circulator_leak, "raised_magnitude", seen)
+    monkeypatch.setattr(permanent_line, "raised_magnitude", seen)
     leak = {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
     for shape in ("receiver", "white"):
         scene = scene_of(table_4_1, 280e6) | leak | {"instrument.receiver.noise_shape": shape}
@@ -196,8 +195,8 @@ def test_a_leaked_line_is_beside_the_noise_where_it_is_seen(table_4_1, at):
     beat = 1e9 / 500e-6 * 3.0 / SPEED_OF_LIGHT
     aliases = (at or beat) + RATE * np.arange(-4000, 4001)
     density = (np.abs(poles(aliases)) ** 2).sum() * RATE / 8e8
-    scale, _ = leak_line_of_point(shots, 0, 0, at)
-    amplitude = float(np.broadcast_to(shots.circulator_leak_amplitude, 1)[0])
+    scale, _ = permanent_line.line_of_point(shots, 0, 0, at)
+    amplitude = float(np.broadcast_to(shots.permanent_line.amplitude, 1)[0])
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-4)
 
 

@@ -56,8 +56,8 @@ class Instrument(NamedTuple):
         shots, length = self.shots, self.shots.window.length
         rate = float(shots.sample_rate[0])
         poles = {
-            "detector_bandwidth": shots.detector_bandwidth,
-            "amplifier_bandwidth": shots.amplifier_bandwidth,
+            "detector_bandwidth": shots.receiver_filter.detector_bandwidth,
+            "amplifier_bandwidth": shots.receiver_filter.amplifier_bandwidth,
         }
         # enough samples that what a transform's circle brings back is far from the record
         whole = OVER * (length + 64)
@@ -73,8 +73,8 @@ class Instrument(NamedTuple):
         taper = window_samples(shots.window.name, shots.window.length)
         density = receiver_chain.relative_noise_density(
             np.fft.rfftfreq(self.size, 1 / shots.sample_rate[0]),
-            detector_bandwidth=shots.detector_bandwidth,
-            amplifier_bandwidth=shots.amplifier_bandwidth,
+            detector_bandwidth=shots.receiver_filter.detector_bandwidth,
+            amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
             sample_rate=shots.sample_rate[0],
         )
         return np.abs(np.fft.rfft(taper * records, self.size, axis=-1)) / np.sqrt(density)
@@ -86,11 +86,11 @@ class Instrument(NamedTuple):
         random complex amplitude, one for all segments.
         """
         shots, rng = self.shots, np.random.default_rng(seed)
-        lines, level = shots.relative_range_offset.shape[1], float(shots.threshold[0])
+        lines, level = shots.footprint.n_beamlets, float(shots.threshold[0])
         lobe = int(np.ceil(main_lobe_half_width(shots.window) * self.size / shots.window.length))
         edge = first_circular_bin(shots.window, self.size)
         speckle = np.ones((DRAWS, lines), complex)
-        if shots.segment_correlations is not None:
+        if shots.speckle.segment_correlations is not None:
             speckle = rng.normal(size=(DRAWS, lines, 2)) @ [1, 1j] / np.sqrt(2)
         found, alarms = [], []
         for segment in (0, 2):

@@ -231,7 +231,7 @@ def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
     )
     surfaces = [SurfaceMaterial(name, 1.0, "thesis") for name in ("ground", "leaf")]
     shots = prepare_eyepoint_shots(eyepoints, one, surfaces, DEFAULT_EFFECTS)
-    echo = (shots.relative_amplitude**2)[0] / eyepoints.weight
+    echo = (shots.footprint.relative_amplitude**2)[0] / eyepoints.weight
     near = eyepoints.surface[0] == 1
     sent = GaussianBeam.from_waist(waist=8e-3, wavelength=WAVELENGTH, focus=50.0)
     ratio = overlap(sent, sent, 11.0) / overlap(sent, sent, 50.0)

@@ -139,7 +139,7 @@ def test_without_the_platforms_motion_a_target_at_rest_stands_still(table_4_1, m
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has(table_4_1, phases):
     """Bit for bit, all combinations of effects that shots are not kept apart for."""
-    free = [k for k, effect in enumerate(EFFECTS) if not effect.needs_own_batch]
+    free = [k for k, effect in enumerate(EFFECTS) if not effect.needs_separate_batches]
     assert {EFFECT_NAMES[k] for k in free} == {
         "several_returns", "doppler_spread", "signal_shot_noise", "solar_background",
     }  # fmt: skip
@@ -191,7 +191,9 @@ def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
         [SurfaceMaterial("a", 0.1, "lommel_seeliger"), SurfaceMaterial("b", 0.1)],
     )
     power = (
-        shots.relative_amplitude[0] ** 2 / seen.weight * (1 + shots.relative_range_offset[0]) ** 2
+        shots.footprint.relative_amplitude[0] ** 2
+        / seen.weight
+        * (1 + shots.footprint.relative_range_offset[0]) ** 2
     )
     first, second = (power[seen.surface[0] == s] for s in (0, 1))
     assert min(first.size, second.size) > 5

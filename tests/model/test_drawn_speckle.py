@@ -289,7 +289,7 @@ def test_three_segments_of_a_shot_are_detected_together(table_4_1):
     shots, draws = prepare_single_category(p), 8000
     detected, _, _ = scatterers_reported(p, draws, seed=3)
     error = np.sqrt(detected.mean() * (1 - detected.mean()) / draws)
-    assert shots.detection == "peak_bin"
+    assert shots.detection_settings.echo_bins == "peak_bin"
     for method in ("probabilities", "noise"):
         got = flown(p, method, draws)
         flags = got["flags"][0, :, 0]

@@ -131,8 +131,8 @@ def test_beamlets_that_miss_send_nothing_back(table_4_1):
     hit = seen.surface[0] >= 0
     assert 0 < hit.sum() < hit.size
     shots = prepare_eyepoint_shots(seen, table_4_1(), [GROUND])
-    assert (shots.relative_amplitude[0][~hit] == 0).all() and (
-        shots.relative_amplitude[0][hit] > 0
+    assert (shots.footprint.relative_amplitude[0][~hit] == 0).all() and (
+        shots.footprint.relative_amplitude[0][hit] > 0
     ).all()
     assert not observe_shots(
         straight_flight(position=(50.0, 0.0, 100.0)), bodies=edge

@@ -118,9 +118,13 @@ def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     # Up to Nyquist and beyond: images are as near as the lines at some points, far at others.
     parameters["target.radial_velocity"] = generator.uniform(-470.0, 470.0, 300)
     ((_, shots),) = prepare_shots(parameters)
-    assert shots.sums_images
+    assert shots.images.are_summed
     whole = evaluate_segments(shots)
-    some = evaluate_segments(replace(shots, leakage_tolerance=np.asarray(allowed)))
+    some = evaluate_segments(
+        replace(
+            shots, tolerances=shots.tolerances._replace(leakage_probability=np.asarray(allowed))
+        )
+    )
     missed = whole[:, LEAKAGE] - some[:, LEAKAGE]
     assert (missed <= allowed).all() and (missed >= -1e-6 * whole[:, LEAKAGE]).all()
     others = [PD, MISS, MAGNITUDE, FREQUENCY, EXEMPTED]
@@ -210,7 +214,7 @@ def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_s
     """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = drawn_bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
-        held(replace(shots, sums_images=image))
+        held(replace(shots, images=shots.images._replace(are_summed=image)))
 
 
 @pytest.mark.parametrize("fft_size", [64, 255, 1023, 5000])
@@ -258,7 +262,7 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
             exact = time_domain_truth.time_domain_spectrum(shots, 0, segment, with_range_walk=False)
             assert 5 < found.size < 4097
             error = magnitude_error(shots, found, exact[low : low + found.size], exact.max())
-            assert error < (1e-9 if shots.adds_powers else 1e-10)
+            assert error < (1e-9 if shots.footprint.adds_powers else 1e-10)
 
 
 @pytest.mark.parametrize("apart", [0.5, 50.0])

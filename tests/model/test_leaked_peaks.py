@@ -16,13 +16,14 @@ from sweep.model import outputs
 from sweep.model.detection.looks import SINGLE_LOOK
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 from sweep.model.detection.sub_bin_interpolation import interpolator
-from sweep.model.effects import circulator_leak
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.effects.circulator_leak import ISOLATION_PATH, LEAK_LENGTH_PATH
 from sweep.model.geometry.mesh import SurfaceMaterial
 from sweep.model.pointcloud import leaked_peaks as leaked
 from sweep.model.pointcloud.bin_groups import list_bin_groups
 from sweep.model.pointcloud.pairing import FALSE_ALARM_FLAG
 from sweep.model.pointcloud.point_cloud import simulate_cloud
+from sweep.model.spectrum import permanent_line
 from sweep.model.window import get_window
 
 NUMBER = {"probabilities": 8000, "noise": 8000, "spectra": 1500}
@@ -269,16 +270,16 @@ def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1
 
 def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypatch):
     """Records of the line at a uniform phase, in noise; the echo itself leaks nothing."""
-    monkeypatch.setattr(circulator_leak, "MASK_THRESHOLD_FRACTION", 0.8)  # for many alarms
+    monkeypatch.setattr(permanent_line, "MASK_THRESHOLD_FRACTION", 0.8)  # for many alarms
     draws, random = 4000, np.random.default_rng(4)
-    further = {circulator_leak.LEAK_LENGTH_PATH: 40.0, circulator_leak.ISOLATION_PATH: 1e5}
+    further = {LEAK_LENGTH_PATH: 40.0, ISOLATION_PATH: 1e5}
     shots = _one_shot(
         table_4_1, (*DEFAULT_EFFECTS, "circulator_leak"), further, range=1500.0, power=1.0
     )
     found = list_bin_groups(shots)
     ((_, leaks),) = leaked.iter_leakage_bins(shots, found, np.zeros(1, np.int64))
     level = float(shots.threshold[0] / shots.bin_noise_sigma[0])
-    scale, line = circulator_leak.leak_line_of_point(shots, 0, 0)
+    scale, line = permanent_line.line_of_point(shots, 0, 0)
     bins = leaks.line_bins[slice(*leaks.line_slice[0, 0])]
     one, other = scale / shots.bin_noise_sigma[0] * line.transforms[:, bins]
     turn = np.exp(2j * np.pi * random.random(draws))[:, None]

@@ -35,7 +35,11 @@ def test_bins_are_within_what_is_allowed_and_pd_within_half_of_it(table_4_1, pha
         shots = some_shots(table_4_1, phases, effects, seed)
         exact = evaluate_segments(shots)
         for tolerance in (1e-1, 1e-3, 1e-6):
-            found = evaluate_segments(replace(shots, line_error_tolerance=np.asarray(tolerance)))
+            found = evaluate_segments(
+                replace(
+                    shots, tolerances=shots.tolerances._replace(line_error=np.asarray(tolerance))
+                )
+            )
             apart = abs(found[:, MAGNITUDE] - exact[:, MAGNITUDE]) / shots.bin_noise_sigma
             rounding = 1e-11 * exact[:, MAGNITUDE] / shots.bin_noise_sigma
             assert (apart <= tolerance + rounding).all()
@@ -48,7 +52,7 @@ def test_parts_of_the_tolerance_can_be_set_by_hand(table_4_1):
     parameters = PARAMETER_DEFAULTS | table_4_1(phases="coherent", fft_size=2**12)
     given = {"accuracy.line_error": 1e-4, "accuracy.leakage_error": 2e-5}
     ((_, by_hand),) = prepare_shots(parameters | given | {"accuracy.tolerance": 0.1})
-    assert (by_hand.line_error_tolerance, by_hand.leakage_tolerance) == (1e-4, 2e-5)
+    assert (by_hand.tolerances.line_error, by_hand.tolerances.leakage_probability) == (1e-4, 2e-5)
     ((_, auto),) = prepare_shots(parameters | {"accuracy.tolerance": 0.1})
-    assert auto.line_error_tolerance == pytest.approx(0.1)
-    assert auto.leakage_tolerance == pytest.approx(0.05)
+    assert auto.tolerances.line_error == pytest.approx(0.1)
+    assert auto.tolerances.leakage_probability == pytest.approx(0.05)

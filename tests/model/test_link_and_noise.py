@@ -45,7 +45,7 @@ def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_
     assert far[lit].max() / far[lit].min() > 2
     shots = prepare_single_category(scene)
     power = (
-        shots.beat_amplitude_scale * shots.relative_amplitude[0] / (2 * 1.1 * GAIN)
+        shots.link_scales.beat_amplitude * shots.footprint.relative_amplitude[0] / (2 * 1.1 * GAIN)
     ) ** 2 / 1e-3
     scattered = down / np.pi if law == "lambert" else 1 / (2 * np.pi)
     expected = 0.1 * np.pi * 0.0125**2 * share * scattered / (100.0 * far) ** 2
@@ -157,7 +157,7 @@ def test_direct_detection_ignores_the_local_oscillator_and_has_no_shot_noise_of_
 ):
     scene = thermally_limited | {"instrument.receiver.local_oscillator_power": 5.0}
     assert direct_snr(scene) == direct_snr(thermally_limited)
-    assert "local_oscillator_shot" not in prepare_single_category(scene).noise_variances
+    assert "local_oscillator_shot" not in prepare_single_category(scene).noise.variances
 
 
 # Noise
@@ -168,21 +168,21 @@ def test_the_noise_of_table_4_1_by_hand(table_4_1):
     shots = prepare_single_category(table_4_1(fft_size=1024))
     by_hand = {"local_oscillator_shot": 1.40992e-13, "detector": 1.21e-14, "amplifier": 6.25e-16}
     for source, current in by_hand.items():
-        assert shots.noise_variances[source] == pytest.approx(current * 4.9e7, rel=1e-5)
+        assert shots.noise.variances[source] == pytest.approx(current * 4.9e7, rel=1e-5)
     assert shots.noise_variance == pytest.approx(7.53211e-6, rel=1e-5)
-    assert set(shots.noise_variances) == {*by_hand, "signal_shot", "solar_shot"}
-    assert shots.noise_variances["solar_shot"] == 0.0
+    assert set(shots.noise.variances) == {*by_hand, "signal_shot", "solar_shot"}
+    assert shots.noise.variances["solar_shot"] == 0.0
     # 2 q Re P B of the echo, 1.953e-12 W.
-    assert shots.noise_variances["signal_shot"] == pytest.approx(2.7537e-22 * 4.9e7, rel=1e-3)
+    assert shots.noise.variances["signal_shot"] == pytest.approx(2.7537e-22 * 4.9e7, rel=1e-3)
 
 
 def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_amplifiers(table_4_1):
     plain = prepare_single_category(
         table_4_1(fft_size=1024, solar_irradiance=2.6e8)
-    ).noise_variances
+    ).noise.variances
     gained = prepare_single_category(
         table_4_1(fft_size=1024, solar_irradiance=2.6e8, apd_gain=10.0, excess_noise_factor=4.0)
-    ).noise_variances
+    ).noise.variances
     factors = {
         "local_oscillator_shot": 400.0, "signal_shot": 400.0, "solar_shot": 400.0,
         "detector": 100.0, "amplifier": 1.0,
@@ -196,7 +196,7 @@ def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
         stages = {"detector_bandwidth": detector, "amplifier_bandwidth": amplifier}
         assert electrical_bandwidth(stages) == 100e6
         scene = table_4_1(detector_bandwidth=detector, amplifier_bandwidth=amplifier, fft_size=1024)
-        shot_noise = prepare_single_category(scene).noise_variances["local_oscillator_shot"]
+        shot_noise = prepare_single_category(scene).noise.variances["local_oscillator_shot"]
         assert shot_noise == pytest.approx(1.40992e-13 / 4 * 4.9e7, rel=1e-5)
 
 

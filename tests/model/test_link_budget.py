@@ -79,44 +79,49 @@ def test_the_planner_has_the_link_budget_of_the_shots(case, table_4_1):
     points = PlannerInputs({path: np.asarray(value) for path, value in scene.items()})
     has_adc_noise = case[2] == "antialias"  # the planner counts it where filters leave no noise
     at_rest = prepare_single_category(scene, ())
-    assert_equal(points.receiver_noise_variance, at_rest.noise_variance)
-    assert_equal(points.bin_noise_sigma, at_rest.bin_noise_sigma)
-    assert_equal(points.threshold_ratio * points.bin_noise_sigma, at_rest.threshold)
-    assert_equal(points.beat_amplitude, at_rest.beat_amplitude_scale * axis_amplitude(at_rest))
-    assert_equal(points.record_duration, at_rest.record_duration)
-    assert_equal(points.bin_width, at_rest.sample_rate / at_rest.fft_size)
-    assert_equal(points.approach_speed, at_rest.approach_speed)
-    assert_equal(points.look_period, at_rest.look_period)
+    assert_equal(points.noise.variance_without_echo, at_rest.noise_variance)
+    bin_noise_sigma = points.record.bin_noise_sigma(
+        points.noise.variance_without_echo, points.looks
+    )
+    assert_equal(bin_noise_sigma, at_rest.bin_noise_sigma)
+    assert_equal(points.threshold_ratio * bin_noise_sigma, at_rest.threshold)
+    assert_equal(
+        points.beat_amplitude, at_rest.link_scales.beat_amplitude * axis_amplitude(at_rest)
+    )
+    assert_equal(points.record.duration, at_rest.record.duration)
+    assert_equal(points.record.bin_width, at_rest.sample_rate / at_rest.fft_size)
+    assert_equal(points.target.approach_speed, at_rest.target.approach_speed)
+    assert_equal(points.waveform.look_period, at_rest.waveform.look_period)
     assert points.window == at_rest.window
 
     effects = (*MOTION, "quantisation") if has_adc_noise else MOTION
     shots = prepare_single_category(scene, effects)
     shape = int(shots.has_segment.sum()), N_POINTS
-    assert_equal(points.carriers, existing(shots, shots.carriers), shape)
-    assert_equal(points.segment_starts, existing(shots, shots.segment_starts), shape)
+    assert_equal(points.carriers, existing(shots, shots.waveform.carriers), shape)
+    assert_equal(points.segment_starts, existing(shots, shots.motion.segment_starts), shape)
     beats = existing(shots, shots.beat_frequencies)
     assert_equal(points.beat_frequency, beats, shape)
     n_missing = 0 if points.missing_samples is None else points.missing_samples.n_missing
-    before_echo = shots.n_samples_before_echo
+    before_echo = shots.echo_record.n_samples_before
     expected = 0 if before_echo is None else before_echo[shots.has_segment]
     assert np.array_equal(np.broadcast_to(n_missing, shape), np.broadcast_to(expected, shape))
 
     pole_gain = np.abs(
         receiver_chain.receiver_transfer(
             beats,
-            detector_bandwidth=shots.detector_bandwidth,
-            amplifier_bandwidth=shots.amplifier_bandwidth,
+            detector_bandwidth=shots.receiver_filter.detector_bandwidth,
+            amplifier_bandwidth=shots.receiver_filter.amplifier_bandwidth,
         )
     )
-    magnitude = shots.beat_amplitude_scale * axis_amplitude(shots) * shots.window.sum / 2
+    magnitude = shots.link_scales.beat_amplitude * axis_amplitude(shots) * shots.window.sum / 2
     signal_ratio = magnitude * pole_gain * shots.whitening_gain[shots.has_segment]
     assert_equal(points.line_signal_ratio, signal_ratio / shots.bin_noise_sigma, shape)
 
 
 def axis_amplitude(shots):
     """Relative amplitude of the echo on the axis, (n,), alone without a footprint."""
-    assert shots.relative_amplitude.shape[1] == 1
-    return shots.relative_amplitude[shots.footprint_row, 0]
+    assert shots.footprint.n_beamlets == 1
+    return shots.footprint.relative_amplitude[shots.footprint.row_of_point, 0]
 
 
 def test_effects_that_are_off_leave_lines_at_rest(table_4_1):
@@ -125,9 +130,7 @@ def test_effects_that_are_off_leave_lines_at_rest(table_4_1):
     arrays = {path: np.asarray(value) for path, value in scene.items()}
     for effects in ((), ("doppler",), ("doppler", "segment_motion")):
         points = PlannerInputs(arrays)
-        points.ignores_doppler = "doppler" not in effects
-        points.ignores_segment_motion = "segment_motion" not in effects
-        points.ignores_overlap = True
+        points.effects_off = {"doppler", "segment_motion", "overlap"} - set(effects)
         shots = prepare_single_category(scene, effects)
         beats = existing(shots, shots.beat_frequencies)
         assert_equal(points.beat_frequency, beats, beats.shape)

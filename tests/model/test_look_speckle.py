@@ -213,7 +213,7 @@ def test_a_target_at_rest_has_one_speckle_in_all_looks(table_4_1):
     p = PARAMETER_DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {LOOKS_NUMBER_PATH: 8}
     p |= {"target.radial_velocity": 0.0, "target.transverse_velocity": 0.0}
     shots = prepare_single_category(p)
-    assert shots.look_speckle is None
+    assert shots.speckle.look_speckle is None
     common = shot_statistics(prepare_single_category(p | {LOOKS_SPECKLE_PATH: "common"}))
     np.testing.assert_array_equal(shot_statistics(shots)["pd_shot"], common["pd_shot"])
 
@@ -233,7 +233,7 @@ def test_added_amplitudes_of_looks_lose_what_their_speckle_does_not_share(table_
     )
     powers = prepare_single_category(
         p | {LOOKS_COMBINE_PATH: "power"}
-    ).look_speckle.correlation_by_lag[0, 0]
+    ).speckle.look_speckle.correlation_by_lag[0, 0]
     lag = np.arange(6) - np.arange(6)[:, None]
     shared = np.abs(powers)[np.abs(lag)].sum() / 36
     assert 0.05 < shared < 0.9

@@ -24,9 +24,8 @@ from sweep.model.detection.looks import (
     coherent_gain,
 )
 from sweep.model.detection.marcum import at_least_one_probability, marcum_q1
-from sweep.model.effects.line_width import apparent_line_and_pedestal, coherent_power_fraction
-from sweep.model.effects.segment_motion import split_looks
 from sweep.model.evaluation import evaluate, evaluate_segments, prepare_shots
+from sweep.model.laser_line import apparent_line_and_pedestal, pure_line_power_fraction
 from sweep.model.sampling.samplers import simulate_draws
 from sweep.model.spectrum.segment_spectra import segment_spectrum
 from sweep.model.threshold import DESIGN_PFA_BIN_PATH, DESIGN_PFA_SEGMENT_PATH, tnr_from_parameters
@@ -293,14 +292,14 @@ def test_acceleration_costs_coherent_looks_what_exact_records_lose(scene):
     record = partial(
         time_domain_truth.analytic_record, point=0, segment=0, beamlet=0, with_acceleration=True
     )
-    sums = np.array([(record(look) * bins).sum() for look in split_looks(shots)])
+    sums = np.array([(record(look) * bins).sum() for look in shots.split_by_look()])
     place = np.arange(8) - 3.5
     phase = np.unwrap(np.angle(sums))
     turned = sums * np.exp(-1j * np.polyfit(place, phase, 1)[0] * place)
     lost = np.abs(turned.mean()) / np.abs(sums).mean()
     told = coherent_gain(
         Looks(8, "coherent"), acceleration=np.array(80.0),
-        carrier=np.asarray(shots.carriers[0]), look_period=np.array(20e-6),
+        carrier=np.asarray(shots.waveform.carriers[0]), look_period=np.array(20e-6),
     )  # fmt: skip
     assert 0.5 < told < 0.9
     assert float(told) == pytest.approx(lost, rel=2e-3)
@@ -334,7 +333,7 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     assert without > told + 0.1
     timing = {"line_width": np.array([1e5]), "delay": np.array([delay])}
     own = {"duration": np.array([2e-6]), "window": shots.window}
-    assert apparent_line_and_pedestal(**timing, **own)[0] > coherent_power_fraction(
+    assert apparent_line_and_pedestal(**timing, **own)[0] > pure_line_power_fraction(
         **timing, duration=own["duration"]
     )
 
@@ -352,7 +351,7 @@ def test_a_target_that_moves_smears_the_mean_power_of_its_looks(scene, combine):
         return
     ((_, shots),) = prepare_shots(moving, effects)
     bins, magnitude = segment_spectrum(shots, 0, 0)
-    each = [dict(zip(*segment_spectrum(look, 0, 0), strict=True)) for look in split_looks(shots)]
+    each = [dict(zip(*segment_spectrum(look, 0, 0), strict=True)) for look in shots.split_by_look()]
     for k in range(95, 105):
         expected = np.sqrt(np.mean([look[k] ** 2 for look in each]))
         # The receiver's poles are those of the middle look's line.

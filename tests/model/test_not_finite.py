@@ -1,6 +1,7 @@
 """Numbers that are not finite: every loop ends on them, and the shot that has one is named."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -56,22 +57,25 @@ def shots(table_4_1):
 
 @pytest.mark.parametrize("value", NOT_FINITE)
 @pytest.mark.parametrize(
-    ("name", "words"),
-    [("range", "the range"), ("relative_amplitude", "beamlets' echoes"),
-     ("relative_range_offset", "beamlets' ranges"), ("echo_power_scale", "echo's power")],
+    ("record_name", "name", "words"),
+    [("target", "range", "the range"),
+     ("footprint", "relative_amplitude", "beamlets' echoes"),
+     ("footprint", "relative_range_offset", "beamlets' ranges"),
+     ("link_scales", "echo_power", "echo's power")],
 )  # fmt: skip
-def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words, value):
+def test_a_shot_with_a_number_that_is_not_finite_is_named(
+    table_4_1, record_name, name, words, value
+):
     prepared = shots(table_4_1)
     require_finite(prepared)
-    values = np.array(np.broadcast_to(getattr(prepared, name), np.shape(getattr(prepared, name))))
+    record = getattr(prepared, record_name)
+    values = np.array(getattr(record, name))
     if values.ndim:
         values[1 if values.shape[0] > 1 else 0] = value
     else:
         values = np.asarray(value)
-    if name == "range":
-        spoilt = replace(prepared, target=replace(prepared.target, range=values))
-    else:
-        spoilt = replace(prepared, **{name: values})
+    change = record._replace if hasattr(record, "_replace") else partial(replace, record)
+    spoilt = replace(prepared, **{record_name: change(**{name: values})})
     with pytest.raises(UnsupportedShotError, match=words) as refused:
         require_finite(spoilt)
     assert refused.value.point_index in (0, 1)

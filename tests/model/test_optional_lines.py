@@ -64,8 +64,8 @@ def plain_sum(shots, i, segment, bins):
         y = (way * bins - origin - place) * shots.window.length / shots.fft_size
         # C_b counts its phase from the middle of the record, the transform from its beginning
         line = direct_transform(shots.window, y) * c * np.exp(1j * np.pi * y)
-        total += abs(line) ** 2 if shots.adds_powers else line
-    return np.sqrt(total.real) if shots.adds_powers else abs(total)
+        total += abs(line) ** 2 if shots.footprint.adds_powers else line
+    return np.sqrt(total.real) if shots.footprint.adds_powers else abs(total)
 
 
 @pytest.mark.parametrize(
@@ -83,9 +83,13 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
         for segment in range(3):
             bins, fast = segment_spectra.segment_spectrum(shots, 0, segment)
             slow = plain_sum(shots, 0, segment, bins)
-            assert magnitude_error(shots, fast, slow) < (AGREEMENT if shots.adds_powers else 1e-11)
+            assert magnitude_error(shots, fast, slow) < (
+                AGREEMENT if shots.footprint.adds_powers else 1e-11
+            )
         if distance < 1:  # beats next to DC: images are there, and were left out
-            both = evaluate_segments(replace(shots, sums_images=True))[1, MAGNITUDE]
+            both = evaluate_segments(replace(shots, images=shots.images._replace(are_summed=True)))[
+                1, MAGNITUDE
+            ]
             assert abs(both / evaluate_segments(shots)[1, MAGNITUDE] - 1) > 1e-3
 
 
@@ -97,7 +101,12 @@ def same_detections(shots):
     whole = evaluate_segments(shots)
     worst = np.zeros(2)
     for every_bin in (False, True):
-        found = evaluate_segments(replace(shots, includes_leakage=False), bin_by_bin=every_bin)
+        found = evaluate_segments(
+            replace(
+                shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
+            ),
+            bin_by_bin=every_bin,
+        )
         assert not np.nan_to_num(found[:, LEAKAGE]).any()
         for field in (FREQUENCY, EXEMPTED):
             np.testing.assert_array_equal(found[:, field], whole[:, field])
@@ -114,7 +123,9 @@ def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, imag
     """Bundles wide and narrow, weak and strong, on DC and Nyquist and beyond."""
     for seed, apart in enumerate((0.0, 0.5, 5.0, 50.0, 300.0)):
         shots = bundles(table_4_1, 10 * fft_size + seed, fft_size, apart)
-        magnitude, pd = same_detections(replace(shots, sums_images=image))
+        magnitude, pd = same_detections(
+            replace(shots, images=shots.images._replace(are_summed=image))
+        )
         assert magnitude < 1e-11 and pd < 1e-12
 
 
@@ -168,21 +179,26 @@ def exact(shots, i, segment, shifts):
     window, length = window_samples(shots.window.name, shots.window.length), shots.window.length
     x, half = 2 * np.arange(length) / length - 1, shots.fft_size // 2 + 1
     cycles = np.zeros(length)
-    for error in shots.phase_errors:
+    for error in shots.echo_record.phase_errors:
         values = error.select_arguments(segment, np.array([i]))
         cycles = cycles + error.phase(x, sign=DEFAULT_CHIRP_SLOPES[segment], **values)[0]
     records = [
         time_domain_truth.analytic_record(shots, i, segment, b, with_range_walk=False)
-        for b in range(shots.relative_range_offset.shape[1])
+        for b in range(shots.footprint.n_beamlets)
     ]
     total = np.zeros(half)
     for shift, weight in zip(*shifts, strict=True):
         turn = window * np.exp(2j * np.pi * (cycles + shift * x / 2))
-        for record in records if shots.adds_powers else [sum(records)]:
+        for record in records if shots.footprint.adds_powers else [sum(records)]:
             spectrum = np.fft.fft(turn * record, shots.fft_size) / 2
-            line, image = spectrum[:half], spectrum[-np.arange(half)].conj() * shots.sums_images
+            line, image = (
+                spectrum[:half],
+                spectrum[-np.arange(half)].conj() * shots.images.are_summed,
+            )
             power = (
-                abs(line) ** 2 + abs(image) ** 2 if shots.adds_powers else abs(line + image) ** 2
+                abs(line) ** 2 + abs(image) ** 2
+                if shots.footprint.adds_powers
+                else abs(line + image) ** 2
             )
             total += weight * power
     return np.sqrt(total)
@@ -190,10 +206,12 @@ def exact(shots, i, segment, shifts):
 
 def width_by_hermite(shots, i):
     """Shifts [bins of fs/L] of a Gaussian line, by a rule of its own: Gauss and Hermite's."""
-    if shots.gaussian_line_width is None:
+    if shots.laser_line.gaussian_width is None:
         return np.zeros(1), np.ones(1)
     place, weight = np.polynomial.hermite_e.hermegauss(61)
-    bins = shots.gaussian_line_width[i] * np.broadcast_to(shots.record_duration, shots.size)[i]
+    bins = (
+        shots.laser_line.gaussian_width[i] * np.broadcast_to(shots.record.duration, shots.size)[i]
+    )
     return DEVIATION_PER_FWHM * bins * place, weight / weight.sum()
 
 

@@ -56,13 +56,18 @@ def error(shots, degree):
 
     Of |X|; of |X|^2 where powers add, as a root of rounding is much.
     """
-    worst, order = 0.0, 2 if shots.adds_powers else 1
+    worst, order = 0.0, 2 if shots.footprint.adds_powers else 1
     for i in range(shots.size):
-        gain = 1 / (1 + (2e8 / shots.detector_bandwidth) ** 2)  # of lines below 200 MHz, at least
-        peak = shots.relative_amplitude[shots.footprint_row[i]]
-        peak = np.sqrt((peak**2).sum()) if shots.adds_powers else peak.sum()
+        gain = 1 / (
+            1 + (2e8 / shots.receiver_filter.detector_bandwidth) ** 2
+        )  # of lines below 200 MHz, at least
+        peak = shots.footprint.relative_amplitude[shots.footprint.row_of_point[i]]
+        peak = np.sqrt((peak**2).sum()) if shots.footprint.adds_powers else peak.sum()
         peak *= (
-            np.broadcast_to(shots.beat_amplitude_scale, shots.size)[i] * shots.window.sum / 2 * gain
+            np.broadcast_to(shots.link_scales.beat_amplitude, shots.size)[i]
+            * shots.window.sum
+            / 2
+            * gain
         )
         for segment in range(3):
             _, exact = segment_spectra.segment_spectrum(shots, i, segment)
@@ -77,7 +82,8 @@ def error(shots, degree):
 @pytest.mark.parametrize("window", DEPOSIT)
 def test_lines_in_cells_are_as_near_as_cells_can_be(window, phases, table_4_1):
     number = 2 if "kaiser" in window else 12  # whose whole spectrum takes its time
-    shots = replace(drawn(table_4_1, number, window=window, phases=phases), sums_images=False)
+    shots = drawn(table_4_1, number, window=window, phases=phases)
+    shots = replace(shots, images=shots.images._replace(are_summed=False))
     nearest, shared = DEPOSIT[window]
     assert 1e-3 < error(shots, 0) < nearest
     # Powers have twice the bandwidth: 2^10 times the remainder.
@@ -102,7 +108,9 @@ def test_images_about_dc_and_nyquist_are_summed(phases, acquisition_delay, table
             bins, found = spectrum(shots, i, 1, degree=9)
             edge = np.abs(bins - (0, fft_size // 2)[i]) < 20
             assert np.abs(found - exact[bins])[edge].max() < 1e-8 * exact.max()
-            without = segment_spectra.segment_spectrum(replace(shots, sums_images=False), i, 1)[1]
+            without = segment_spectra.segment_spectrum(
+                replace(shots, images=shots.images._replace(are_summed=False)), i, 1
+            )[1]
             assert np.abs(without - exact).max() > 0.01 * exact.max()
 
 
@@ -114,7 +122,7 @@ def test_the_way_back_to_the_bins_alone_is_the_whole_way_back(phases, table_4_1)
         _, real = spectrum(shots, i, segment, real=True)
         _, folded = spectrum(shots, i, segment, folded=True)
         _, both = spectrum(shots, i, segment, real=True, folded=True)
-        order = 2 if shots.adds_powers else 1  # a root of rounding is much
+        order = 2 if shots.footprint.adds_powers else 1  # a root of rounding is much
         for other in (real, folded, both):
             assert np.abs(whole**order - other**order).max() < 1e-14 * whole.max() ** order
 

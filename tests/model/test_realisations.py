@@ -98,19 +98,25 @@ def test_random_effects_come_and_go_without_moving_each_others_numbers(table_4_1
     parameters = scene(table_4_1, range=np.array([2000.0, 5000.0]), fft_size=4096)
     both = drawn_shots(parameters, ["speckle", "scintillation"])
     speckled, twinkling = (drawn_shots(parameters, [e]) for e in ("speckle", "scintillation"))
-    np.testing.assert_array_equal(both.relative_amplitude, speckled.relative_amplitude)
-    np.testing.assert_array_equal(both.beamlet_phase_cycles, speckled.beamlet_phase_cycles)
-    np.testing.assert_array_equal(both.beat_amplitude_scale, twinkling.beat_amplitude_scale)
+    np.testing.assert_array_equal(
+        both.footprint.relative_amplitude, speckled.footprint.relative_amplitude
+    )
+    np.testing.assert_array_equal(both.footprint.phase_cycles, speckled.footprint.phase_cycles)
+    np.testing.assert_array_equal(
+        both.link_scales.beat_amplitude, twinkling.link_scales.beat_amplitude
+    )
     shaken, every = (drawn_shots(parameters, e) for e in (["pointing_jitter"], RANDOM))
     np.testing.assert_array_equal(every.range, shaken.range)
     # Beamlets are elsewhere, and the factors on them are what they were.
     plain = drawn_shots(parameters, [])
     np.testing.assert_allclose(
-        every.relative_amplitude / shaken.relative_amplitude[shaken.footprint_row],
-        speckled.relative_amplitude / plain.relative_amplitude[plain.footprint_row],
+        every.footprint.relative_amplitude
+        / shaken.footprint.relative_amplitude[shaken.footprint.row_of_point],
+        speckled.footprint.relative_amplitude
+        / plain.footprint.relative_amplitude[plain.footprint.row_of_point],
         rtol=1e-12,
     )
-    np.testing.assert_array_equal(every.beamlet_phase_cycles, speckled.beamlet_phase_cycles)
+    np.testing.assert_array_equal(every.footprint.phase_cycles, speckled.footprint.phase_cycles)
 
 
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
@@ -189,8 +195,8 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
     for stretch in stretches[:2]:
         shots, outputs = stretch.shots, shot_statistics(stretch.shots)
         share = shots.echo_power / plain.shots.echo_power[0]
-        quiet = plain.shots.noise_variances["signal_shot"][0]
-        np.testing.assert_allclose(shots.noise_variances["signal_shot"], share * quiet, rtol=1e-12)
+        quiet = plain.shots.noise.variances["signal_shot"][0]
+        np.testing.assert_allclose(shots.noise.variances["signal_shot"], share * quiet, rtol=1e-12)
         by_light = 2 if architecture == "direct" else 1
         signal = outputs["snr_up"] * shots.noise_variance
         alone = evaluate_without(parameters, DEFAULT_EFFECTS)
@@ -269,7 +275,7 @@ def test_a_moving_instrument_sees_what_its_jitter_turns_into_the_beam(table_4_1)
         parameters, (*DEFAULT_EFFECTS, "pointing_jitter"), keys=make_point_keys(1), draws=2000
     )
     upwards = np.arcsin(2000.0 * np.sin(0.5) / stretch.shots.range) - 0.5  # -a
-    found = stretch.shots.radial_velocity - 50.0
+    found = stretch.shots.target.radial_velocity - 50.0
     np.testing.assert_allclose(found, 80.0 * upwards, atol=3 * 130.0 * 1e-4**2 * 10)
     assert found.std() == pytest.approx(80.0 * 1e-4, rel=5 / np.sqrt(4000))
 

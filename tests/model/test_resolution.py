@@ -151,7 +151,9 @@ def test_a_velocity_along_a_wide_beam_spreads_its_lines_alone(table_4_1, transve
     (x, y), _ = place_beamlets(61 * 61, "square")
     cosine = 1 / np.sqrt(1 + (x**2 + y**2) * 0.005**2)
     speeds = moving["target.radial_velocity"] * (cosine - 1)
-    assert shots.doppler_ratio_offset[0] * SPEED_OF_LIGHT / 2 == pytest.approx(speeds, abs=2e-10)
+    assert shots.footprint.doppler_ratio_offset[0] * SPEED_OF_LIGHT / 2 == pytest.approx(
+        speeds, abs=2e-10
+    )
 
 
 def test_a_lattice_of_many_beamlets_agrees_with_the_line(table_4_1):
@@ -184,7 +186,7 @@ def test_where_no_number_is_enough_it_is_the_thesiss(table_4_1, changes):
     parameters = table_4_1(**{"phases": "incoherent"} | changes) | AUTO
     by_hand = {} if changes else {"footprint.pattern": "hexagonal"}
     ((_, shots),) = prepare_shots(parameters | {"accuracy.tolerance": 1e-3} | by_hand)
-    assert shots.relative_range_offset.shape[1] == 109
+    assert shots.footprint.n_beamlets == 109
 
 
 def test_without_a_footprint_there_is_one_beamlet(table_4_1):
@@ -192,14 +194,14 @@ def test_without_a_footprint_there_is_one_beamlet(table_4_1):
     ((_, shots),) = prepare_shots(
         parameters, [name for name in DEFAULT_EFFECTS if name != "footprint"]
     )
-    assert shots.relative_range_offset.shape[1] == 1
+    assert shots.footprint.n_beamlets == 1
 
 
 def test_numbers_given_by_hand_are_kept(table_4_1):
     for pattern, number in (("line", 5), ("square", 9), ("sunflower", 33), ("hexagonal", 7)):
         parameters = table_4_1(beamlets=number, phases="incoherent")
         ((_, shots),) = prepare_shots(parameters | {"footprint.pattern": pattern})
-        assert shots.relative_range_offset.shape[1] == number
+        assert shots.footprint.n_beamlets == number
 
 
 def test_where_no_provided_number_is_enough_the_error_says_so(table_4_1):

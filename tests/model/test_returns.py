@@ -67,9 +67,11 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     share = np.ones(len(ranges)) if shares is None else np.array(shares)
     return dataclasses.replace(
         shots,
-        relative_range_offset=offset[None],
-        doppler_ratio_offset=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
-        relative_amplitude=shots.relative_amplitude[:1] * np.sqrt(share[which])[None],
+        footprint=shots.footprint._replace(
+            relative_range_offset=offset[None],
+            doppler_ratio_offset=(2 / LIGHT * (velocities[which] - velocities[0]))[None],
+            relative_amplitude=shots.footprint.relative_amplitude[:1] * np.sqrt(share[which])[None],
+        ),
     )
 
 
@@ -170,9 +172,7 @@ def test_a_triangle_loses_no_return_for_want_of_a_third_segment(order, table_4_1
     shots = _surfaces(table_4_1, (300.0, 320.0), (1.0, 1.0), shares=(0.8, 0.2), power=0.5)
     shots = dataclasses.replace(
         shots,
-        waveform_settings=dataclasses.replace(
-            shots.waveform_settings, segment_order=tuple(order.split())
-        ),
+        waveform=dataclasses.replace(shots.waveform, segment_order=tuple(order.split())),
     )
     got = _drawn(shots)
     assert got.flags[0, 0].tolist() == [TRUE_FLAG, TRUE_FLAG, 0, 0]
@@ -417,7 +417,10 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
     got = _drawn(shots, draws=1000, method=method)
     assert (got.flags[..., 0] == TRUE_FLAG).all()
     assert 2 * got.snr[..., 0].mean() == pytest.approx(64**2, rel=0.4)
-    for quantity, expected in (("range", shots.range), ("radial_velocity", shots.radial_velocity)):
+    for quantity, expected in (
+        ("range", shots.range),
+        ("radial_velocity", shots.target.radial_velocity),
+    ):
         found = getattr(got, f"{quantity}_interpolated")[..., 0]
         reported = getattr(got, f"{quantity}_interpolated_standard_error")[..., 0]
         deviation = (found - expected[:, None]) / reported
@@ -482,15 +485,18 @@ def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
     shots = prepare_single_category(
         table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
     )
-    shots = dataclasses.replace(shots, doppler_ratio_offset=np.linspace(-1e-9, 1e-9, 7)[None])
-    velocity = -170.0 + shots.doppler_ratio_offset[0] * LIGHT / 2
+    shots = dataclasses.replace(
+        shots,
+        footprint=shots.footprint._replace(doppler_ratio_offset=np.linspace(-1e-9, 1e-9, 7)[None]),
+    )
+    velocity = -170.0 + shots.footprint.doppler_ratio_offset[0] * LIGHT / 2
     lines = beamlet_line_positions(shots)[0]
-    for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.carriers, strict=True)):
+    for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.waveform.carriers, strict=True)):
         beats = waveform.beat_frequency(
             sign,
             carrier=carrier,
             chirp_rate=2e12,
-            range=8000.0 * (1 + shots.relative_range_offset[0]),
+            range=8000.0 * (1 + shots.footprint.relative_range_offset[0]),
             radial_velocity=velocity,
         )
         expected = waveform.fold_frequency(beats, np.array(600e6)) / 600e6 * 2**17
@@ -541,7 +547,10 @@ def test_a_pair_without_its_doppler_peak_is_read_as_two_beats_are(table_4_1, two
     """Range and velocity of the other target are exchanged, and flagged."""
     for velocity, kind in ((2.0, waveform.FAR_TARGET), (60.0, waveform.FAST_TARGET)):
         shots = _surfaces(table_4_1, [400.0], [velocity])
-        shots = dataclasses.replace(shots, two_beat_assumption=two_beats)
+        shots = dataclasses.replace(
+            shots,
+            detection_settings=shots.detection_settings._replace(two_beat_assumption=two_beats),
+        )
         kind = TRUE_FLAG if kind == two_beats else MISREAD_FLAG
         found = _only(_certain(list_bin_groups(shots)), {(1, g): 0.0 for g in range(4)})
         got = _drawn(shots, found)
@@ -559,9 +568,9 @@ def test_sidelobes_above_the_threshold_are_flagged(table_4_1):
         detector_bandwidth=4e8,
     )  # fmt: skip
     assert shots.window.length < shots.fft_size
-    shots = dataclasses.replace(
-        shots, includes_leakage=False
-    )  # false peaks may pair with the true ones
+    shots = dataclasses.replace(  # false peaks may pair with the true ones
+        shots, detection_settings=shots.detection_settings._replace(includes_leakage=False)
+    )
     got = _drawn(shots, _certain(list_bin_groups(shots)))
     assert got.flags[0, 0, 0] == TRUE_FLAG
     assert (got.flags[0, 0, 1:] & SIDELOBE_FLAG > 0).all()

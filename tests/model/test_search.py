@@ -95,7 +95,7 @@ def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table
     end = 220.0 + offset * metre
     scene = scene_of(table_4_1, (end - 60 * metre, end, 3.0, 3.0), record)
     shots, found = prepare_single_category(scene), evaluate(scene)
-    first, number = shots.search_band[0, :, 0]
+    first, number = shots.detection_settings.search_band[0, :, 0]
     inside = np.isin(place % SIZE, (first + np.arange(number)) % SIZE)
     assert inside == (offset >= 0) and abs(number - 61) <= 1
     magnitude = noisy_spectra(shots, 0, np.random.default_rng(50 + offset))

@@ -74,7 +74,9 @@ def test_acceleration_moves_the_doppler_shift_on_from_segment_to_segment(table_4
 def test_segments_follow_those_that_there_are(architecture, order, gap, starts, table_4_1):
     scene = table_4_1(architecture=architecture, radial_velocity=80.0)
     shots = prepared(scene | {SEGMENT_ORDER_PATH: order, SEGMENT_GAP_PATH: gap})
-    np.testing.assert_allclose([float(start) for start in shots.segment_starts], starts, rtol=1e-12)
+    np.testing.assert_allclose(
+        [float(start) for start in shots.motion.segment_starts], starts, rtol=1e-12
+    )
     assert shots.has_segment.tolist() == [True, architecture != "direct" and "dopp" in order, True]
 
 
@@ -92,7 +94,7 @@ def test_the_records_are_those_of_one_delay_over_the_whole_shot(segment, a, orde
         | {"target.acceleration": a, SEGMENT_ORDER_PATH: SEGMENT_ORDERS[order]}
     )  # fmt: skip
     record = time_domain_truth.analytic_record(shots, 0, segment, 0, with_acceleration=True)
-    sign, carrier = DEFAULT_CHIRP_SLOPES[segment], float(shots.carriers[segment])
+    sign, carrier = DEFAULT_CHIRP_SLOPES[segment], float(shots.waveform.carriers[segment])
     expected = []
     with mpmath.workdps(40):
         for n in range(0, 512, 73):
@@ -170,7 +172,12 @@ def test_beamlets_keep_their_own_velocities_from_segment_to_segment(table_4_1):
     scene = table_4_1(fft_size=4096, phases="coherent", radial_velocity=20.0, range=900.0)
     shots = prepared(scene | {"footprint.beamlets": 19})
     own = replace(
-        shots, doppler_ratio_offset=rng.uniform(-1e-8, 1e-8, shots.relative_range_offset.shape)
+        shots,
+        footprint=shots.footprint._replace(
+            doppler_ratio_offset=rng.uniform(
+                -1e-8, 1e-8, shots.footprint.relative_range_offset.shape
+            )
+        ),
     )
     assert disagreement(own, with_range_walk=False) < 1e-9
 
@@ -237,8 +244,8 @@ def test_morpheus_magnitudes_are_those_of_the_truth_that_decelerates(made, table
     """Without the acceleration they are off by a tenth, 14 kHz of drift over bins of 4.6 kHz."""
     within = (*MOVING, "range_walk")
     slowing, steady = (made(table_4_1, (*within, *also)) for also in (["acceleration"], []))
-    assert float(np.ravel(slowing.acceleration)[0]) == pytest.approx(-10.509, abs=1e-3)
-    assert float(np.ravel(slowing.approach_speed)[0]) == pytest.approx(100.0 / np.cos(TILT))
+    assert float(np.ravel(slowing.target.acceleration)[0]) == pytest.approx(-10.509, abs=1e-3)
+    assert float(np.ravel(slowing.target.approach_speed)[0]) == pytest.approx(100.0 / np.cos(TILT))
     assert disagreement(slowing, with_acceleration=True) < 1e-8
     lost = disagreement(steady, with_acceleration=True)
     assert 0.05 < lost < 0.3

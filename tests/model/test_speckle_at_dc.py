@@ -144,7 +144,7 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
     power = float(evaluate_segments(shots)[1, 2, 0]) ** 2 / (line**2 + image**2)
     amplitude = rng.normal(size=(draws, looks, 2)) @ [1, 1j] * np.sqrt(power / 2)
     if speckle == "common":
-        cycles = place * BIN_WIDTH * np.ravel(shots.look_period)[0] * np.arange(looks)
+        cycles = place * BIN_WIDTH * np.ravel(shots.waveform.look_period)[0] * np.arange(looks)
         amplitude = amplitude[:, :1] * np.exp(2j * np.pi * cycles)
     pseudo = (w**2 * np.cos(4 * np.pi * k * time)).sum() / (w**2).sum()
     noise = rng.normal(size=(draws, looks, 2)) * np.sqrt([1 + pseudo, 1 - pseudo])

@@ -103,6 +103,6 @@ def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):
     turn = 4 * np.pi * frequencies_apart * deviation / 299792458.0
     assert abs(turn) > 0.5
     # The strongest bin sees a little less of the footprint, a tenth of a bin wide, than all of it.
-    assert abs(shots.segment_correlations.up_down[0]) == pytest.approx(
+    assert abs(shots.speckle.segment_correlations.up_down[0]) == pytest.approx(
         np.exp(-0.5 * turn**2), rel=0.03
     )

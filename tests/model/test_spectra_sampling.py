@@ -7,9 +7,9 @@ from shot_helpers import make_point_keys
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.estimators import SPECTRUM_METHOD_DEFAULTS
 from sweep.model.detection.sub_bin_interpolation import neighbour_noise_correlations
-from sweep.model.effects.line_width import n_phase_walk_steps, phase_walk
 from sweep.model.error_budget import ErrorBudget
 from sweep.model.evaluation import evaluate, prepare_shots
+from sweep.model.laser_line import n_phase_walk_steps, phase_walk
 from sweep.model.outputs import DRAW_COUNT_OUTPUTS, SPECTRA_OUTPUTS
 from sweep.model.sampling import philox, samplers
 from sweep.model.sampling.noisy_spectra import (

@@ -63,10 +63,10 @@ def reported(shots, segment, echo, rng):
     if not shots.complex_record:
         first = bin_noise.first_circular_bin(shots.window, SIZE)
         searched = (bins >= first) & (bins <= SIZE // 2 - first)
-    if shots.search_band is not None:
-        first, number = shots.search_band[segment, :, 0]
+    if shots.detection_settings.search_band is not None:
+        first, number = shots.detection_settings.search_band[segment, :, 0]
         searched &= (bins - first) % SIZE < number
-    if shots.detection == "peak_bin":
+    if shots.detection_settings.echo_bins == "peak_bin":
         own = magnitude[:, int(np.rint(place)) % SIZE]
     else:
         own = magnitude[:, near & searched].max(axis=1)
@@ -84,8 +84,8 @@ def speckle_of(kind, rng):
 
 def shares(shots, alike):
     """Shots whose segments share so much of their speckle."""
-    fading = SegmentCorrelations(*(alike * one for one in shots.segment_correlations))
-    return replace(shots, segment_correlations=fading)
+    fading = SegmentCorrelations(*(alike * one for one in shots.speckle.segment_correlations))
+    return replace(shots, speckle=shots.speckle._replace(segment_correlations=fading))
 
 
 @pytest.mark.parametrize(

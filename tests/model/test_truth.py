@@ -8,6 +8,7 @@ from scipy.constants import c as speed_of_light
 from shot_helpers import magnitude_error, parametrize_product, prepare_single_category
 
 from sweep.model import time_domain_truth
+from sweep.model.shot_records import EchoRecord
 from sweep.model.spectrum import segment_spectra
 from sweep.model.window import window_samples
 
@@ -124,7 +125,12 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
         scene = table_4_1(fft_size=8192, phases=phases, radial_velocity=v, grazing_angle=0.4)
         shots = prepare_single_category(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
         own = replace(
-            shots, doppler_ratio_offset=rng.uniform(-1e-8, 1e-8, shots.relative_range_offset.shape)
+            shots,
+            footprint=shots.footprint._replace(
+                doppler_ratio_offset=rng.uniform(
+                    -1e-8, 1e-8, shots.footprint.relative_range_offset.shape
+                )
+            ),
         )
         assert disagreement(own) < AGREEMENT
         _, with_shifts = segment_spectra.segment_spectrum(own, 0, 1)
@@ -256,8 +262,8 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         radial_velocity=velocity,
     )  # fmt: skip
     shots = prepare_single_category(scene)
-    record = replace(shots.record_settings, is_complex=True)
-    shots = replace(shots, record_settings=record, phase_errors=())
+    record = replace(shots.record, is_complex=True)
+    shots = replace(shots, record=record, echo_record=EchoRecord())
     w, half = window_samples(window, 4096), 2048
     found = segment_spectra.evaluate_segments(shots)
     for segment in range(3):

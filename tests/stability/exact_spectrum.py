@@ -41,26 +41,26 @@ class ExactLine:
     """One beamlet's beat in one segment of a shot: place [bins], weight at t_0."""
 
     def __init__(self, shots: Shots, point: int, segment: int, beamlet: int) -> None:
-        row, sign = shots.footprint_row[point], DEFAULT_CHIRP_SLOPES[segment]
+        row, sign = shots.footprint.row_of_point[point], DEFAULT_CHIRP_SLOPES[segment]
         rate, carrier = (
-            point_value(shots.chirp_rate, point),
-            point_value(shots.carriers[segment], point),
+            point_value(shots.waveform.chirp_rate, point),
+            point_value(shots.waveform.carriers[segment], point),
         )
         range_m = point_value(shots.range, point) * (
-            1 + mp.mpf(float(shots.relative_range_offset[row, beamlet]))
+            1 + mp.mpf(float(shots.footprint.relative_range_offset[row, beamlet]))
         )
         delay = 2 * range_m / mp.mpf(SPEED_OF_LIGHT)
-        beta = point_value(shots.doppler_ratio, point) + mp.mpf(
-            float(shots.doppler_ratio_offset[row, beamlet])
+        beta = point_value(shots.motion.doppler_ratio, point) + mp.mpf(
+            float(shots.footprint.doppler_ratio_offset[row, beamlet])
         )
         self.beat = carrier * beta - sign * rate * delay * (1 + beta)
         self.bins = self.beat * shots.fft_size / point_value(shots.sample_rate, point)
-        start = self.beat * point_value(shots.acquisition_delay, point)
+        start = self.beat * point_value(shots.record.acquisition_delay, point)
         self.phase = -carrier * delay + sign * rate * delay**2 / 2 + start
-        poles = 1 + 1j * self.beat / point_value(shots.detector_bandwidth, point)
-        poles *= 1 + 1j * self.beat / point_value(shots.amplifier_bandwidth, point)
-        scale = point_value(shots.beat_amplitude_scale, point) * mp.mpf(
-            float(shots.relative_amplitude[row, beamlet])
+        poles = 1 + 1j * self.beat / point_value(shots.receiver_filter.detector_bandwidth, point)
+        poles *= 1 + 1j * self.beat / point_value(shots.receiver_filter.amplifier_bandwidth, point)
+        scale = point_value(shots.link_scales.beat_amplitude, point) * mp.mpf(
+            float(shots.footprint.relative_amplitude[row, beamlet])
         )
         self.weight = scale / 2 / poles * mp.expjpi(2 * self.phase)
 
@@ -76,9 +76,7 @@ def exact_magnitudes(
 ) -> list[mp.mpf]:
     """|X[k]| of some bins: lines, and images if wanted, as amplitudes or as powers."""
     window, result = shots.window, []
-    lines = [
-        ExactLine(shots, point, segment, b) for b in range(shots.relative_range_offset.shape[1])
-    ]
+    lines = [ExactLine(shots, point, segment, b) for b in range(shots.footprint.n_beamlets)]
     weights = (
         None
         if window.name in COSINE_SUM_COEFFICIENTS
@@ -101,7 +99,7 @@ def exact_magnitudes(
             )
             for line in lines
         ]
-        if shots.adds_powers:
+        if shots.footprint.adds_powers:
             result.append(mp.sqrt(mp.fsum(abs(x) ** 2 for pair in pairs for x in pair)))
         else:
             result.append(abs(mp.fsum(x for pair in pairs for x in pair)))
@@ -110,9 +108,7 @@ def exact_magnitudes(
 
 def peak_magnitude(shots: Shots, point: int, segment: int) -> float:
     """Height on a bin of a line with the weight of all lines of a segment."""
-    lines = (
-        ExactLine(shots, point, segment, b) for b in range(shots.relative_range_offset.shape[1])
-    )
+    lines = (ExactLine(shots, point, segment, b) for b in range(shots.footprint.n_beamlets))
     return float(mp.fsum(abs(line.weight) for line in lines)) * shots.window.sum
 
 

@@ -9,14 +9,14 @@ from hard_cases import EPS, Family
 from table_4_1_shots import prepare_shot, table_4_1_parameters
 
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, EFFECTS
-from sweep.model.effects.line_width import (
-    coherent_power_fraction,
+from sweep.model.effects.saturation import clipping_gains
+from sweep.model.evaluation import evaluate
+from sweep.model.laser_line import (
     gaussian_frequency_shifts,
     pedestal_density_under_line,
     pedestal_power_under_line,
+    pure_line_power_fraction,
 )
-from sweep.model.effects.saturation import clipping_gains
-from sweep.model.evaluation import evaluate
 from sweep.model.spectrum.segment_spectra import segment_spectrum as segment_spectrum
 from sweep.model.window import get_window, window_samples
 
@@ -289,7 +289,10 @@ def wider_than_the_band() -> float:
     )
     _, magnitude = segment_spectrum(single_shot, 0, 1)
     half_amplitude = (
-        float(single_shot.beat_amplitude_scale * single_shot.relative_amplitude[0, 0]) / 2
+        float(
+            single_shot.link_scales.beat_amplitude * single_shot.footprint.relative_amplitude[0, 0]
+        )
+        / 2
     )
     even_magnitude = half_amplitude * math.sqrt(2 * float((window_samples("hann", 256) ** 2).sum()))
     return float(np.abs(magnitude[3:-3] / even_magnitude - 1).max())
@@ -359,7 +362,7 @@ def share_of_the_line() -> float:
     worst = 0.0
     with mp.workdps(30):
         for width, delay in ((1e-9, 1e-5), (1e4, 1e-5), (1e7, 1e-5), (1e11, 1e-9)):
-            share = coherent_power_fraction(
+            share = pure_line_power_fraction(
                 line_width=np.array(width), delay=np.array(delay), duration=np.array(1.0)
             )
             exact_share = mp.exp(-2 * mp.pi * mp.mpf(width) * mp.mpf(delay))

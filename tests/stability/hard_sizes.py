@@ -140,7 +140,10 @@ def error_of_coincident_beamlets(phases: str, n_beamlets: int) -> float:
     """A footprint so small that all of it is one line, over that line and its amplitudes' sum."""
     scene = {"fft_size": 4096, "beam_divergence": 1e-9, "window": "hann", "phases": phases}
     shots_of_many, shots_of_one = prepare_shot(**scene, beamlets=n_beamlets), prepare_shot(**scene)
-    weights = shots_of_many.relative_amplitude[0] / shots_of_one.relative_amplitude[0, 0]
+    weights = (
+        shots_of_many.footprint.relative_amplitude[0]
+        / shots_of_one.footprint.relative_amplitude[0, 0]
+    )
     amplitude_sum = math.fsum(weights) if phases == "coherent" else math.sqrt(math.fsum(weights**2))
     worst = 0.0
     for segment in range(3):

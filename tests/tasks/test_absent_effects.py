@@ -86,7 +86,10 @@ def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):
     assert "footprint" not in called and calls["plane_footprint"] == 0
     ((_, one),) = prepare_shots(spec.parameters(), called)
     ((_, every),) = prepare_shots(spec.parameters(), {*called, "footprint"})
-    assert one.relative_range_offset.shape == (1, 1) and every.relative_range_offset.shape == (
+    assert one.footprint.relative_range_offset.shape == (
+        1,
+        1,
+    ) and every.footprint.relative_range_offset.shape == (
         1,
         109,
     )
@@ -115,21 +118,29 @@ def test_what_spreads_beamlets_does_nothing_where_there_are_none():
     )
     ((_, alone),) = prepare_shots(spec.parameters(), {"doppler_spread", "several_returns"})
     ((_, both),) = prepare_shots(spec.parameters(), {"footprint", "doppler_spread"})
-    assert alone.doppler_ratio_offset.shape == (1, 1) and not alone.doppler_ratio_offset.any()
-    assert both.doppler_ratio_offset.shape == (1, 9) and both.doppler_ratio_offset.any()
+    assert (
+        alone.footprint.doppler_ratio_offset.shape == (1, 1)
+        and not alone.footprint.doppler_ratio_offset.any()
+    )
+    assert both.footprint.doppler_ratio_offset.shape == (1, 9)
+    assert both.footprint.doppler_ratio_offset.any()
 
 
 def test_bare_shots_hold_nothing_of_any_effect():
     spec = small_spec(axes={})
     ((_, bare),) = prepare_shots(spec.parameters(), ())
     assert (
-        bare.relative_range_offset.shape == (1, 1)
-        and bare.beamlet_phase_cycles.size == 0
-        and bare.doppler_ratio == 0.0
+        bare.footprint.relative_range_offset.shape == (1, 1)
+        and bare.footprint.phase_cycles.size == 0
+        and bare.motion.doppler_ratio == 0.0
     )
-    assert bare.phase_errors == () and bare.gaussian_line_width is None
-    assert not bare.sums_images and not bare.includes_leakage and bare.adds_powers
-    assert set(bare.noise_variances) == {"local_oscillator_shot", "detector", "amplifier"}
+    assert bare.echo_record.phase_errors == () and bare.laser_line.gaussian_width is None
+    assert (
+        not bare.images.are_summed
+        and not bare.detection_settings.includes_leakage
+        and bare.footprint.adds_powers
+    )
+    assert set(bare.noise.variances) == {"local_oscillator_shot", "detector", "amplifier"}
 
 
 def test_forced_effects_without_their_parameters_are_not_in_the_graph(calls):

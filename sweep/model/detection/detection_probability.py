@@ -49,8 +49,8 @@ def pd_follows_from_computed_spans(shots: Any) -> bool:
         Prepared shots.
     """
     return (
-        shots.search_band is None
-        and shots.circulator_leak_amplitude is None
+        shots.detection_settings.search_band is None
+        and shots.permanent_line is None
         and not shots.looks.is_noncoherent
     )
 
@@ -168,7 +168,7 @@ def shot_pd_and_miss(
     magnitude_up, _, magnitude_down = magnitudes
     pd_both = shots.joint_detection_probability(pd_up, pd_down, (magnitude_up, magnitude_down))
     miss_shot = miss_up + pd_up * miss_down
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         miss_shot = miss_up + np.maximum(pd_up - pd_both, 0.0)
     return DetectionArrays(pd_both, np.minimum(miss_shot, 1.0))  # rounding may exceed 1
 
@@ -177,13 +177,13 @@ def _pd_and_miss_any_two(
     shots: Any, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> DetectionArrays:
     """Compute :func:`shot_pd_and_miss` of shots that any two of three segments detect."""
-    if shots.segment_correlations is None:
+    if shots.speckle.segment_correlations is None:
         return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
     threshold_ratio = shots.threshold / shots.line_noise_sigma
     if shots.looks.is_noncoherent:
-        look_speckle = shots.look_speckle
+        look_speckle = shots.speckle.look_speckle
         correlations = (
-            np.abs(np.array(shots.segment_correlations))
+            np.abs(np.array(shots.speckle.segment_correlations))
             if look_speckle is None
             else look_speckle.segment_correlation
         )
@@ -191,7 +191,7 @@ def _pd_and_miss_any_two(
         return shots.looks.pd_and_miss_any_two(
             signal_ratios, threshold_ratio, correlations, pd, look_speckle
         )
-    correlations = np.abs(np.array(shots.segment_correlations))
+    correlations = np.abs(np.array(shots.speckle.segment_correlations))
     pd_shot, miss_shot = pd_and_miss_any_two_in_speckle(pd, miss, threshold_ratio, correlations)
     speckle_table = shots.speckle_table
     near_ends = np.flatnonzero(speckle_table.ratio_row.any(axis=0))

@@ -77,7 +77,7 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
             np.where(is_near_nyquist[:, None], fft_size / 2 - line_positions, line_positions)
             / padding_factor
         )
-        line_power = shots.relative_amplitude[shots.footprint_row[points]] ** 2
+        line_power = shots.footprint.relative_amplitude[shots.footprint.row_of_point[points]] ** 2
         bin_positions = np.arange(n_bins) / padding_factor
         line_transform = window_transform(shots.window, bin_positions - line_positions[..., None])
         image_transform = window_transform(shots.window, bin_positions + line_positions[..., None])
@@ -96,7 +96,11 @@ def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
         peak_power = np.take_along_axis(
             power_by_phase, mean_power.argmax(axis=1)[:, None, None], axis=1
         )[:, 0]
-        phase_power = peak_power if shots.detection == "peak_bin" else power_by_phase.max(axis=1)
+        phase_power = (
+            peak_power
+            if shots.detection_settings.echo_bins == "peak_bin"
+            else power_by_phase.max(axis=1)
+        )
         peak_mean_power = mean_power.max(axis=1)[:, None]
         factor_rows.append(
             np.where(peak_mean_power > 0, phase_power / np.maximum(peak_mean_power, 1e-300), 1.0)
@@ -172,7 +176,7 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
     overlap_distance = _image_reach(shots.window) * shots.fft_size / shots.window.length
     position = axis_line_positions(shots)
     distance_from_end = np.minimum(position, shots.fft_size / 2 - position)
-    return np.asarray(distance_from_end - 3 * shots.line_deviation_bins < overlap_distance)
+    return np.asarray(distance_from_end - 3 * shots.speckle.line_deviation_bins < overlap_distance)
 
 
 @lru_cache(maxsize=64)

@@ -36,13 +36,8 @@ import numpy as np
 
 from sweep.model import receiver_chain
 from sweep.model.constants import PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects.effect import (
-    Effect,
-    EffectContext,
-    ErrorBound,
-    Parameter,
-    add_noise_sources,
-)
+from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX
 from sweep.model.preparation import Shots
@@ -66,7 +61,7 @@ def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.nda
     return np.asarray(photon_energy * parameters[_INVERSION_PATH] * (parameters[_GAIN_PATH] - 1))
 
 
-def beat_noise_current_variance(
+def emission_beat_current_variance(
     parameters: Mapping[str, np.ndarray], amplified_light: str
 ) -> np.ndarray:
     """Compute the current variance of the beat of light with spontaneous emission.
@@ -103,15 +98,15 @@ def beat_noise_current_variance(
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the exact relative noise of spontaneous emission; the threshold follows it."""
-    if points.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
+    if points.waveform.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
-    current_variance = beat_noise_current_variance(
+    current_variance = emission_beat_current_variance(
         points.parameters, points.option(_AMPLIFIED_LIGHT_PATH)
     )
     return ErrorBound(
         noise_variance_change=current_variance
         * points.receiver_noise.variance_per_square_ampere
-        / points.receiver_noise_variance
+        / points.noise.variance_without_echo
     )
 
 
@@ -120,15 +115,16 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Current variance 4 (M Re)^2 P N' B_e, as of :func:`beat_noise_current_variance`.
+    Current variance 4 (M Re)^2 P N' B_e, as of :func:`emission_beat_current_variance`.
     """
-    if shots.architecture == "direct":
+    if shots.waveform.architecture == "direct":
         return shots
-    current_variance = beat_noise_current_variance(
+    current_variance = emission_beat_current_variance(
         context.parameters, str(context.parameters[_AMPLIFIED_LIGHT_PATH])
     )
     return add_noise_sources(
-        shots, spontaneous_emission=current_variance * shots.noise_variance_per_square_ampere
+        shots,
+        spontaneous_emission=current_variance * shots.receiver_noise.variance_per_square_ampere,
     )
 
 

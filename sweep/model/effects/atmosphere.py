@@ -29,15 +29,10 @@ from numpy.typing import ArrayLike
 
 from sweep.model import beam
 from sweep.model.effects import noise_sources
-from sweep.model.effects.effect import (
-    Effect,
-    EffectContext,
-    ErrorBound,
-    Parameter,
-    add_noise_sources,
-)
+from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.link_budget import LASER_PREFIX, TELESCOPE_PREFIX
+from sweep.model.link_budget import BEAM_ELEVATION_PATH, LASER_PREFIX, TELESCOPE_PREFIX
 from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
@@ -189,10 +184,6 @@ def _mean_extinction(
     return np.asarray(a0 + (a1 - a0) * ((start + end) / 2 - z0) / (z1 - z0))
 
 
-BEAM_ELEVATION_PATH = "path.elevation"
-"""Path of the angle of the beam below the horizon [rad], by shot; present only in scenes."""
-
-
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
     """Return the extinction profile of points of one category; None without an atmosphere."""
     name = str(parameters["atmosphere.profile"])
@@ -241,13 +232,12 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
     transmission = np.exp(
         -optical_depth(profile, **_path_geometry(context.parameters, shots.range))
     )
-    return replace(
-        shots,
-        echo_power_scale=shots.echo_power_scale * transmission**2,
-        beat_amplitude_scale=shots.beat_amplitude_scale
-        * (transmission**2 if shots.architecture == "direct" else transmission),
-        ground_transmission=transmission,
+    is_direct = shots.waveform.architecture == "direct"
+    link_scales = shots.link_scales.scale_echo(
+        power_factor=transmission**2,
+        amplitude_factor=transmission**2 if is_direct else transmission,
     )
+    return replace(shots, link_scales=link_scales._replace(ground_transmission=transmission))
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -263,7 +253,8 @@ def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
         light_noise_ratio = light_noise_ratio + solar_bound.noise_variance_change
     # The threshold follows the sunlight's part, not the echo's. The worse case is assumed for both.
     return ErrorBound(
-        magnitude_change=1 - (transmission**2 if points.architecture == "direct" else transmission),
+        magnitude_change=1
+        - (transmission**2 if points.waveform.architecture == "direct" else transmission),
         noise_variance_change=-(1 - transmission**2) * light_noise_ratio / (1 + light_noise_ratio),
         threshold_follows_noise=False,
     )
@@ -435,7 +426,8 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
         ),
     )
     return add_noise_sources(
-        shots, backscatter_shot=np.asarray(shots.shot_noise_variance_per_watt * power)
+        shots,
+        backscatter_shot=np.asarray(shots.receiver_noise.shot_noise_variance_per_watt * power),
     )
 
 
@@ -463,7 +455,7 @@ def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
     return ErrorBound(
         noise_variance_change=_backscattered_power(parameters, integral_max)
         * points.receiver_noise.shot_noise_variance_per_watt
-        / points.receiver_noise_variance
+        / points.noise.variance_without_echo
     )
 
 

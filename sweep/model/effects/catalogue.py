@@ -89,8 +89,8 @@ DEFAULT_EFFECTS = (
 )  # fmt: skip
 """Effects that the model's functions simulate by default: ideal lines and their noise."""
 
-OWN_BATCH_FLAGS = np.uint32(
-    sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_own_batch)
+SEPARATE_BATCHES_MASK = np.uint32(
+    sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_separate_batches)
 )
 """Bit mask of effects for which points with and without the effect are computed separately."""
 

@@ -3,14 +3,9 @@
 A fraction 1 / I of the transmitted light P_tx (I is the isolation) reaches the detector over a path
 d longer than the local oscillator's, with the delay tau = d / c. It is present in every record:
 
-- **A line.** It beats with the local oscillator as an echo does. Its photocurrent is i = 2 M Re
-  sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0 in the Doppler segment. With the window's
-  transform W and the receiver's transfer function H,
-
-      L_k = i H / 2 (e^{j phi} W(k - nu) + e^{-j phi} W(k + nu)),   nu = S tau N / fs
-
-  in a real record. A complex record has only the first term, at -nu or nu by the chirp's sign. The
-  phase phi drifts with the path's temperature and is assumed to be uniform.
+- **A line** (:mod:`sweep.model.spectrum.permanent_line`). It beats with the local oscillator as an
+  echo does. Its photocurrent is i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0
+  in the Doppler segment. Its phase drifts with the path's temperature.
 - **Shot noise** 2 q M^2 F Re P_tx / I B_e.
 - **Intensity noise**. A balanced receiver rejects that of the light, but not that of the beat. The
   variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
@@ -23,13 +18,6 @@ The line begins at its own delay tau, as an echo does (:mod:`sweep.model.effects
 of a metre takes 3 ns of a record that begins with the chirp. With overlap off the line fills the
 record.
 
-The line is always present, so the processing knows it. Bins in which it reaches
-:data:`MASK_THRESHOLD_FRACTION` of the threshold, at any phase, are **masked**. They raise no alarm,
-and an echo whose largest bin is masked is not detected. In other bins the line's skirts, which add
-as powers, help an echo over the threshold. They also help noise, which counts as leakage
-(`p_leakage_up`, `p_leakage_down`): the mean over the phase, which all bins share. An echo that
-fades in developed speckle crosses with Q_1(L / s, Th / s), s^2 = sigma^2 + |X|^2 / 2.
-
 Neglected are saturation of the ADC by the line, the line's own image of I and Q, and skirts of echo
 and line that together raise one bin. The spectrum of
 :func:`sweep.model.spectrum.segment_spectra.segment_spectrum` is that of the echo alone.
@@ -41,34 +29,21 @@ References
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from sweep.model import receiver_chain
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.looks import Looks
-from sweep.model.effects.effect import (
-    Effect,
-    EffectContext,
-    ErrorBound,
-    Parameter,
-    add_noise_sources,
-)
+from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import LASER_PREFIX, RECEIVER_PREFIX, TELESCOPE_PREFIX, beat_current
 from sweep.model.preparation import Shots
-from sweep.model.waveform import count_samples_before_echo
-from sweep.model.window import Window, window_samples
-
-MASK_THRESHOLD_FRACTION = 0.5
-"""Fraction of the threshold from which a bin's line masks it; a smaller line raises few alarms."""
-N_PHASES = 16
-"""Number of phases of the line over which alarms are averaged."""
+from sweep.model.shot_records import PermanentLine
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
-"""Path of the leaked light's optical path beyond that of the local oscillator [m]."""
+"""Parameters of the leaked light: its optical path beyond the local oscillator's [m], and the ratio
+of transmitted to leaked power."""
 
 
 def _leaked_power_and_current(
@@ -79,7 +54,7 @@ def _leaked_power_and_current(
     return power, beat_current(architecture, parameters, power)
 
 
-def beat_noise_current_variance(
+def leak_beat_current_variance(
     parameters: Mapping[str, np.ndarray], architecture: str, line_shape: str
 ) -> np.ndarray:
     """Compute the current variance [A^2] of the noise of the leaked light's beat.
@@ -135,354 +110,49 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
         return None
     parameters, receiver_noise = points.parameters, points.receiver_noise
     noise_variance = (
-        _leaked_power_and_current(parameters, points.architecture)[0]
+        _leaked_power_and_current(parameters, points.waveform.architecture)[0]
         * receiver_noise.shot_noise_variance_per_watt
     )
     line_shape = points.option(LASER_PREFIX + "line_shape")
     noise_variance = (
         noise_variance
-        + beat_noise_current_variance(parameters, points.architecture, line_shape)
+        + leak_beat_current_variance(parameters, points.waveform.architecture, line_shape)
         * receiver_noise.variance_per_square_ampere
     )
     return ErrorBound(
-        noise_variance_change=noise_variance / points.receiver_noise_variance,
+        noise_variance_change=noise_variance / points.noise.variance_without_echo,
         probability_change=1.0,
     )
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Add the noise and the line of the leaked light."""
-    parameters = context.parameters
-    power, beat_current = _leaked_power_and_current(parameters, shots.architecture)
-    beat_noise = (
-        beat_noise_current_variance(
-            parameters, shots.architecture, str(parameters[LASER_PREFIX + "line_shape"])
-        )
-        * shots.noise_variance_per_square_ampere
-    )
-    shots = add_noise_sources(
-        shots, leak_shot=shots.shot_noise_variance_per_watt * power, leak_excess=beat_noise
-    )
-    return replace(
-        shots,
-        circulator_leak_amplitude=beat_current * parameters[RECEIVER_PREFIX + "transimpedance"],
-        circulator_leak_delay=parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT,
-    )
-
-
-class LeakLine(NamedTuple):
-    """Line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
-
-    transforms: np.ndarray
-    """(2, bins) complex: transform of the line at its frequency, and at the negative frequency."""
-    magnitude_max: np.ndarray
-    """(bins,): largest magnitude at any phase."""
-    magnitude_rms: np.ndarray
-    """(bins,): root mean square of the magnitude over the phase."""
-
-
-@lru_cache(maxsize=16)
-def _leak_line(
-    window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
-) -> LeakLine:
-    """Return the line at a frequency [bins] without the record's first `n_missing` samples."""
-    cycles = line_bin * np.arange(window.length) / fft_size
-    record = window_samples(window.name, window.length) * np.exp(
-        2j * np.pi * (cycles - np.rint(cycles))
-    )
-    record[:n_missing] = 0.0
-    spectrum = np.fft.fft(record, fft_size)
-    real_bins = np.arange(fft_size // 2 + 1)
-    transform_rows = (
-        [spectrum, 0 * spectrum]
-        if is_complex
-        else [spectrum[real_bins], spectrum[-real_bins].conj()]
-    )
-    transforms = np.array(transform_rows)
-    return LeakLine(transforms, np.abs(transforms).sum(axis=0), np.hypot(*np.abs(transforms)))
-
-
-def leak_line_of_point(
-    shots: Shots, i: int, segment: int, noise_frequency: float | None = None
-) -> tuple[float, LeakLine]:
-    """Return the leaked light's line in one segment of one point.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared shots.
-    i, segment : int
-        Indices of the point and of the segment.
-    noise_frequency : float, optional
-        Frequency [Hz] whose noise density whitens the line, for skirts; by default the line's.
-
-    Returns
-    -------
-    half_amplitude : float
-        Half of the line's amplitude [V].
-    line : LeakLine
-        Line of amplitude 2.
-    """
-    shot_columns = (
-        shots.circulator_leak_amplitude,
-        shots.circulator_leak_delay,
-        shots.chirp_rate,
-        shots.sample_rate,
-        shots.detector_bandwidth,
-        shots.amplifier_bandwidth,
-        shots.acquisition_delay,
-    )
-    assert shots.circulator_leak_amplitude is not None
-    (
-        amplitude,
-        delay,
-        chirp_rate,
-        sample_rate,
-        detector_bandwidth,
-        amplifier_bandwidth,
-        acquisition_delay,
-    ) = (float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in shot_columns)
-    beat_frequency = -shots.waveform_segments[segment].chirp_slope * chirp_rate * delay
-    transfer_gain = receiver_chain.receiver_transfer(
-        np.array(beat_frequency),
-        detector_bandwidth=np.array(detector_bandwidth),
-        amplifier_bandwidth=np.array(amplifier_bandwidth),
-    )
-    whitened = shots.whitening_gain_at(
-        np.array(beat_frequency), None if noise_frequency is None else np.array(noise_frequency)
-    )
-    whitening_gain = float(np.broadcast_to(whitened, shots.size)[i])
-    half_amplitude = 0.5 * amplitude * abs(complex(transfer_gain)) * whitening_gain
-    line_bin = beat_frequency * shots.fft_size / sample_rate
-    n_missing = 0
-    if shots.n_samples_before_echo is not None:
-        n_missing = int(
-            count_samples_before_echo(
-                delay=np.array(delay),
-                doppler_ratio=0.0,
-                record_start=np.array(acquisition_delay),
-                sample_rate=np.array(sample_rate),
-                length=shots.window.length,
-            )
-        )
-    return half_amplitude, _leak_line(
-        shots.window, shots.fft_size, line_bin, shots.complex_record, n_missing
-    )
-
-
-def line_alarm_probability(
-    looks: Looks,
-    line: LeakLine,
-    bins: np.ndarray,
-    *,
-    amplitude_ratio: float,
-    threshold_ratio: float,
-) -> float:
-    """Return the probability that a line raises an alarm in its bins where noise alone does not.
-
-    Parameters
-    ----------
-    looks : Looks
-        Number and combination of records.
-    line : LeakLine
-        Line of amplitude 2.
-    bins : ndarray of int
-        Bins that may raise an alarm.
-    amplitude_ratio, threshold_ratio : float
-        Half of the line's amplitude, and the threshold, over the noise sigma.
-    """
-    positive_term, negative_term = amplitude_ratio * line.transforms[:, bins]
-    phases = np.pi * (np.arange(N_PHASES) + 0.5) / N_PHASES  # period of the magnitude
-    log_no_alarm = [
-        np.log1p(
-            -np.minimum(
-                looks.added_crossing_probability(
-                    np.abs(positive_term * phasor + negative_term * phasor.conjugate()),
-                    threshold_ratio,
-                ),
-                1.0,
-            )
-        )
-        for phasor in np.exp(1j * phases)
-    ]
-    return float(-np.expm1(np.sum(log_no_alarm, axis=1)).mean())
-
-
-def line_bin_masks(
-    shots: Shots, i: int, line: LeakLine, *, half_amplitude: float, echo_bins: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bins of a segment that a line masks, and those in which it raises alarms.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared shots.
-    i : int
-        Index of the point.
-    line : LeakLine
-        Line of amplitude 2.
-    half_amplitude : float
-        Half of the line's amplitude [V].
-    echo_bins : ndarray of int
-        Bins of the echo.
-
-    Returns
-    -------
-    is_masked : ndarray (bins,) bool
-        Masked bins.
-    is_searched : ndarray (bins,) bool
-        Bins searched for alarms, masked or not.
-    may_raise_alarm : ndarray (bins,) bool
-        Bins in which the line may raise an alarm.
-    """
-    noise_sigma, threshold, floor = (
-        float(np.broadcast_to(value, shots.size)[i])
-        for value in (shots.bin_noise_sigma, shots.threshold, shots.negligible_signal_ratio)
-    )
-    magnitude_max = half_amplitude * line.magnitude_max
-    is_masked, is_searched = (
-        magnitude_max >= MASK_THRESHOLD_FRACTION * threshold,
-        np.ones(line.magnitude_max.size, bool),
-    )
-    if not shots.complex_record:
-        first_searched = shots.first_searched_bin
-        is_searched[:first_searched] = is_searched[is_searched.size - first_searched :] = False
-    is_searched[echo_bins % shots.fft_size if shots.complex_record else echo_bins] = False
-    return is_masked, is_searched, is_searched & ~is_masked & (magnitude_max >= floor * noise_sigma)
-
-
-def raised_magnitude(
-    echo_magnitude: np.ndarray,
-    line_rms: np.ndarray,
-    *,
-    noise_sigma: float,
-    threshold: float,
-    in_speckle: bool,
-) -> np.ndarray:
-    """Return |X| of an echo alone whose bins cross as often as those of echo and line together.
-
-    Parameters
-    ----------
-    echo_magnitude : ndarray (m,)
-        |X| of the echo [V]; its root mean square in speckle.
-    line_rms : ndarray (m,)
-        Root mean square of the line over its phase [V].
-    noise_sigma, threshold : float
-        Noise per quadrature, and threshold [V].
-    in_speckle : bool
-        True for an echo in developed speckle.
+    """Add the noise and the line of the leaked light.
 
     Notes
     -----
-    Without speckle powers add. In speckle the echo crosses with Q_1(L / s, Th / s), s^2 = sigma^2 +
-    |X|^2 / 2.
+    The line has the amplitude 2 M Re sqrt(eta P_lo P_tx / I) times the transimpedance, and the
+    delay d / c. The noise is the shot noise, intensity noise and phase noise of the module's
+    description; departures are stated there.
     """
-    from sweep.model.detection.marcum import marcum_q1  # imports the compiler
-
-    if not in_speckle:
-        return np.hypot(echo_magnitude, line_rms)
-    total_sigma = np.sqrt(noise_sigma**2 + echo_magnitude**2 / 2)
-    pd, miss = marcum_q1(line_rms / total_sigma, threshold / total_sigma)
-    with np.errstate(divide="ignore"):
-        power = threshold**2 / -np.where(miss < 0.5, np.log1p(-miss), np.log(pd))
-    return np.where(
-        line_rms > 1e-6 * noise_sigma,
-        np.sqrt(np.maximum(power - 2 * noise_sigma**2, 0)),
-        echo_magnitude,
+    parameters = context.parameters
+    power, beat_current = _leaked_power_and_current(parameters, shots.waveform.architecture)
+    beat_noise = (
+        leak_beat_current_variance(
+            parameters, shots.waveform.architecture, str(parameters[LASER_PREFIX + "line_shape"])
+        )
+        * shots.receiver_noise.variance_per_square_ampere
     )
-
-
-def apply_leak_line(shots: Shots, bin_spans: Any) -> Any:
-    """Apply the leaked light's line to spectra: it masks some bins and raises others.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared shots.
-    bin_spans : BinSpans
-        Spectra around the echoes, as of :func:`sweep.model.spectrum.segment_spectra.iter_spans`.
-
-    Returns
-    -------
-    BinSpans
-        Spectra with changed magnitudes, probabilities, exempt bins and leakage.
-    """
-    from sweep.model.detection.echo_detection import (
-        EchoBins,
-        bin_speckle_at,
-        bin_threshold_at,
-        pd_and_miss,
+    shots = add_noise_sources(
+        shots,
+        leak_shot=shots.receiver_noise.shot_noise_variance_per_watt * power,
+        leak_excess=beat_noise,
     )
-
-    magnitudes = bin_spans.magnitudes.copy()
-    pd, miss, exempted, leakage = (
-        values.copy()
-        for values in (bin_spans.pd, bin_spans.miss, bin_spans.n_exempt, bin_spans.leakage)
-    )
-    noise_sigma, line_noise_sigma, threshold = (
-        np.broadcast_to(values, shots.size)[bin_spans.point_numbers]
-        for values in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
-    )
-    fft_size, rule, speckle = shots.fft_size, shots.detection_rule, shots.speckle_table
-    for segment_index, i in np.argwhere(bin_spans.n_bins > 0):
-        bin_slice = slice(
-            bin_spans.span_start[segment_index, i],
-            bin_spans.span_start[segment_index, i] + bin_spans.n_bins[segment_index, i],
-        )
-        bins = bin_spans.first_bin[segment_index, i] + np.arange(bin_spans.n_bins[segment_index, i])
-        bins = bins % fft_size if shots.complex_record else bins
-        (half_amplitude, line), peak = (
-            leak_line_of_point(shots, int(bin_spans.point_numbers[i]), segment_index),
-            bin_spans.peak_index[segment_index, i],
-        )
-        is_echo = bin_spans.is_exempt[bin_slice]
-        is_masked, is_searched, may_raise_alarm = line_bin_masks(
-            shots,
-            int(bin_spans.point_numbers[i]),
-            line,
-            half_amplitude=half_amplitude,
-            echo_bins=bins[is_echo],
-        )
-        peak_frequency = float(
-            bins[peak]
-            / fft_size
-            * np.broadcast_to(shots.sample_rate, shots.size)[bin_spans.point_numbers[i]]
-        )
-        skirt_half_amplitude, _ = leak_line_of_point(
-            shots, int(bin_spans.point_numbers[i]), segment_index, peak_frequency
-        )
-        skirt_rms = np.where(is_masked[bins], 0.0, skirt_half_amplitude * line.magnitude_rms[bins])
-        raised_magnitudes = raised_magnitude(
-            bin_spans.magnitudes[bin_slice],
-            skirt_rms,
-            noise_sigma=line_noise_sigma[i],
-            threshold=threshold[i],
-            in_speckle=shots.segment_correlations is not None,
-        )
-        raised_magnitudes[is_masked[bins]] = 0.0
-        magnitudes[bin_slice] = raised_magnitudes
-        if is_masked[bins[peak]]:
-            pd[segment_index, i], miss[segment_index, i] = 0.0, 1.0
-        else:
-            pd[segment_index, i], miss[segment_index, i] = pd_and_miss(
-                EchoBins(raised_magnitudes, is_echo, bin_spans.first_bin[segment_index, i]),
-                peak,
-                rule,
-                bin_threshold_at(shots.bin_thresholds, bin_spans.point_numbers[i]),
-                bin_speckle_at(speckle, segment_index, bin_spans.point_numbers[i]),
-            )
-        exempted[segment_index, i] += np.count_nonzero(is_masked & is_searched)
-        if shots.waveform_segments[segment_index].includes_leakage:
-            alarm_probability = line_alarm_probability(
-                shots.looks,
-                line,
-                np.flatnonzero(may_raise_alarm),
-                amplitude_ratio=half_amplitude / noise_sigma[i],
-                threshold_ratio=threshold[i] / noise_sigma[i],
-            )
-            leakage[segment_index, i] += (1 - leakage[segment_index, i]) * alarm_probability
-    return bin_spans._replace(
-        magnitudes=magnitudes, pd=pd, miss=miss, n_exempt=exempted, leakage=leakage
+    return replace(
+        shots,
+        permanent_line=PermanentLine(
+            amplitude=beat_current * parameters[RECEIVER_PREFIX + "transimpedance"],
+            delay=parameters[LEAK_LENGTH_PATH] / SPEED_OF_LIGHT,
+        ),
     )
 
 

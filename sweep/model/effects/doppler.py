@@ -17,9 +17,9 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model.beamlets import NO_SPREAD
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
-from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
-from sweep.model.link_budget import doppler_ratio
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots
 
 OMITTED_SHIFT_MAX_BINS = 0.1
@@ -28,16 +28,19 @@ as an error of 1."""
 
 
 def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by the shift.
+    """Bound the change of the largest bin if the Doppler shift of all lines is omitted.
 
-    The shift changes the receiver's transfer and the line's position between two bins.
-
-    The shift in bins counts as well, as it is the measure of velocity. A line that moves further
-    than :data:`OMITTED_SHIFT_MAX_BINS` is never skipped.
+    Notes
+    -----
+    The shift is 2 v_r / lambda. It changes the receiver's gain and the line's position between two
+    bins. Its size in bins counts as well, as it is the measure of velocity. A line that moves
+    further than :data:`OMITTED_SHIFT_MAX_BINS` is never skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None
-    return line_shift_bound(points, np.abs(points.radial_velocity) * points.bins_per_velocity)
+    return line_shift_bound(
+        points, np.abs(points.target.radial_velocity) * points.bins_per_velocity
+    )
 
 
 def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBound:
@@ -62,7 +65,7 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
         return ErrorBound(shift_bins=omitted_shift_bins)
     magnitude_change: np.ndarray | float = 0.0
     coherent_change: np.ndarray | float = 0.0
-    if points.architecture != "direct":
+    if points.waveform.architecture != "direct":
         near_change = magnitude_change_from_power(
             points.power_change_bound(NO_SPREAD, points.line_spread, shift_bins)
         )
@@ -80,13 +83,13 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
 
 
 def apply_doppler(shots: Shots, context: EffectContext) -> Shots:
-    """Shift all lines by the radial velocity on the axis.
+    """Shift all lines by the radial velocity on the beam's axis.
 
     Notes
     -----
-    The Doppler ratio of the line on the axis becomes beta = 2 v_r / c.
+    The Doppler ratio of the line on the axis becomes beta = 2 v_r / c, of first order in v_r / c.
     """
-    return replace(shots, doppler_ratio=doppler_ratio(shots.radial_velocity))
+    return replace(shots, motion=shots.motion._replace(doppler_ratio=shots.target.doppler_ratio))
 
 
 DOPPLER = Effect(
@@ -100,9 +103,13 @@ DOPPLER = Effect(
 
 
 def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by differences of velocity over the footprint.
+    """Bound the change of the largest bin if velocities are taken as equal over the footprint.
 
-    If amplitudes add, the bound of a sum in phase follows from the lines' own shifts.
+    Notes
+    -----
+    The bound follows from mean and rms of the lines' shifts 2 (v_b - v_0) / lambda
+    (:meth:`~sweep.model.effects.planner_inputs.PlannerInputs.power_change_bound`). If amplitudes
+    add, that of their sum in phase follows from the largest shift.
     """
     velocity_spread = points.velocity_spread
     if not np.any(velocity_spread.extreme):
@@ -110,7 +117,7 @@ def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
     coherent_change = (
         points.coherent_sum_bound(velocity_spread.extreme) if points.adds_amplitudes else 0.0
     )
-    if points.architecture == "direct":
+    if points.waveform.architecture == "direct":
         return ErrorBound(coherent_sum_change=coherent_change)
     power_change = points.power_change_bound(velocity_spread, points.range_spread)
     return ErrorBound(
@@ -120,14 +127,23 @@ def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
-    """Give beamlets their own radial velocities, if the footprint has beamlets."""
+    """Give beamlets their own radial velocities, if the footprint has beamlets.
+
+    Notes
+    -----
+    Beamlet b has the Doppler ratio beta_0 + (beta_b - beta_0), beta = 2 V.d / c for the velocity V
+    of the instrument relative to the ground and the direction d of the beamlet.
+    """
     doppler_ratios = context.ground.beamlets.doppler_ratio_offset
-    if shots.doppler_ratio_offset.shape != doppler_ratios.shape:
+    if shots.footprint.doppler_ratio_offset.shape != doppler_ratios.shape:
         return shots
     doppler_ratios = context.select_beamlets(
-        "doppler_spread", shots.footprint_row, doppler_ratios, shots.doppler_ratio_offset
+        "doppler_spread",
+        shots.footprint.row_of_point,
+        doppler_ratios,
+        shots.footprint.doppler_ratio_offset,
     )
-    return replace(shots, doppler_ratio_offset=doppler_ratios)
+    return replace(shots, footprint=shots.footprint._replace(doppler_ratio_offset=doppler_ratios))
 
 
 DOPPLER_SPREAD = Effect(
@@ -136,7 +152,8 @@ DOPPLER_SPREAD = Effect(
     stage="lines",
     error_bound=doppler_spread_bound,
     apply=apply_doppler_spread,
-    needs_own_batch=False,
+    uses_beamlet_velocities=True,
+    needs_separate_batches=False,
     parameters=(
         Parameter(
             path="target.transverse_velocity",

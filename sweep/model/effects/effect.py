@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sweep.model.effects.error_bounds import ErrorBound, PhaseErrorBound
 from sweep.model.ground import Ground
 from sweep.model.preparation import Parameters, Shots
 
 if TYPE_CHECKING:
-    from sweep.model.effects.planner_inputs import PhaseErrorBound, PlannerInputs
+    from sweep.model.effects.planner_inputs import PlannerInputs
 
 EFFECT_MODES = ("auto", "on", "off")
 """Settings of an effect in a spec: planned by its error bound, always on, or off."""
@@ -73,7 +74,7 @@ class EffectContext(NamedTuple):
     """Masks (n,) of effects that not all points have: 1.0 where enabled, else 0.0."""
 
     def presence_factor(self, effect: str) -> np.ndarray | float:
-        """Return 1 for points with an effect and 0 for others: (n,), or one number for all."""
+        """Return 1 for points that have an effect and 0 for others: (n,), or one number for all."""
         return self.presence.get(effect, 1.0)
 
     def select_beamlets(
@@ -109,42 +110,6 @@ class DrawAddresses(NamedTuple):
     """(n, 2) uint64: random key of each point."""
     draw_numbers: np.ndarray
     """(n,) int64: number of each point's draw."""
-
-
-ArrayOrFloat = np.ndarray | float
-
-
-class ErrorBound(NamedTuple):
-    """Upper bound on the output change at each point if an effect is omitted.
-
-    Values are scalars, (n,), or (segments, n).
-    """
-
-    magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude; 1 or more means no knowledge of it."""
-    coherent_sum_change: ArrayOrFloat = 0.0
-    """Additional absolute change of the largest bin's magnitude, as a fraction of the sum of all
-    amplitudes in phase. Sums that may cancel have no relative change."""
-    noise_variance_change: ArrayOrFloat = 0.0
-    """Relative change of a bin's noise variance."""
-    threshold_follows_noise: bool = True
-    """True if the threshold is set on the changed noise, as for noise that is always present; False
-    for noise that comes with the signal."""
-    shift_bins: ArrayOrFloat = 0.0
-    """Shift of measured frequencies [bins]; it counts like a change of a probability."""
-    log10_pfa_change: ArrayOrFloat = 0.0
-    """Change of log10 of a shot's probability of a false alarm, due to bins that cross the
-    threshold."""
-    leaking_bin_change_sigma: ArrayOrFloat = 0.0
-    """Change of bins with leaked signal [sigma], in addition to their share of the largest bin's
-    change."""
-    probability_change: ArrayOrFloat = 0.0
-    """Change of a probability itself, summed over the segments if there is one for each."""
-    residual_magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude that remains when the effect is simulated."""
-    residual_coherent_sum_change: ArrayOrFloat = 0.0
-    """Residual change as a fraction of the sum of all amplitudes in phase; the smaller of the two
-    residuals counts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,9 +152,15 @@ class Effect:
     parent: str = ""
     """Name of the effect that this one is part of. The parent is kept wherever this effect is, and
     this effect is off where the parent is."""
-    needs_own_batch: bool = True
+    needs_separate_batches: bool = True
     """True if points with and without the effect are computed separately. If False, `apply` uses
     :attr:`EffectContext.presence` and leaves the bits of points without the effect unchanged."""
+    uses_beamlet_velocities: bool = False
+    """True if `apply` reads the radial velocities of single beamlets, which are computed only then.
+    """
+    defines_scene_if_off: bool = False
+    """True if ``off`` is a rule of the scene, such as "all segments begin at one range", and not
+    the omission of something that is there: it then counts as no error."""
     required_effects: tuple[str, ...] = ()
     """Names of effects that are simulated with this one, however small their own change is."""
 

@@ -8,27 +8,38 @@ from dataclasses import replace
 
 import numpy as np
 
-from sweep.model.beamlets import BEAMLET_PATTERNS, NO_SPREAD
+from sweep.model.beamlets import BEAMLET_PATTERNS, NO_SPREAD, OffsetMoments
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects import image_and_leakage
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
-from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import CHIRP_PREFIX, relative_amplitude
 from sweep.model.preparation import Shots
 
 
-def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by the ranges of the footprint and by its larger echo.
+def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
+    """Return moments of lines' offsets [bins] by ranges of beamlets on the axis's surface."""
+    return points.footprint_extent.axis_surface_range_offsets.scaled_by(
+        points.bins_per_relative_range
+    )
 
-    The bound is for powers, without velocities, other surfaces or phases, which are separate
-    effects. In direct detection the echoes' beats always add as amplitudes, with the phases that
-    the ranges give to the radio frequency.
+
+def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
+    """Bound the change of the largest bin if the echo is one line on the beam's axis.
+
+    Notes
+    -----
+    The ranges of beamlets spread their lines, and their echoes add up to another total. The bound
+    is for powers, without velocities, other surfaces or phases, which are separate effects. In
+    direct detection the echoes' beats always add as amplitudes, with the phases 4 pi f (R_b - R_0)
+    / c that the ranges give to the radio frequency f.
     """
     if points.n_beamlets == 1:
         return None
-    power_change = points.power_change_bound(points.axis_surface_spread, NO_SPREAD)
+    power_change = points.power_change_bound(axis_surface_spread(points), NO_SPREAD)
     echo_change = 2 * np.abs(points.footprint_extent.total_echo_ratio - 1)
-    if points.architecture != "direct":
+    if points.waveform.architecture != "direct":
         return ErrorBound(magnitude_change=magnitude_change_from_power(power_change + echo_change))
     range_deviation = points.range * points.footprint_extent.axis_surface_range_offsets.extreme
     highest_frequency = points.carriers + 2 * points[CHIRP_PREFIX + "bandwidth"]
@@ -42,20 +53,27 @@ def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
-    """Give beamlets their own ranges.
+    """Give beamlets their own ranges and echoes.
 
     Beamlets on other surfaces keep the axis's range, and all keep its velocity: those are separate
     effects.
+
+    Notes
+    -----
+    Beamlet b has the range R_0 (1 + r_b), with the relative offset r_b of the ground
+    (:mod:`sweep.model.ground`), and the square root of its echo as amplitude.
     """
     row, range_offset, _, echo = context.ground.beamlets
     if context.ground.off_axis_surface is not None:
         range_offset = np.where(context.ground.off_axis_surface, 0.0, range_offset)
     return replace(
         shots,
-        footprint_row=row,
-        relative_range_offset=range_offset,
-        doppler_ratio_offset=np.zeros_like(range_offset),
-        relative_amplitude=relative_amplitude(shots.architecture, echo),
+        footprint=shots.footprint._replace(
+            row_of_point=row,
+            relative_range_offset=range_offset,
+            doppler_ratio_offset=np.zeros_like(range_offset),
+            relative_amplitude=relative_amplitude(shots.waveform.architecture, echo),
+        ),
     )
 
 
@@ -99,10 +117,16 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
-    """Add beamlets as amplitudes, if the spec states that their phases follow the surface."""
+    """Add beamlets as amplitudes, if the spec states that their phases follow the surface.
+
+    Notes
+    -----
+    X_k = sum_b a_b W(k - nu_b) exp(-2 pi i f tau_b), in place of |X_k|^2 = sum_b |a_b W(k -
+    nu_b)|^2.
+    """
     if str(context.parameters["footprint.phases"]) != "coherent":
         return shots
-    return replace(shots, adds_powers=False)
+    return replace(shots, footprint=shots.footprint._replace(adds_powers=False))
 
 
 FOOTPRINT_PHASE = Effect(
@@ -117,7 +141,7 @@ FOOTPRINT_PHASE = Effect(
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin because other surfaces lie at other ranges.
+    """Bound the change of the largest bin if all surfaces are taken at the range of the axis's.
 
     None if all power is on the surface that the beam's axis meets.
 
@@ -141,7 +165,7 @@ def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
     line_distance_bins = (
         points.footprint_extent.off_axis_range_offset_max * points.bins_per_relative_range
     )
-    power_min = points.peak_power_bounds_for(points.axis_surface_spread)[0]
+    power_min = points.peak_power_bounds_for(axis_surface_spread(points))[0]
     gain_ratio_max = np.minimum(
         np.exp(np.minimum(points.gain_slope_max * line_distance_bins, 50.0)),
         1 / points.transfer_gain**2,
@@ -167,13 +191,16 @@ def apply_several_returns(shots: Shots, context: EffectContext) -> Shots:
     range_offset = context.ground.beamlets.relative_range_offset
     if (
         context.ground.off_axis_surface is None
-        or shots.relative_range_offset.shape != range_offset.shape
+        or shots.footprint.relative_range_offset.shape != range_offset.shape
     ):
         return shots
     range_offset = context.select_beamlets(
-        "several_returns", shots.footprint_row, range_offset, shots.relative_range_offset
+        "several_returns",
+        shots.footprint.row_of_point,
+        range_offset,
+        shots.footprint.relative_range_offset,
     )
-    return replace(shots, relative_range_offset=range_offset)
+    return replace(shots, footprint=shots.footprint._replace(relative_range_offset=range_offset))
 
 
 SEVERAL_RETURNS = Effect(
@@ -183,6 +210,6 @@ SEVERAL_RETURNS = Effect(
     error_bound=several_returns_bound,
     apply=apply_several_returns,
     parent="footprint",
-    needs_own_batch=False,
+    needs_separate_batches=False,
 )
 """Effect of more than one surface in a footprint."""

@@ -2,7 +2,7 @@
 
 **Images**: a real record has the line also at -f, which reaches the bins of f near DC and Nyquist.
 
-X[k] contains W(k - nu) and, conjugated, W(k + nu). Past Nyquist the visible line is itself an
+Bin X[k] contains W(k - nu) and, conjugated, W(k + nu). Past Nyquist the visible line is itself an
 image. Without the effect only the transform of the folded line is summed, where it is visible. The
 effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
 Let all light of a line, wherever footprint and record put it, be at least e bins from the edge (DC
@@ -37,12 +37,13 @@ from functools import lru_cache
 import numpy as np
 
 from sweep.model.detection.looks import SINGLE_LOOK, Looks
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
+from sweep.model.effects.effect import Effect, EffectContext
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
-from sweep.model.effects.window_response import window_response
 from sweep.model.link_budget import PROCESSING_PREFIX, RECORD_PATH
 from sweep.model.preparation import Shots
 from sweep.model.window import get_window
+from sweep.model.window_response import window_response
 
 _LN_10 = math.log(10)
 _RATIO_MAX = 1e12
@@ -52,10 +53,13 @@ _EXPECTED_BINS_MIN = 1e-4
 
 
 def image_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by images; complex records have none.
+    """Bound the change of the largest bin if images are omitted; complex records have none.
 
-    If amplitudes add, the sum may be anything; images add at most E(e) of all lines in phase to any
-    bin of 0..N/2.
+    Notes
+    -----
+    If powers add, the bound follows from the largest sidelobes at e/2, e and 3 e/2 bins, as the
+    module's description states. If amplitudes add, the sum may be anything; images add at most E(e)
+    of all lines in phase to any bin of 0..N/2.
     """
     if points.option(RECORD_PATH) == "complex":
         return None
@@ -168,8 +172,13 @@ def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
 
 
 def apply_image(shots: Shots, context: EffectContext) -> Shots:
-    """Sum images with the lines, if the record is real."""
-    return replace(shots, sums_images=not shots.complex_record)
+    """Sum images with the lines, if the record is real.
+
+    Notes
+    -----
+    X[k] = W(k - nu) a / 2 + (W(k + nu) a / 2)^*, for a line at the position nu [bins].
+    """
+    return replace(shots, images=shots.images._replace(are_summed=not shots.complex_record))
 
 
 IMAGE = Effect(
@@ -346,8 +355,17 @@ def _added_crossing_probability(
 
 
 def apply_leakage(shots: Shots, context: EffectContext) -> Shots:
-    """Evaluate bins on either side of the detection."""
-    return replace(shots, includes_leakage=True)
+    """Evaluate the leaked signal in bins on either side of the detection.
+
+    Notes
+    -----
+    p_leakage = 1 - prod_k (1 - p_k) over the bins k that leaked signal may raise, where p_k is the
+    probability that a bin crosses the threshold by signal and noise where noise alone does not
+    (:mod:`sweep.model.spectrum.leakage`).
+    """
+    return replace(
+        shots, detection_settings=shots.detection_settings._replace(includes_leakage=True)
+    )
 
 
 LEAKAGE = Effect(

@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import RECEIVER_PREFIX
 from sweep.model.preparation import Shots
@@ -50,7 +51,7 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 where there is an image, which may be a peak of its own."""
+    """Return an error of 1 where I and Q are unequal, as an image may be a peak of its own."""
     image_amplitude = image_gain(
         gain=points[GAIN_IMBALANCE_PATH], phase=points[PHASE_IMBALANCE_PATH]
     )
@@ -62,13 +63,19 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Add images of the lines, if the record is complex."""
+    """Add images of the lines at their negative frequencies, if the record is complex.
+
+    Notes
+    -----
+    The image has |1 - g e^(i p)| / |1 + g e^(i p)| of the line's amplitude, with the ratio g of the
+    amplitudes of Q and I, and the departure p of their phase from 90 degrees (:func:`image_gain`).
+    """
     if not shots.complex_record:
         return shots
     image_amplitude = image_gain(
         gain=context.parameters[GAIN_IMBALANCE_PATH], phase=context.parameters[PHASE_IMBALANCE_PATH]
     )
-    return replace(shots, image_gain=image_amplitude)
+    return replace(shots, images=shots.images._replace(iq_gain=image_amplitude))
 
 
 IQ_IMBALANCE = Effect(

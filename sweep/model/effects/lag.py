@@ -11,13 +11,17 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import beam
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
-from sweep.model.effects.planner_inputs import PlannerInputs, magnitude_change_from_power
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound, magnitude_change_from_power
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the loss of the echo and of its shot noise; None without offset or single mode."""
+    """Return the loss of the echo and of its shot noise.
+
+    None if the axes coincide, or if all light in the aperture mixes.
+    """
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
         return None
@@ -40,11 +44,10 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     if not beam.is_single_mode(context.parameters):
         return shots
     kept_fraction = beam.axis_offset_transmission(context.parameters, shots.range)
-    return replace(
-        shots,
-        echo_power_scale=shots.echo_power_scale * kept_fraction,
-        beat_amplitude_scale=shots.beat_amplitude_scale * np.sqrt(kept_fraction),
+    link_scales = shots.link_scales.scale_echo(
+        power_factor=kept_fraction, amplitude_factor=np.sqrt(kept_fraction)
     )
+    return replace(shots, link_scales=link_scales)
 
 
 LAG = Effect(

@@ -1,450 +1,53 @@
-"""Laser line width: the mean power of bins under a line that is not a pure tone.
+"""Laser line width: a beat that is not a pure tone.
 
-There are two models. Both give the mean of |X|^2 over records, with the window's actual transform.
-
-**Gaussian** [T, section 3.2]: the power spectrum is convolved with a Gaussian of the given FWHM, at
-any delay. This is exactly the mean over records that each have one random normal frequency, common
-to all beamlets: jitter slow against the record. The mean over the frequency is a sum over equally
-spaced shifts, to a stated error. The spectrum |X|^2 of a record of L samples has only lags below L,
-so the trapezium rule errs only by a Gaussian's aliases.
-
-**Lorentzian**: a laser whose phase is a random walk (FWHM dnu, Gamma = 2 pi dnu), mixed with itself
-after a delay tau [1]_ [2]_. The beat's factor exp(i (theta(t - tau) - theta(t))) has the
-autocorrelation
-
-    exp(-Gamma min(|T|, tau)) = exp(-Gamma tau) + [exp(-Gamma |T|) - exp(-Gamma tau)]_{|T| < tau}
-
-which is a pure line with exp(-Gamma tau) of the power, and a pedestal with the rest. The pedestal
-is taken at its height under the line. A record shorter than the delay has only lags below its own
-length; there the record's length replaces the delay.
-
-|X| does not depend on a phase common to the full record, and little on the part of the pedestal in
-quadrature to the line. With the phase less its mean under the window, the mean of exp(i phi) is the
-line that |X| shows. Only the part of the pedestal in phase with it changes |X|
-(:func:`apparent_line_and_pedestal`). Full spectra are drawn with both parts (:func:`phase_walk`).
-An echo that arrives within the record has the line and the pedestal of its own samples, in steps of
-1/32 of the record.
-
-References
-----------
-.. [1] Gallion and Debarge, 1984.
-.. [2] Richter et al., IEEE J. Quantum Electron. 22, 2070, 1986.
+The models of a Gaussian and of a Lorentzian line, with their sources, are in
+:mod:`sweep.model.laser_line`. A Gaussian line averages |X|^2 over frequency shifts. A Lorentzian
+line takes power from the pure line, and adds a pedestal of noise that comes with the echo. An echo
+that arrives within the record has the line and the pedestal of its own samples.
 """
 
-import math
 from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
-from sweep.model.effects.phase_errors import coherent_phase_change, window_moments
-from sweep.model.effects.planner_inputs import (
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import (
+    ErrorBound,
     PhaseErrorBound,
-    PlannerInputs,
     magnitude_change_from_power,
+)
+from sweep.model.effects.phase_errors import coherent_phase_change, window_moments
+from sweep.model.effects.planner_inputs import PlannerInputs
+from sweep.model.laser_line import (
+    DEVIATION_PER_FWHM,
+    LaserLine,
+    apparent_line_and_pedestal,
+    pedestal_density_under_line,
+    pedestal_power_under_line,
+    pure_line_power_fraction,
 )
 from sweep.model.link_budget import LASER_PREFIX
 from sweep.model.preparation import Shots, window_energy_from_sample
 from sweep.model.unsupported_shot import UnsupportedShotError
-from sweep.model.window import Window, window_samples, zero_first_samples
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-
-DEVIATION_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
-"""Standard deviation of a Gaussian over its full width at half maximum."""
-
-MEAN_POWER_TOLERANCE = 1e-12
-"""Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
-
-LINE_DEVIATION_MAX_WINDOW_BINS = 500
-"""Largest standard deviation of a Gaussian line [bins of fs/L] that can be simulated."""
-
-
-_gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
-
-_DECAY_EXPONENT_MAX = 40.0
-"""Gamma T from which exp(-Gamma T) is neglected."""
-
-_DECAY_PER_SAMPLE_MIN = 0.1
-"""Gamma over the sample rate above which lags are summed one by one; after 400 lags nothing is
-left."""
+from sweep.model.window import zero_first_samples
 
 _LINE_REACH_DEVIATIONS = 6.0
 """Standard deviations of a Gaussian line beyond which its light is neglected."""
 
-_N_PHASE_NODES = 256
-"""Number of positions in the record at which the mean phase is subtracted."""
-
-_TINY = 1e-100
-"""Lower limit of the fraction of power that stays in the line, as it is divided by."""
-
 _DENSEST_PEDESTAL_EXPONENT = 1.7932821329
 """Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
-
-
-class FrequencyShifts(NamedTuple):
-    """Frequency shifts over which |X|^2 is averaged."""
-
-    offset_window_bins: np.ndarray
-    """(n, k): shifts of all lines [bins of fs/L]."""
-    weight: np.ndarray
-    """(n, k): weights of the powers, >= 0, sum 1."""
-
-
-def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> FrequencyShifts:
-    """Return shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
-
-    Parameters
-    ----------
-    fwhm : ndarray (n,)
-        FWHM of the beat's line [Hz].
-    duration : ndarray (n,)
-        Length of the record [s].
-
-    Returns
-    -------
-    FrequencyShifts
-        One shift for a width of 0, 19 for lines narrow against a bin, and 15 more per bin of
-        standard deviation. Weights of 0 fill rows with fewer than k shifts.
-
-    Raises
-    ------
-    UnsupportedShotError
-        If the standard deviation exceeds :data:`LINE_DEVIATION_MAX_WINDOW_BINS` bins.
-
-    Notes
-    -----
-    With step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
-    summation formula. The Gaussian's tails are cut where they hold as much.
-    """
-    deviation = np.atleast_1d(DEVIATION_PER_FWHM * np.asarray(fwhm, float) * duration)
-    if deviation.max(initial=0.0) > LINE_DEVIATION_MAX_WINDOW_BINS:
-        raise UnsupportedShotError(
-            f"instrument.laser.line_width makes a line of {deviation.max():.3g} bins standard "
-            f"deviation, and {LINE_DEVIATION_MAX_WINDOW_BINS} can be simulated: lower it, or "
-            "shorten the record by "
-            "instrument.processing.fft_size"
-        )
-    step_margin = math.sqrt(math.log(2 / MEAN_POWER_TOLERANCE) / 2) / math.pi
-    steps_per_deviation = deviation + step_margin  # s / h
-    reach_deviations = math.sqrt(2 * math.log(1 / MEAN_POWER_TOLERANCE))
-    n_steps = int(np.ceil(reach_deviations * steps_per_deviation.max(initial=0.0)))
-    position = np.arange(-n_steps, n_steps + 1) / steps_per_deviation[:, None]
-    weight = np.where(
-        np.abs(position) <= reach_deviations + 1 / steps_per_deviation[:, None],
-        np.exp(-(position**2) / 2),
-        0.0,
-    )
-    weight[deviation == 0] = np.arange(-n_steps, n_steps + 1) == 0
-    # A cumulative sum, so that padding with zeros, and thus other rows, changes no bit.
-    weight /= np.cumsum(weight, axis=1)[:, -1:]
-    return FrequencyShifts(deviation[:, None] * position, weight)
-
-
-def coherent_power_fraction(
-    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray
-) -> np.ndarray:
-    """Return the fraction of the beat's power in the pure line, exp(-2 pi dnu tau), 0..1.
-
-    Parameters
-    ----------
-    line_width : ndarray (n,)
-        FWHM dnu of the laser's Lorentzian line [Hz].
-    delay : ndarray (n,)
-        Delay tau of the echo [s].
-    duration : ndarray (n,)
-        Length of the record [s], which replaces a longer delay.
-    """
-    return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
-
-
-def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Return the power density of the pedestal under a line of power 1 [1/Hz].
-
-    Parameters
-    ----------
-    line_width : ndarray
-        FWHM dnu [Hz]; 0 gives 0.
-    delay : ndarray
-        Delay tau of the echo [s].
-
-    Notes
-    -----
-    2 (1 - e^-g (1 + g)) / Gamma with g = Gamma tau.
-    """
-    gamma = 2 * np.pi * np.asarray(line_width, float)
-    g = gamma * delay
-    bracket = -np.expm1(-g) - g * np.exp(-g)
-    # A series in place of the bracket, which cancels for small g.
-    bracket = np.where(g < 0.02, g * g * (1 / 2 - g * (1 / 3 - g * (1 / 8 - g / 30))), bracket)
-    return np.where(gamma > 0, 2 * gamma * bracket / np.where(gamma > 0, gamma**2, 1.0), 0.0)
-
-
-def pedestal_power_under_line(
-    *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
-) -> np.ndarray:
-    """Return the mean |X|^2 of the pedestal in its line's bin, over |C|^2 of the line.
-
-    Parameters
-    ----------
-    line_width, delay, duration : ndarray (n,)
-        As of :func:`coherent_power_fraction`.
-    window : Window
-        Window of the record.
-
-    Returns
-    -------
-    ndarray (n,)
-        >= 0. A line of weight C (|C| = a/2) has the mean bin power |C|^2 times (coherent fraction x
-        |W(0)|^2 + this). The pedestal adds as noise does: circular, and independent in every
-        record.
-
-    Notes
-    -----
-    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], with the window's autocorrelation r, is summed
-    directly if few lags contribute. Otherwise it is an integral over the lag by Gauss-Legendre
-    quadrature, plus a closed-form correction for aliasing of the integrand's kinks at lag 0 and at
-    the delay. The result is accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a
-    delay below one sample.
-    """
-    duration = np.asarray(duration, float)
-    gamma = 2 * np.pi * np.asarray(line_width, float) * duration
-    lag = np.minimum(np.asarray(delay, float) / duration, 1.0)
-    gamma, lag = np.broadcast_arrays(np.atleast_1d(gamma), np.atleast_1d(lag))
-    power, has_few_lags = np.empty(gamma.shape), gamma > _DECAY_PER_SAMPLE_MIN * window.length
-    for rows, method in (
-        (has_few_lags, _pedestal_power_by_lags),
-        (~has_few_lags, _pedestal_power_by_integral),
-    ):
-        if rows.any():
-            power[rows] = method(gamma[rows], lag[rows], window)
-    return power
-
-
-def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Sum over the lags directly, up to where the terms have decayed."""
-    j = np.arange(min(int(_DECAY_EXPONENT_MAX / _DECAY_PER_SAMPLE_MIN), window.length))
-    decay = (gamma / window.length)[:, None] * j
-    decay_left = np.maximum((gamma * lag)[:, None] - decay, 0.0)
-    terms = np.exp(-decay) * -np.expm1(-decay_left) * window_autocorrelation(window)(j)
-    terms[:, 1:] *= 2
-    return np.asarray(terms.sum(axis=-1))
-
-
-def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Integrate over the lag, and correct for the aliasing of the integrand's kinks.
-
-    The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with B_2(x) = x^2 -
-    x + 1/6.
-    """
-    length = window.length
-    lag_max = np.minimum(lag, _DECAY_EXPONENT_MAX / np.maximum(gamma, 1e-300))
-    node, weight = _gauss_legendre(128)
-    lag_at_nodes = lag_max[:, None] * (node + 1) / 2
-    integrand = np.exp(-gamma[:, None] * lag_at_nodes) * -np.expm1(
-        -gamma[:, None] * (lag[:, None] - lag_at_nodes)
-    )
-    correlation = window_autocorrelation(window)
-    integrand *= correlation(lag_at_nodes * length) * length * lag_max[:, None] * weight
-    # Jumps of the slope: r'(0) is that of the window's edge, the others are those of the bracket.
-    decay_per_sample, decay_at_delay = gamma / length, np.exp(-gamma * lag)
-    kink_at_zero = 2 * (
-        correlation(0.0, 1) * (1 - decay_at_delay) - decay_per_sample * correlation(0.0)
-    )
-    kink_at_delay = decay_per_sample * decay_at_delay * correlation(lag * length)
-    fractional_lag = lag * length - np.floor(lag * length)
-    power = integrand.sum(axis=1) - kink_at_zero * (1 / 6 / 2)
-    return np.asarray(
-        power - 2 * kink_at_delay * ((fractional_lag * fractional_lag - fractional_lag + 1 / 6) / 2)
-    )
-
-
-def apparent_line_and_pedestal(
-    *,
-    line_width: np.ndarray,
-    delay: np.ndarray,
-    duration: np.ndarray,
-    window: Window,
-    looks: int = 1,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the line and the pedestal in the line's bin as |X| shows them.
-
-    A phase common to the full record is excluded.
-
-    Parameters
-    ----------
-    line_width, delay, duration : ndarray (n,)
-        As of :func:`coherent_power_fraction`.
-    window : Window
-        Window of the record.
-    looks : int
-        Number of looks that are added in amplitude. With several, the phase of each record counts
-        as well.
-
-    Returns
-    -------
-    line_fraction : ndarray (n,)
-        Fraction of the power |C W(0)|^2 in the line; larger than :func:`coherent_power_fraction`.
-    in_phase_pedestal : ndarray (n,)
-        Mean square of the pedestal in phase with the line, over |C|^2. As noise, half of this
-        counts.
-
-    Notes
-    -----
-    C(t, s) is the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
-    window w. The line is m = sum w E, and the pedestal sum w E w E cosh C - m^2. C(t, s) is c(t -
-    s) - q(t) - q(s), with the triangle c = Gamma (tau - |t|). So each exponential is a product of
-    functions of the lag, of t and of s: autocorrelations of w and of w exp(2 q), at 256 positions.
-    """
-    power = pedestal_power_under_line(
-        line_width=line_width, delay=delay, duration=duration, window=window
-    )
-    gamma = np.broadcast_to(2 * np.pi * np.asarray(line_width) * duration, power.shape)
-    lag = np.broadcast_to(np.minimum(np.asarray(delay) / duration, 1.0), power.shape)
-    w, double_integral = _window_at_nodes(window)
-    position, phase_variance, coherent_fraction = (
-        np.arange(w.size) / w.size,
-        gamma * lag,
-        np.exp(-gamma * lag),
-    )
-
-    def double_integral_at(t: np.ndarray) -> np.ndarray:
-        """Return the window's double integral at t [records], extended linearly past the record."""
-        return np.where(
-            t > 1,
-            double_integral(1.0) + (t - 1) * double_integral(1.0, 1),
-            double_integral(np.clip(t, 0, 1)),
-        )
-
-    lag_column, integral_at_position = lag[:, None], double_integral_at(position)
-    mean_exponent = gamma[:, None] * (
-        double_integral_at(position + lag_column)
-        - 2 * integral_at_position
-        + double_integral_at(position - lag_column)
-    )
-    mean_exponent -= 0.5 * (w * mean_exponent).sum(axis=1)[:, None]
-    # A line with no power left needs no correction.
-    mean_exponent = np.where(
-        (phase_variance[:, None] < _DECAY_EXPONENT_MAX) & (looks == 1), mean_exponent, 0.0
-    )
-    single_factor, double_factor = np.exp(mean_exponent), w * np.exp(2 * mean_exponent)
-    sums = (w * single_factor).sum(axis=1), double_factor.sum(axis=1)
-    nodes, weight = _gauss_legendre(128)
-    lag_at_nodes = 0.5 * (nodes + 1) * lag[:, None]
-    # One transform at a time, so that bits do not depend on the number of rows.
-    spectra = [np.abs(np.fft.rfft(row, 2 * w.size)) ** 2 for row in double_factor]
-    correlation = np.array(
-        [
-            np.interp(
-                row_lags * w.size, np.arange(w.size + 1), np.fft.irfft(row_spectrum)[: w.size + 1]
-            )
-            for row_lags, row_spectrum in zip(lag_at_nodes, spectra, strict=True)
-        ]
-    ).reshape(lag_at_nodes.shape)
-    decorrelated = -np.expm1(-gamma[:, None] * (lag[:, None] - lag_at_nodes)) * correlation * weight
-    decorrelated_sum = decorrelated.sum(axis=1) * lag * w.size
-    squared_window_sum = window.sum**2
-    pedestal = 0.5 * (1 + sums[1] ** 2 - decorrelated_sum) - sums[0] ** 2
-    line_fraction = np.maximum(coherent_fraction * sums[0] ** 2, _TINY)
-    return line_fraction, np.maximum(
-        0.5 * power + coherent_fraction * pedestal * squared_window_sum, 0.0
-    )
-
-
-@lru_cache(maxsize=16)
-def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """Return the window over the record, of sum 1, and its double integral, of end slope 1."""
-    from scipy.interpolate import CubicSpline  # slow to import
-
-    w, position = (
-        window_samples(window.name, _N_PHASE_NODES),
-        np.arange(_N_PHASE_NODES + 1) / _N_PHASE_NODES,
-    )
-    end_value = w[0]
-    if window.n_missing:
-        w = np.where(position[:-1] < window.n_missing / window.length, 0.0, w)
-    double_integral = CubicSpline(position, np.append(w, end_value) / w.mean()).antiderivative(2)
-    return w / w.sum(), double_integral
-
-
-def n_phase_walk_steps(*, delay: float, length: int) -> int:
-    """Return the even number of steps that :func:`phase_walk` takes.
-
-    Parameters
-    ----------
-    delay : float
-        Delay tau [samples]. A delay beyond the record counts as its length: the delayed record then
-        shares nothing with it.
-    length : int
-        Length of the record [samples].
-    """
-    return 2 * (length + min(math.floor(delay), length))
-
-
-def phase_walk(
-    steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
-) -> np.ndarray:
-    """Return the phase theta(t) - theta(t - tau) [rad] of a laser over a record.
-
-    Parameters
-    ----------
-    steps : ndarray (n_steps,)
-        Standard normal numbers; :func:`n_phase_walk_steps` gives their number.
-    variance_per_sample : float
-        Variance of theta's change from sample to sample, Gamma / fs [rad^2].
-    delay : float
-        Delay tau [samples].
-    from_first_sample : bool
-        True to include the first sample's phase, for a delay shorter than the record. Otherwise the
-        phase is relative to the first sample's.
-
-    Returns
-    -------
-    ndarray (L,)
-
-    Notes
-    -----
-    Each step between samples is taken in two parts, before and after the time of the delayed
-    sample. So delays need not be integers.
-    """
-    step_before, step_after = steps.reshape(2, -1)
-    fraction = delay - math.floor(delay)
-    step_before = step_before * math.sqrt(variance_per_sample * (1 - fraction))
-    step_after = step_after * math.sqrt(variance_per_sample * fraction)
-    length = max(step_before.size - math.floor(delay), step_before.size // 2)
-    undelayed_step = (step_before + step_after)[step_before.size - length + 1 :]
-    delayed_step = step_before[1:length] + step_after[: length - 1]
-    phase = np.concatenate([[0.0], np.cumsum(undelayed_step - delayed_step)])
-    if from_first_sample:
-        first_steps = (step_before + step_after)[1 : math.floor(delay) + 1]
-        phase += step_after[0] + first_steps.sum()
-    return phase
-
-
-@lru_cache(maxsize=16)
-def window_autocorrelation(window: Window) -> "CubicSpline":
-    """Return the function sum_n w_n w_(n+j) of the lag j, 0..L [samples], as a spline."""
-    from scipy.interpolate import CubicSpline  # slow to import
-
-    spectrum = np.abs(np.fft.rfft(window.samples(), 2 * window.length)) ** 2
-    correlation = np.fft.irfft(spectrum, 2 * window.length)[: window.length + 1]
-    return CubicSpline(np.arange(window.length + 1), correlation)
-
 
 _WIDTH_PATH, _SHAPE_PATH = LASER_PREFIX + "line_width", LASER_PREFIX + "line_shape"
 
 
 def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
     """Return the standard deviation of a Gaussian line [bins of fs/L]."""
-    return DEVIATION_PER_FWHM * points[_WIDTH_PATH] * points.record_duration
+    return DEVIATION_PER_FWHM * points[_WIDTH_PATH] * points.record.duration
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the reach of a Gaussian line; None for other lines."""
+    """Return the distance to which a Gaussian line moves light [bins]; None for other lines."""
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
     return PhaseErrorBound(
@@ -490,17 +93,17 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
     """Bound the loss of the pure line and the noise of the pedestal, for a Lorentzian line."""
-    line_width, delay = points[_WIDTH_PATH], np.minimum(points.delay, points.record_duration)
-    coherent_fraction = coherent_power_fraction(
+    line_width, delay = points[_WIDTH_PATH], np.minimum(points.target.delay, points.record.duration)
+    coherent_fraction = pure_line_power_fraction(
         line_width=line_width, delay=delay, duration=np.asarray(np.inf)
     )
     densest_width = np.minimum(line_width, _DENSEST_PEDESTAL_EXPONENT / (2 * np.pi * delay))
     density = pedestal_density_under_line(line_width=densest_width, delay=delay)
     echo_ratio = points.footprint_extent.total_echo_ratio
     beat_amplitude = points.beat_amplitude * (
-        echo_ratio if points.architecture == "direct" else np.sqrt(echo_ratio)
+        echo_ratio if points.waveform.architecture == "direct" else np.sqrt(echo_ratio)
     )
-    cnr = beat_amplitude**2 / points.receiver_noise_variance  # including its image
+    cnr = beat_amplitude**2 / points.noise.variance_without_echo  # including its image
     return ErrorBound(
         magnitude_change=1 - np.sqrt(coherent_fraction),
         noise_variance_change=cnr * (points.sample_rate * density + (1 - coherent_fraction)),
@@ -509,11 +112,11 @@ def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
 
 
 def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the apparent line and pedestal, for the part of the record that holds the echo."""
+    """Return the power fraction of the line and the pedestal, as the echo's samples show them."""
     looks = shots.looks.n_coherent
-    if shots.n_samples_before_echo is None:
+    if shots.echo_record.n_samples_before is None:
         return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
-    n_before_echo = shots.n_samples_before_echo[0]
+    n_before_echo = shots.echo_record.n_samples_before[0]
     windows = [zero_first_samples(shots.window, n_missing) for n_missing in n_before_echo.tolist()]
     line_fraction, in_phase_pedestal = np.empty((2, shots.size))
     timing = {name: np.broadcast_to(values, shots.size) for name, values in timing.items()}
@@ -532,6 +135,13 @@ def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.nda
 def apply(shots: Shots, context: EffectContext) -> Shots:
     """Give the beat a Gaussian line; or attenuate the pure line and add a pedestal of noise.
 
+    Notes
+    -----
+    Gaussian: |X|^2 is averaged over frequencies of the given FWHM. Lorentzian of width dnu: the
+    pure line keeps exp(-2 pi dnu tau) of its power, for the delay tau or the record's length if
+    that is shorter, and the rest is a pedestal of noise
+    (:func:`sweep.model.laser_line.apparent_line_and_pedestal`).
+
     Raises
     ------
     UnsupportedShotError
@@ -540,33 +150,37 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     """
     line_width = np.asarray(context.parameters[_WIDTH_PATH], float)
     if str(context.parameters[_SHAPE_PATH]) == "gaussian":
-        return replace(shots, gaussian_line_width=line_width + np.zeros(shots.size))
+        return replace(
+            shots, laser_line=LaserLine(gaussian_width=line_width + np.zeros(shots.size))
+        )
     delay = 2 * shots.range / SPEED_OF_LIGHT
     line_width = line_width + np.zeros(shots.size)
-    timing = {"line_width": line_width, "delay": delay, "duration": shots.record_duration}
-    if shots.looks.n_coherent > 1 and np.any(delay > shots.record_duration):
+    timing = {"line_width": line_width, "delay": delay, "duration": shots.record.duration}
+    if shots.looks.n_coherent > 1 and np.any(delay > shots.record.duration):
         raise UnsupportedShotError(
             f"{_WIDTH_PATH} leaves of looks that are added what their phases have in common, which "
             "is "
             f"known for echoes that come back within a record, of "
-            f"{np.min(shots.record_duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
+            f"{np.min(shots.record.duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
     line_fraction, in_phase_pedestal = _apparent_lines(shots, timing)
-    line_power = (shots.beat_amplitude_scale / 2) ** 2 * shots.total_relative_echo
+    line_power = (shots.link_scales.beat_amplitude / 2) ** 2 * shots.total_relative_echo
     side_pedestal = pedestal_power_under_line(window=shots.window, **timing)
-    if shots.n_samples_before_echo is not None:
+    if shots.echo_record.n_samples_before is not None:
         side_pedestal = (
             side_pedestal
-            * window_energy_from_sample(shots.window)[shots.n_samples_before_echo[0]]
+            * window_energy_from_sample(shots.window)[shots.echo_record.n_samples_before[0]]
             / shots.window.energy
         )
     return replace(
         shots,
-        beat_amplitude_scale=shots.beat_amplitude_scale * np.sqrt(line_fraction),
-        lorentzian_line_width=line_width,
-        pedestal_variance_under_lines=line_power * 2 * in_phase_pedestal / shots.window.energy,
-        pedestal_variance_beside_lines=line_power * side_pedestal / shots.window.energy,
+        link_scales=shots.link_scales.scale_echo(amplitude_factor=np.sqrt(line_fraction)),
+        laser_line=LaserLine(
+            lorentzian_width=line_width,
+            pedestal_variance_beside=line_power * side_pedestal / shots.window.energy,
+            pedestal_variance_under=line_power * 2 * in_phase_pedestal / shots.window.energy,
+        ),
     )
 
 

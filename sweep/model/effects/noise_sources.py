@@ -10,13 +10,8 @@ from numpy.typing import ArrayLike
 
 from sweep.model import beam, receiver_chain
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
-from sweep.model.effects.effect import (
-    Effect,
-    EffectContext,
-    ErrorBound,
-    Parameter,
-    add_noise_sources,
-)
+from sweep.model.effects.effect import Effect, EffectContext, Parameter, add_noise_sources
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import (
     ADC_NOISE_SOURCE,
@@ -41,7 +36,7 @@ def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
 def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of the total echo, 2 q M^2 F Re P B_e."""
     variance = (
-        shots.shot_noise_variance_per_watt
+        shots.receiver_noise.shot_noise_variance_per_watt
         * shots.echo_power
         * context.presence_factor("signal_shot_noise")
     )
@@ -54,7 +49,7 @@ SIGNAL_SHOT_NOISE = Effect(
     stage="noise",
     error_bound=signal_shot_noise_bound,
     apply=apply_signal_shot_noise,
-    needs_own_batch=False,
+    needs_separate_batches=False,
 )
 """Effect of the echo's own shot noise."""
 
@@ -132,7 +127,7 @@ def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
     return ErrorBound(
         noise_variance_change=received_sunlight(points.parameters)
         * points.receiver_noise.shot_noise_variance_per_watt
-        / points.receiver_noise_variance
+        / points.noise.variance_without_echo
     )
 
 
@@ -145,9 +140,9 @@ def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
     air's transmission.
     """
     presence = context.presence_factor("solar_background")
-    light = received_sunlight(context.parameters) * shots.ground_transmission * presence
+    light = received_sunlight(context.parameters) * shots.link_scales.ground_transmission * presence
     return add_noise_sources(
-        shots, solar_shot=np.asarray(shots.shot_noise_variance_per_watt * light)
+        shots, solar_shot=np.asarray(shots.receiver_noise.shot_noise_variance_per_watt * light)
     )
 
 
@@ -157,7 +152,7 @@ SOLAR_BACKGROUND = Effect(
     stage="noise",
     error_bound=solar_background_bound,
     apply=apply_solar_background,
-    needs_own_batch=False,
+    needs_separate_batches=False,
     parameters=(
         Parameter(
             path=_SUN_DISTANCE_PATH,
@@ -212,13 +207,13 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
     """Return the exact intensity noise; the threshold follows it."""
-    if points.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
+    if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
     current_variance = intensity_noise_current_variance(points.parameters)
     return ErrorBound(
         noise_variance_change=current_variance
         * points.receiver_noise.variance_per_square_ampere
-        / points.receiver_noise_variance
+        / points.noise.variance_without_echo
     )
 
 
@@ -229,11 +224,11 @@ def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shot
     -----
     Current variance (M Re P_lo)^2 RIN B_e / CMRR, as of :func:`intensity_noise_current_variance`.
     """
-    if shots.architecture == "direct":
+    if shots.waveform.architecture == "direct":
         return shots
     current_variance = intensity_noise_current_variance(context.parameters)
     return add_noise_sources(
-        shots, relative_intensity=current_variance * shots.noise_variance_per_square_ampere
+        shots, relative_intensity=current_variance * shots.receiver_noise.variance_per_square_ampere
     )
 
 
@@ -275,9 +270,11 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_BITS_PATH):
         return None
-    white_noise_ratio = adc_noise_variance(points.parameters) / points.receiver_noise_variance
+    white_noise_ratio = adc_noise_variance(points.parameters) / points.noise.variance_without_echo
     density_min = np.finfo(float).tiny  # density where filters pass nothing
-    relative_density = np.maximum(points.relative_noise_density, density_min)
+    relative_density = np.maximum(
+        points.receiver_filter.relative_noise_density(points.beat_frequency), density_min
+    )
     magnitude_factor = np.sqrt((1 + white_noise_ratio) / (1 + white_noise_ratio / relative_density))
     return ErrorBound(
         magnitude_change=np.abs(magnitude_factor - 1),

@@ -42,10 +42,12 @@ from typing import Any
 import numpy as np
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
+from sweep.model.effects.effect import Effect, EffectContext
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.phase_errors import mean_phase_bound
-from sweep.model.effects.planner_inputs import PlannerInputs, window_max_near
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots
+from sweep.model.window_response import window_max_near
 
 _IMAGED_LINE_MIN = 0.9
 """Smallest fraction of a line's amplitude that a distant image leaves."""
@@ -104,7 +106,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Bound the error of a common first sample, the axis's at the middle look, for all beamlets.
+    """Bound the error because all beamlets and looks share the first sample of the beam's axis.
 
     Returns
     -------
@@ -119,20 +121,20 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
         points.sample_rate
         * 2
         / SPEED_OF_LIGHT
-        * np.abs(points.approach_speed)
+        * np.abs(points.target.approach_speed)
         * points.middle_look_delay
     )
     extra_samples_max = (
-        points.sample_rate * points.delay * np.minimum(range_moments.extreme, 1e3)
+        points.sample_rate * points.target.delay * np.minimum(range_moments.extreme, 1e3)
         + look_drift_samples
     )
     extra_samples_mean = (
-        points.sample_rate * points.delay * np.minimum(mean_range, 1e3) + look_drift_samples
+        points.sample_rate * points.target.delay * np.minimum(mean_range, 1e3) + look_drift_samples
     )
     # Numbers of samples are integers: those of two delays differ by up to one more.
     whole_samples = np.where(extra_samples_max > 0, extra_samples_mean + 1, 0.0)
     # If no samples or all samples are missing, the same are missing at nearby delays.
-    samples_to_echo = points.sample_rate * (points.delay - points.acquisition_delay)
+    samples_to_echo = points.sample_rate * (points.target.delay - points.record.acquisition_delay)
     record_starts_inside = (samples_to_echo + extra_samples_max > -1) & (
         samples_to_echo - extra_samples_max < points.window.length + 1
     )
@@ -145,22 +147,22 @@ def residual_bound(points: PlannerInputs) -> np.ndarray:
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
-    """Set ``n_samples_before_echo``: the number of record samples before the echo, by segment.
+    """Leave out the echo in the first samples of each record, before the echo arrives.
 
     Notes
     -----
     n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s), limited to 0..L, as of
     :meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`.
     """
-    n_samples_before_echo = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
+    n_samples_before = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]
-        n_samples_before_echo[segment_index] = shots.record_settings.count_samples_before_echo(
+        n_samples_before[segment_index] = shots.record.count_samples_before_echo(
             segment, shots.range
         )
     return (
-        replace(shots, n_samples_before_echo=n_samples_before_echo)
-        if n_samples_before_echo.any()
+        replace(shots, echo_record=shots.echo_record._replace(n_samples_before=n_samples_before))
+        if n_samples_before.any()
         else shots
     )
 

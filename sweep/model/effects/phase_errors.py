@@ -59,13 +59,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model import link_budget
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import coherent_gain
-from sweep.model.effects.effect import ArrayOrFloat, Effect, EffectContext, ErrorBound, Parameter
-from sweep.model.effects.planner_inputs import NO_PHASE_ERROR, PhaseErrorBound, PlannerInputs
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import (
+    NO_PHASE_ERROR,
+    ArrayOrFloat,
+    ErrorBound,
+    PhaseErrorBound,
+)
+from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.effects.sweep_error_table import SweepErrorTable, fit_sweep_error
 from sweep.model.link_budget import CHIRP_PREFIX
-from sweep.model.preparation import PhaseError, Shots
+from sweep.model.preparation import Shots
+from sweep.model.shot_records import PhaseError
 from sweep.model.window import Window, window_samples
 
 _N_NODES = 256
@@ -141,8 +149,8 @@ def phase_over_record(
     PhaseErrorBound
         Magnitudes of the coefficients of x^0..x^4.
     """
-    half_duration = 0.5 * points.record_duration
-    record_middle = points.acquisition_delay + half_duration
+    half_duration = 0.5 * points.record.duration
+    record_middle = points.record.acquisition_delay + half_duration
     polynomial: list[np.ndarray | float] = [0.0] * 5
     for j, coefficient in coefficient_by_power.items():
         for k in range(j + 1):
@@ -284,7 +292,12 @@ def _add_phase_error(
 ) -> Shots:
     """Return shots with an additional phase error."""
     phase_error = PhaseError(phase_function, values | shots.echo_record_times)
-    return replace(shots, phase_errors=(*shots.phase_errors, phase_error))
+    return replace(
+        shots,
+        echo_record=shots.echo_record._replace(
+            phase_errors=(*shots.echo_record.phase_errors, phase_error)
+        ),
+    )
 
 
 def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
@@ -321,7 +334,7 @@ def range_walk_phase(
     duration: np.ndarray,
     slide: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Return the phase that range walk adds to the line's.
+    """Return the phase that range walk adds to the beat of a line.
 
     Parameters
     ----------
@@ -356,13 +369,19 @@ def range_walk_phase(
 
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     """Return the phase that range walk adds over the record; None without range walk."""
-    slide_speed = points.approach_speed - points.radial_velocity
-    doppler_ratio = points.doppler_ratio + points.doppler_ratio_growth
+    doppler_ratio_growth = points.stack_segments(
+        *(
+            link_budget.doppler_ratio(points.target.acceleration * segment.start_time)
+            for segment in points.existing_segments
+        )
+    )
+    slide_speed = points.target.approach_speed - points.target.radial_velocity
+    doppler_ratio = points.target.doppler_ratio + doppler_ratio_growth
     drift_ratio = doppler_ratio * (1 + doppler_ratio / 2) + slide_speed / SPEED_OF_LIGHT
     if not drift_ratio.any():
         return None
     return phase_over_record(
-        points, {2: points.existing_chirp_rates * points.chirp_rate * drift_ratio}
+        points, {2: points.existing_chirp_rates * points.waveform.chirp_rate * drift_ratio}
     )
 
 
@@ -376,12 +395,17 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
     """
     velocity, slide = (
         shots.motion_by_segment["radial_velocity"],
-        shots.approach_speed - shots.radial_velocity,
+        shots.target.approach_speed - shots.target.radial_velocity,
     )
     shots = _add_phase_error(
-        shots, range_walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
+        shots,
+        range_walk_phase,
+        chirp_rate=shots.waveform.chirp_rate,
+        radial_velocity=velocity,
+        slide=slide,
     )
-    return replace(shots, range_walk_time=shots.range_walk_time + chirp_drift_time(shots))
+    walk_time = shots.motion.range_walk_time + chirp_drift_time(shots)
+    return replace(shots, motion=shots.motion._replace(range_walk_time=walk_time))
 
 
 def chirp_drift_time(shots: Shots) -> np.ndarray:
@@ -390,13 +414,13 @@ def chirp_drift_time(shots: Shots) -> np.ndarray:
     It is the slope of the best straight line under the window, over the samples that hold the echo.
     For a full record this is twice the time of its middle.
     """
-    drift_time = 2 * shots.acquisition_delay + shots.record_duration
-    if shots.n_samples_before_echo is None:
+    drift_time = 2 * shots.record.acquisition_delay + shots.record.duration
+    if shots.echo_record.n_samples_before is None:
         return np.asarray(drift_time)
-    slope = _square_slope_by_first_sample(shots.window)[shots.n_samples_before_echo[::2]].mean(
-        axis=0
-    )
-    return np.asarray(drift_time + 0.5 * shots.record_duration * slope)
+    slope = _square_slope_by_first_sample(shots.window)[
+        shots.echo_record.n_samples_before[::2]
+    ].mean(axis=0)
+    return np.asarray(drift_time + 0.5 * shots.record.duration * slope)
 
 
 @lru_cache(maxsize=8)
@@ -481,10 +505,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
     if not points.any_nonzero(_ACCELERATION_PATH):
         return None
     alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT
-    signed_chirp_rate = points.existing_chirp_rates * points.chirp_rate
+    signed_chirp_rate = points.existing_chirp_rates * points.waveform.chirp_rate
     coefficient_by_power = {
-        2: alpha * (points.carriers - signed_chirp_rate * points.delay),
-        3: alpha * signed_chirp_rate * (1 + points.doppler_ratio),
+        2: alpha * (points.carriers - signed_chirp_rate * points.target.delay),
+        3: alpha * signed_chirp_rate * (1 + points.target.doppler_ratio),
         4: alpha**2 * signed_chirp_rate * 0.5,
     }
     return phase_over_record(points, coefficient_by_power)
@@ -499,30 +523,31 @@ def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
     if bound is None or points.looks.n_coherent == 1:
         return bound
     gain = coherent_gain(
-        points.looks, acceleration=points.acceleration, carrier=points.carriers[0],
-        look_period=points.look_period,
+        points.looks, acceleration=points.target.acceleration, carrier=points.carriers[0],
+        look_period=points.waveform.look_period,
     )  # fmt: skip
     return bound._replace(magnitude_change=bound.magnitude_change + 1 - gain)
 
 
 def apply_acceleration(shots: Shots, context: EffectContext) -> Shots:
-    """Let the Doppler frequency drift over the record of every segment.
+    """Let the Doppler frequency drift over the record of every segment, as the target accelerates.
 
     The loss that it causes in looks that are added in amplitude is included.
     """
     if shots.looks.n_coherent > 1:
         gain = coherent_gain(
-            shots.looks, acceleration=shots.acceleration, carrier=shots.carriers[0],
-            look_period=shots.look_period,
+            shots.looks, acceleration=shots.target.acceleration, carrier=shots.waveform.carriers[0],
+            look_period=shots.waveform.look_period,
         )  # fmt: skip
-        shots = replace(shots, beat_amplitude_scale=shots.beat_amplitude_scale * gain)
-    shots = replace(shots, velocity_drift_time=shots.acquisition_delay + shots.record_duration / 2)
+        shots = replace(shots, link_scales=shots.link_scales.scale_echo(amplitude_factor=gain))
+    drift_time = shots.record.acquisition_delay + shots.record.duration / 2
+    shots = replace(shots, motion=shots.motion._replace(velocity_drift_time=drift_time))
     return _add_phase_error(
         shots,
         acceleration_phase,
-        carrier=shots.carriers,
-        chirp_rate=shots.chirp_rate,
-        acceleration=shots.acceleration,
+        carrier=shots.waveform.carriers,
+        chirp_rate=shots.waveform.chirp_rate,
+        acceleration=shots.target.acceleration,
         **shots.motion_by_segment,
     )
 
@@ -672,14 +697,14 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
             else _error_table_phase_bound(points, fit_sweep_error(table_text))
         )
     quadratic, cubic, sinusoidal = (points[path] for path in _ERROR_PEAK_PATHS)
-    half_duration, chirp_rates = 0.5 * points.record_duration, points.existing_chirp_rates
+    half_duration, chirp_rates = 0.5 * points.record.duration, points.existing_chirp_rates
     record_middle, position_per_second = (
-        points.acquisition_delay + half_duration,
+        points.record.acquisition_delay + half_duration,
         2 / points[CHIRP_PREFIX + "duration"],
     )
     delay = [
-        points.delay - points.doppler_ratio * record_middle,
-        -points.doppler_ratio * half_duration,
+        points.target.delay - points.target.doppler_ratio * record_middle,
+        -points.target.doppler_ratio * half_duration,
     ]
     step = [-chirp_rates * position_per_second * part for part in delay]
     sweep_position = [
@@ -725,11 +750,13 @@ def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> P
     error_slope_max = np.abs(np.polynomial.chebyshev.chebval(position, slope_coefficients)).max()
     error_slope_max = error_slope_max * 2 / (table.last_time - table.first_time)
     record_duration, delay_rate, slope_magnitude = (
-        points.record_duration,
-        np.abs(points.doppler_ratio),
+        points.record.duration,
+        np.abs(points.target.doppler_ratio),
         np.abs(points.existing_chirp_rates),
     )
-    delay_max = points.delay + delay_rate * (points.acquisition_delay + record_duration)
+    delay_max = points.target.delay + delay_rate * (
+        points.record.acquisition_delay + record_duration
+    )
     linear_phase = 0.5 * delay_rate * record_duration * abs(mid_error)
     extra_shift = (delay_max * error_slope_max + delay_rate * half_span) * record_duration
     coefficients = (slope_magnitude * linear_phase, 0.0, 0.0, 0.0)
@@ -753,10 +780,16 @@ def _polynomial_product(
 
 
 def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
-    """Add the sweep's error to the records of the two chirps."""
+    """Add the phase of the sweep's frequency error to the records of the two chirps.
+
+    Notes
+    -----
+    psi(t) = E(t - tau(t)) - E(t), with the integral E of the frequency error over time, as the
+    module's description states.
+    """
     parameters, phase_inputs = (
         context.parameters,
-        {"chirp_duration": shots.chirp_duration, **shots.motion_by_segment},
+        {"chirp_duration": shots.waveform.chirp_duration, **shots.motion_by_segment},
     )
     if (table_text := str(parameters[ERROR_TABLE_PATH])) != NO_TABLE:
         shots = _add_phase_error(

@@ -1,20 +1,20 @@
-"""Link budget, lines and footprints of many points at once, for the error bounds of effects.
+"""Inputs of the error bounds of effects: link budget, lines and footprints of many points at once.
 
-The link budget is that of the shots (:mod:`sweep.model.link_budget`), for arrays that broadcast
-over the points. This module adds bounds over the lines of a footprint.
+The link budget is that of the shots, :class:`sweep.model.link_budget.LinkBudget`, for arrays that
+broadcast over the points. This module adds bounds over the lines of a footprint.
 
 Values are computed on first use. Arrays by segment have an additional first axis over the existing
 segments. All points share text parameters, and the parameters that
 :meth:`PlannerInputs.shared_integer` reads.
 """
 
-from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from sweep.model import beam, beamlet_counts, ground, receiver_chain, waveform
+from sweep.model import beam, beamlet_counts, ground, waveform
 from sweep.model.beamlets import (
     NO_SPREAD,
     OffsetMoments,
@@ -24,19 +24,23 @@ from sweep.model.beamlets import (
     plane_offset_moment_bounds,
 )
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection.looks import Looks
-from sweep.model.effects.window_response import WindowResponse, window_response
+from sweep.model.effects.error_bounds import NO_PHASE_ERROR, ErrorBound, PhaseErrorBound
 from sweep.model.ground import FootprintExtent, backscatter
 from sweep.model.link_budget import (
     ADC_NOISE_SOURCE,
     LineMotion,
     LinkBudget,
     adc_noise_variance,
-    doppler_ratio,
     relative_amplitude,
 )
 from sweep.model.waveform import WaveformSegment
-from sweep.model.window import Window, window_samples
+from sweep.model.window import Window
+from sweep.model.window_response import (
+    MissingSamples,
+    WindowResponse,
+    missing_sample_bounds,
+    window_response,
+)
 
 _CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
 """Half-widths t in standard deviations for Chebyshev's inequality, of which the best bound is
@@ -46,149 +50,11 @@ _NEAR_IMAGE_WINDOW_BINS = 8.0
 below 5 %."""
 
 
-class PhaseErrorBound(NamedTuple):
-    """Bound of an effect's change of lines over the record: a phase, or a shift of positions.
+class PlannerInputs(LinkBudget):
+    """Link budget of points that share all text parameters, and their lines, for error bounds.
 
-    Values are by segment, or scalars. Coefficients are those of powers of the position x in the
-    record, -1..1, in cycles.
-    """
-
-    coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """Magnitudes of the coefficients of x, x^2, x^3, x^4 [cycles]."""
-    non_polynomial: np.ndarray | float = 0.0
-    """Largest magnitude of the phase that is no polynomial [cycles]."""
-    constant: np.ndarray | float = 0.0
-    """Magnitude of the phase in the record's middle [cycles], which matters to lines near their
-    images."""
-    extra_shift_window_bins: np.ndarray | float = 0.0
-    """Shift of light in addition to the slopes of the polynomial [bins of fs/L]."""
-
-    @property
-    def shift_window_bins(self) -> np.ndarray | float:
-        """Largest shift of light [bins of fs/L]."""
-        slope_window_bins = sum(2 * (k + 1) * value for k, value in enumerate(self.coefficients))
-        return slope_window_bins + self.extra_shift_window_bins
-
-    def plus(self, other: "PhaseErrorBound") -> "PhaseErrorBound":
-        """Return the bound for the sum of two phase errors."""
-        coefficients = tuple(
-            a + b for a, b in zip(self.coefficients, other.coefficients, strict=True)
-        )
-        return PhaseErrorBound(
-            coefficients, *(a + b for a, b in zip(self[1:], other[1:], strict=True))
-        )
-
-
-NO_PHASE_ERROR = PhaseErrorBound()
-"""Bound of no phase error."""
-
-
-class MissingSamples(NamedTuple):
-    """Samples of the record that are taken before the echo arrives, by segment."""
-
-    lost_fraction: np.ndarray
-    """Sum |w| over the missing samples, over sum w."""
-    step_sidelobe_factor: np.ndarray
-    """Factor on the sidelobes of a rectangular window, relative to sum w, that bounds the sidelobes
-    added by the missing samples."""
-    n_missing: np.ndarray
-    """Number of missing samples."""
-    centroid_bound: np.ndarray
-    """Bound on the mean position, -1..1, of the remaining samples."""
-    all_missing: np.ndarray
-    """True where all samples are missing."""
-
-
-def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
-    """Compute bounds for records whose first samples have no echo.
-
-    Parameters
-    ----------
-    window : Window
-        Window of the record.
-    n_missing : ndarray of int
-        Number of missing samples.
-
-    Notes
-    -----
-    The transform of the missing samples is at most their variation over 2 sin(pi y / L). The same
-    holds for the remaining samples, and bounds the sidelobes where these are fewer.
-    """
-    lost_fraction_by_count, bound_by_missing, bound_by_remaining = _bounds_by_missing_count(window)
-    lost_fraction = lost_fraction_by_count[n_missing]
-    step_sidelobe_factor = np.minimum(
-        bound_by_missing[n_missing], bound_by_remaining[n_missing]
-    ) * (window.length / window.sum)
-    with np.errstate(divide="ignore"):
-        centroid_bound = np.minimum(lost_fraction / np.maximum(1 - lost_fraction, 1e-300), 1.0)
-    step_sidelobe_factor = np.where(n_missing > 0, step_sidelobe_factor, 0.0)
-    return MissingSamples(
-        lost_fraction, step_sidelobe_factor, n_missing, centroid_bound, n_missing >= window.length
-    )
-
-
-@lru_cache(maxsize=8)
-def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate bounds of :func:`missing_sample_bounds` by missing samples, (L + 1,) each.
-
-    They are the lost fraction, and the factors by the variation of missing and of remaining
-    samples.
-    """
-    w = window_samples(window.name, window.length)
-    magnitude = np.abs(w)
-    lost_fraction = np.append(0.0, np.cumsum(magnitude)) / window.sum
-    variation = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # variation up to each sample
-    bound_by_missing = 0.5 * (magnitude[0] + variation + magnitude)
-    bound_by_remaining = 0.5 * (magnitude + variation[-1] - variation + magnitude[-1])
-    bound_by_missing, bound_by_remaining = (
-        np.append(0.0, bound_by_missing),
-        np.append(bound_by_remaining, 0.0),
-    )
-    return lost_fraction, bound_by_missing, bound_by_remaining
-
-
-def window_max_near(
-    window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
-) -> np.ndarray:
-    """Return the largest |w| near a sample, over sum w.
-
-    Parameters
-    ----------
-    window : Window
-        Window of the record.
-    first_sample : ndarray of int
-        Number of the sample.
-    reach_samples : ndarray
-        Distance from the sample [samples], rounded up to a power of two.
-    """
-    exponents = np.ceil(np.log2(np.clip(reach_samples, 1, window.length))).astype(int)
-    window_max = np.empty(np.broadcast_shapes(first_sample.shape, exponents.shape))
-    first_sample, exponents = np.broadcast_arrays(first_sample, exponents)
-    for exponent in np.unique(exponents):
-        has_exponent = exponents == exponent
-        window_max[has_exponent] = _window_max_within(window, int(exponent))[
-            first_sample[has_exponent]
-        ]
-    return window_max
-
-
-@lru_cache(maxsize=64)
-def _window_max_within(window: Window, exponent: int) -> np.ndarray:
-    """Return the largest |w| within 2^exponent samples of each position, (L + 1,), over sum w."""
-    from scipy.ndimage import maximum_filter1d  # slow to import
-
-    magnitude = np.abs(window_samples(window.name, window.length))
-    magnitude = np.append(magnitude, magnitude[-1])
-    return np.asarray(maximum_filter1d(magnitude, 2 * 2**exponent + 1, mode="nearest")) / window.sum
-
-
-def magnitude_change_from_power(power_change: np.ndarray) -> np.ndarray:
-    """Return the relative decrease of a magnitude for one of its power, larger than an increase."""
-    return np.asarray(1 - np.sqrt(1 - np.minimum(power_change, 1.0)))
-
-
-class PlannerInputs:
-    """Points that share all text parameters, with quantities for error bounds.
+    The records of the link budget have the names of those of the prepared shots, such as
+    ``points.target.radial_velocity`` and ``shots.target.radial_velocity``.
 
     Parameters
     ----------
@@ -208,19 +74,16 @@ class PlannerInputs:
         *,
         has_rotating_body: bool = False,
     ) -> None:
-        self.parameters = {path: np.asarray(value) for path, value in parameters.items()}
+        super().__init__({path: np.asarray(value) for path, value in parameters.items()})
         self.ndim = max((array.ndim for array in self.parameters.values()), default=0)
         self._given_extent, self.has_rotating_body = extent, has_rotating_body
-        self.budget = LinkBudget(self.parameters)
-        """Link budget of the points."""
-        self.ignores_doppler = False
-        """True if the Doppler effect is off."""
-        self.ignores_segment_motion = False
-        """True if the effect of motion between segments is off."""
-        self.ignores_overlap = False
-        """True if the effect of overlap is off."""
+        self.effects_off: Collection[str] = ()
+        """Names of effects that are off at all points; bounds of others may rely on it."""
         self.phase_error_bounds: dict[str, PhaseErrorBound] = {}
-        """Bounds of phase errors by name of the effect."""
+        """Bounds of phase errors by name of the effect, known before any other bound."""
+        self.noise_bounds: dict[str, ErrorBound] = {}
+        """Error bounds of the effects of the stage ``noise`` by name, known before those of other
+        stages."""
         n_beamlets = self.shared_integer(beamlet_counts.BEAMLETS_PATH)
         self.n_beamlets, self.beamlet_pattern = beamlet_counts.largest_beamlet_count_and_pattern(
             self.parameters
@@ -231,10 +94,10 @@ class PlannerInputs:
                 ground.beamlet_pattern(self.parameters),
             )
         self.existing_chirp_rates = self.stack_segments(
-            *self._of_existing_segments(self.budget.waveform.chirp_slopes)
+            *self._of_existing_segments(self.waveform.chirp_slopes)
         )
-        """Chirp rates of the existing segments over :attr:`chirp_rate`, signed."""
-        is_direct = self.architecture == "direct"
+        """Chirp rates of the existing segments over that of the up-chirp, signed."""
+        is_direct = self.waveform.architecture == "direct"
         is_coherent = self.option("footprint.phases") == "coherent"
         self.adds_amplitudes = is_coherent or is_direct
         self.adds_field_amplitudes = is_coherent and not is_direct
@@ -259,7 +122,7 @@ class PlannerInputs:
     def _of_existing_segments(self, values_by_segment: Sequence[Any]) -> list[Any]:
         """Select the values of existing segments from those of up, Doppler and down."""
         named_values = zip(waveform.SEGMENT_NAMES, values_by_segment, strict=True)
-        return [value for name, value in named_values if name in self.segment_order]
+        return [value for name, value in named_values if name in self.waveform.segment_order]
 
     def stack_segments(self, *values: np.ndarray | float) -> np.ndarray:
         """Stack values of segments along a new first axis."""
@@ -269,54 +132,19 @@ class PlannerInputs:
     # The instrument
 
     @property
-    def architecture(self) -> str:
-        """Receiver architecture."""
-        return self.budget.waveform.architecture
-
-    @property
-    def segment_order(self) -> tuple[str, ...]:
-        """Names of the segments that exist, in the order of time."""
-        return self.budget.waveform.segment_order
-
-    @property
-    def chirp_rate(self) -> np.ndarray:
-        """Chirp rate of the up-chirp B/T [Hz/s]."""
-        return self.budget.waveform.chirp_rate
-
-    @property
-    def looks(self) -> Looks:
-        """Number of records of each segment, and their combination."""
-        return self.budget.looks
-
-    @property
     def fft_size(self) -> int:
         """FFT size N."""
-        return self.budget.record.fft_size
+        return self.record.fft_size
 
     @property
     def sample_rate(self) -> np.ndarray:
         """Sample rate f_s [Hz]."""
-        return self.budget.record.sample_rate
-
-    @property
-    def acquisition_delay(self) -> np.ndarray:
-        """Time from a segment's start to the start of its record [s]."""
-        return self.budget.record.acquisition_delay
-
-    @property
-    def bin_width(self) -> np.ndarray:
-        """Width of a bin f_s/N [Hz]."""
-        return self.budget.record.bin_width
-
-    @property
-    def record_duration(self) -> np.ndarray:
-        """Length of the record L/f_s [s]."""
-        return self.budget.record.duration
+        return self.record.sample_rate
 
     @property
     def window(self) -> Window:
         """Window of the record, whose length all points share."""
-        return self.budget.record.window
+        return self.record.window
 
     @cached_property
     def window_response(self) -> WindowResponse:
@@ -331,27 +159,7 @@ class PlannerInputs:
     @cached_property
     def carriers(self) -> np.ndarray:
         """Frequency that the delay turns into phase [Hz], by segment."""
-        return self.stack_segments(*self._of_existing_segments(self.budget.waveform.carriers))
-
-    @property
-    def receiver_noise(self) -> receiver_chain.ReceiverNoise:
-        """Noise of the receiver alone, at the ADC [V^2]."""
-        return self.budget.receiver_noise
-
-    @property
-    def receiver_noise_variance(self) -> np.ndarray:
-        """Noise variance of the receiver alone, at the ADC [V^2]."""
-        return self.budget.noise.variance_without_echo
-
-    @cached_property
-    def bin_noise_sigma(self) -> np.ndarray:
-        """Noise sigma of a bin by the receiver alone, per quadrature [V]."""
-        return self.budget.record.bin_noise_sigma(self.receiver_noise_variance, self.looks)
-
-    @property
-    def threshold_ratio(self) -> np.ndarray:
-        """Threshold over sigma."""
-        return self.budget.threshold_ratio
+        return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
     @property
     def noise_peak_ratio(self) -> float | None:
@@ -368,32 +176,7 @@ class PlannerInputs:
     @property
     def range(self) -> np.ndarray:
         """Range of the target on the beam's axis [m]."""
-        return self.budget.target.range
-
-    @property
-    def radial_velocity(self) -> np.ndarray:
-        """Radial velocity of the target on the beam's axis [m/s], positive when closing."""
-        return self.budget.target.radial_velocity
-
-    @property
-    def acceleration(self) -> np.ndarray:
-        """Rate at which the radial velocity grows [m/s^2]."""
-        return self.budget.target.acceleration
-
-    @property
-    def approach_speed(self) -> np.ndarray:
-        """Speed at which the range along the beam falls [m/s]."""
-        return self.budget.target.approach_speed
-
-    @cached_property
-    def delay(self) -> np.ndarray:
-        """Delay of the echo 2 R / c [s]."""
-        return self.budget.target.delay
-
-    @cached_property
-    def doppler_ratio(self) -> np.ndarray:
-        """Doppler ratio 2 v_r / c, also if the Doppler effect is off."""
-        return self.budget.target.doppler_ratio
+        return self.target.range
 
     @cached_property
     def footprint_angles(self) -> beam.FootprintAngles:
@@ -415,7 +198,7 @@ class PlannerInputs:
         }  # fmt: skip
         range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
-            radial_velocity=self.radial_velocity,
+            radial_velocity=self.target.radial_velocity,
             direction_angle=self.footprint_angles.directions,
             **geometry,
         )
@@ -437,8 +220,8 @@ class PlannerInputs:
     @cached_property
     def beat_amplitude(self) -> np.ndarray:
         """Amplitude of the beat of the line on the axis [V], before the receiver's poles."""
-        return self.budget.link_scales.beat_amplitude * relative_amplitude(
-            self.architecture, self.footprint_extent.axis_echo
+        return self.link_scales.beat_amplitude * relative_amplitude(
+            self.waveform.architecture, self.footprint_extent.axis_echo
         )
 
     @cached_property
@@ -448,23 +231,18 @@ class PlannerInputs:
             self.footprint_extent.total_echo_ratio, 1.0
         )
         return (
-            self.budget.link_scales.echo_power
+            self.link_scales.echo_power
             * total_echo
             * self.receiver_noise.shot_noise_variance_per_watt
-            / self.receiver_noise_variance
+            / self.noise.variance_without_echo
         )
 
     # Lines
 
     @property
-    def look_period(self) -> np.ndarray:
-        """Time from look to look [s]."""
-        return self.budget.waveform.look_period
-
-    @property
     def middle_look_delay(self) -> np.ndarray | float:
         """Time from the first look to the middle one [s]."""
-        return self.budget.waveform.middle_look_delay(self.looks)
+        return self.waveform.middle_look_delay(self.looks)
 
     @cached_property
     def segment_starts(self) -> np.ndarray:
@@ -472,27 +250,19 @@ class PlannerInputs:
 
         Segments start at these times whether or not the motion between them is simulated.
         """
-        starts = self.budget.waveform.middle_look_starts(self.looks)
+        starts = self.waveform.middle_look_starts(self.looks)
         return self.stack_segments(*self._of_existing_segments(starts))
 
     @cached_property
     def existing_segments(self) -> list[WaveformSegment]:
         """Existing segments, with the motion that is not switched off."""
-        waveform_settings, target = self.budget.waveform, self.budget.target
         motion = LineMotion(
-            doppler_ratio=0.0 if self.ignores_doppler else target.doppler_ratio,
+            doppler_ratio=0.0 if "doppler" in self.effects_off else self.target.doppler_ratio,
             segment_starts=(0.0, 0.0, 0.0)
-            if self.ignores_segment_motion
-            else waveform_settings.middle_look_starts(self.looks),
+            if "segment_motion" in self.effects_off
+            else self.waveform.middle_look_starts(self.looks),
         )
-        return self._of_existing_segments(waveform_settings.segments(target, motion))
-
-    @cached_property
-    def doppler_ratio_growth(self) -> np.ndarray:
-        """Growth of the Doppler ratio from the shot's start to each segment's."""
-        return self.stack_segments(
-            *(doppler_ratio(self.acceleration * s.start_time) for s in self.existing_segments)
-        )
+        return self._of_existing_segments(self.waveform.segments(self.target, motion))
 
     @cached_property
     def beat_frequency(self) -> np.ndarray:
@@ -502,12 +272,12 @@ class PlannerInputs:
     @cached_property
     def missing_samples(self) -> MissingSamples | None:
         """Samples of the record without an echo; None if echoes fill all records."""
-        if self.ignores_overlap:
+        if "overlap" in self.effects_off:
             return None
         delay = self.stack_segments(*(s.delay(self.range) for s in self.existing_segments))
         n_missing = self.stack_segments(
             *(
-                self.budget.record.count_samples_before_echo(segment, self.range)
+                self.record.count_samples_before_echo(segment, self.range)
                 for segment in self.existing_segments
             )
         ).astype(np.int64)
@@ -515,9 +285,10 @@ class PlannerInputs:
             self.footprint_extent.range_offsets.extreme, 1e3
         )  # beyond the axis's
         latest_delay = (
-            latest_delay + 2 / SPEED_OF_LIGHT * np.abs(self.approach_speed) * self.middle_look_delay
+            latest_delay
+            + 2 / SPEED_OF_LIGHT * np.abs(self.target.approach_speed) * self.middle_look_delay
         )
-        if not n_missing.any() and not (delay + latest_delay > self.acquisition_delay).any():
+        if not n_missing.any() and not (delay + latest_delay > self.record.acquisition_delay).any():
             return None
         return missing_sample_bounds(
             self.window, np.broadcast_to(n_missing, self.beat_frequency.shape)
@@ -550,66 +321,42 @@ class PlannerInputs:
         return np.asarray(np.maximum(np.sqrt(power) - self.missing_samples.lost_fraction, 0.0) ** 2)
 
     @cached_property
-    def range_drift_max(self) -> np.ndarray:
-        """Upper bound of the target's motion from the shot's start to a segment's start [m]."""
-        end_time = self.segment_starts + self.middle_look_delay
-        return (np.abs(self.approach_speed) + np.abs(self.acceleration) * end_time / 2) * end_time
-
-    @cached_property
-    def line_drift_max_bins(self) -> np.ndarray:
-        """Upper bound of the line's motion from the shot's start to a segment's start [bins]."""
-        velocity_change = np.abs(self.acceleration) * (self.segment_starts + self.middle_look_delay)
-        bins_per_metre = (
-            np.abs(self.existing_chirp_rates)
-            * self.chirp_rate
-            * (2 / SPEED_OF_LIGHT)
-            / self.bin_width
-        )
-        bins_by_range = bins_per_metre * (1 + np.abs(self.doppler_ratio)) * self.range_drift_max
-        return bins_by_range + self.bins_per_velocity * velocity_change
-
-    @cached_property
     def bin_offset(self) -> np.ndarray:
         """Distance of the line from the nearest bin [bins], 0..1/2."""
-        bin_position = self.beat_frequency / self.bin_width
+        bin_position = self.beat_frequency / self.record.bin_width
         return np.abs(bin_position - np.rint(bin_position))
 
     @cached_property
     def bins_to_edge(self) -> np.ndarray:
         """Distance of the folded line from the nearer of DC and Nyquist [bins]."""
         nyquist_bin = self.fft_size / 2
-        nyquist_position = self.beat_frequency / (self.bin_width * nyquist_bin)
+        nyquist_position = self.beat_frequency / (self.record.bin_width * nyquist_bin)
         return np.abs(nyquist_position - np.rint(nyquist_position)) * nyquist_bin
 
     @cached_property
     def transfer_gain(self) -> np.ndarray:
         """Receiver's gain |H| at the line relative to DC."""
-        return self.budget.receiver_filter.gain(self.beat_frequency)
+        return self.receiver_filter.gain(self.beat_frequency)
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
         """Bound on the relative change of |H|^2 per bin [1/bin]."""
-        receiver_filter = self.budget.receiver_filter
+        receiver_filter = self.receiver_filter
         bandwidths = receiver_filter.detector_bandwidth, receiver_filter.amplifier_bandwidth
-        return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.bin_width)
+        return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.record.bin_width)
 
     @cached_property
     def line_signal_ratio(self) -> np.ndarray:
         """Magnitude over sigma of the line on the axis, if it lay on a bin, by segment."""
-        receiver_filter, noise = self.budget.receiver_filter, self.budget.noise
+        receiver_filter, noise = self.receiver_filter, self.noise
         # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
         if receiver_filter.antialias_filter and receiver_filter.noise_shape != "white":
             noise = noise.with_sources(**{ADC_NOISE_SOURCE: adc_noise_variance(self.parameters)})
-        sigma = self.budget.record.bin_noise_sigma(noise.variance_without_echo, self.looks)
+        sigma = self.record.bin_noise_sigma(noise.variance_without_echo, self.looks)
         gain = receiver_filter.pole_gain(self.beat_frequency) * receiver_filter.whitening_gain(
             self.beat_frequency, noise.adc_noise_fraction
         )
         return self.beat_amplitude * (0.5 * self.window.sum) / sigma * gain
-
-    @cached_property
-    def relative_noise_density(self) -> np.ndarray | float:
-        """Density of the receiver's noise at the line over its mean over all bins, by segment."""
-        return self.budget.receiver_filter.relative_noise_density(self.beat_frequency)
 
     @cached_property
     def peak_ratio(self) -> np.ndarray:
@@ -619,23 +366,18 @@ class PlannerInputs:
     @cached_property
     def bins_per_relative_range(self) -> np.ndarray:
         """Shift of a line [bins] per relative change of range, by segment."""
-        beat_per_relative_range = self.chirp_rate * self.delay * (1 + np.abs(self.doppler_ratio))
-        return np.abs(self.existing_chirp_rates) * (beat_per_relative_range / self.bin_width)
+        beat_per_relative_range = (
+            self.waveform.chirp_rate * self.target.delay * (1 + np.abs(self.target.doppler_ratio))
+        )
+        return np.abs(self.existing_chirp_rates) * (beat_per_relative_range / self.record.bin_width)
 
     @cached_property
     def bins_per_velocity(self) -> np.ndarray:
         """Shift of a line [bins] per 1 m/s, by segment."""
         return bins_per_velocity(
-            range=self.range, carrier=self.carriers, chirp_rate=self.chirp_rate,
-            bin_width=self.bin_width,
+            range=self.range, carrier=self.carriers, chirp_rate=self.waveform.chirp_rate,
+            bin_width=self.record.bin_width,
         )  # fmt: skip
-
-    @cached_property
-    def axis_surface_spread(self) -> OffsetMoments:
-        """Moments of lines' offsets [bins] due to the ranges of beamlets on the axis's surface."""
-        return self.footprint_extent.axis_surface_range_offsets.scaled_by(
-            self.bins_per_relative_range
-        )
 
     @cached_property
     def range_spread(self) -> OffsetMoments:
@@ -798,7 +540,10 @@ class PlannerInputs:
         of line and image.
         """
         phase_per_bin = (
-            2 * np.pi * (self.acquisition_delay + 0.5 * self.record_duration) * self.bin_width
+            2
+            * np.pi
+            * (self.record.acquisition_delay + 0.5 * self.record.duration)
+            * self.record.bin_width
         )
         line_change = (
             np.sqrt(self.window_response.curvature_max) + 2 * self.gain_slope_max + phase_per_bin

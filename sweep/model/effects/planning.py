@@ -26,7 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.effect import Effect, ErrorBound
+from sweep.model.effects.effect import Effect
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 
 _LN_10 = math.log(10.0)
@@ -100,9 +101,7 @@ def plan_effects(
     """
     effect_names = tuple(effect.name for effect in effects)
     forced_modes = _forced_modes(effects, modes or {})
-    points.ignores_doppler = forced_modes.get("doppler") == "off"
-    points.ignores_segment_motion = forced_modes.get("segment_motion") == "off"
-    points.ignores_overlap = forced_modes.get("overlap") == "off"
+    points.effects_off = {name for name, mode in forced_modes.items() if mode == "off"}
     with np.errstate(all="ignore"):  # an effect whose bound overflows is kept
         bounds = error_bounds(points, effects)
         moves_light = None
@@ -142,16 +141,32 @@ def plan_effects(
 def error_bounds(
     points: PlannerInputs, effects: Sequence[Effect] = EFFECTS
 ) -> dict[str, ErrorBound]:
-    """Return the error bounds of the effects that are present, by name."""
-    phase_bounds = (
-        (effect.name, effect.phase_error_bound(points))
-        for effect in effects
-        if effect.phase_error_bound
-    )
+    """Return the error bounds of the effects that are present, by name.
+
+    Bounds of phase errors come first, then those of noise, on which other bounds depend.
+    """
     points.phase_error_bounds = {
-        name: phase_bound for name, phase_bound in phase_bounds if phase_bound is not None
+        effect.name: phase_bound
+        for effect in effects
+        if effect.phase_error_bound is not None
+        and (phase_bound := effect.phase_error_bound(points)) is not None
     }
-    bounds = ((effect.name, effect.error_bound(points)) for effect in effects)
+    noise_effects = [effect for effect in effects if effect.stage == "noise"]
+    points.noise_bounds = {
+        effect.name: bound
+        for effect in noise_effects
+        if (bound := effect.error_bound(points)) is not None
+    }
+    bounds = (
+        (
+            effect.name,
+            points.noise_bounds.get(effect.name)
+            if effect.stage == "noise"
+            else effect.error_bound(points),
+        )
+        for effect in effects
+        if not (effect.defines_scene_if_off and effect.name in points.effects_off)
+    )
     return {name: bound for name, bound in bounds if bound is not None}
 
 

@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sweep.model.beamlets import NO_SPREAD, pattern_radius
-from sweep.model.effects.effect import DrawAddresses, Effect, ErrorBound, Parameter
-from sweep.model.effects.planner_inputs import (
+from sweep.model.effects.effect import DrawAddresses, Effect, Parameter
+from sweep.model.effects.error_bounds import (
+    ErrorBound,
     PhaseErrorBound,
-    PlannerInputs,
     magnitude_change_from_power,
 )
+from sweep.model.effects.planner_inputs import PlannerInputs
 
 RARE_DRAW_PROBABILITY = 1e-6
 """Probability of a draw whose deflection exceeds that assumed by the error bound."""
@@ -126,7 +127,9 @@ def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
         np.inf,
     )
     transverse_speed = np.abs(points["target.transverse_velocity"])
-    velocity_change = np.abs(points.radial_velocity) * turn_max**2 / 2 + transverse_speed * turn_max
+    velocity_change = (
+        np.abs(points.target.radial_velocity) * turn_max**2 / 2 + transverse_speed * turn_max
+    )
     range_ratio = np.where(turn_max > 0, np.maximum(range_ratio, turn_max**2 / 2), 0.0)
     shift_bins = (
         points.bins_per_relative_range * np.minimum(range_ratio, 1e6)
@@ -161,7 +164,7 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     is_unknown = points.may_cancel & (points[_JITTER_PATH] > 0)
     coherent_change: np.ndarray | float = 0.0
     if points.amplitudes_may_add:  # the phase between line and image changes with range
-        turned_cycles = points.carriers * points.delay * np.minimum(range_ratio, 1e6)
+        turned_cycles = points.carriers * points.target.delay * np.minimum(range_ratio, 1e6)
         coherent_change = points.image_bound * np.minimum(4 * math.pi * turned_cycles, 2.0)
     return ErrorBound(
         magnitude_change=np.where(is_unknown, 1.0, magnitude_change_from_power(power_change)),
@@ -174,7 +177,13 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 def perturb_parameters(
     parameters: dict[str, np.ndarray], draw_addresses: DrawAddresses
 ) -> dict[str, np.ndarray]:
-    """Draw range, grazing angle and velocity of deflected beams; no echo if they miss the plane."""
+    """Draw range, grazing angle and velocity of deflected beams; no echo if they miss the plane.
+
+    Notes
+    -----
+    sin(grazing') = sin(grazing) cos(t) - a cos(grazing) sin(t)/t for normal deflections a and b,
+    t^2 = a^2 + b^2; range' = range sin(grazing) / sin(grazing').
+    """
     jitter_angles = draw_jitter_angles(draw_addresses, parameters[_JITTER_PATH])
     transverse_velocity = np.zeros_like(jitter_angles)
     transverse_velocity[:, 0] = -parameters[

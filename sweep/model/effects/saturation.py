@@ -29,8 +29,8 @@ from scipy.special import ndtr
 
 from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import amplifier, atmosphere, circulator_leak, noise_sources
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.effect import Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import PROCESSING_PREFIX
 from sweep.model.preparation import Shots
@@ -126,13 +126,6 @@ def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndar
 
 _FULL_SCALE_PATH = PROCESSING_PREFIX + "full_scale"
 
-NOISE_EFFECTS = (
-    noise_sources.SOLAR_BACKGROUND, atmosphere.BACKSCATTER,
-    noise_sources.RELATIVE_INTENSITY_NOISE, amplifier.SPONTANEOUS_EMISSION,
-    circulator_leak.CIRCULATOR_LEAK, noise_sources.QUANTISATION,
-)  # fmt: skip
-"""Effects that add noise before the ADC clips, besides the shot noise of the echo."""
-
 FULL_SCALE_EXCESS_MAX = 1e6
 """Largest ratio of signal or noise to full scale; the result loses as many digits as the ratio has.
 """
@@ -170,7 +163,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     gains = clipping_gains(amplitude=amplitude, deviation=deviation, full_scale=voltage_limit)
     return replace(
         shots,
-        beat_amplitude_scale=shots.beat_amplitude_scale * gains.signal_gain,
+        link_scales=shots.link_scales.scale_echo(amplitude_factor=gains.signal_gain),
         noise=replace(shots.noise, gain=shots.noise.gain * gains.noise_gain),
     )
 
@@ -182,20 +175,22 @@ def total_beat_amplitude(shots: Shots) -> np.ndarray:
     best.
     """
     beat_inputs = {
-        "chirp_rate": shots.chirp_rate, "range": shots.range,
-        "radial_velocity": np.asarray(shots.doppler_ratio * SPEED_OF_LIGHT / 2),
+        "chirp_rate": shots.waveform.chirp_rate, "range": shots.range,
+        "radial_velocity": np.asarray(shots.motion.doppler_ratio * SPEED_OF_LIGHT / 2),
     }  # fmt: skip
     beat_frequencies = [
         waveform.beat_frequency(
-            shots.chirp_slopes[segment_index], carrier=shots.carriers[segment_index], **beat_inputs
+            shots.waveform.chirp_slopes[segment_index],
+            carrier=shots.waveform.carriers[segment_index],
+            **beat_inputs,
         )
         for segment_index in np.flatnonzero(shots.has_segment)
     ]
     lowest_beat = np.min(np.abs(beat_frequencies), axis=0)
     gain = shots.receiver_filter.gain(lowest_beat)
     echo = shots.total_relative_echo
-    echo = echo if shots.architecture == "direct" else np.sqrt(echo)
-    return np.asarray(shots.beat_amplitude_scale * echo * gain)
+    echo = echo if shots.waveform.architecture == "direct" else np.sqrt(echo)
+    return np.asarray(shots.link_scales.beat_amplitude * echo * gain)
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -209,13 +204,14 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
     if not points.any_nonzero(_FULL_SCALE_PATH):
         return None
     echo_ratio = np.maximum(points.footprint_extent.total_echo_ratio, 1.0)
-    amplitude_ratio = echo_ratio if points.architecture == "direct" else np.sqrt(echo_ratio)
+    amplitude_ratio = (
+        echo_ratio if points.waveform.architecture == "direct" else np.sqrt(echo_ratio)
+    )
     amplitude = (points.beat_amplitude * amplitude_ratio * points.transfer_gain).max(axis=0)
-    noise_factor = 1 + points.echo_noise_ratio
-    for effect in NOISE_EFFECTS:
-        if (bound := effect.error_bound(points)) is not None:
-            noise_factor = noise_factor + bound.noise_variance_change
-    deviation = np.sqrt(points.receiver_noise_variance * noise_factor)
+    noise_factor: np.ndarray | float = 1.0
+    for bound in points.noise_bounds.values():
+        noise_factor = noise_factor + bound.noise_variance_change
+    deviation = np.sqrt(points.noise.variance_without_echo * noise_factor)
     full_scale = points[_FULL_SCALE_PATH]
     voltage_limit = np.where(full_scale > 0, full_scale, _UNLIMITED_VOLTAGE)
     clip_probability = ndtr((amplitude - voltage_limit) / deviation) + ndtr(

@@ -32,7 +32,8 @@ from scipy import special
 
 from sweep.model import beam
 from sweep.model.effects.atmosphere import path_heights
-from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import ECHO_NOISE_SOURCES, LASER_PREFIX, TELESCOPE_PREFIX
 from sweep.model.preparation import Shots
@@ -391,7 +392,7 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     power_factor = draw_scintillation_factors(
         str(parameters[_DISTRIBUTION_PATH]), legs, draw_addresses
     )
-    beat_factor = power_factor if shots.architecture == "direct" else np.sqrt(power_factor)
+    beat_factor = power_factor if shots.waveform.architecture == "direct" else np.sqrt(power_factor)
     echo_variances = {
         name: variance * power_factor
         for name, variance in shots.noise.variances.items()
@@ -399,11 +400,11 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     }
     return replace(
         shots,
-        echo_power_scale=shots.echo_power_scale * power_factor,
-        beat_amplitude_scale=shots.beat_amplitude_scale * beat_factor,
+        link_scales=shots.link_scales.scale_echo(
+            power_factor=power_factor, amplitude_factor=beat_factor
+        ),
         noise=shots.noise.with_sources(**echo_variances),
-        pedestal_variance_under_lines=shots.pedestal_variance_under_lines * beat_factor**2,
-        pedestal_variance_beside_lines=shots.pedestal_variance_beside_lines * beat_factor**2,
+        laser_line=shots.laser_line.scale_pedestal(beat_factor**2),
     )
 
 

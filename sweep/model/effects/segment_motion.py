@@ -33,7 +33,8 @@ import numpy as np
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.looks import DRIFT_POSITIONS_MAX, LOOKS_NUMBER_PATH
 from sweep.model.effects.doppler import line_shift_bound
-from sweep.model.effects.effect import Effect, EffectContext, ErrorBound
+from sweep.model.effects.effect import Effect, EffectContext
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.link_budget import doppler_ratio
 from sweep.model.preparation import Shots
@@ -44,27 +45,55 @@ LOOK_DRIFT_MAX_WINDOW_BINS = 0.25
 power."""
 
 
-def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin as its line moves, including phases of lines that add.
+def range_drift_max(points: PlannerInputs) -> np.ndarray:
+    """Return an upper bound of the target's motion from the shot's start to each segment's [m]."""
+    end_time = points.segment_starts + points.middle_look_delay
+    target = points.target
+    return np.asarray(
+        (np.abs(target.approach_speed) + np.abs(target.acceleration) * end_time / 2) * end_time
+    )
 
-    A line meets its image at the phase of its new position. Beamlets with velocities of their own
-    turn against each other. If the effect is off, segments begin at one range, by the law of [T]:
-    that is not an error of the simulation.
+
+def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
+    """Return an upper bound of the line's motion from the shot's start to each segment's [bins]."""
+    target = points.target
+    velocity_change = np.abs(target.acceleration) * (
+        points.segment_starts + points.middle_look_delay
+    )
+    bins_per_metre = (
+        np.abs(points.existing_chirp_rates)
+        * points.waveform.chirp_rate
+        * (2 / SPEED_OF_LIGHT)
+        / points.record.bin_width
+    )
+    bins_by_range = bins_per_metre * (1 + np.abs(target.doppler_ratio)) * range_drift_max(points)
+    return np.asarray(bins_by_range + points.bins_per_velocity * velocity_change)
+
+
+def error_bound(points: PlannerInputs) -> ErrorBound | None:
+    """Bound the change of the largest bin if all segments begin at one range and velocity.
+
+    Phases of lines that add are included. A line meets its image at the phase of its new position.
+    Beamlets with velocities of their own turn against each other.
     """
-    if points.ignores_segment_motion or not any(
+    if not any(
         np.any(speed)
-        for speed in (points.radial_velocity, points.approach_speed, points.acceleration)
+        for speed in (
+            points.target.radial_velocity,
+            points.target.approach_speed,
+            points.target.acceleration,
+        )
     ):
         return None
-    shift_bins = points.line_drift_max_bins
+    shift_bins = line_drift_max_bins(points)
     bound = line_shift_bound(points, shift_bins)
     if not points.adds_amplitudes:
         return bound
-    spread_cycles = points.velocity_spread.extreme * points.bin_width * points.segment_starts
+    spread_cycles = points.velocity_spread.extreme * points.record.bin_width * points.segment_starts
     spread_change = (
         np.minimum(2 * np.pi * spread_cycles, 2.0) / points.window_response.scalloping_gain_min
     )
-    cycles = 2 / SPEED_OF_LIGHT * points.carriers * points.range_drift_max
+    cycles = 2 / SPEED_OF_LIGHT * points.carriers * range_drift_max(points)
     image_change = points.image_bound * np.minimum(4 * np.pi * cycles, 2.0)
     coherent_change = bound.coherent_sum_change + 2 * spread_change + image_change
     return bound._replace(coherent_sum_change=coherent_change)
@@ -80,20 +109,20 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
     frequency at mid-chirp by which the beats underestimate the radial velocity, and the drift of
     lines per look.
     """
-    starts, looks = shots.scheduled_segment_starts, shots.looks
+    waveform, motion, looks = shots.waveform, shots.motion, shots.looks
+    starts = waveform.segment_starts
     middle_time, half_interval = (starts[2] + starts[0]) / 2, (starts[2] - starts[0]) / 2
-    shots = replace(
-        shots,
-        segment_starts=shots.waveform_settings.middle_look_starts(looks),
-        range_walk_time=shots.range_walk_time
-        + (middle_time + shots.waveform_settings.middle_look_delay(looks)),
-        velocity_bias_fraction=shots.chirp_rate
+    motion = motion._replace(
+        segment_starts=waveform.middle_look_starts(looks),
+        range_walk_time=motion.range_walk_time + (middle_time + waveform.middle_look_delay(looks)),
+        velocity_bias_fraction=waveform.chirp_rate
         * half_interval
-        / (shots.carriers[0] + shots.chirp_bandwidth / 2),
+        / (waveform.carriers[0] + waveform.chirp_bandwidth / 2),
     )
+    shots = replace(shots, motion=motion)
     if looks.number == 1:
         return shots
-    return replace(shots, line_drift_per_look=line_drift_per_look(shots))
+    return replace(shots, motion=motion._replace(line_drift_per_look=line_drift_per_look(shots)))
 
 
 def line_drift_per_look(shots: Shots) -> np.ndarray:
@@ -109,11 +138,11 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
     UnsupportedShotError
         If looks drift too far to be modelled.
     """
-    doppler_ratio_rate = doppler_ratio(shots.acceleration)
+    doppler_ratio_rate = doppler_ratio(shots.target.acceleration)
     drift_bins = np.zeros((len(shots.waveform_segments), shots.size))
     for segment_index in np.flatnonzero(shots.has_segment):
         segment = shots.waveform_segments[segment_index]
-        closing_speed = shots.approach_speed + shots.acceleration * segment.start_time
+        closing_speed = shots.target.approach_speed + shots.target.acceleration * segment.start_time
         beat_rate = segment.carrier * doppler_ratio_rate + segment.chirp_rate * (
             2 / SPEED_OF_LIGHT
         ) * (
@@ -121,7 +150,7 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
             - (shots.range - segment.range_decrease) * doppler_ratio_rate
         )
         drift_bins[segment_index] = (
-            beat_rate * shots.look_period * shots.fft_size / shots.sample_rate
+            beat_rate * shots.waveform.look_period * shots.fft_size / shots.sample_rate
         )
     looks, last_look = shots.looks, shots.looks.number - 1
     drift_max_window_bins = (
@@ -131,7 +160,9 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
         / shots.fft_size
     )
     fade_independently = (
-        looks.has_independent_speckle and shots.architecture != "direct" and shots.adds_powers
+        looks.has_independent_speckle
+        and shots.waveform.architecture != "direct"
+        and shots.footprint.adds_powers
     )
     drift_limit = (
         LOOK_DRIFT_MAX_WINDOW_BINS
@@ -140,12 +171,12 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
     )
     if last_look >= DRIFT_POSITIONS_MAX:  # few positions represent all looks
         drift_limit = min(drift_limit, DRIFT_POSITIONS_MAX / 2)
-    turned_cycles = np.abs(shots.doppler_ratio_offset).max(initial=0.0) * np.max(
-        shots.carriers[0] * shots.look_period
+    turned_cycles = np.abs(shots.footprint.doppler_ratio_offset).max(initial=0.0) * np.max(
+        shots.waveform.carriers[0] * shots.waveform.look_period
     )
     if (
-        not shots.adds_powers
-        and shots.architecture != "direct"
+        not shots.footprint.adds_powers
+        and shots.waveform.architecture != "direct"
         and turned_cycles * last_look > LOOK_DRIFT_MAX_WINDOW_BINS
     ):
         raise UnsupportedShotError(
@@ -167,28 +198,12 @@ def line_drift_per_look(shots: Shots) -> np.ndarray:
     return drift_bins
 
 
-def split_looks(shots: Shots) -> list[Shots]:
-    """Return the shots as each look sees them; copies of the same shots if looks do not differ."""
-    if not np.any(shots.line_drift_per_look):
-        return [shots] * shots.looks.number
-    looks_from_middle = np.arange(shots.looks.number) - (shots.looks.number - 1) / 2
-    return [
-        replace(
-            shots,
-            line_drift_per_look=0.0,
-            segment_starts=tuple(
-                start + look_offset * shots.look_period for start in shots.segment_starts
-            ),
-        )
-        for look_offset in looks_from_middle
-    ]
-
-
 SEGMENT_MOTION = Effect(
     name="segment_motion",
     description="range and velocity that change from segment to segment",
     stage="lines",
     error_bound=error_bound,
     apply=apply,
+    defines_scene_if_off=True,
 )
 """Effect of range and velocity that change from segment to segment."""

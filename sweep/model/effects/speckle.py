@@ -54,10 +54,12 @@ from sweep.model.detection.speckle_correlation import (
     peak_bin_correlation,
     window_transform,
 )
-from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, ErrorBound, Parameter
+from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext, Parameter
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.ground import BeamGradients, FlatGround, Ground, RayTracedGround
 from sweep.model.preparation import Shots
+from sweep.model.shot_records import EchoSpeckle
 
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
@@ -66,7 +68,7 @@ _DIFFUSE_RATIO_MAX = 5.0
 """
 
 
-def coherent_power_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
+def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
     """Return the fraction kappa of the mean echo power that keeps its phase, 0 .. 1.
 
     Parameters
@@ -157,7 +159,7 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
     """
     if not points.any_nonzero(_ROUGHNESS_PATH):
         return None
-    kappa = coherent_power_fraction(
+    kappa = coherent_echo_fraction(
         roughness=points[_ROUGHNESS_PATH], wavelength=points["instrument.laser.wavelength"]
     )
     diffuse_change = _DIFFUSE_RATIO_MAX * np.sqrt(1 - kappa)
@@ -187,7 +189,12 @@ _TINY = 1e-300
 
 
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
-    """Give each point its own footprint with speckled beamlet amplitudes.
+    """Draw the speckle of every beamlet, so that each point has a footprint of its own.
+
+    Notes
+    -----
+    The amplitude of beamlet b is multiplied by g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b, with
+    kappa = exp(-(4 pi sigma_h / lambda)^2), as the module's description states.
 
     Raises
     ------
@@ -195,36 +202,36 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
         For direct detection, which sums the intensities of all speckles in the aperture: that is
         not a factor on each beamlet's echo.
     """
-    if shots.architecture == "direct":
+    if shots.waveform.architecture == "direct":
         raise ValueError(
             "speckle is simulated for homodyne and heterodyne receivers: what direct detection "
             "sees depends on how many speckles its aperture averages, of which nothing is known"
         )
-    coherent_fraction = coherent_power_fraction(
+    coherent_fraction = coherent_echo_fraction(
         roughness=context.parameters[_ROUGHNESS_PATH],
         wavelength=context.parameters["instrument.laser.wavelength"],
     )
     magnitude, cycles = draw_speckle_factors(
         draw_addresses,
-        n_beamlets=shots.relative_amplitude.shape[1],
+        n_beamlets=shots.footprint.n_beamlets,
         coherent_fraction=coherent_fraction,
-        random_phases=shots.adds_powers and shots.relative_amplitude.shape[1] > 1,
+        random_phases=shots.footprint.adds_powers and shots.footprint.n_beamlets > 1,
     )
     offset, doppler, mean_amplitude = (
-        values[shots.footprint_row]
+        values[shots.footprint.row_of_point]
         for values in (
-            shots.relative_range_offset,
-            shots.doppler_ratio_offset,
-            shots.relative_amplitude,
+            shots.footprint.relative_range_offset,
+            shots.footprint.doppler_ratio_offset,
+            shots.footprint.relative_amplitude,
         )
     )
     amplitude = mean_amplitude * magnitude
     # The coherent part of a smooth surface has the same phase at the start of every segment.
-    is_decorrelated = shots.adds_powers | (coherent_fraction < _DECORRELATED_KAPPA_MAX)
+    is_decorrelated = shots.footprint.adds_powers | (coherent_fraction < _DECORRELATED_KAPPA_MAX)
     is_decorrelated &= not shots.target_moves_between_segments  # else lines contain it
     phase = np.empty((3, *cycles.shape))
     for segment_index, (carrier, start) in enumerate(
-        zip(shots.carriers, shots.scheduled_segment_starts, strict=True)
+        zip(shots.waveform.carriers, shots.waveform.segment_starts, strict=True)
     ):
         turned_cycles = np.where(
             is_decorrelated, np.asarray(carrier, float) * start, 0.0
@@ -233,23 +240,24 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
     power_ratio = (amplitude**2).sum(axis=1) / np.maximum((mean_amplitude**2).sum(axis=1), _TINY)
     return replace(
         shots,
-        footprint_row=np.arange(shots.size),
-        relative_range_offset=offset,
-        doppler_ratio_offset=doppler,
-        relative_amplitude=amplitude,
-        beamlet_phase_cycles=phase,
-        adds_powers=False,
-        pedestal_variance_under_lines=shots.pedestal_variance_under_lines * power_ratio,
-        pedestal_variance_beside_lines=shots.pedestal_variance_beside_lines * power_ratio,
+        footprint=shots.footprint._replace(
+            row_of_point=np.arange(shots.size),
+            relative_range_offset=offset,
+            doppler_ratio_offset=doppler,
+            relative_amplitude=amplitude,
+            phase_cycles=phase,
+            adds_powers=False,
+        ),
+        laser_line=shots.laser_line.scale_pedestal(power_ratio),
     )
 
 
 def fading_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1, as fading changes the detection law; None if inactive.
+    """Return an error of 1, as fading changes the law of detection; None if it is absent.
 
-    It is the error in pd of mean in place of fluctuating power (Swerling).
+    The error is that of pd for the mean power in place of the fluctuating one (Swerling).
     """
-    is_smooth = points.adds_field_amplitudes or points.architecture == "direct"
+    is_smooth = points.adds_field_amplitudes or points.waveform.architecture == "direct"
     return (
         None
         if is_smooth or points.option(_SPECKLE_PATH) == "none"
@@ -258,11 +266,22 @@ def fading_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_fading(shots: Shots, context: EffectContext) -> Shots:
-    """Set up detection in developed speckle, if the spec selects it and beamlets add as powers."""
+    """Set up detection in developed speckle, if the spec selects it and beamlets add as powers.
+
+    Notes
+    -----
+    The amplitude of a bin is circular complex normal. With noise of sigma per quadrature, the mean
+    power |X|^2 and the threshold Th, pd is exp(-Th^2 / (2 sigma^2 + |X|^2)), Swerling's
+    first case. Two segments are detected jointly by the correlation of their amplitudes.
+    """
     from sweep.model.detection.echo_detection import SegmentCorrelations
 
     speckle_law = str(context.parameters[_SPECKLE_PATH])
-    if speckle_law == "none" or shots.architecture == "direct" or not shots.adds_powers:
+    if (
+        speckle_law == "none"
+        or shots.waveform.architecture == "direct"
+        or not shots.footprint.adds_powers
+    ):
         return shots
     beam_spread = _beam_spread(shots, context.ground)
     line_deviation = _line_deviation_bins(shots, beam_spread.moments)
@@ -273,9 +292,11 @@ def apply_fading(shots: Shots, context: EffectContext) -> Shots:
     line_gradients = _line_gradients(shots, context.ground)
     shots = replace(
         shots,
-        segment_correlations=SegmentCorrelations(*correlations),
-        line_deviation_bins=line_deviation,
-        line_gradients=line_gradients,
+        speckle=EchoSpeckle(
+            segment_correlations=SegmentCorrelations(*correlations),
+            line_deviation_bins=line_deviation,
+            line_gradients=line_gradients,
+        ),
     )
     return shots if shots.looks.number == 1 else _set_look_speckle(shots, beam_spread)
 
@@ -307,19 +328,19 @@ _DECORRELATION_MIN = 1e-9
 def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     """Set the correlation of the speckle between the looks of a shot, from the motion between them.
 
-    Looks that are added coherently get a smaller amplitude (``beat_amplitude_scale``) instead.
+    Looks that are added coherently get a smaller amplitude (``link_scales``) instead.
     """
     looks = shots.looks
     n_looks, n_points = looks.number, shots.size
     echo_frequencies, _ = _echo_frequencies(shots)
     cycles_per_look = [
-        np.broadcast_to(echo_frequency * shots.look_period, n_points)
+        np.broadcast_to(echo_frequency * shots.waveform.look_period, n_points)
         for echo_frequency in echo_frequencies
     ]
     if looks.is_noncoherent:
-        shots = replace(
-            shots, phase_cycles_per_look=np.stack(cycles_per_look) * shots.doppler_ratio
-        )
+        phase_cycles_per_look = np.stack(cycles_per_look) * shots.motion.doppler_ratio
+        speckle = shots.speckle._replace(phase_cycles_per_look=phase_cycles_per_look)
+        shots = replace(shots, speckle=speckle)
     if not looks.has_moving_speckle:
         return shots
     zeros = np.zeros(n_points)
@@ -338,14 +359,14 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
             axis=1
         )
         gain = np.sqrt(np.maximum(n_looks + squared_sum, 0.0)) / n_looks
-        return replace(shots, beat_amplitude_scale=shots.beat_amplitude_scale * gain)
+        return replace(shots, link_scales=shots.link_scales.scale_echo(amplitude_factor=gain))
     look_power = _look_powers(shots, beam_spread.slopes)
     if (
         np.abs(correlation_by_lag - 1).max() < _DECORRELATION_MIN
         and np.abs(look_power - 1).max() < _DECORRELATION_MIN
     ):
         return shots
-    segment_correlation = np.abs(np.array(shots.segment_correlations))
+    segment_correlation = np.abs(np.array(shots.speckle.segment_correlations))
     lag_weight = n_looks - np.abs(np.arange(1 - n_looks, n_looks))
     squared_sum_by_segment = [
         (
@@ -384,7 +405,7 @@ def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
     look_speckle = LookSpeckle.from_correlations(
         correlation_by_lag, look_power, np.minimum(segment_correlation, 1.0)
     )
-    return replace(shots, look_speckle=look_speckle)
+    return replace(shots, speckle=shots.speckle._replace(look_speckle=look_speckle))
 
 
 def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
@@ -394,7 +415,7 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
     """
     n_looks = shots.looks.number
     look_power = np.ones((3, shots.size, n_looks))
-    if not np.any(shots.line_drift_per_look):
+    if not np.any(shots.motion.line_drift_per_look):
         return look_power
     zero_phase = PhaseDifference(np.zeros(shots.size), np.zeros(shots.size))
     padding_factor = shots.fft_size / shots.window.length
@@ -402,7 +423,9 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
     node = np.linspace(-_LINE_DEVIATIONS_MAX, _LINE_DEVIATIONS_MAX, _N_LINE_NODES)
     weight = np.exp(-0.5 * node * node)
     drift = (
-        np.broadcast_to(shots.line_drift_per_look, (len(shots.waveform_segments), shots.size))
+        np.broadcast_to(
+            shots.motion.line_drift_per_look, (len(shots.waveform_segments), shots.size)
+        )
         / padding_factor
     )
     for segment in map(int, np.flatnonzero(shots.has_segment)):
@@ -541,7 +564,7 @@ def segment_phase_differences(shots: Shots) -> list[PhaseDifference]:
     phase_cycles = [
         frequency * (start + middle)
         for frequency, start, middle in zip(
-            echo_frequencies, shots.scheduled_segment_starts, record_middles, strict=True
+            echo_frequencies, shots.waveform.segment_starts, record_middles, strict=True
         )
     ]
     return [
@@ -562,17 +585,18 @@ def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
     delay = 2 * shots.range / SPEED_OF_LIGHT
     middle_shift = (
         0.0
-        if shots.n_samples_before_echo is None
-        else centroid_delay(shots.window)[shots.n_samples_before_echo]
+        if shots.echo_record.n_samples_before is None
+        else centroid_delay(shots.window)[shots.echo_record.n_samples_before]
     )
     middle_shift = (
-        np.broadcast_to(middle_shift, (len(shots.carriers), shots.size)) / shots.sample_rate
+        np.broadcast_to(middle_shift, (len(shots.waveform.carriers), shots.size))
+        / shots.sample_rate
     )
-    record_middles = shots.acquisition_delay + shots.record_duration / 2 + middle_shift
+    record_middles = shots.record.acquisition_delay + shots.record.duration / 2 + middle_shift
     return [
-        carrier + slope * shots.chirp_rate * (middle - delay)
+        carrier + slope * shots.waveform.chirp_rate * (middle - delay)
         for carrier, slope, middle in zip(
-            shots.carriers, shots.chirp_slopes, record_middles, strict=True
+            shots.waveform.carriers, shots.waveform.chirp_slopes, record_middles, strict=True
         )
     ], record_middles
 
@@ -598,7 +622,7 @@ def _line_pair_gradients(
         line_shifts.append(np.broadcast_to(shift_hertz / window_bin_width, shots.size))
         bin_position = np.broadcast_to(bin_position, shots.size)
         nearest_bin = bin_position
-        if shots.detection == "peak_bin":
+        if shots.detection_settings.echo_bins == "peak_bin":
             nearest_bin = _strongest_bins_with_images(
                 shots, bin_position, line_shifts[-1] * padding_factor
             )
@@ -626,7 +650,7 @@ def _strongest_bins_with_images(
     standard deviation of the lines.
     """
     nearest_bins = np.rint(line_positions)
-    if not shots.real_fft_size or not shots.sums_images:
+    if not shots.real_fft_size or not shots.images.are_summed:
         return nearest_bins
     nyquist_bin = shots.fft_size // 2
     spectrum_ends = np.rint(line_positions / nyquist_bin) * nyquist_bin
@@ -674,9 +698,12 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     The covariance is about the mean of each surface. Surfaces at different ranges, such as a roof
     and the ground below, are separate echoes, which fade independently.
     """
-    values = np.array([shots.doppler_ratio_offset, shots.relative_range_offset])
+    values = np.array([shots.footprint.doppler_ratio_offset, shots.footprint.relative_range_offset])
     return _moments_by_surface(
-        shots.relative_amplitude**2, values, ground.off_axis_surface, shots.footprint_row
+        shots.footprint.relative_amplitude**2,
+        values,
+        ground.off_axis_surface,
+        shots.footprint.row_of_point,
     )
 
 

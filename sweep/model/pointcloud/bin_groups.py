@@ -127,7 +127,9 @@ def find_groups_in_spans(
     pd = bin_groups.pd
     nyquist_bin = 0 if shots.complex_record else shots.fft_size // 2
     n_bins, magnitudes = (
-        (spans.n_bins, spans.magnitudes) if shots.search_band is None else _echo_bins_only(spans)
+        (spans.n_bins, spans.magnitudes)
+        if shots.detection_settings.search_band is None
+        else _echo_bins_only(spans)
     )
     _fill_groups(
         spans.point_numbers,

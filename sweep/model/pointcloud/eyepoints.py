@@ -14,7 +14,6 @@ import numpy as np
 from sweep.model import beam
 from sweep.model.beamlets import place_beamlets
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.atmosphere import BEAM_ELEVATION_PATH
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS
 from sweep.model.evaluation import prepare_ray_traced_shots
 from sweep.model.geometry.body_motion import BodyState, MovingBody
@@ -23,7 +22,7 @@ from sweep.model.geometry.quaternion import rotate
 from sweep.model.geometry.ray_casting import BundleHits, Pose, RayCaster
 from sweep.model.geometry.scanner import PointingJitter, ScanPattern, beamlet_rays
 from sweep.model.ground import BeamletTable, RayTracedGround, backscatter
-from sweep.model.link_budget import APPROACH_SPEED_PATH
+from sweep.model.link_budget import APPROACH_SPEED_PATH, BEAM_ELEVATION_PATH
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 

@@ -49,11 +49,11 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.added_crossings import crossing_rate, edge_crossing_probability
 from sweep.model.detection.looks import Looks
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
-from sweep.model.effects.circulator_leak import N_PHASES, leak_line_of_point, line_bin_masks
 from sweep.model.pointcloud.bin_groups import BinGroups, allocate_bin_groups, find_groups_in_spans
 from sweep.model.preparation import Shots
 from sweep.model.sampling import philox
 from sweep.model.sampling.draws import NoiselessSpectra, iter_noiseless_spectra
+from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_of_point
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 N_RATES = 2048
@@ -270,11 +270,11 @@ def iter_leakage_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakageBins]]:
     """Yield indices of points in batches, with the bins of their leaked signal."""
-    if shots.circulator_leak_amplitude is None:
+    if shots.permanent_line is None:
         for spans in _iter_leaking_spans(shots, points):
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
         return
-    echoes_alone = replace(shots, circulator_leak_amplitude=None)
+    echoes_alone = replace(shots, permanent_line=None)
     for batch_begin in range(0, points.size, LINE_BATCH_POINTS):
         for batch, spectra in iter_noiseless_spectra(
             echoes_alone, points[batch_begin : batch_begin + LINE_BATCH_POINTS]
@@ -326,7 +326,8 @@ def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[Bin
 def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
     """Return the |X| / sigma from which bins of points may leak, (n,)."""
     return np.broadcast_to(
-        shots.negligible_signal_ratio if shots.includes_leakage else np.inf, shots.size
+        shots.negligible_signal_ratio if shots.detection_settings.includes_leakage else np.inf,
+        shots.size,
     )
 
 
@@ -460,7 +461,7 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
         batch
     ]
     threshold_ratios, threshold_index = _distinct_thresholds(point_threshold_ratio)
-    in_speckle = shots.segment_correlations is not None
+    in_speckle = shots.speckle.segment_correlations is not None
     tables = [
         _tabulate_rates(shots.looks, float(threshold_ratio), in_speckle)
         for threshold_ratio in threshold_ratios
@@ -557,7 +558,7 @@ def _mask_leaked_light(
             slices[:, j, s] = slice_ends[:, None]
             if not shots.has_segment[s]:
                 continue
-            line_scale, line = leak_line_of_point(shots, i, s)
+            line_scale, line = line_of_point(shots, i, s)
             start, first_bin = spectra.bins_start[j, s], spectra.first_bin[j, s]
             echo_bins = first_bin + np.flatnonzero(
                 spectra.is_echo[start : start + spectra.n_bins[j, s]]

@@ -130,7 +130,7 @@ def simulate_cloud(
         draw_arguments = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA_METHOD:
             if (
-                shots.reported_peaks == STRONGEST_PEAK
+                shots.detection_settings.reported_peaks == STRONGEST_PEAK
                 or parameters.get(DETECTOR_PREFIX + "kind", FIXED_THRESHOLD) != FIXED_THRESHOLD
             ):
                 # Probabilities are those of crossing the fixed threshold.
@@ -165,7 +165,7 @@ def simulate_cloud(
                 bin_groups.magnitude[:, :, 0],
             )
         part_results = _statistics_before_draws(shots, bin_groups) | _cloud_points(
-            part_eyepoints, part_returns, shots.relative_range_offset.shape[1]
+            part_eyepoints, part_returns, shots.footprint.n_beamlets
         )
         part_results["beamlets_error"] = np.where(part_eyepoints.has_target, rays_error, np.nan)
         part_results["beamlets"] = np.full(shots.size, part_eyepoints.weight.size)
@@ -220,10 +220,14 @@ def _prepare_batch(
             shots = effect.perturb_shots(
                 shots, context, DrawAddresses(keys, np.zeros(shots.size, np.int64))
             )
-    leaks_in_speckle = shots.segment_correlations is not None and bool(shots.includes_leakage)
+    leaks_in_speckle = shots.speckle.segment_correlations is not None and bool(
+        shots.detection_settings.includes_leakage
+    )
     known_leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None = None
     finds_groups_with_leakage = (
-        leaks_in_speckle and shots.circulator_leak_amplitude is None and shots.search_band is None
+        leaks_in_speckle
+        and shots.permanent_line is None
+        and shots.detection_settings.search_band is None
     )
     if finds_groups_with_leakage:
         bin_groups, known_leakage_bins = find_groups_and_leakage_bins(shots, groups_max)
@@ -239,7 +243,7 @@ def _prepare_batch(
         bin_groups.n_exempt[without_target] = bin_groups.leakage[without_target] = 0.0
     if leaks_in_speckle and not finds_groups_with_leakage:
         known_leakage_bins = (
-            [] if shots.circulator_leak_amplitude is None else None
+            [] if shots.permanent_line is None else None
         )  # the leak of a circulator has too many bins to keep
         for indices, leakage_bins in iter_leakage_bins(
             shots, bin_groups, np.flatnonzero(has_target)

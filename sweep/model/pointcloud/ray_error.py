@@ -195,11 +195,11 @@ def _bin_powers(
     columns = (
         shots.range - segment.range_decrease,
         segment.doppler_ratio,
-        shots.chirp_rate,
+        shots.waveform.chirp_rate,
         shots.sample_rate,
         segment.carrier,
-        shots.detector_bandwidth,
-        shots.amplifier_bandwidth,
+        shots.receiver_filter.detector_bandwidth,
+        shots.receiver_filter.amplifier_bandwidth,
     )
     (
         axis_range,

@@ -258,7 +258,7 @@ def draw_returns(
         )
         if (
             shots.real_fft_size
-            and shots.segment_correlations is not None
+            and shots.speckle.segment_correlations is not None
             and (shots.speckle_table.ratio_row > 0).any()
         ):
             noise_ratio = noise_pseudo_variance_ratio(shots.window, shots.fft_size)
@@ -385,22 +385,22 @@ class DrawConfig(NamedTuple):
         """Return the settings for draws of shots, from the draw `first_draw` on."""
         two_beat_reading = (
             waveform.FAST_READING
-            if shots.two_beat_assumption == waveform.FAST_TARGET
+            if shots.detection_settings.two_beat_assumption == waveform.FAST_TARGET
             else waveform.FAR_READING
         )
         down_beat_sign = 0.0
         if shots.complex_record:
             two_beat_reading, down_beat_sign = (
                 waveform.SIGNED_READING,
-                math.copysign(1.0, 1.0 - shots.chirp_slopes[2]),
+                math.copysign(1.0, 1.0 - shots.waveform.chirp_slopes[2]),
             )
         votes = shots.looks.votes if shots.looks.combine == COMBINE_BINARY else 0
-        if shots.look_speckle is not None and shots.looks.number > CORRELATED_LOOKS_MAX:
+        if shots.speckle.look_speckle is not None and shots.looks.number > CORRELATED_LOOKS_MAX:
             votes = -1
         return cls(
             int(first_draw),
             in_noise,
-            shots.adds_powers,
+            shots.footprint.adds_powers,
             bool(shots.has_segment[1]),
             shots.fft_size // 2,
             down_beat_sign,
@@ -412,7 +412,8 @@ class DrawConfig(NamedTuple):
             make_echo_noise_filter(shots, NoiselessSpectra.empty(0)),
             np.empty(0),
             shots.looks.number if shots.looks.is_noncoherent else 1,
-            shots.looks.has_independent_speckle or (shots.look_speckle is not None and votes >= 0),
+            shots.looks.has_independent_speckle
+            or (shots.speckle.look_speckle is not None and votes >= 0),
             votes,
         )
 
@@ -571,7 +572,7 @@ def make_draw_inputs(
     bin_groups = bin_groups.without_unused_groups()
     line_positions, beamlet_amplitude = (
         beamlet_line_positions(shots),
-        shots.relative_amplitude[shots.footprint_row],
+        shots.footprint.relative_amplitude[shots.footprint.row_of_point],
     )
     if shots.complex_record:
         apart = (line_positions - bin_groups.strongest_bin[:, :, :1]) / shots.fft_size
@@ -594,7 +595,7 @@ def make_draw_inputs(
     mean_offset = (weight * apart).sum(axis=-1) / total
     mean_square = (weight * apart**2).sum(axis=-1) / total
     line_deviation = np.sqrt(np.maximum(mean_square - mean_offset**2, 0.0))
-    if shots.segment_correlations is not None:  # drawn lines include their spread
+    if shots.speckle.segment_correlations is not None:  # drawn lines include their spread
         line_deviation *= 0.0
     return DrawInputs(
         group_bins,
@@ -623,10 +624,10 @@ def make_draw_inputs(
 
 def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
     """Return ``cholesky_factors`` of :class:`DrawInputs`, (n, 6)."""
-    if shots.segment_correlations is None:
+    if shots.speckle.segment_correlations is None:
         return np.zeros((shots.size, 6))
     cholesky_factors = np.broadcast_to(
-        shots.segment_correlations.cholesky_factors(), (6, shots.size)
+        shots.speckle.segment_correlations.cholesky_factors(), (6, shots.size)
     )
     return np.ascontiguousarray(cholesky_factors.T)
 
@@ -634,9 +635,9 @@ def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
     """Return ``look_covariance_root`` of :class:`DrawInputs`, (n, 3, looks, sets) complex."""
     n_looks = shots.looks.number
-    if shots.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
+    if shots.speckle.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
         return np.zeros((shots.size, 3, 1, 0), complex)
-    return np.ascontiguousarray(np.moveaxis(shots.look_speckle.covariance_roots(), 0, 1))
+    return np.ascontiguousarray(np.moveaxis(shots.speckle.look_speckle.covariance_roots(), 0, 1))
 
 
 def _n_independent_bins(
@@ -648,7 +649,7 @@ def _n_independent_bins(
     near DC and Nyquist it is 1.
     """
     n_independent = np.ones(bin_groups.pd.shape)
-    if shots.detection == "peak_bin":
+    if shots.detection_settings.echo_bins == "peak_bin":
         return n_independent
     for segments in ((0, 2), (1,)):
         pd_by_segment = tuple(bin_groups.pd[:, s].T for s in segments)
@@ -671,7 +672,7 @@ def _speckle_draw_inputs(
         np.broadcast_to(v, shots.size)[:, None, None]
         for v in (shots.bin_noise_sigma, shots.line_noise_sigma, shots.threshold)
     )
-    if shots.line_gradients is None:
+    if shots.speckle.line_gradients is None:
         return (
             np.zeros(bin_groups.pd.shape),
             np.zeros(bin_groups.pd.shape),
@@ -694,7 +695,7 @@ def _speckle_draw_inputs(
         echo_fraction = np.where(
             has_noncircular_bins, signal_power / (2 + signal_power), echo_fraction
         )
-    line_deviation = np.sqrt((shots.line_gradients.line_shift**2).sum(axis=-1))
+    line_deviation = np.sqrt((shots.speckle.line_gradients.line_shift**2).sum(axis=-1))
     n_looks = (
         shots.looks.number
         if shots.looks.is_noncoherent and shots.looks.has_independent_speckle
@@ -717,8 +718,8 @@ def _doppler_prediction(
 
     The third value is the error of that prediction by the known motion [bins].
     """
-    _, doppler, down = shots.chirp_slopes
-    up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.carriers)
+    _, doppler, down = shots.waveform.chirp_slopes
+    up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)
     determinant = at_down - down * up_carrier
     up_share = (doppler * at_down - down * at_doppler) / determinant
     down_share = (at_doppler - doppler * up_carrier) / determinant
@@ -742,8 +743,11 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
     last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
     bounds = np.empty((shots.size, 3, 2), np.int64)
     bounds[:] = (0, shots.fft_size - 1) if shots.complex_record else (first_searched, last_searched)
-    if shots.search_band is not None:
-        first, number = shots.search_band[:, 0].T, shots.search_band[:, 1].T
+    if shots.detection_settings.search_band is not None:
+        first, number = (
+            shots.detection_settings.search_band[:, 0].T,
+            shots.detection_settings.search_band[:, 1].T,
+        )
         if shots.complex_record:
             bounds[..., 0], bounds[..., 1] = first, first + number - 1
         else:
@@ -821,11 +825,11 @@ def _measure_listed_returns(
     from_three_bins: bool,
 ) -> Returns:
     """Compute :func:`measure_returns` for m listed returns; the fields of the result are (m,)."""
-    uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
+    uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
     point, at_returns = listed_returns.point, partial(_values_at, shots, listed_returns.point)
     listed_returns = _add_drift_errors(shots, listed_returns, motion)
     measure = _measure_by_fit if uses_fit else _measure_by_reading
-    if from_three_bins and shots.n_samples_before_echo is not None:  # errors by noise alone
+    if from_three_bins and shots.echo_record.n_samples_before is not None:  # errors by noise alone
         listed_returns = _correct_late_echoes(
             shots, listed_returns, measure(shots, listed_returns, None)
         )
@@ -844,11 +848,13 @@ def _measure_listed_returns(
         4 + np.where(listed_returns.group >= 0, group_widths, 0).sum(axis=-1)
     )  # number of half bins
     beamlet = np.maximum(listed_returns.beamlet, 0)
-    footprint_row = shots.footprint_row[point]
-    true_range = at_returns(shots.range) * (1 + shots.relative_range_offset[footprint_row, beamlet])
+    footprint_row = shots.footprint.row_of_point[point]
+    true_range = at_returns(shots.range) * (
+        1 + shots.footprint.relative_range_offset[footprint_row, beamlet]
+    )
     true_velocity = (
-        at_returns(shots.radial_velocity)
-        + SPEED_OF_LIGHT / 2 * shots.doppler_ratio_offset[footprint_row, beamlet]
+        at_returns(shots.target.radial_velocity)
+        + SPEED_OF_LIGHT / 2 * shots.footprint.doppler_ratio_offset[footprint_row, beamlet]
     )
     range_error = measurements.range[:, POSITION_COLUMN] - measurements.range_bias - true_range
     is_right = abs(range_error) <= tolerance_half_bins * measurements.range_per_half_bin
@@ -866,11 +872,11 @@ def _measure_listed_returns(
     )
     if not uses_fit:  # refer to the shot's start by the measured velocity
         measurements.radial_velocity[:, POSITION_COLUMN] *= 1 + at_returns(
-            shots.velocity_bias_fraction
+            shots.motion.velocity_bias_fraction
         )
         measurements.range[:, POSITION_COLUMN] += measurements.radial_velocity[
             :, POSITION_COLUMN
-        ] * at_returns(shots.range_walk_time)
+        ] * at_returns(shots.motion.range_walk_time)
     per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
     if motion is not None:
         per_slip = _apply_motion_correction(shots, listed_returns, measurements, motion)
@@ -919,7 +925,7 @@ def _wander_covariance(
 
     They are (m, 3, 3) by segment, signed as the beats; None for shots without speckle.
     """
-    line_gradients = shots.line_gradients
+    line_gradients = shots.speckle.line_gradients
     if line_gradients is None:
         return None
     covariance = np.zeros((*listed_returns.group.shape, 3))
@@ -940,7 +946,9 @@ def _wander_covariance(
     ) ** 2
     mean_power = signal_power + 2 * (line_sigma / noise_sigma) ** 2
     offset = peaks[..., POSITION_COLUMN] - peaks[..., BIN_COLUMN]
-    if shots.detection == "peak_bin":  # the position is relative to the group's strongest bin
+    if (
+        shots.detection_settings.echo_bins == "peak_bin"
+    ):  # the position is relative to the group's strongest bin
         bin_shift = (
             peaks[..., BIN_COLUMN]
             - inputs.group_bins[point_column, segment, STRONGEST_ROW, group_index]
@@ -954,7 +962,7 @@ def _wander_covariance(
     )
     segment_pairs = (
         CHIRP_PAIRS_WITH_SELF
-        if shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+        if shots.waveform.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
         else SEGMENT_PAIRS_WITH_SELF
     )
     covariance[is_echo] = position_error_moments(
@@ -979,7 +987,7 @@ def _add_drift_errors(
                 approach_speed=motion.approach_speed_at(shots.range),
             ),
         )
-    bins_per_rate = shots.record_duration * shots.fft_size / shots.sample_rate
+    bins_per_rate = shots.record.duration * shots.fft_size / shots.sample_rate
     drift_bins = np.array(
         [
             np.broadcast_to(abs(rate) * bins_per_rate, shots.size)
@@ -1011,7 +1019,7 @@ def _correct_late_echoes(
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[:, BIN_COLUMN])
     beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.radial_velocity[:, BIN_COLUMN])
     n_missing = waveform.count_samples_before_echo(
-        delay=delay, doppler_ratio=beta, record_start=at_returns(shots.acquisition_delay),
+        delay=delay, doppler_ratio=beta, record_start=at_returns(shots.record.acquisition_delay),
         sample_rate=at_returns(shots.sample_rate), length=shots.window.length,
     )  # fmt: skip
     peaks = listed_returns.peaks.copy()
@@ -1074,7 +1082,7 @@ def _response_to_motion(
     point = listed_returns.point
     point_index: np.ndarray | slice = point
     if (
-        shots.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
+        shots.waveform.chirp_slopes == waveform.DEFAULT_CHIRP_SLOPES
     ):  # half sum and half difference of up and down beat, which all returns of a point share
         point_index = slice(None)
         weights = np.array([[1.0], [0.0], [1.0]]) + 0 * chirp_rates
@@ -1099,15 +1107,19 @@ def _response_to_motion(
 def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     """Return changes of the beats (3, n) [Hz] by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
     chirp_rates = shots.beat_coefficients[1]
-    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.segment_starts])
+    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.motion.segment_starts])
     middle_time = shots.record_middle_time
     two_over_c = 2 / SPEED_OF_LIGHT
-    carriers = np.array([np.broadcast_to(carrier, shots.size) for carrier in shots.carriers])
+    carriers = np.array(
+        [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
+    )
     range_terms = (
-        starts**2 / 2 + 2 * starts * middle_time + 1.5 * middle_time * shots.velocity_drift_time
+        starts**2 / 2
+        + 2 * starts * middle_time
+        + 1.5 * middle_time * shots.motion.velocity_drift_time
     )
     by_acceleration = two_over_c * (
-        carriers * (starts + shots.velocity_drift_time) + chirp_rates * range_terms
+        carriers * (starts + shots.motion.velocity_drift_time) + chirp_rates * range_terms
     )
     return by_acceleration, -two_over_c * chirp_rates * (starts + middle_time)
 
@@ -1124,9 +1136,9 @@ def _measure_by_reading(
     carrier, bandwidth, duration, sample_rate = (
         at_returns(values)
         for values in (
-            shots.carriers[0],
-            shots.chirp_bandwidth,
-            shots.chirp_duration,
+            shots.waveform.carriers[0],
+            shots.waveform.chirp_bandwidth,
+            shots.waveform.chirp_duration,
             shots.sample_rate,
         )
     )
@@ -1156,10 +1168,10 @@ def _measure_by_reading(
         for value in (range_variance, velocity_variance)
     )
     # Up and down beat give the range at the mean of their starts, plus a term by acceleration.
-    up_start, down_start = (at_returns(shots.segment_starts[s]) for s in (0, 2))
-    range_bias = carrier / chirp_rate * at_returns(shots.acceleration)
+    up_start, down_start = (at_returns(shots.motion.segment_starts[s]) for s in (0, 2))
+    range_bias = carrier / chirp_rate * at_returns(shots.target.acceleration)
     range_bias = 0.5 * (down_start - up_start) * range_bias
-    range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.approach_speed)
+    range_bias -= 0.5 * (down_start + up_start) * at_returns(shots.target.approach_speed)
     return Measurements(
         measured_range,
         measured_velocity,
@@ -1177,8 +1189,8 @@ def _measure_by_fit(
     """Measure range and velocity at the shot's start by the fit of each return's peaks."""
     point = listed_returns.point
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
-    carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
-    chirp_rate = np.broadcast_to(shots.chirp_rate, shots.size)
+    carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
+    chirp_rate = np.broadcast_to(shots.waveform.chirp_rate, shots.size)
     peaks = np.moveaxis(listed_returns.peaks, 1, 0)
     is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
 
@@ -1191,9 +1203,9 @@ def _measure_by_fit(
             down=down,
             carriers=tuple(carrier[points] for carrier in carriers),
             chirp_rate=chirp_rate[points],
-            slopes=shots.chirp_slopes,
+            slopes=shots.waveform.chirp_slopes,
             range=shots.range[points],
-            radial_velocity=shots.radial_velocity[points],
+            radial_velocity=shots.target.radial_velocity[points],
         )
 
     results_by_column = []

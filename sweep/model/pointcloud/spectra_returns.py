@@ -105,7 +105,7 @@ def draw_spectra_returns(
     workspace = DrawWorkspace.allocate(0, groups_max)
     zero_index, peaks_max = (
         zero_frequency_index(shots),
-        1 if shots.reported_peaks == STRONGEST_PEAK else groups_max + 1,
+        1 if shots.detection_settings.reported_peaks == STRONGEST_PEAK else groups_max + 1,
     )
     rounding_error = (
         math.sqrt(1 / 12) if str(method_parameters[ESTIMATOR_PREFIX + "kind"]) == PEAK_BIN else 0.0
@@ -211,7 +211,7 @@ def _echo_bin_bounds(
     shift = centring_shift(shots, signal.strongest_bin)
     if shots.complex_record:
         echo_indices = (echo_indices + shift - 1) % shots.fft_size + 1
-    if shots.detection != "any_bin":
+    if shots.detection_settings.echo_bins != "any_bin":
         return EchoBounds(echo_indices, echo_indices)
     if echo_indices.size == 1:
         return EchoBounds(np.array([signal.first_bin + shift]), np.array([signal.last_bin + shift]))

@@ -185,8 +185,8 @@ def count_in_noise(
     threshold_ratio, line_noise_ratio = threshold_and_line_noise_ratios(shots)
     mixing = (
         np.empty((0, shots.size))
-        if shots.segment_correlations is None
-        else shots.segment_correlations.cholesky_factors()
+        if shots.speckle.segment_correlations is None
+        else shots.speckle.segment_correlations.cholesky_factors()
     )
     pfa_bin, speckle_table = np.exp(-0.5 * threshold_ratio**2), shots.speckle_table
     line_grid = speckle_line_grid(shots)
@@ -271,7 +271,7 @@ def make_echo_noise_filter(
         max(int(spectra.n_bins.max(initial=1)), bins_min) if shots.detection_rule.any_bin else 0
     )
     n_filter_bins = 1 << (n_echo_bins - 1).bit_length() if n_echo_bins else 0
-    if shots.noise_bins == "independent":
+    if shots.detection_settings.noise_bins == "independent":
         weights = np.zeros((n_filter_bins, NOISE_FILTER_TAPS))
         weights[:, NOISE_FILTER_TAPS // 2] = 1.0
         return NoiseFilter(weights, np.arange(n_filter_bins) - NOISE_FILTER_TAPS // 2, 0)
@@ -478,7 +478,7 @@ def iter_noiseless_spectra(
     # Without leakage only the peak is evaluated.
     negligible_ratio = (
         shots.negligible_signal_ratio + np.zeros(shots.size)
-        if shots.includes_leakage
+        if shots.detection_settings.includes_leakage
         else np.full(shots.size, np.inf)
     )
     magnitude_min = np.minimum(shots.threshold, negligible_ratio * noise_sigma)

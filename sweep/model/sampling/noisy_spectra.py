@@ -19,7 +19,7 @@ phases of a separate tone, and separate speckle. A phase common to all bins make
 circular noise and is omitted.
 
 The phase of a laser of Lorentzian line width is a random walk. Each draw has a walk, with a step at
-every sample, which rotates the signal's record (:func:`sweep.model.effects.line_width.phase_walk`).
+every sample, which rotates the signal's record (:func:`sweep.model.laser_line.phase_walk`).
 
 In several looks (:mod:`sweep.model.detection.looks`) each record has noise and a phase walk of its
 own, and its signal follows the moving target. Speckle is common to all looks or separate. Bins are
@@ -68,13 +68,12 @@ from sweep.model.detection.sub_bin_interpolation import (
     estimate_sub_bin_offset,
     interpolator,
 )
-from sweep.model.effects.line_width import (
+from sweep.model.evaluation import fit_peaks
+from sweep.model.laser_line import (
     apparent_line_and_pedestal,
     n_phase_walk_steps,
     phase_walk,
 )
-from sweep.model.effects.segment_motion import split_looks
-from sweep.model.evaluation import fit_peaks
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.sampling.philox import (
     STREAM_LASER_PHASE,
@@ -209,9 +208,9 @@ def noiseless_signal(
         "line_width"
     ] > 0:  # magnitude before the phase walk, which draws apply
         echo_window = shots.window
-        if shots.n_samples_before_echo is not None:
+        if shots.echo_record.n_samples_before is not None:
             echo_window = zero_first_samples(
-                echo_window, int(shots.n_samples_before_echo[0, point])
+                echo_window, int(shots.echo_record.n_samples_before[0, point])
             )
         (line_power_fraction, *_), *_ = apparent_line_and_pedestal(
             window=echo_window, looks=shots.looks.n_coherent, **phase_noise_arguments
@@ -259,8 +258,8 @@ def noiseless_signal(
         first_bin, last_bin = max(first_bin, margin), min(last_bin, last_index - margin)
     first_sample = (
         0
-        if shots.n_samples_before_echo is None
-        else int(shots.n_samples_before_echo[segment, point])
+        if shots.echo_record.n_samples_before is None
+        else int(shots.echo_record.n_samples_before[segment, point])
     )
     phases = _tone_phases(peak_position, shots, first_sample)
     if (
@@ -432,9 +431,9 @@ def _phase_noise_arguments(shots: Shots, point: int) -> dict[str, np.ndarray]:
     ``duration`` of the record [s].
     """
     return {
-        "line_width": _value_at(shots.lorentzian_line_width, point),
+        "line_width": _value_at(shots.laser_line.lorentzian_width, point),
         "delay": 2 * _value_at(shots.range, point) / SPEED_OF_LIGHT,
-        "duration": _value_at(shots.record_duration, point),
+        "duration": _value_at(shots.record.duration, point),
     }
 
 
@@ -557,7 +556,7 @@ def draw_bin_speckle(
     line_grid
         Result of :func:`speckle_line_grid` for `shots`; computed if None.
     """
-    if shots.line_gradients is None:
+    if shots.speckle.line_gradients is None:
         return np.ones((1, 1))
     line_grid = speckle_line_grid(shots) if line_grid is None else line_grid
     if signal.footprint_records is None:
@@ -615,8 +614,8 @@ def draw_bin_speckle(
             # Refer their phases to the record's middle, as those of the noise are.
             first_sample = (
                 0
-                if shots.n_samples_before_echo is None
-                else int(shots.n_samples_before_echo[segment, point])
+                if shots.echo_record.n_samples_before is None
+                else int(shots.echo_record.n_samples_before[segment, point])
             )
             record_middle_phases = np.exp(
                 -1j * np.pi * bins * ((shots.window.length + first_sample) / shots.fft_size)
@@ -638,7 +637,7 @@ def add_footprint_records(
 
     These are :attr:`SegmentSignal.footprint_records` and :attr:`SegmentSignal.record_scalings`.
     """
-    if shots.line_gradients is None:
+    if shots.speckle.line_gradients is None:
         return signal
     segment, zero_index = signal.segment, zero_frequency_index(shots)
     line_deviation = (
@@ -648,8 +647,8 @@ def add_footprint_records(
         return signal._replace(footprint_records=())
     first_sample = (
         0
-        if shots.n_samples_before_echo is None
-        else int(shots.n_samples_before_echo[segment, point])
+        if shots.echo_record.n_samples_before is None
+        else int(shots.echo_record.n_samples_before[segment, point])
     )
     if not cached_window_samples(shots.window)[first_sample:].any():
         return signal._replace(footprint_records=())
@@ -740,14 +739,14 @@ def _draw_look_speckle(
         "key": point_spectra.key,
         "line_grid": point_spectra.line_grid,
     }
-    if shots.look_speckle is None:
+    if shots.speckle.look_speckle is None:
         look_draws = (
             draws + look * LOOK_DRAW_STRIDE if shots.looks.has_independent_speckle else draws
         )
         return draw_bin_speckle(
             shots, point_spectra.point, segment, signal, draws=look_draws, **draw_arguments
         )
-    root_row = shots.look_speckle.covariance_root(segment, point_spectra.point)[look]
+    root_row = shots.speckle.look_speckle.covariance_root(segment, point_spectra.point)[look]
     # The mean power of each look is already in its signal.
     root_row = root_row / np.sqrt((np.abs(root_row) ** 2).sum())
     return np.asarray(
@@ -884,7 +883,7 @@ def prepare_point_spectra(
         point,
         key,
         (),
-        split_looks(shots),
+        shots.split_by_look(),
         settings,
         methods.detectors[str(parameters[DETECTOR_PREFIX + "kind"])],
         methods.estimators[str(parameters[ESTIMATOR_PREFIX + "kind"])],
@@ -982,7 +981,7 @@ def detect_and_estimate(
     )
     bins, end_index = np.arange(power.shape[1]), power.shape[1] - 1
     first_detecting, end_detecting = strongest_index, strongest_index + 1
-    if shots.detection == "any_bin" and last_index >= first_index:
+    if shots.detection_settings.echo_bins == "any_bin" and last_index >= first_index:
         first_detecting, end_detecting = first_index, last_index + 1
         if not shots.real_fft_size:
             first_detecting, end_detecting = max(first_detecting, 1), min(end_detecting, end_index)
@@ -1132,7 +1131,7 @@ def _wander_variances(
     `detections` are those of each segment, and `is_detected` (3, m) says which count.
     """
     shots, point, n_draws = point_spectra.shots, point_spectra.point, is_detected.shape[1]
-    if shots.line_gradients is None:
+    if shots.speckle.line_gradients is None:
         return np.zeros((2, n_draws))
     point_indices = np.full(n_draws, point)
     line_noise_sigma = float(np.broadcast_to(shots.line_noise_sigma, shots.size)[point])
@@ -1182,13 +1181,15 @@ def measurement_bound(
         _phase_noise_arguments(shots, point),
     )
     record_lengths = np.full(len(point_spectra.signals), shots.window.length)
-    if shots.n_samples_before_echo is not None:
-        record_lengths = np.maximum(record_lengths - shots.n_samples_before_echo[:, point], 2)
+    if shots.echo_record.n_samples_before is not None:
+        record_lengths = np.maximum(
+            record_lengths - shots.echo_record.n_samples_before[:, point], 2
+        )
         phase_noise_arguments["duration"] = record_lengths[0] / np.asarray(sample_rate)
     laser_deviation = phase_noise_deviation(**phase_noise_arguments)
     cnr_factor = 2 if shots.complex_record else 1  # two samples (I, Q) for the noise of one
     if is_used is None:
-        is_used = (True, shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES, True)
+        is_used = (True, shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES, True)
     up, doppler, down = (
         np.inf
         if s is None or not exists
@@ -1205,8 +1206,8 @@ def measurement_bound(
     )
     return range_velocity_deviation(
         up=up, doppler=doppler, down=down, carriers=_carriers_at(shots, point),
-        chirp_rate=_value_at(shots.chirp_rate, point), range=shots.range[point],
-        radial_velocity=shots.radial_velocity[point], slopes=shots.chirp_slopes,
+        chirp_rate=_value_at(shots.waveform.chirp_rate, point), range=shots.range[point],
+        radial_velocity=shots.target.radial_velocity[point], slopes=shots.waveform.chirp_slopes,
     )  # fmt: skip
 
 
@@ -1219,26 +1220,28 @@ def _measurement_errors(
     """
     shots, point = point_spectra.shots, point_spectra.point
     bin_width = point_spectra.settings.sample_rate / point_spectra.settings.fft_size
-    up_carrier, _, _ = shots.carriers
+    up_carrier, _, _ = shots.waveform.carriers
     up, doppler, down = (segment.frequency * bin_width for segment in detections)
     measured = waveform.resolve_range_velocity(
         up=up,
         doppler=doppler if shots.has_segment[1] else None,
         down=down,
         carrier=_value_at(up_carrier, point),
-        bandwidth=_value_at(shots.chirp_bandwidth, point),
-        duration=_value_at(shots.chirp_duration, point),
+        bandwidth=_value_at(shots.waveform.chirp_bandwidth, point),
+        duration=_value_at(shots.waveform.chirp_duration, point),
         sample_rate=shots.sample_rate[point],
         bin_width=np.asarray(bin_width),
-        two_beat_assumption=shots.two_beat_assumption,
+        two_beat_assumption=shots.detection_settings.two_beat_assumption,
         has_signs=shots.complex_record,
     )
     measured_velocity = measured.radial_velocity * (
-        1 + _value_at(shots.velocity_bias_fraction, point)
+        1 + _value_at(shots.motion.velocity_bias_fraction, point)
     )
-    range_walk = _value_at(shots.range_walk_time, point) * measured_velocity  # to the shot's start
+    range_walk = (
+        _value_at(shots.motion.range_walk_time, point) * measured_velocity
+    )  # to the shot's start
     measured_range = measured.range + range_walk
-    uses_fit = shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (
+    uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or (
         shots.any_two & ~is_detected.all(axis=0)
     )
     if np.any(uses_fit):
@@ -1248,12 +1251,14 @@ def _measurement_errors(
         )
         measured_range = np.where(uses_fit, fitted_values.range, measured_range)
         measured_velocity = np.where(uses_fit, fitted_values.radial_velocity, measured_velocity)
-    return measured_range - shots.range[point], measured_velocity - shots.radial_velocity[point]
+    return measured_range - shots.range[point], measured_velocity - shots.target.radial_velocity[
+        point
+    ]
 
 
 def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the carriers of a point in the up, Doppler and down segment [Hz]."""
-    up, doppler, down = (_value_at(carrier, point) for carrier in shots.carriers)
+    up, doppler, down = (_value_at(carrier, point) for carrier in shots.waveform.carriers)
     return up, doppler, down
 
 

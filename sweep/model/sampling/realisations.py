@@ -20,7 +20,7 @@ from sweep.kernel_cache import njit
 from sweep.model.beamlet_counts import split_with_beamlet_counts
 from sweep.model.effects.catalogue import EFFECT_CATEGORY_PATHS, PARAMETER_DEFAULTS
 from sweep.model.effects.effect import DrawAddresses, Effect, EffectContext
-from sweep.model.evaluation import apply_effects, select_effects
+from sweep.model.evaluation import apply_effects, select_effects, use_beamlet_velocities
 from sweep.model.ground import FlatGround
 from sweep.model.outputs import (
     GRID_OUTPUTS,
@@ -115,7 +115,7 @@ def _realise_batch(
         if effect.perturb_parameters is not None:
             parameters = effect.perturb_parameters(parameters, draw_keys)
     context = EffectContext(
-        parameters, FlatGround(parameters, n_points, has_velocities="doppler_spread" in effects)
+        parameters, FlatGround(parameters, n_points, has_velocities=use_beamlet_velocities(effects))
     )
     shots = apply_effects(parameters, n_points, context.ground, effects)
     for effect in random:

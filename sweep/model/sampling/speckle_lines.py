@@ -168,7 +168,7 @@ def _quadrature_tables() -> tuple[np.ndarray, np.ndarray]:
 
 def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     """Return the speckle lines of shots; without developed speckle those of no points."""
-    gradients = shots.line_gradients
+    gradients = shots.speckle.line_gradients
     _, window_transform = transform_table(shots.window)
     node, weight = _quadrature_tables()
     n_points = 0 if gradients is None else shots.size
@@ -181,7 +181,7 @@ def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
     quadrature_index = np.searchsorted(_QUADRATURE_PHASE_MAX, phase_max)
     line_shift_max = np.sqrt((line_shift**2).sum(axis=-1)).max(axis=1)
     peak_search_bins = np.ones(n_points, np.int64)
-    if shots.detection == "any_bin":
+    if shots.detection_settings.echo_bins == "any_bin":
         is_wide = line_shift_max > 0.02 * padding_factor
         peak_search_bins = np.where(is_wide, 1 + np.ceil(2.5 * line_shift_max), 1).astype(np.int64)
     return SpeckleLineGrid(
@@ -1000,7 +1000,7 @@ def position_error_moments(
         * shape_error
     )
     wander_factor = np.ones(variance.shape)
-    if shots.detection == "peak_bin":
+    if shots.detection_settings.echo_bins == "peak_bin":
         wander_factor = 1 / np.sqrt(1 + variance / WANDER_MAX_BINS**2)
     n_looks = (
         shots.looks.number

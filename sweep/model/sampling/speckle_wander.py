@@ -39,13 +39,13 @@ def wander_variance(
     J M J' with the second moments M of the peaks' positions (:func:`position_error_moments`) and
     the derivatives J of range and velocity by those positions.
     """
-    if shots.line_gradients is None:
+    if shots.speckle.line_gradients is None:
         return np.zeros((2, point_indices.size))
     beat_covariance_bins = position_error_moments(
-        shots.line_gradients.select(point_indices), peaks, shots
+        shots.speckle.line_gradients.select(point_indices), peaks, shots
     )
     is_resolved = np.array(
-        [True, shots.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or shots.any_two, True]
+        [True, shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES or shots.any_two, True]
     )
     carriers, chirp_rates = (values[:, point_indices] for values in shots.beat_coefficients)
     response_arguments = {

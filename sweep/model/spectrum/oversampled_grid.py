@@ -137,10 +137,14 @@ def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray
     The lines are in the middle of the grid, with `CLEARANCE_BINS` and as much room as they take
     on both sides.
     """
-    beat_per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
-    carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.carriers])
-    offset_max = np.abs(shots.relative_range_offset).max(axis=1)[shots.footprint_row]
-    doppler_max = np.abs(shots.doppler_ratio_offset).max(axis=1)[shots.footprint_row]
+    beat_per_ratio = 2 * np.abs(shots.waveform.chirp_rate) * shots.range / SPEED_OF_LIGHT
+    carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.waveform.carriers])
+    offset_max = np.abs(shots.footprint.relative_range_offset).max(axis=1)[
+        shots.footprint.row_of_point
+    ]
+    doppler_max = np.abs(shots.footprint.doppler_ratio_offset).max(axis=1)[
+        shots.footprint.row_of_point
+    ]
     line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
     line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
     cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
@@ -169,7 +173,7 @@ def grid_magnitudes(
         Options of :func:`find_peaks_on_grid`.
     """
     degree, real, folded = grid_options
-    adds_powers, record_length = shots.adds_powers, shots.window.length
+    adds_powers, record_length = shots.footprint.adds_powers, shots.window.length
     real = real and adds_powers
     grid = np.zeros((points.size, n_cells), float if real else complex)
     centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
@@ -177,7 +181,7 @@ def grid_magnitudes(
         points,
         point_parameters(point_table),
         segment_parameters(point_table),
-        shots.footprint_row[points],
+        shots.footprint.row_of_point[points],
         beamlet_arrays(shots.beamlet_table),
         segment,
         SpectrumLayout(
@@ -189,7 +193,7 @@ def grid_magnitudes(
             holds_all_bins=False,
             clearance_bins=0,
         ),
-        shots.sums_images,
+        shots.images.are_summed,
         np.array(
             [
                 1 / np.prod(np.delete(node - polynomial_nodes, node_number))

@@ -116,9 +116,9 @@ def n_alarm_bins(
 
 def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.ndarray:
     """Return true for those of ``bins`` that are searched in one segment of one point."""
-    if shots.search_band is None:
+    if shots.detection_settings.search_band is None:
         return np.ones(np.shape(bins), bool)
-    first_bin, n_bins = shots.search_band[segment, :, point]
+    first_bin, n_bins = shots.detection_settings.search_band[segment, :, point]
     distance = np.asarray(bins) - first_bin
     if shots.complex_record:
         distance %= shots.fft_size

@@ -55,7 +55,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
         Spans within the band, with the leakage in them. Probabilities of detection are unchanged:
         :func:`sweep.model.detection.detection_probability.detect_in_spans` sets them.
     """
-    if shots.search_band is None:
+    if shots.detection_settings.search_band is None:
         return spans
     points = spans.point_numbers
     first_bin, n_bins, peak_index, n_exempt, span_start = (
@@ -71,7 +71,8 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
     leakage = np.array(spans.leakage)
     period_bins = shots.fft_size if shots.complex_record else 0
     band_first_bin, band_n_bins = (
-        np.ascontiguousarray(shots.search_band[:, row][:, points]) for row in range(2)
+        np.ascontiguousarray(shots.detection_settings.search_band[:, row][:, points])
+        for row in range(2)
     )
     peak_distance = spans.first_bin + spans.peak_index - band_first_bin
     peak_distance = peak_distance % period_bins if period_bins else peak_distance
@@ -82,7 +83,10 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
         else beamlet_line_positions(shots)[points]
     )
     evaluates_leakage = np.array(
-        [shots.includes_leakage and segment.includes_leakage for segment in shots.waveform_segments]
+        [
+            shots.detection_settings.includes_leakage and segment.includes_leakage
+            for segment in shots.waveform_segments
+        ]
     )
     _restrict_spans(
         EchoSpans(first_bin, n_bins, peak_index, span_start, spans.magnitudes, spans.is_exempt),
@@ -128,10 +132,10 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
         """Return values of the points as a column (m, 1)."""
         return as_columns(shots, values)[points]
 
-    hertz_per_metre = by_point(shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
+    hertz_per_metre = by_point(shots.waveform.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     axis_range_beat = hertz_per_metre * by_point(shots.range)
-    relative_range = 1 + shots.relative_range_offset[shots.footprint_row[points]]
-    beamlet_doppler = shots.doppler_ratio_offset[shots.footprint_row[points]]
+    relative_range = 1 + shots.footprint.relative_range_offset[shots.footprint.row_of_point[points]]
+    beamlet_doppler = shots.footprint.doppler_ratio_offset[shots.footprint.row_of_point[points]]
     n_points, n_beamlets = beamlet_doppler.shape
     positions = np.empty((n_points, 3, n_beamlets))
     for s, segment in enumerate(shots.waveform_segments):
@@ -162,7 +166,9 @@ def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarr
     line_offsets = beamlet_line_positions(shots, points) - strongest_bins[..., None]
     if shots.complex_record:
         line_offsets -= shots.fft_size * np.rint(line_offsets / shots.fft_size)
-    line_power = shots.relative_amplitude[shots.footprint_row[points]][:, None] ** 2
+    line_power = (
+        shots.footprint.relative_amplitude[shots.footprint.row_of_point[points]][:, None] ** 2
+    )
     return np.asarray(
         strongest_bins + (line_power * line_offsets).sum(axis=-1) / line_power.sum(axis=-1)
     )

@@ -40,9 +40,8 @@ from sweep.model.detection.speckle_crossing_rates import (
     empty_crossing_rates,
     tabulate_crossing_rates,
 )
-from sweep.model.effects.circulator_leak import apply_leak_line
-from sweep.model.effects.line_width import gaussian_frequency_shifts
 from sweep.model.ground import distinct_rows
+from sweep.model.laser_line import gaussian_frequency_shifts
 from sweep.model.preparation import LINE_APPROXIMATIONS_MAX, Shots
 from sweep.model.spectrum import line_shape
 from sweep.model.spectrum.bin_spectrum import (
@@ -82,6 +81,7 @@ from sweep.model.spectrum.lines import (
     segment_parameters,
     summarise_lines,
 )
+from sweep.model.spectrum.permanent_line import apply_permanent_line
 from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
@@ -288,13 +288,13 @@ def iter_spans(
             if leakage_method == LEAKAGE_BIN_BY_BIN
             else np.inf
         )
-        if shots.segment_correlations is not None:  # faint leakage of bright speckle counts
+        if shots.speckle.segment_correlations is not None:  # faint leakage of bright speckle counts
             negligible_magnitude = negligible_magnitude / math.sqrt(SPECKLE_POWER_MAX)
         lowest_levels, n_done = np.minimum(point_levels, negligible_magnitude), 0
         while n_done < group.point_numbers.size:
             must_keep = keeps_magnitudes or (shots.looks.is_noncoherent and bool(leakage_method))
             must_keep |= (
-                shots.circulator_leak_amplitude is not None or shots.search_band is not None
+                shots.permanent_line is not None or shots.detection_settings.search_band is not None
             )
             spans = _evaluate_batch(
                 shots,
@@ -316,18 +316,16 @@ def iter_spans(
                 spans = _leakage_in_looks(shots, spans)
             if with_pd:
                 spans = detect_in_spans(shots, spans)
-            yield (
-                spans if shots.circulator_leak_amplitude is None else apply_leak_line(shots, spans)
-            )
+            yield (spans if shots.permanent_line is None else apply_permanent_line(shots, spans))
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
     """Empty the spans of segments whose echo arrives after the record: nothing is searched."""
-    if shots.n_samples_before_echo is None:
+    if shots.echo_record.n_samples_before is None:
         return spans
-    lacks_echo = (shots.n_samples_before_echo[:, spans.point_numbers] >= shots.window.length) & (
-        spans.n_bins > 0
-    )
+    lacks_echo = (
+        shots.echo_record.n_samples_before[:, spans.point_numbers] >= shots.window.length
+    ) & (spans.n_bins > 0)
     if not lacks_echo.any():
         return spans
     return spans._replace(
@@ -346,7 +344,9 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
         for value in (shots.negligible_signal_ratio, shots.bin_noise_sigma, shots.threshold)
     )
     leakage_in_looks, looks = spans.leakage.copy(), shots.looks
-    for s, column in np.argwhere(spans.n_bins > 0) if shots.includes_leakage else ():
+    for s, column in (
+        np.argwhere(spans.n_bins > 0) if shots.detection_settings.includes_leakage else ()
+    ):
         if not shots.waveform_segments[s].includes_leakage:
             continue
         span_slice = slice(
@@ -358,9 +358,9 @@ def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
         )
         signal_ratio_min = negligible_signal_ratio[column]
         powers, weights = np.ones(1), np.ones(1)
-        if shots.segment_correlations is not None:
+        if shots.speckle.segment_correlations is not None:
             powers, weights = looks.speckle_power_quadrature(
-                shots.look_speckle, s, int(spans.point_numbers[column])
+                shots.speckle.look_speckle, s, int(spans.point_numbers[column])
             )
             signal_ratio_min = negligible_signal_ratio[column] / math.sqrt(SPECKLE_POWER_MAX)
         is_counted = ~is_exempt & (signal >= signal_ratio_min)
@@ -402,7 +402,7 @@ def segment_spectrum(
     Bins whose |X| is below ``level_min`` [V, summed over the record] may be left out; 0 returns all
     bins.
     """
-    shots = replace(shots, circulator_leak_amplitude=None)
+    shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
         shots,
         points=np.array([point]),
@@ -433,7 +433,7 @@ def spectrum_type(shots: Shots) -> int:
         COMPLEX_RECORD
         if shots.complex_record
         else REAL_WITH_IMAGES
-        if shots.sums_images
+        if shots.images.are_summed
         else REAL_WITHOUT_IMAGES
     )
 
@@ -444,11 +444,14 @@ def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
     ``bin_by_bin`` excludes LEAKAGE_BY_INTEGRAL.
     """
     layout = group.tables.layout
-    if not shots.includes_leakage:
+    if not shots.detection_settings.includes_leakage:
         return NO_LEAKAGE
-    is_averaged = shots.gaussian_line_width is not None and not shots.adds_powers
+    is_averaged = shots.laser_line.gaussian_width is not None and not shots.footprint.adds_powers
     is_averaged |= (
-        shots.looks.is_noncoherent or bin_by_bin or shots.search_band is not None or group.is_late
+        shots.looks.is_noncoherent
+        or bin_by_bin
+        or shots.detection_settings.search_band is not None
+        or group.is_late
     )
     is_smooth = layout.fft_size == layout.record_length and not layout.holds_all_bins
     if is_smooth and not is_averaged and spectrum_type(shots) != COMPLEX_RECORD:
@@ -458,18 +461,22 @@ def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
 
 def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
     """Yield groups of points whose line shapes can be computed together, in any order."""
-    if shots.n_samples_before_echo is not None:
+    if shots.echo_record.n_samples_before is not None:
         segment_exists = shots.has_segment
-        is_late = (shots.n_samples_before_echo[segment_exists][:, points] > 0).any(axis=0)
+        is_late = (shots.echo_record.n_samples_before[segment_exists][:, points] > 0).any(axis=0)
         yield from _iter_late_shape_groups(shots, points[is_late])
         points = points[~is_late]
-    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.adds_powers
+    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     has_modes = line_shape.window_has_modes(window, fft_size)
     segments = len(shots.waveform_segments)
-    lines_stand_still = shots.gaussian_line_width is None and not np.any(shots.line_drift_per_look)
-    has_few_shapes = lines_stand_still and (shots.shares_phase_errors or not shots.phase_errors)
+    lines_stand_still = shots.laser_line.gaussian_width is None and not np.any(
+        shots.motion.line_drift_per_look
+    )
+    has_few_shapes = lines_stand_still and (
+        shots.echo_record.shares_phase_errors or not shots.echo_record.phase_errors
+    )
     batch_size = 16 * POINTS_PER_BATCH if has_few_shapes else POINTS_PER_BATCH
-    if not shots.phase_errors:
+    if not shots.echo_record.phase_errors:
         make_tables = line_shape.line_shape_tables if has_modes else _tables_without_phase_error
         tables = make_tables(window, fft_size, adds_powers, 0 if has_modes else segments)
         modes = line_shape.zero_modes(segments, 1, 1)
@@ -500,7 +507,11 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
                     batch[members],
                     table_index[shape_index[members]],
                     line_shape.line_shape_tables(
-                        window, fft_size, adds_powers, tier, shared=shots.shares_phase_errors
+                        window,
+                        fft_size,
+                        adds_powers,
+                        tier,
+                        shared=shots.echo_record.shares_phase_errors,
                     ),
                     modes.select(is_resolved),
                 )
@@ -537,12 +548,12 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
 
     A late echo has only the last samples of the record of at least one segment.
     """
-    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.adds_powers
+    window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
-    assert shots.n_samples_before_echo is not None
-    lacks_echo = (shots.n_samples_before_echo[segment_exists][:, points] >= window.length).all(
-        axis=0
-    )
+    assert shots.echo_record.n_samples_before is not None
+    lacks_echo = (
+        shots.echo_record.n_samples_before[segment_exists][:, points] >= window.length
+    ).all(axis=0)
     if lacks_echo.any():
         tables = _tables_without_echo(window, fft_size, adds_powers, segments)
         batch = points[lacks_echo]
@@ -551,7 +562,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
     for batch_begin in range(0, points.size, POINTS_PER_BATCH):
         batch = points[batch_begin : batch_begin + POINTS_PER_BATCH]
         distinct_points, shape_index = _find_distinct_shapes(shots, batch)
-        echo_lengths = window.length - shots.n_samples_before_echo[:, distinct_points]
+        echo_lengths = window.length - shots.echo_record.n_samples_before[:, distinct_points]
         echo_lengths[~segment_exists] = echo_lengths[segment_exists][0]
         length_min, length_max = echo_lengths.min(axis=0), echo_lengths.max(axis=0)
         length_classes = line_shape.late_length_class(window, length_min)
@@ -647,8 +658,8 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
     """Find the distinct line shapes of a batch of points."""
     first_samples = (
         ()
-        if shots.n_samples_before_echo is None
-        else shots.n_samples_before_echo[shots.has_segment]
+        if shots.echo_record.n_samples_before is None
+        else shots.echo_record.n_samples_before[shots.has_segment]
     )
     values_of_points = (
         np.broadcast_to(np.asarray(entry, float), shots.size)[batch]
@@ -656,7 +667,7 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
             *first_samples,
             *(
                 error_value
-                for error in shots.phase_errors
+                for error in shots.echo_record.phase_errors
                 for error_value in error.arguments.values()
             ),
         )
@@ -668,7 +679,7 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
     first_varying = next(varying, None)
     if first_varying is None:
         return DistinctShapes(batch[:1], np.zeros(batch.size, np.int64))
-    if not shots.shares_phase_errors:
+    if not shots.echo_record.shares_phase_errors:
         return DistinctShapes(batch, np.arange(batch.size))
     first_of_shape, shape_index = distinct_rows([first_varying, *varying])
     return DistinctShapes(batch[first_of_shape], shape_index)
@@ -682,7 +693,7 @@ def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray
     """
     phase = np.zeros((len(shots.waveform_segments), points.size, record_positions.size))
     for segment in np.flatnonzero(shots.has_segment):
-        for error in shots.phase_errors:
+        for error in shots.echo_record.phase_errors:
             arguments = error.select_arguments(int(segment), points)
             phase[segment] += error.phase(
                 record_positions, sign=shots.waveform_segments[segment].chirp_slope, **arguments
@@ -709,9 +720,7 @@ def _evaluate_batch(
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
     shifts = _averaging_shifts(shots, points)
-    n_lines_max = max(2 * shots.relative_range_offset.shape[1], NODES_MAX) * max(
-        shifts.offset.shape[2], 1
-    )
+    n_lines_max = max(2 * shots.footprint.n_beamlets, NODES_MAX) * max(shifts.offset.shape[2], 1)
     width = max(n_lines_max, shots.n_bins, 2 * GAUSS_POINTS_MAX) + 16
     n_kept = max(SPAN_BINS_PER_BATCH, segments * shots.n_bins) if keeps_magnitudes else 0
     shape = segments, n_points
@@ -735,7 +744,7 @@ def _evaluate_batch(
         segment_parameters(point_table),
         lowest_levels,
         beamlet_arrays(shots.beamlet_table),
-        np.ascontiguousarray(shots.footprint_row, np.int64),
+        np.ascontiguousarray(shots.footprint.row_of_point, np.int64),
         np.ascontiguousarray(group.shape_index[batch_begin:]),
         shifts,
         group.modes,
@@ -775,8 +784,8 @@ def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
     For late echoes it is that of a window which is all at the record's end.
     """
     if not group.is_late:
-        return shots.window.node_phase_limits(shots.adds_powers)
-    tolerances = POWER_TOLERANCES if shots.adds_powers else AMPLITUDE_TOLERANCES
+        return shots.window.node_phase_limits(shots.footprint.adds_powers)
+    tolerances = POWER_TOLERANCES if shots.footprint.adds_powers else AMPLITUDE_TOLERANCES
     return node_phase_limits((0.0, 1.0), tolerances)
 
 
@@ -793,12 +802,12 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
     0 are the last ones.
     """
     segments = len(shots.waveform_segments)
-    if shots.gaussian_line_width is None:
+    if shots.laser_line.gaussian_width is None:
         offset_rows, weight_rows = np.empty((points.size, 0)), np.empty((points.size, 0))
     else:
-        duration = np.broadcast_to(shots.record_duration, shots.size)[points]
+        duration = np.broadcast_to(shots.record.duration, shots.size)[points]
         shifts = gaussian_frequency_shifts(
-            fwhm=shots.gaussian_line_width[points], duration=duration
+            fwhm=shots.laser_line.gaussian_width[points], duration=duration
         )
         padding_factor = shots.fft_size / shots.window.length
         offset_rows, weight_rows = padding_factor * shifts.offset_window_bins, shifts.weight
@@ -810,7 +819,7 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
     offset, weight = (
         np.repeat(rows[:, None], segments, axis=1) for rows in (offset_rows, weight_rows)
     )
-    drift = np.broadcast_to(shots.line_drift_per_look, (segments, shots.size))[:, points].T
+    drift = np.broadcast_to(shots.motion.line_drift_per_look, (segments, shots.size))[:, points].T
     if shots.looks.n_power_averaged == 1 or not drift.any():
         return AveragingShifts(offset, weight)
     if not offset.shape[2]:

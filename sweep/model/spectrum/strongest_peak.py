@@ -125,7 +125,7 @@ def strongest_peak_probabilities(
     }
     p_no_alarm = (1 - p_alarm[UP]) * (1 - p_alarm[DOWN])
     p_both_right = pd_right[UP] * pd_right[DOWN] + shared_gain
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         speckle_covariance = (
             shots.joint_detection_probability(pd[UP], pd[DOWN], (magnitude[UP], magnitude[DOWN]))
             - pd[UP] * pd[DOWN]
@@ -170,7 +170,7 @@ def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProb
         shots.bin_thresholds.select(points),
         negligible_signal_ratio,
         shots.detection_rule,
-        shots.includes_leakage,
+        shots.detection_settings.includes_leakage,
         shots.speckle_table,
         pd_loss,
         exponents,
@@ -178,9 +178,9 @@ def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProb
     p_alarm = -np.expm1(-exponents[..., 0])
     weight = _level_weights(exponents[..., 1:], p_alarm)
     segment_exists, joint_excess = shots.has_segment[:, None], np.zeros(points.size)
-    if shots.segment_correlations is not None:
+    if shots.speckle.segment_correlations is not None:
         squared_correlation = np.broadcast_to(
-            np.abs(shots.segment_correlations.up_down) ** 2, shots.size
+            np.abs(shots.speckle.segment_correlations.up_down) ** 2, shots.size
         )[points]
         with np.errstate(divide="ignore"):
             level_exponents = np.minimum(
@@ -224,7 +224,7 @@ def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.nda
     ``half_squares`` (3, m, levels) is y of the levels; the result has the same shape.
     """
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)[..., None]
-    if shots.noise_bins == "correlated":
+    if shots.detection_settings.noise_bins == "correlated":
         n_bins = bin_noise.alarm_equivalent_bins(
             n_bins,
             threshold_ratio=np.sqrt(2 * half_squares),

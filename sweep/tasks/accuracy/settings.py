@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sweep.model.effects.catalogue import EFFECT_NAMES, EFFECTS
-from sweep.model.effects.segment_motion import SEGMENT_MOTION
 from sweep.model.ground import beamlets_add_as_powers
 from sweep.spec import GridSpec, SceneSpec
 from sweep.spec.fields import OFF
@@ -362,20 +361,17 @@ def _build_draw_setting_ladder(spec: GridSpec) -> SettingLadder:
 def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
     """Return overrides that enable all effects.
 
-    Segment motion stays off if the spec disables it, as it then is a rule of the scene that all
-    segments begin at one range. Random effects are enabled only if probabilities are means over
+    An effect whose absence is a rule of the scene, such as segment motion, stays off if the spec
+    disables it. Random effects are enabled only if probabilities are means over
     draws, which they are not in a flight.
     """
-    segment_motion, has_draws = (
-        SEGMENT_MOTION.name,
-        isinstance(spec, GridSpec) and spec.draws.has_draws,
-    )
-    overrides = {
-        f"effects.{effect.name}": "on" for effect in EFFECTS if has_draws or not effect.is_random
+    has_draws, modes = isinstance(spec, GridSpec) and spec.draws.has_draws, spec.effect_modes()
+    return {
+        f"effects.{effect.name}": "on"
+        for effect in EFFECTS
+        if (has_draws or not effect.is_random)
+        and not (effect.defines_scene_if_off and modes[effect.name] == OFF)
     }
-    if spec.effect_modes()[segment_motion] == OFF:
-        del overrides[f"effects.{segment_motion}"]
-    return overrides
 
 
 def _is_on_axis(spec: AnySpec, path: str) -> bool:

@@ -17,7 +17,6 @@ from sweep.model import beam, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection.estimators import ESTIMATOR_PREFIX
 from sweep.model.effects.catalogue import PARAMETER_DEFAULTS
-from sweep.model.effects.planner_inputs import missing_sample_bounds
 from sweep.model.evaluation import MISREAD_TOLERANCE_BINS
 from sweep.model.link_budget import (
     CHIRP_PREFIX,
@@ -28,6 +27,7 @@ from sweep.model.link_budget import (
     LinkBudget,
 )
 from sweep.model.preparation import split_by_category
+from sweep.model.window_response import missing_sample_bounds
 from sweep.tasks.studies.flight_study import FlightStudy
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from sweep.model.beamlet_counts import (
 from sweep.model.detection.looks import LOOKS_NUMBER_PATH, LOOKS_VOTES_PATH
 from sweep.model.effects.catalogue import (
     EFFECT_CATEGORY_PATHS,
-    OWN_BATCH_FLAGS,
     PARAMETER_DEFAULTS,
+    SEPARATE_BATCHES_MASK,
     effect_flag_attributes,
     pack_effect_flags,
     unpack_effect_flags,
@@ -149,7 +149,7 @@ class SelectedEffects(NamedTuple):
         A group has the indices (m,) of its points, the names of all their effects, and their flags
         (m,).
         """
-        separating_flags = self.effect_flags & OWN_BATCH_FLAGS
+        separating_flags = self.effect_flags & SEPARATE_BATCHES_MASK
         for shared_flags in np.unique(separating_flags):
             index = np.flatnonzero(separating_flags == shared_flags)
             group_flags = self.effect_flags[index]

@@ -161,7 +161,7 @@ def _spectra_dataset(
         "line_frequency": (("segment", "line"), line_frequency),
         "line_amplitude": (("line",), line_amplitude),
         "range": ((), float(shots.range[-1])),
-        "radial_velocity": ((), float(shots.radial_velocity[-1])),
+        "radial_velocity": ((), float(shots.target.radial_velocity[-1])),
         "draw": (("draw",), draw_numbers),
         "segment": (("segment",), np.array(segment_names, dtype=object)),
         "frequency": (("frequency",), shots.all_signed_bins * bin_width),
@@ -188,8 +188,10 @@ def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarr
     from sweep.model.pointcloud.returns import beamlet_line_positions
 
     line_bins = beamlet_line_positions(shots)[-1, list(shots.has_segment)]
-    scale = np.broadcast_to(shots.beat_amplitude_scale, shots.size)[-1]
-    return line_bins * bin_width, shots.relative_amplitude[int(shots.footprint_row[-1])] * scale
+    scale = np.broadcast_to(shots.link_scales.beat_amplitude, shots.size)[-1]
+    return line_bins * bin_width, shots.footprint.relative_amplitude[
+        int(shots.footprint.row_of_point[-1])
+    ] * scale
 
 
 def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:

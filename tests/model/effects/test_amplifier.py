@@ -7,7 +7,7 @@ from random_planner_points import planner_inputs
 from sweep.model import evaluation
 from sweep.model.effects.amplifier import (
     SENT_AND_OSCILLATOR_LIGHT,
-    beat_noise_current_variance,
+    emission_beat_current_variance,
     error_bound,
     spontaneous_emission_density,
 )
@@ -38,7 +38,7 @@ def _variance():
     given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
     given |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
     isolation = {"instrument.telescope.isolation": spontaneous_emission_density(given) / DENSITY}
-    return beat_noise_current_variance(given | isolation, "sent")
+    return emission_beat_current_variance(given | isolation, "sent")
 
 
 def test_emission_beats_with_the_local_oscillator_on_both_diodes_of_a_receiver():
@@ -82,15 +82,15 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
         next(evaluation.prepare_shots(parameters, effects))
         for effects in (DEFAULT_EFFECTS, (*DEFAULT_EFFECTS, "spontaneous_emission"))
     )
-    own_shot = bare.noise_variances["local_oscillator_shot"]
-    more = noisy.noise_variances["spontaneous_emission"]
+    own_shot = bare.noise.variances["local_oscillator_shot"]
+    more = noisy.noise.variances["spontaneous_emission"]
     assert more / own_shot == pytest.approx(2 * 1.1 * on_detector / 1.602176634e-19, rel=1e-9)
     assert noisy.noise_variance_without_echo == pytest.approx(
         bare.noise_variance_without_echo + more
     )
     size = error_bound(planner_inputs(parameters))
     assert size.noise_variance_change == pytest.approx(more / sum(
-        value for name, value in bare.noise_variances.items() if name != "signal_shot"
+        value for name, value in bare.noise.variances.items() if name != "signal_shot"
     ))  # fmt: skip
     assert size.threshold_follows_noise
     seen = [

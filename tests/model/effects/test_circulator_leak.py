@@ -8,6 +8,7 @@ from sweep.model import evaluation
 from sweep.model.detection.marcum import marcum_q1
 from sweep.model.effects import circulator_leak as leak
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
+from sweep.model.spectrum import permanent_line
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 LIGHT, CHARGE = 299792458.0, 1.602176634e-19
@@ -33,7 +34,7 @@ def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
     shots = prepare_single_category(
         leaking(path=40.0, further=further, range=1500.0, fft_size=2**14), WITH
     )
-    scale, line = leak.leak_line_of_point(shots, 0, segment)
+    scale, line = permanent_line.line_of_point(shots, 0, segment)
     # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
     beat = -sign * 1e9 / 500e-6 * 40.0 / LIGHT
     amplitude = 2 * 1.1 * np.sqrt(1e-3 * 1.0 / ISOLATION) * 7e3 / (1 + (beat / 4e8) ** 2)
@@ -76,14 +77,14 @@ def test_the_beats_noise_is_that_of_simulated_records():
     }  # fmt: skip
     given = {f"instrument.{name}": value for name, value in given.items()}
     given |= {leak.LEAK_LENGTH_PATH: steps / rate * LIGHT, leak.ISOLATION_PATH: 1.0}
-    law = leak.beat_noise_current_variance(given, "homodyne", "lorentzian")
+    law = leak.leak_beat_current_variance(given, "homodyne", "lorentzian")
     # A bin's power has a relative variance of 1.
     spread = 1 / np.sqrt(records * (last - first) / 2)  # of records with all of either noise
     assert density.mean() == pytest.approx(law, rel=5 * spread)
     quiet = given | {"instrument.laser.relative_intensity_noise": 0.0}
     parts = (
-        leak.beat_noise_current_variance(given, "homodyne", "gaussian"),
-        leak.beat_noise_current_variance(quiet, "homodyne", "lorentzian"),
+        leak.leak_beat_current_variance(given, "homodyne", "gaussian"),
+        leak.leak_beat_current_variance(quiet, "homodyne", "lorentzian"),
     )
     assert min(parts) > 0.2 * law  # both are seen
     # All the light of a laser fluctuates together, by what a balanced receiver rejects.
@@ -93,7 +94,7 @@ def test_the_beats_noise_is_that_of_simulated_records():
     }
     leaked = beat**2 / 4
     more = rin * ((1.0 + leaked) ** 2 - 1.0) / 50.0
-    assert leak.beat_noise_current_variance(rejecting, "homodyne", "gaussian") == pytest.approx(
+    assert leak.leak_beat_current_variance(rejecting, "homodyne", "gaussian") == pytest.approx(
         more, rel=1e-12
     )
 
@@ -104,7 +105,7 @@ def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
         "instrument.laser.relative_intensity_noise": 1e-15,
         "instrument.receiver.common_mode_rejection": 300.0,
     }  # fmt: skip
-    sources = prepare_single_category(leaking(further=laser), WITH).noise_variances
+    sources = prepare_single_category(leaking(further=laser), WITH).noise.variances
     light, volts = 1 / ISOLATION, 7e3**2
     assert sources["leak_shot"] == pytest.approx(2 * CHARGE * 1.1 * light * 4e8 * volts)
     power = (2 * 1.1) ** 2 * 1e-3 * light / 2  # of the beat [A^2]
@@ -121,7 +122,7 @@ def test_an_echo_that_fades_beside_a_line_crosses_as_drawn(own, line):
     echo = own * np.sqrt(0.5) * (normal[0] + 1j * normal[1])
     phase = np.exp(2j * np.pi * rng.random(number))
     crosses = np.mean(np.abs(echo + line * phase + normal[2] + 1j * normal[3]) >= level)
-    m = leak.raised_magnitude(
+    m = permanent_line.raised_magnitude(
         np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=True
     )[0]
     law = np.exp(-(level**2) / (2 + m**2))
@@ -130,14 +131,14 @@ def test_an_echo_that_fades_beside_a_line_crosses_as_drawn(own, line):
 
 def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypatch):
     monkeypatch.setattr(
-        leak, "MASK_THRESHOLD_FRACTION", 0.8
+        permanent_line, "MASK_THRESHOLD_FRACTION", 0.8
     )  # for many more alarms than noise makes
     p = leaking(
         path=7.3, isolation=10**9.3, window="rectangular", fft_size=2**12, tnr=8.0,
         reflectance=1e-12, range=2000.0,
     )  # fmt: skip
     shots = prepare_single_category(p, WITH)
-    scale, line = leak.leak_line_of_point(shots, 0, 0)
+    scale, line = permanent_line.line_of_point(shots, 0, 0)
     level, sigma = float(shots.threshold[0]), float(shots.bin_noise_sigma[0])
     rng, number, size = np.random.default_rng(8), 5_000, 2**12
     (runs,) = iter_spans(shots)
@@ -165,7 +166,7 @@ def test_a_steady_echo_beside_a_line_crosses_nearly_as_drawn():
     phase = np.exp(2j * np.pi * rng.random(number))
     noise = rng.normal(size=number) + 1j * rng.normal(size=number)
     crosses = np.mean(np.abs(own + line * phase + noise) >= level)
-    m = leak.raised_magnitude(
+    m = permanent_line.raised_magnitude(
         np.array([own]), np.array([line]), noise_sigma=1.0, threshold=level, in_speckle=False
     )
     # Powers add, in place of the mean of the crossings over the phase: within 0.03.

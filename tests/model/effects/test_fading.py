@@ -110,7 +110,7 @@ def sloping(table_4_1):
 def test_it_is_what_drawn_speckle_comes_to(sloping):
     """The random effect draws each beamlet's amplitude, and has a spectrum for each draw."""
     shots = prepared(sloping)
-    assert 0.2 < abs(shots.segment_correlations.up_down[0]) < 0.98
+    assert 0.2 < abs(shots.speckle.segment_correlations.up_down[0]) < 0.98
     outputs = shot_statistics(shots)
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=1)
     rough = sloping | {"target.roughness": np.inf}
@@ -132,26 +132,27 @@ def beamlet_correlation(shots, first, second):
     """
     samples = np.arange(shots.window.length)
     w = window.window_samples(shots.window.name, shots.window.length)
-    middle = float(shots.acquisition_delay + shots.record_duration[0] / 2)
+    middle = float(shots.record.acquisition_delay + shots.record.duration[0] / 2)
     delay = 2 * float(shots.range[0]) / 299792458
     fields = []
     for s in (first, second):
         segment = shots.waveform_segments[s]
         rate, carrier = float(segment.chirp_rate), float(segment.carrier)
-        start = float(np.ravel(shots.scheduled_segment_starts[s])[0])
-        apart = delay * shots.relative_range_offset[0] - shots.doppler_ratio_offset[0] * (
-            start + middle
-        )  # of delays, then
+        start = float(np.ravel(shots.waveform.segment_starts[s])[0])
+        apart = delay * shots.footprint.relative_range_offset[
+            0
+        ] - shots.footprint.doppler_ratio_offset[0] * (start + middle)  # of delays, then
         cycles = -(carrier + rate * (middle - delay)) * apart
         line = (
-            carrier * shots.doppler_ratio_offset[0] - rate * delay * shots.relative_range_offset[0]
+            carrier * shots.footprint.doppler_ratio_offset[0]
+            - rate * delay * shots.footprint.relative_range_offset[0]
         ) / shots.sample_rate[0]
         axis = carrier * float(np.ravel(segment.doppler_ratio)[0]) - rate * delay
         place = axis / shots.sample_rate[0] * shots.fft_size
         off = (np.rint(place) - place) / shots.fft_size
         turns = (off - line)[:, None] * (samples - shots.window.length / 2)
         fields.append((w * np.cos(2 * np.pi * turns)).sum(axis=1) * np.exp(2j * np.pi * cycles))
-    power = shots.relative_amplitude[0] ** 2
+    power = shots.footprint.relative_amplitude[0] ** 2
     strength = [(power * np.abs(field) ** 2).sum() for field in fields]
     return (power * fields[1] * fields[0].conj()).sum() / np.sqrt(np.prod(strength))
 
@@ -177,7 +178,7 @@ def test_correlations_are_the_sum_over_many_beamlets(order, changed, near, slopi
     }  # fmt: skip
     shots = prepared(several | changed | {"footprint.beamlets": 2})
     fine = prepared(several | changed | {"footprint.beamlets": 1024, "footprint.pattern": "square"})
-    for found, pair in zip(shots.segment_correlations, SEGMENT_PAIRS, strict=True):
+    for found, pair in zip(shots.speckle.segment_correlations, SEGMENT_PAIRS, strict=True):
         assert found[0] == pytest.approx(beamlet_correlation(fine, *pair), abs=near)
 
 
@@ -194,7 +195,7 @@ def test_segments_of_a_cast_footprint_do_not_agree_by_few_rays(transverse, slopi
     )
     shots = prepare_ray_traced_shots(p, cast, FADING)
     turn = 2 * np.pi * 2 / 1550e-9 * transverse * 12.5e-6 * 1e-3
-    assert abs(shots.segment_correlations.up_down[0]) == pytest.approx(
+    assert abs(shots.speckle.segment_correlations.up_down[0]) == pytest.approx(
         np.exp(-0.5 * turn**2), abs=1e-4
     )
 
@@ -210,7 +211,9 @@ def test_drawn_speckle_has_as_many_beamlets_as_its_segments_need(divergence, ang
     }  # fmt: skip
     drawn = prepared(p | {"target.roughness": np.inf})
     share = abs(beamlet_correlation(drawn, 0, 2)) ** 2
-    assert share == pytest.approx(abs(prepared(p).segment_correlations.up_down[0]) ** 2, abs=2e-3)
+    assert share == pytest.approx(
+        abs(prepared(p).speckle.segment_correlations.up_down[0]) ** 2, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize("near", [0.3 + 0.2j, 1.0, 0.0])
@@ -261,8 +264,10 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
     turn = np.array([0.0, 20.0, 40.0])[:, None] + np.zeros((1, 3, 2))
     shots = replace(
         shots,
-        segment_correlations=SegmentCorrelations(apart, apart, apart),
-        line_gradients=shots.line_gradients._replace(phase=turn),
+        speckle=shots.speckle._replace(
+            segment_correlations=SegmentCorrelations(apart, apart, apart),
+            line_gradients=shots.speckle.line_gradients._replace(phase=turn),
+        ),
     )
     method = "noise" if noisy else "probabilities"
     found = list_bin_groups(shots)
@@ -281,7 +286,7 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
 
 def test_a_smooth_surface_does_not_fade(sloping):
     coherent = sloping | {"footprint.phases": "coherent"}
-    assert prepared(coherent).segment_correlations is None
+    assert prepared(coherent).speckle.segment_correlations is None
     assert np.array_equal(
         evaluate_segments(prepared(coherent)),
         evaluate_segments(prepared(coherent, DEFAULT_EFFECTS)),

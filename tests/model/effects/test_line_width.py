@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sweep.model import laser_line
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import line_width
 from sweep.model.evaluation import evaluate, prepare_shots
 from sweep.model.time_domain_truth import analytic_record
 from sweep.model.window import direct_transform, get_window, window_samples
@@ -28,7 +28,7 @@ def by_lags(name, y, correlation):
 
 def gaussian_power(name, y, fwhm):
     """The module's mean power of a single line, from its shifts."""
-    shifts = line_width.gaussian_frequency_shifts(
+    shifts = laser_line.gaussian_frequency_shifts(
         fwhm=np.array([fwhm]), duration=np.array([DURATION])
     )
     form = get_window(name, LENGTH)
@@ -66,15 +66,15 @@ def test_shifts_are_the_gaussian_convolution_to_their_tolerance(name, bins_fwhm)
     expected = by_lags(name, y, np.exp(-2 * (np.pi * deviation * lag) ** 2))
     found = gaussian_power(name, y, bins_fwhm / DURATION)
     top = window_samples(name, LENGTH).sum() ** 2
-    assert np.abs(found - expected).max() < 10 * line_width.MEAN_POWER_TOLERANCE * top
+    assert np.abs(found - expected).max() < 10 * laser_line.MEAN_POWER_TOLERANCE * top
 
 
 def lorentzian_power(name, laser_width, delay):
     """The module's mean power of a single line in its bin: pure line and pedestal."""
     laser = {"line_width": np.array([laser_width]), "delay": np.array([delay]),
              "duration": np.array([DURATION])}  # fmt: skip
-    pedestal = line_width.pedestal_power_under_line(window=get_window(name, LENGTH), **laser)
-    pure = line_width.coherent_power_fraction(**laser) * window_samples(name, LENGTH).sum() ** 2
+    pedestal = laser_line.pedestal_power_under_line(window=get_window(name, LENGTH), **laser)
+    pure = laser_line.pure_line_power_fraction(**laser) * window_samples(name, LENGTH).sum() ** 2
     return pure + pedestal, pedestal
 
 
@@ -106,7 +106,7 @@ def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
     expected = line @ (np.cosh(rest) - 1) @ line
     laser = {"line_width": np.array([g / (2 * np.pi * delay)]), "delay": np.array([delay])}
     form = get_window(name, length)
-    share, in_phase = line_width.apparent_line_and_pedestal(
+    share, in_phase = laser_line.apparent_line_and_pedestal(
         duration=np.array([float(length)]), window=form, **laser
     )
     np.testing.assert_allclose(share * form.sum**2, line.sum() ** 2, rtol=1e-4)
@@ -117,10 +117,10 @@ def test_the_line_is_seen_without_the_phase_of_all_the_record(name, delays, g):
 def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(delay):
     """Of what differs by u samples the variance is 2 Gamma min(u, tau), to 5 sigma."""
     rng, per_sample, number = np.random.default_rng(5), 1e-3, 2000
-    steps = line_width.n_phase_walk_steps(delay=delay, length=LENGTH)
+    steps = laser_line.n_phase_walk_steps(delay=delay, length=LENGTH)
     phases = np.array(
         [
-            line_width.phase_walk(
+            laser_line.phase_walk(
                 rng.standard_normal(steps), variance_per_sample=per_sample, delay=delay
             )
             for _ in range(number)

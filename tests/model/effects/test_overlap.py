@@ -6,7 +6,7 @@ from random_planner_points import effects_kept_in_tile, plan_points, planner_inp
 
 from sweep.model import evaluation, time_domain_truth
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import overlap, segment_motion
+from sweep.model.effects import overlap
 from sweep.model.effects.catalogue import DEFAULT_EFFECTS, PARAMETER_DEFAULTS
 from sweep.model.effects.phase_errors import chirp_drift_time
 from sweep.model.link_budget import RECORD_PATH
@@ -35,7 +35,11 @@ def difference(shots, i, segment, **how):
     exact = time_domain_truth.time_domain_spectrum(shots, i, segment, **how)
     if shots.complex_record:
         exact = np.roll(exact, -(shots.fft_size // 2))[bins % shots.fft_size]
-    scale = shots.window.sum * float(np.broadcast_to(shots.beat_amplitude_scale, shots.size)[i]) / 2
+    scale = (
+        shots.window.sum
+        * float(np.broadcast_to(shots.link_scales.beat_amplitude, shots.size)[i])
+        / 2
+    )
     return np.abs(fast - exact).max() / (scale * np.sqrt(shots.total_relative_echo[i]))
 
 
@@ -67,7 +71,7 @@ def test_lines_are_those_of_the_samples_that_the_echo_has(table_4_1, number):
         scene["instrument.receiver.architecture"] = "homodyne"
     moving = () if number % 3 else ("range_walk", "segment_motion")
     shots = shots_of(scene, *moving)
-    assert shots.n_samples_before_echo is not None
+    assert shots.echo_record.n_samples_before is not None
     for segment in np.flatnonzero(shots.has_segment).tolist():
         off = difference(shots, 0, segment, with_range_walk=bool(moving))
         assert off < (1e-7 if moving else AGREEMENT), scene
@@ -92,8 +96,12 @@ def test_lines_with_a_phase_error_are_those_of_the_samples_that_the_echo_has(
         "instrument.chirp.quadratic_error": 3e5, "instrument.chirp.sinusoidal_error": 1e5,
     }  # fmt: skip
     whole = shots_of(bent, "chirp_nonlinearity")
-    (error,) = whole.phase_errors
-    first = int(whole.n_samples_before_echo[0, 0]) if whole.n_samples_before_echo is not None else 0
+    (error,) = whole.echo_record.phase_errors
+    first = (
+        int(whole.echo_record.n_samples_before[0, 0])
+        if whole.echo_record.n_samples_before is not None
+        else 0
+    )
     length = 2**16 - first
     values = error.select_arguments(0, np.array([0]))
     psi = error.phase(2 * np.arange(length) / length - 1, sign=1, **values)[0]
@@ -284,7 +292,7 @@ def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
     ) | {"instrument.looks.number": 16}  # fmt: skip
     ((_, shots),) = evaluation.prepare_shots(scene, (*WITH_OVERLAP, "segment_motion"))
     bound = float(np.ravel(overlap.residual_bound(planner_inputs(scene)))[0])
-    first = segment_motion.split_looks(shots)[0]
+    first = shots.split_by_look()[0]
     assert 0 < bound < 0.05
     assert difference(first, 0, 0, with_range_walk=False) <= bound + AGREEMENT
 
@@ -338,8 +346,8 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         "footprint.speckle": "none",
     }  # fmt: skip
     shots, plain = shots_of(scene, "line_width"), shots_of(scene)
-    first = int(shots.n_samples_before_echo[0, 0])
-    share = float((shots.beat_amplitude_scale / plain.beat_amplitude_scale)[0] ** 2)
+    first = int(shots.echo_record.n_samples_before[0, 0])
+    share = float((shots.link_scales.beat_amplitude / plain.link_scales.beat_amplitude)[0] ** 2)
     rng = np.random.default_rng(3)
     delay, rate = 2 * far / SPEED_OF_LIGHT, 600e6
     w, n = get_window("hann", 6000).samples(), np.arange(6000)
@@ -350,9 +358,9 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         phase = walk[lag:] - walk[: steps - lag]
         power.append(abs((w * np.exp(1j * phase) * (n >= first)).sum()) ** 2)
     line = (w * (n >= first)).sum() ** 2
-    pedestal = float(np.ravel(shots.pedestal_variance_under_lines)[0])
+    pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under)[0])
     amplitude = (
-        float(np.ravel(plain.beat_amplitude_scale)[0]) ** 2 * plain.total_relative_echo[0] / 4
+        float(np.ravel(plain.link_scales.beat_amplitude)[0]) ** 2 * plain.total_relative_echo[0] / 4
     )
     told = share + pedestal * get_window("hann", 6000).energy / amplitude / line
     assert np.mean(power) / line == pytest.approx(told, rel=0.15)
@@ -389,7 +397,7 @@ def test_range_walk_is_put_right_for_the_part_of_the_record_that_the_echo_has(ta
             record = time_domain_truth.analytic_record(still, 0, 0, 0, with_range_walk=walk)
             place.append(np.argmax(abs(np.fft.fft(w * record, padded))) * 300e6 / padded)
         drift = (place[1] - place[0] + 150e6) % 300e6 - 150e6
-        per_second = float(still.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
+        per_second = float(still.waveform.chirp_rate) * 2 * velocity / SPEED_OF_LIGHT
         told = np.ravel(chirp_drift_time(walking))[0]
         assert drift / per_second == pytest.approx(told, abs=3 * 300e6 / padded / per_second)
 

@@ -60,13 +60,13 @@ def drawn_spectra(shots, plain, draws=DRAWS, seed=1):
     """
     rng, length, w = np.random.default_rng(seed), shots.window.length, shots.window.samples()
     rate, delay = float(shots.sample_rate[0]), 2 * float(shots.range[0]) / SPEED_OF_LIGHT
-    per_step = 2 * np.pi * float(shots.lorentzian_line_width[0]) / (FINER * rate)
+    per_step = 2 * np.pi * float(shots.laser_line.lorentzian_width[0]) / (FINER * rate)
     later, size = round(delay * rate * FINER), shots.fft_size
     beat = float(plain.beat_frequencies[0][0]) / rate
     beat = beat if shots.complex_record else abs(beat)
     tone, line = np.exp(2j * np.pi * beat * np.arange(length)), round(beat * size) % size
     amplitude = float(evaluate_segments(plain)[0, 2, 0]) / abs(np.fft.fft(w * tone, size)[line])
-    fades = shots.segment_correlations is not None
+    fades = shots.speckle.segment_correlations is not None
     deviation = float(shots.bin_noise_sigma[0]) / np.sqrt(shots.window.energy)
     echoes, noisy = [], []
     for _ in range(draws // 250):

@@ -16,7 +16,8 @@ from random_planner_points import (
 from sweep.model.detection.looks import SINGLE_LOOK
 from sweep.model.detection.marcum import log_at_least_one_probability, marcum_q1
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.effect import Effect, ErrorBound
+from sweep.model.effects.effect import Effect
+from sweep.model.effects.error_bounds import ErrorBound
 from sweep.model.effects.planning import omission_errors, plan_effects
 
 TILES = 40

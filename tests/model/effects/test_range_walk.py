@@ -32,9 +32,9 @@ def motion(shots, segment):
     rate = float(shots.sample_rate[0])
     return {
         "sign": DEFAULT_CHIRP_SLOPES[segment],
-        "chirp_rate": np.array([float(shots.chirp_rate)]),
-        "radial_velocity": shots.radial_velocity[:1],
-        "start": np.array([float(shots.acquisition_delay)]),
+        "chirp_rate": np.array([float(shots.waveform.chirp_rate)]),
+        "radial_velocity": shots.target.radial_velocity[:1],
+        "start": np.array([float(shots.record.acquisition_delay)]),
         "duration": np.array([shots.window.length / rate]),
     }
 

@@ -52,7 +52,7 @@ def true_spectra(shots, segment):
             w * time_domain_truth.analytic_record(shots, 0, segment, b, with_range_walk=False),
             shots.fft_size,
         )
-        for b in range(shots.relative_range_offset.shape[1])
+        for b in range(shots.footprint.n_beamlets)
     ]
     return np.array([[x[half] / 2 for x in both], [x[-half].conj() / 2 for x in both]])
 
@@ -80,8 +80,8 @@ def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     """The same factors for all segments, conjugated where the beat folds."""
     parameters = table_4_1(**{"fft_size": 4096} | scene)
     shots, share = prepare_single_category(parameters, STILL[:-1]), 0.2
-    number = shots.relative_range_offset.shape[1]
-    g = factors(20, number, share, random_phases=shots.adds_powers)
+    number = shots.footprint.n_beamlets
+    g = factors(20, number, share, random_phases=shots.footprint.adds_powers)
     (drawn,) = iter_realisations(
         with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20
     )
@@ -209,12 +209,12 @@ def test_the_coherent_share_is_that_of_a_sum_over_random_heights():
     for roughness in (0.02, 0.08, 0.15):
         heights = rng.normal(scale=roughness * wavelength, size=number)
         mean = np.exp(4j * np.pi * heights / wavelength).mean()
-        share = speckle.coherent_power_fraction(
+        share = speckle.coherent_echo_fraction(
             roughness=roughness * wavelength, wavelength=wavelength
         )
         assert abs(abs(mean) - np.sqrt(share)) < 5 / np.sqrt(number)
-    assert speckle.coherent_power_fraction(roughness=np.inf, wavelength=wavelength) == 0
-    assert speckle.coherent_power_fraction(roughness=0.0, wavelength=wavelength) == 1
+    assert speckle.coherent_echo_fraction(roughness=np.inf, wavelength=wavelength) == 0
+    assert speckle.coherent_echo_fraction(roughness=0.0, wavelength=wavelength) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
@@ -320,11 +320,13 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
     }  # fmt: skip
     effects = (*SPECKLED, "line_width")
     (stretch,) = iter_realisations(parameters, effects, keys=make_point_keys(1), draws=50)
-    ratio = stretch.shots.pedestal_variance_under_lines / shot_statistics(stretch.shots)["snr_up"]
+    ratio = (
+        stretch.shots.laser_line.pedestal_variance_under / shot_statistics(stretch.shots)["snr_up"]
+    )
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # the image's phase moves with it
     assert (
-        np.ptp(stretch.shots.pedestal_variance_under_lines)
-        > 0.5 * stretch.shots.pedestal_variance_under_lines.mean()
+        np.ptp(stretch.shots.laser_line.pedestal_variance_under)
+        > 0.5 * stretch.shots.laser_line.pedestal_variance_under.mean()
     )
 
 

@@ -182,3 +182,102 @@ def _central_energy_min(
         # slope.
         return float(max(power.sum(axis=0).min() - 2 * reach_bins * slope_max / 128, 0.5))
     return float(0.98 * power.sum(axis=0).min())
+
+
+class MissingSamples(NamedTuple):
+    """Samples of the record that are taken before the echo arrives, by segment."""
+
+    lost_fraction: np.ndarray
+    """Sum |w| over the missing samples, over sum w."""
+    step_sidelobe_factor: np.ndarray
+    """Factor on the sidelobes of a rectangular window, relative to sum w, that bounds the sidelobes
+    added by the missing samples."""
+    n_missing: np.ndarray
+    """Number of missing samples."""
+    centroid_bound: np.ndarray
+    """Bound on the mean position, -1..1, of the remaining samples."""
+    all_missing: np.ndarray
+    """True where all samples are missing."""
+
+
+def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
+    """Compute bounds for records whose first samples have no echo.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record.
+    n_missing : ndarray of int
+        Number of missing samples.
+
+    Notes
+    -----
+    The transform of the missing samples is at most their variation over 2 sin(pi y / L). The same
+    holds for the remaining samples, and bounds the sidelobes where these are fewer.
+    """
+    lost_fraction_by_count, bound_by_missing, bound_by_remaining = _bounds_by_missing_count(window)
+    lost_fraction = lost_fraction_by_count[n_missing]
+    step_sidelobe_factor = np.minimum(
+        bound_by_missing[n_missing], bound_by_remaining[n_missing]
+    ) * (window.length / window.sum)
+    with np.errstate(divide="ignore"):
+        centroid_bound = np.minimum(lost_fraction / np.maximum(1 - lost_fraction, 1e-300), 1.0)
+    step_sidelobe_factor = np.where(n_missing > 0, step_sidelobe_factor, 0.0)
+    return MissingSamples(
+        lost_fraction, step_sidelobe_factor, n_missing, centroid_bound, n_missing >= window.length
+    )
+
+
+@lru_cache(maxsize=8)
+def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tabulate bounds of :func:`missing_sample_bounds` by missing samples, (L + 1,) each.
+
+    They are the lost fraction, and the factors by the variation of missing and of remaining
+    samples.
+    """
+    w = window_samples(window.name, window.length)
+    magnitude = np.abs(w)
+    lost_fraction = np.append(0.0, np.cumsum(magnitude)) / window.sum
+    variation = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # variation up to each sample
+    bound_by_missing = 0.5 * (magnitude[0] + variation + magnitude)
+    bound_by_remaining = 0.5 * (magnitude + variation[-1] - variation + magnitude[-1])
+    bound_by_missing, bound_by_remaining = (
+        np.append(0.0, bound_by_missing),
+        np.append(bound_by_remaining, 0.0),
+    )
+    return lost_fraction, bound_by_missing, bound_by_remaining
+
+
+def window_max_near(
+    window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
+) -> np.ndarray:
+    """Return the largest |w| near a sample, over sum w.
+
+    Parameters
+    ----------
+    window : Window
+        Window of the record.
+    first_sample : ndarray of int
+        Number of the sample.
+    reach_samples : ndarray
+        Distance from the sample [samples], rounded up to a power of two.
+    """
+    exponents = np.ceil(np.log2(np.clip(reach_samples, 1, window.length))).astype(int)
+    window_max = np.empty(np.broadcast_shapes(first_sample.shape, exponents.shape))
+    first_sample, exponents = np.broadcast_arrays(first_sample, exponents)
+    for exponent in np.unique(exponents):
+        has_exponent = exponents == exponent
+        window_max[has_exponent] = _window_max_within(window, int(exponent))[
+            first_sample[has_exponent]
+        ]
+    return window_max
+
+
+@lru_cache(maxsize=64)
+def _window_max_within(window: Window, exponent: int) -> np.ndarray:
+    """Return the largest |w| within 2^exponent samples of each position, (L + 1,), over sum w."""
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    magnitude = np.abs(window_samples(window.name, window.length))
+    magnitude = np.append(magnitude, magnitude[-1])
+    return np.asarray(maximum_filter1d(magnitude, 2 * 2**exponent + 1, mode="nearest")) / window.sum
