@@ -486,13 +486,11 @@ class SceneStorage(SpecSection):
     """Division of results into blocks in the store; part of a study's identity."""
 
     block_shots: int = declare.integer_field(
-        "Shots that one block holds at most; 0 for 256 to 4096, by the time that they take",
-        "4096", "0", default=0,
+        "Largest number of shots in a block; blocks have fewer if this and block_draws have their "
+        "defaults and so many take long",
+        "4096", default=4096,
     )  # fmt: skip
-    block_draws: int = declare.integer_field(
-        "Draws that one block holds at most; 0 for up to 64, by the time that they take",
-        "64", "0", default=0,
-    )  # fmt: skip
+    block_draws: int = declare.integer_field("Largest number of draws in a block", "64", default=64)
 
 
 # The built scene: objects as bodies at which rays can be cast

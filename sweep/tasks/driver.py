@@ -57,6 +57,7 @@ from sweep.tasks.engine.study_store import (
     find_pending_replacement,
     refuse_damaged_template,
     refuse_foreign_files,
+    refuse_other_blocks,
     refuse_other_versions,
     refuse_to_replace,
     remove_store,
@@ -351,6 +352,7 @@ def _refuse_altered_store(
             "its attributes were changed after it was made"
         )
     refuse_damaged_template(store_path)
+    refuse_other_blocks(store_path, study)
 
 
 def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy) -> None:
@@ -639,6 +641,7 @@ def _is_eyepoint_store_complete(eyepoint_store_path: Location, eyepoints: Eyepoi
         eyepoint_store_path, attributes, eyepoints.model_version, reader="this machine"
     )
     refuse_damaged_template(eyepoint_store_path)
+    refuse_other_blocks(eyepoint_store_path, eyepoints)
     return bool(read_recipe(eyepoint_store_path)) and bool(
         committed_blocks(eyepoint_store_path, eyepoints).all()
     )

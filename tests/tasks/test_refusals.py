@@ -12,11 +12,12 @@ from small_studies import (
     small_spec,
 )
 
-from sweep.tasks.driver import resume, run
+from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine import cluster_connection
 from sweep.tasks.engine.journal import StoreLock
 from sweep.tasks.engine.progress import ClusterError, StoreError
 from sweep.tasks.engine.study_store import current_software_versions
+from sweep.tasks.studies import parameter_grid
 from sweep.tasks.studies.store_summary import status
 
 
@@ -149,3 +150,19 @@ def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monke
         )
     assert list(tmp_path.iterdir()) == []
     assert dask.config.get("scheduler", None) is None  # what is read later is read without it
+
+
+def test_a_store_that_is_cut_into_other_blocks_is_refused(tmp_path, monkeypatch):
+    """As of another version: its receipts would be taken for those of other points."""
+    spec = small_spec(storage={})
+    monkeypatch.setattr(parameter_grid, "DEFAULT_BLOCK_CPU_SECONDS_MIN", 1e-4)
+    store = run_serially(spec, tmp_path / "s.zarr").store
+    before = file_contents(store)
+    monkeypatch.undo()
+    for refused in (
+        lambda: resume(store, progress=False, scheduler="none"),
+        lambda: extend(store, small_spec(storage={}, draws={"number": 10}), scheduler="none"),
+    ):
+        with pytest.raises(StoreError, match=r"has blocks of .* in \w+, and this version of sweep"):
+            refused()
+    assert file_contents(store) == before

@@ -40,7 +40,6 @@ from sweep.tasks.studies.eyepoint_study import build_world
 from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_points
 from sweep.tasks.studies.parameter_grid import (
-    DEFAULT_BLOCK_SHOTS_MAX,
     SHOTS_PER_TILE,
     ParameterBlockGrid,
 )
@@ -428,8 +427,7 @@ class FlightSample(StudySample):
         self.study_with_setting = cache(self._make_study)
         self._cast_eyepoints: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
         # The shots of a block share work that does not depend on their number, such as planning.
-        self.timed_points_max = int(spec.storage.block_shots) or DEFAULT_BLOCK_SHOTS_MAX
-        self.timed_points_max = max(self.timed_points_max, SHOTS_PER_TILE)
+        self.timed_points_max = max(int(spec.storage.block_shots), SHOTS_PER_TILE)
         self._flight_blocks, shots_by_part = zip(*self._sample_shots(n_points), strict=True)
         self._shot_numbers = np.concatenate(shots_by_part)
         self._part_of_row = np.repeat(

@@ -63,6 +63,7 @@ from sweep.storage.store_format import (
     iter_records,
     objects_match_digest,
     parse_software_versions,
+    read_root_metadata,
     stored_objects_digest,
 )
 from sweep.storage.verified_store import CHUNK_NAME_PATTERN
@@ -522,6 +523,28 @@ def refuse_damaged_template(store_path: Location) -> None:
             f"{store_path} is not as it was made:\n{problem_lines}\n"
             f"{suggested_call('verify', store_path, repair=True)} puts back what was there."
         )
+
+
+def refuse_other_blocks(store_path: Location, study: BlockStudy) -> None:
+    """Raise a StoreError if a store is cut into other blocks than the study is here.
+
+    Receipts and chunks of another version of this program would be taken for those of other points.
+    """
+    nodes = read_root_metadata(store_path)["consolidated_metadata"]["metadata"]
+    for layout in study.output_layout_by_name.values():
+        chunk_shape = tuple(nodes[layout.name]["chunk_grid"]["configuration"]["chunk_shape"])
+        if chunk_shape != layout.chunks:
+            raise StoreError(
+                f"{store_path} has blocks of {_shape_text(chunk_shape)} in {layout.name}, and this "
+                f"version of sweep cuts the study into blocks of {_shape_text(layout.chunks)}. "
+                "Install the version that began it to resume it, or run the study anew into "
+                "another store."
+            )
+
+
+def _shape_text(shape: tuple[int, ...]) -> str:
+    """Return a shape as text, such as '728 x 90'."""
+    return " x ".join(str(length) for length in shape)
 
 
 def damage_or_read_error(read_damage: Callable[[], str]) -> str:

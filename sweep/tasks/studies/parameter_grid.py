@@ -48,10 +48,6 @@ BLOCKS_OF_DEFAULT_SIZE_MAX = 1 << 14
 DEFAULT_BLOCKS_MIN = 32
 DEFAULT_BLOCK_CPU_SECONDS_MIN = 0.5
 
-#: Largest default sizes of a flight's block.
-DEFAULT_BLOCK_SHOTS_MAX = 4096
-DEFAULT_BLOCK_DRAWS_MAX = 64
-
 
 def worst_cpu_seconds_per_draw(spec: GridSpec | SceneSpec) -> float:
     """Return an upper estimate of the time of one draw of any point or shot on one core [s].
@@ -90,8 +86,9 @@ def flight_block_size(
 ) -> tuple[int, int]:
     """Return the largest numbers of shots and of draws of a flight's block.
 
-    Both are those of the section `storage`. Where one is 0 there, blocks are cut for the work of
-    all cores: along the draws first, as the effects of 256 consecutive shots are planned together.
+    Both are those of the section `storage`. If it has its defaults, blocks are cut further to have
+    work for all cores: along the draws first, as the effects of 256 consecutive shots are planned
+    together.
 
     Parameters
     ----------
@@ -104,20 +101,14 @@ def flight_block_size(
     n_draws
         Number of draws of each shot.
     """
+    block_shots, block_draws = int(spec.storage.block_shots), int(spec.storage.block_draws)
+    if spec.storage != type(spec.storage)():
+        return block_shots, block_draws
     seconds_per_draw = worst_cpu_seconds_per_draw(spec)
-    draws_per_block = (
-        default_block_cpu_seconds(n_axis_points * n_shots * n_draws * seconds_per_draw)
-        / seconds_per_draw
-    )
-    block_draws = int(spec.storage.block_draws) or min(
-        max(int(draws_per_block / min(n_shots, SHOTS_PER_TILE)), 1),
-        n_draws,
-        DEFAULT_BLOCK_DRAWS_MAX,
-    )
-    block_shots = int(spec.storage.block_shots) or min(
-        max(int(draws_per_block / min(block_draws, n_draws)), SHOTS_PER_TILE),
-        DEFAULT_BLOCK_SHOTS_MAX,
-    )
+    study_cpu_seconds = n_axis_points * n_shots * n_draws * seconds_per_draw
+    shot_draws = default_block_cpu_seconds(study_cpu_seconds) / seconds_per_draw
+    block_draws = min(max(int(shot_draws / min(n_shots, SHOTS_PER_TILE)), 1), n_draws, block_draws)
+    block_shots = min(max(int(shot_draws / block_draws), SHOTS_PER_TILE), block_shots)
     return block_shots, block_draws
 
 
