@@ -129,7 +129,7 @@ def test_only_as_many_threads_compute_as_memory_suffices_for(tmp_path, monkeypat
 
 def test_a_machine_is_not_asked_for_little_memory():
     memory = worker_memory.WorkerMemory(lambda: pytest.fail("it was asked"), "this machine")
-    assert memory.has_room_for(1e6)
+    assert memory.suffices_for(1e6)
 
 
 def test_threads_are_no_part_of_a_study(undisturbed, tmp_path):

@@ -337,7 +337,7 @@ class ComputeBackend(ExitStack):
     def _n_threads(self) -> int:
         """Return the number of threads that compute: as many as memory and blocks suffice for."""
         n_threads = min(self.options.n_threads(self._workload), self.max_workers)
-        if n_threads == 1 or self.memory.has_room_for(n_threads * self.bytes_per_thread):
+        if n_threads == 1 or self.memory.suffices_for(n_threads * self.bytes_per_thread):
             return max(n_threads, 1)
         n_with_memory = max(int(self.memory.bytes_max / self.bytes_per_thread), 1)
         self.progress.say(

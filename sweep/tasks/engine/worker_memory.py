@@ -37,7 +37,7 @@ class WorkerMemory:
         """Largest memory that the process may use [bytes]; inf if unknown."""
         return self.find_bytes_max()
 
-    def has_room_for(self, bytes_needed: float) -> bool:
+    def suffices_for(self, bytes_needed: float) -> bool:
         """Return True if the process may use so much memory [bytes]."""
         return bytes_needed < SMALL_BYTES or bytes_needed <= self.bytes_max
 

@@ -62,7 +62,7 @@ def scene_memory_bytes(spec: SceneSpec) -> int:
 def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if one point needs more memory than a process has."""
     bytes_needed = point_memory_bytes(spec)
-    if not worker_memory.has_room_for(bytes_needed):
+    if not worker_memory.suffices_for(bytes_needed):
         rule = (
             f"makes a point take about {_gigabytes_text(bytes_needed)} of memory, "
             f"{_available_memory_phrase(worker_memory)}"
@@ -83,7 +83,7 @@ def refuse_too_large_study(study: GridStudy | FlightStudy, worker_memory: Worker
 def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if a scene and one point need more memory than a process has."""
     bytes_needed = point_memory_bytes(spec) + scene_memory_bytes(spec)
-    if not worker_memory.has_room_for(bytes_needed):
+    if not worker_memory.suffices_for(bytes_needed):
         rule = (
             f"takes about {_gigabytes_text(bytes_needed)} of memory in each process that computes, "
             f"{_available_memory_phrase(worker_memory)}"
@@ -97,7 +97,7 @@ def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None
 def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> None:
     """Raise a SpecError if the results of one block need more memory than a process has."""
     bytes_needed = 2 * study.block_nbytes_max  # the results, and their encoded copy
-    if not worker_memory.has_room_for(bytes_needed):
+    if not worker_memory.suffices_for(bytes_needed):
         rule = (
             f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "
             f"{_available_memory_phrase(worker_memory)}"
