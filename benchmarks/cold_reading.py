@@ -38,19 +38,23 @@ def iter_definitions(package: Path) -> Iterator[Definition]:
     """Definitions at the level of modules and classes, in the order of their files."""
     for path in sorted(package.rglob("*.py")):
         text = path.read_text(encoding="utf-8")
-        yield from _iter_body(ast.parse(text).body, path.relative_to(package.parent), text, "")
+        yield from _iter_body(
+            ast.parse(text).body, path.relative_to(package.parent), text.splitlines(), ""
+        )
 
 
-def _iter_body(body: list[ast.stmt], path: Path, text: str, prefix: str) -> Iterator[Definition]:
+def _iter_body(
+    body: list[ast.stmt], path: Path, lines: list[str], prefix: str
+) -> Iterator[Definition]:
     for statement, following in zip(body, [*body[1:], None], strict=True):
-        source = ast.get_source_segment(text, statement) or ""
+        source = "\n".join(lines[statement.lineno - 1 : statement.end_lineno])
         if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             if statement.name.startswith("__"):
                 continue
             name, docstring = prefix + statement.name, ast.get_docstring(statement) or ""
             yield Definition(path, name, statement.lineno, docstring, source)
             if isinstance(statement, ast.ClassDef):
-                yield from _iter_body(statement.body, path, text, f"{statement.name}.")
+                yield from _iter_body(statement.body, path, lines, f"{statement.name}.")
         elif isinstance(statement, ast.Assign | ast.AnnAssign):
             targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
             docstring = _attribute_docstring(following)
