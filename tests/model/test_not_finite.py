@@ -19,7 +19,7 @@ from sweep.model.geometry.ray_casting import RayCaster
 from sweep.model.pointcloud.bin_groups import _list_groups
 from sweep.model.pointcloud.eyepoints import HIT_RANGE_MIN, prepare_eyepoint_shots
 from sweep.model.preparation import require_finite
-from sweep.model.spectrum.search_restriction import _mark_searched_echoes
+from sweep.model.spectrum.search_restriction import SearchBand, _mark_searched_echoes
 from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.scenes.meshes import clean_mesh
 
@@ -36,9 +36,7 @@ def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
         peak = int(np.nanargmax(magnitude))
         exempt = np.zeros(6, np.bool_)
         assert _list_groups(magnitude, exempt, peak, level, bins) <= 4
-        _mark_searched_echoes(
-            magnitude, exempt, 0, level, 0, (np.array([0, 6]), 0), np.array([2.0])
-        )
+        _mark_searched_echoes(magnitude, exempt, 0, level, 0, SearchBand(0, 6, 0), np.array([2.0]))
 
 
 def test_probabilities_of_several_records_end_for_levels_that_are_not_finite():
