@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.messages import option_text
+from sweep.messages import option_name, option_text
 from sweep.spec.cluster_config import (
     DASHBOARD_PORT,
     NO_DASHBOARD,
@@ -164,7 +164,7 @@ class RunOptions:
                 raise ClusterError(f"{name} must be a whole number above 0, not {number!r}")
         if self.threads is not None and (named := self._first_option_of_workers()):
             raise ClusterError(
-                f"{option_text('threads')} computes in this process, and {option_text(named)} with "
+                f"{option_name('threads')} computes in this process, and {option_name(named)} with "
                 "workers: leave out one"
             )
         if self.scheduler not in (None, SERIAL_SCHEDULER_OPTION) and not _is_scheduler_address(
