@@ -68,7 +68,8 @@ FOCUS_PATH = "instrument.laser.focus"
 OSCILLATOR_WAIST_PATH = "instrument.receiver.local_oscillator_waist"
 """Path of the 1/e^2 radius of the local oscillator's beam at the telescope [m]."""
 ARCHITECTURE_PATH = "instrument.receiver.architecture"
-"""Path of the receiver's architecture, one of `sweep.model.receiver_chain.ARCHITECTURES`."""
+"""Path of the receiver's architecture in the parameters. The values that it may have are
+`sweep.model.receiver_chain.ARCHITECTURES`."""
 SCAN_RATE_PATH, SEPARATION_PATH, MISALIGNMENT_PATH = (
     f"instrument.telescope.{name}" for name in ("scan_rate", "separation", "misalignment")
 )

@@ -82,7 +82,7 @@ NODE_COUNTS = np.array([
 """Possible numbers of nodes of a quadrature along the slope. They are in wide steps, as points with
 different numbers are computed separately."""
 
-NODE_LINE_COUNTS = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
+NODE_COUNTS_ACROSS_SLOPE = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
 """Possible numbers of parallel lines of nodes, across the slope."""
 
 _UNIFORM_QUADRATURE_ERROR = 1e-10
@@ -310,12 +310,12 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         parameters["target.grazing_angle"],
         np.asarray(parameters["target.radial_velocity"], float),
     )
-    position_angles, direction_angles = beam.footprint_angles(parameters)
+    position_spread_angles, direction_spread_angles = beam.footprint_angles(parameters)
     transverse_velocity = np.asarray(parameters["target.transverse_velocity"], float)
     position_sigma, slope, direction_sigma = (
-        position_angles / 4,
-        position_angles / 4 / np.tan(grazing_angle),
-        direction_angles / 4,
+        position_spread_angles / 4,
+        position_spread_angles / 4 / np.tan(grazing_angle),
+        direction_spread_angles / 4,
     )
     bin_width = budget.record.sample_rate / budget.record.window.length
     chirp_rate = budget.waveform.chirp_rate
@@ -323,10 +323,10 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         transverse_velocity=transverse_velocity,
         radial_velocity=radial_velocity,
         grazing_angle=grazing_angle,
-        beam_divergence=position_angles,
+        beam_divergence=position_spread_angles,
         n_beamlets=beamlets_max,
         pattern="line",
-        direction_angle=direction_angles,
+        direction_spread_angle=direction_spread_angles,
     )
     # Beyond the horizon the moments of ranges have no bound; the first-order slope is used there.
     range_rms = np.where(np.isfinite(range_moments.rms), range_moments.rms, slope)
@@ -527,7 +527,7 @@ def _choose_node_lines(
         tabulated_errors[:, np.searchsorted(tabulated_spreads, linear_deviation)]
         + errors_along[:, curvature_index] / largest_bin_power
     )
-    error_across = np.zeros((NODE_LINE_COUNTS.size, quadratic_max.size))
+    error_across = np.zeros((NODE_COUNTS_ACROSS_SLOPE.size, quadratic_max.size))
     for s, c in zip(spread.smoothing_deviation, spread.quadratic, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.searchsorted(_CURVATURE_RATIOS, np.where(s > 0, c / s, np.inf))
@@ -537,12 +537,16 @@ def _choose_node_lines(
         segment_error = np.fmin(errors_across[:, np.searchsorted(_CURVATURES, c)], smoothed_error)
         error_across = np.maximum(error_across, segment_error / largest_bin_power)
     total_error = error_along[:, None] + error_across
-    cost = NODE_COUNTS[:, None] * NODE_LINE_COUNTS
+    cost = NODE_COUNTS[:, None] * NODE_COUNTS_ACROSS_SLOPE
     total_error = np.where((cost <= beamlets_max)[..., None], total_error, np.inf).reshape(
         -1, quadratic_max.size
     )
     best, error = _cheapest_within_tolerance(total_error, cost.reshape(-1, 1), tolerance)
-    return best // NODE_LINE_COUNTS.size, NODE_LINE_COUNTS[best % NODE_LINE_COUNTS.size], error
+    return (
+        best // NODE_COUNTS_ACROSS_SLOPE.size,
+        NODE_COUNTS_ACROSS_SLOPE[best % NODE_COUNTS_ACROSS_SLOPE.size],
+        error,
+    )
 
 
 def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
@@ -619,7 +623,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     along : ndarray (counts, m + 1)
         Errors of NODE_COUNTS along the slope, at _CURVATURES and beyond the largest.
     across : ndarray (lines, m + 1)
-        Errors of NODE_LINE_COUNTS across the slope.
+        Errors of NODE_COUNTS_ACROSS_SLOPE across the slope.
     """
     lag = (np.arange(_N_CURVATURE_LAGS) + 0.5) / _N_CURVATURE_LAGS
     weight = _window_autocorrelation(window_name, lag)
@@ -635,7 +639,7 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
             np.where(rule_errors < 1, rule_errors, _substitute_error(_CURVATURES, n_nodes)), 1e3
         )
 
-    along, across = NODE_COUNTS.tolist(), (2 * NODE_LINE_COUNTS).tolist()
+    along, across = NODE_COUNTS.tolist(), (2 * NODE_COUNTS_ACROSS_SLOPE).tolist()
     return np.array([errors_of_rule(number) for number in along]), np.array(
         [errors_of_rule(number) for number in across]
     )
@@ -645,13 +649,13 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
 def _smoothed_errors_by_curvature() -> np.ndarray:
     """Tabulate errors by curvature that a linear spread smooths, (lines, ratios + 1).
 
-    Rows are NODE_LINE_COUNTS, columns are _CURVATURE_RATIOS and beyond. Errors are means over a
-    Gaussian.
+    Rows are NODE_COUNTS_ACROSS_SLOPE, columns are _CURVATURE_RATIOS and beyond. Errors are means
+    over a Gaussian.
     """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
-    errors = np.full((NODE_LINE_COUNTS.size, _CURVATURE_RATIOS.size + 1), np.inf)
-    for row, lines in zip(errors, NODE_LINE_COUNTS.tolist(), strict=True):
+    errors = np.full((NODE_COUNTS_ACROSS_SLOPE.size, _CURVATURE_RATIOS.size + 1), np.inf)
+    for row, lines in zip(errors, NODE_COUNTS_ACROSS_SLOPE.tolist(), strict=True):
         rule_errors = np.interp(
             phase * _CURVATURE_RATIOS[:, None],
             _CURVATURE_PHASES,

@@ -222,7 +222,7 @@ def wilson_interval(
     .. [1] Wilson, J. Am. Stat. Assoc. 22, 209, 1927.
     """
     k, n = np.asarray(successes, float), np.asarray(trials, float)
-    z = _normal_quantile(confidence)
+    z = _two_sided_normal_quantile(confidence)
     mean, squared_z = k / n, z * z
     centre = (k + squared_z / 2) / (n + squared_z)
     half_length = z * np.sqrt(k * (1 - mean) + squared_z / 4) / (n + squared_z)
@@ -292,7 +292,7 @@ def bounded_mean_interval(
     The module's description derives the interval.
     """
     m, n = np.asarray(mean, float), np.asarray(n_values, float)
-    z = _normal_quantile(confidence)
+    z = _two_sided_normal_quantile(confidence)
     variance_term = z * z * n * np.where(n > 1, variance, 0.0)
 
     def half_length(distance_to_end: np.ndarray) -> np.ndarray:
@@ -320,7 +320,7 @@ def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np
     return np.maximum(interval.high - estimate, estimate - interval.low)
 
 
-def _normal_quantile(confidence: ArrayLike) -> np.ndarray:
+def _two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
     """Return the z for which a standard normal |Z| <= z with probability `confidence`."""
     return np.asarray(ndtri(0.5 + np.asarray(confidence, float) / 2))
 

@@ -66,7 +66,8 @@ _N_PHASE_NODES = 256
 """Number of positions in the record at which the mean phase is subtracted."""
 
 _TINY = 1e-100
-"""Lower limit of the fraction of power that stays in the line, as it is divided by."""
+"""Smallest value used for the fraction of power that stays in the line. It keeps divisions by the
+fraction finite."""
 
 
 class LaserLine(NamedTuple):

@@ -230,7 +230,10 @@ class RecordSettings:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "RecordSettings":
-        """Return the record of parameters by dotted path, of points that share L and N."""
+        """Read the settings of the record from parameters by dotted path.
+
+        All points must have the same number L of samples and the same FFT size N.
+        """
         length = waveform.record_length(parameters)
         window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
         return cls(

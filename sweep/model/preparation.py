@@ -248,11 +248,11 @@ class Shots:
 
     @cached_property
     def whitening_gain(self) -> np.ndarray:
-        """Gain of each segment's lines after the noise of the spectrum is whitened, (segments, n).
+        """Factor on the amplitude of each segment's lines by whitening the noise, (segments, n).
 
-        Spectra are divided by the root of the noise density relative to white noise. The gain
-        varies little over an echo and is taken on the beam's axis. Noise added by the ADC is white
-        already.
+        To whiten the noise, the spectrum is divided by the root of the noise's relative power
+        density. It is the density over that of white noise. Noise added by the ADC is white
+        already. The factor varies little over an echo, and is that of the line on the beam's axis.
         """
         return broadcast_rows(
             [self.whitening_gain_at(beat_frequency) for beat_frequency in self.beat_frequencies],

@@ -340,12 +340,14 @@ N_READINGS = 16
 """Number of readings of unsigned peaks, as numbered by :func:`beats_of_reading`."""
 
 FAR_READING = 1
-"""Number of the reading without folds in which the half difference of the peaks is the Doppler
-frequency: |f_d| < f_r."""
+"""Number, for :func:`beats_of_reading`, of the reading with |f_d| < f_r, the range beat.
+
+No peak is folded, and half the difference of the up and down peak is the Doppler frequency f_d."""
 
 FAST_READING = 0
-"""Number of the reading without folds in which the half sum of the peaks is the Doppler frequency:
-|f_d| > f_r."""
+"""Number, for :func:`beats_of_reading`, of the reading with |f_d| > f_r, the range beat.
+
+No peak is folded, and half the sum of the up and down peak is the Doppler frequency f_d."""
 
 
 SIGNED_READING = 16

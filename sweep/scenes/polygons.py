@@ -338,7 +338,7 @@ def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.
     result = [tuple(triangle) for triangle in triangles.tolist()]
     triangle_of_edge: dict[tuple[int, int], int] = {}
     for k, triangle in enumerate(result):
-        triangle_of_edge |= _directed_edges(triangle, k)
+        triangle_of_edge |= _triangle_by_directed_edge(triangle, k)
     used_corners = np.flatnonzero(used).tolist()
     for start, stop in zip(used_corners, used_corners[1:] + used_corners[:1], strict=True):
         between = [
@@ -355,13 +355,15 @@ def _insert_collinear_corners(triangles: np.ndarray, corners: np.ndarray) -> np.
         (opposite,) = set(result[k]) - {start, stop}
         for first, second in pairwise([start, *between, stop]):
             result.append((first, second, opposite))
-            triangle_of_edge |= _directed_edges(result[-1], len(result) - 1)
+            triangle_of_edge |= _triangle_by_directed_edge(result[-1], len(result) - 1)
         result[k] = result.pop()  # the last part replaces the original triangle
-        triangle_of_edge |= _directed_edges(result[k], k)
+        triangle_of_edge |= _triangle_by_directed_edge(result[k], k)
     return np.array(result)
 
 
-def _directed_edges(triangle: tuple[int, ...], number: int) -> dict[tuple[int, int], int]:
+def _triangle_by_directed_edge(
+    triangle: tuple[int, ...], number: int
+) -> dict[tuple[int, int], int]:
     """Return the three edges of a triangle as keys, with the triangle's number as value.
 
     An edge is a pair of corner indices, in the order of the winding.

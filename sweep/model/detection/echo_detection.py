@@ -21,7 +21,7 @@ from sweep.model.detection.hoyt import (
 from sweep.model.detection.joint_tail import (
     JointTailRule,
     joint_tail_excess,
-    joint_tail_excess_at,
+    joint_tail_excess_by_four_nodes,
 )
 from sweep.model.detection.marcum import Tails, marcum_q1, marcum_q1_tails
 from sweep.model.detection.speckle_modes import (
@@ -860,7 +860,11 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
-    """Compute :func:`pd_and_miss_any_bin` for a steady echo with bins of its pedestal alone."""
+    """Compute :func:`pd_and_miss_any_bin` for a steady echo of a laser with phase noise.
+
+    The laser's phase noise leaves a pedestal around each line, and some bins of the echo hold no
+    more than that. In each bin :func:`fill_pedestal_ratios` tells how much it adds to the noise.
+    """
     n_bins = echo.magnitude.size
     pedestal_ratios, given_mode = np.empty(n_bins), _zero_given_mode(n_bins)
     fill_pedestal_ratios(echo.magnitude, echo.is_echo, bin_threshold, pedestal_ratios)
@@ -1340,7 +1344,7 @@ def _pd_and_miss_given_mode(
             correlation = (
                 correlation * correlation + correlation * signal * previous_signal
             ) / math.sqrt((1.0 + signal * signal) * (1.0 + previous_signal * previous_signal))
-            p_joint = joint_tail_excess_at(deviate, previous_deviate, correlation)
+            p_joint = joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation)
             p_joint = max(min(p_joint / previous_p_stay, p_cross), -p_stay)
             conditional_cross, conditional_stay = p_cross - p_joint, p_stay + p_joint
         pd += miss * conditional_cross

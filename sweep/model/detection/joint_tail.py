@@ -71,7 +71,7 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def joint_tail_excess_at(deviate, previous_deviate, correlation):
+def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
     """Compute :func:`joint_tail_excess` for any ``correlation``, by 4 nodes in place of 12."""
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):

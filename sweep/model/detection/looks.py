@@ -533,21 +533,26 @@ class Looks(NamedTuple):
         pd: np.ndarray,
         look_speckle: "LookSpeckle | None" = None,
     ) -> DetectionArrays:
-        """Return the probabilities that two or more of three segments are detected, or fewer.
+        """Return the probabilities that two or more, or fewer, of three segments are detected.
 
         Parameters
         ----------
         signals
             (3, n): root mean square |X| of the segments' bins over the noise per quadrature.
         threshold_ratio
-            (n,): threshold over the same.
+            (n,): threshold over the noise per quadrature.
         correlations
             (3, n): moduli of the correlations of up and Doppler, up and down, Doppler and down
             segment.
         pd
             (3, n): probability of detection of each segment.
         look_speckle
-            Correlation of the looks' speckle if it is partial.
+            Correlation of the looks' speckle if it is partial; None otherwise.
+
+        Returns
+        -------
+        DetectionArrays
+            Both probabilities, (n,); nan where a segment's `pd` is not finite.
 
         Notes
         -----

@@ -110,10 +110,11 @@ def sidelobe_correlation(window: Window, fft_size: int) -> float:
 
 @lru_cache(maxsize=32)
 def interpolator(window: Window, fft_size: int) -> Interpolator:
-    """Prepare the tables for a window and FFT size (cached).
+    """Return the tables that give a peak's position from three magnitudes (cached).
 
-    Flat-top windows in a padded FFT have no measure that rises with delta. Positions are then not
-    resolved: delta is 0, with an error of half a bin.
+    They hold for records with this window that are padded to `fft_size` samples. For a flat-top
+    window in a padded FFT, no measure of the magnitudes rises with the offset of the tone from the
+    centre bin. The offset is then given as 0, with an error of half a bin.
     """
     offset = np.arange(_TABLE_INTERVALS + 1) / _TABLE_INTERVALS
     tone_magnitudes = _tone_magnitudes(window, fft_size, offset)

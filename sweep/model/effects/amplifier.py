@@ -97,7 +97,11 @@ def emission_beat_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the exact relative noise of spontaneous emission; the threshold follows it."""
+    """Return the noise variance of spontaneous emission over that of all noise without an echo.
+
+    The value is exact, not a bound. The threshold is set on the changed noise, and rises with it.
+    None for direct detection or without spontaneous emission.
+    """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
     current_variance = emission_beat_current_variance(

@@ -117,12 +117,16 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_footprint_phase(shots: Shots, context: EffectContext) -> Shots:
-    """Add beamlets as amplitudes, if the spec states that their phases follow the surface.
+    """Let the lines of beamlets add as complex amplitudes instead of powers.
+
+    This applies if the spec states that the optical phases follow the surface. Otherwise the shots
+    are returned unchanged.
 
     Notes
     -----
-    X_k = sum_b a_b W(k - nu_b) exp(-2 pi i f tau_b), in place of |X_k|^2 = sum_b |a_b W(k -
-    nu_b)|^2.
+    Bin k of the spectrum is X_k = sum_b a_b W(k - nu_b) exp(-2 pi i f tau_b), in place of
+    |X_k|^2 = sum_b |a_b W(k - nu_b)|^2. Beamlet b has the amplitude a_b, its line at nu_b [bins],
+    and the round-trip time tau_b. W is the transform of the window, and f the optical frequency.
     """
     if str(context.parameters["footprint.phases"]) != "coherent":
         return shots

@@ -205,7 +205,11 @@ _IMAGE_FACTOR = 1.1
 
 
 def leakage_bound(points: PlannerInputs) -> ErrorBound:
-    """Bound the probability that leaked signal raises an additional group in any segment."""
+    """Bound the probability that leaked signal raises an additional group in any segment.
+
+    A group is a run of adjacent bins above the threshold. Leaked signal is the signal in bins that
+    stay below the threshold without noise.
+    """
     threshold_ratio, is_near_image = points.threshold_ratio, points.is_near_image
     ratio_to_threshold = (
         points.line_signal_ratio

@@ -199,7 +199,7 @@ class PlannerInputs(LinkBudget):
         range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
             radial_velocity=self.target.radial_velocity,
-            direction_angle=self.footprint_angles.directions,
+            direction_spread_angle=self.footprint_angles.directions,
             **geometry,
         )
         echo_ratio = plane_echo_ratio_bound(self.option("target.reflectance_law"), **geometry)

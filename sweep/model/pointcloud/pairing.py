@@ -112,7 +112,8 @@ class ConfirmingPeak(NamedTuple):
     doppler_index: int
     """Index of the Doppler peak; -1 if no peak fits."""
     reading: int
-    """Reading of the peaks; -1 if no peak fits."""
+    """Number of the reading, as of :func:`sweep.model.waveform.beats_of_reading`; -1 if no peak
+    fits."""
 
 
 @njit(cache=True, error_model="numpy")

@@ -462,8 +462,8 @@ class DrawInputs(NamedTuple):
     sigma; 0 without speckle."""
     n_independent_bins: np.ndarray
     """(n, 3, groups): equivalent number of independent bins of a group in developed speckle."""
-    cholesky_factors: np.ndarray
-    """(n, 6): Cholesky factors of the segments' correlation; 0 without speckle."""
+    speckle_cholesky_factors: np.ndarray
+    """(n, 6): Cholesky factors of the correlation of the segments' speckle; 0 without speckle."""
     look_covariance_root: np.ndarray
     """(n, 3, looks, sets) complex: coefficients of independent sets of speckle in the speckle of
     each look, for partly common speckle; otherwise without sets."""
@@ -623,7 +623,7 @@ def make_draw_inputs(
 
 
 def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
-    """Return ``cholesky_factors`` of :class:`DrawInputs`, (n, 6)."""
+    """Return ``speckle_cholesky_factors`` of :class:`DrawInputs`, (n, 6)."""
     if shots.speckle.segment_correlations is None:
         return np.zeros((shots.size, 6))
     cholesky_factors = np.broadcast_to(
@@ -2156,7 +2156,7 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
     random_index = _OTHER_BINS_RANDOM_OFFSET + group * int(DRAWN_INDEPENDENT_BINS_MAX)
     while n_bins_left > 1e-6:
         speckle_amplitude = speckle_amplitudes(
-            (a, b), draw, random_index, inputs.cholesky_factors[i]
+            (a, b), draw, random_index, inputs.speckle_cholesky_factors[i]
         )[s]
         re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], random_index)
         noise_weight, echo_weight = math.sqrt(0.5 * (1.0 - echo_fraction)), math.sqrt(echo_fraction)

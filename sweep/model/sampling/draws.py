@@ -1039,10 +1039,24 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
-    """Draw the noise of ``n_bins`` adjacent bins over sigma, by a root of its covariance.
+    """Draw the noise of adjacent bins in units of sigma, by a root of its covariance.
 
-    ``address`` and ``first_index``, which is even, are as in :func:`draw_bin_noise`. ``root`` is
-    the result of :func:`noise_covariance_root`. ``noise``, a :class:`NoiseScratch`, is the result.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64), number of the draw, and stream.
+    first_index
+        Stream index of the first pair of independent numbers; even.
+    n_bins
+        Number of bins.
+    root
+        Result of :func:`noise_covariance_root`.
+    noise
+        :class:`NoiseScratch` of at least as many bins, to which the noise is written.
+
+    Notes
+    -----
+    sigma is the standard deviation of a bin's noise per quadrature.
     """
     re_numbers, im_numbers = noise.number_in_phase, noise.number_in_quadrature
     for k in range(0, n_bins, 2):

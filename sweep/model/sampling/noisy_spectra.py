@@ -232,7 +232,7 @@ def noiseless_signal(
             segment,
             is_exempt=no_bins,
         )
-    peak_position = _tone_position(shots, magnitude, strongest_bin)
+    peak_position = _interpolate_tone_position(shots, magnitude, strongest_bin)
     shift = centring_shift(shots, strongest_bin)
     bins_above_half = (
         np.flatnonzero(
@@ -281,14 +281,14 @@ def noiseless_signal(
             np.asarray(echo_bins),
             np.array(
                 [
-                    _tone_position(shots, magnitude, int(strongest_bin))
+                    _interpolate_tone_position(shots, magnitude, int(strongest_bin))
                     for strongest_bin in echo_bins
                 ]
             ),
         )
         for echo_number, echo_bin in enumerate(echo_bins):
             if (echo_bin - first_bin) % magnitude.size > last_bin - first_bin:
-                echo_position = _tone_position(shots, magnitude, int(echo_bin))
+                echo_position = _interpolate_tone_position(shots, magnitude, int(echo_bin))
                 phases = np.where(
                     nearest_echo == echo_number,
                     _tone_phases(echo_position, shots, first_sample),
@@ -383,7 +383,7 @@ def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarr
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)])
 
 
-def _tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
+def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
     """Interpolate the position of a peak, as a fractional index, as if it were a lone tone.
 
     ``magnitude`` (bins,) is |X|, and ``peak_index`` its largest bin.

@@ -818,7 +818,7 @@ def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.nda
     return np.cos(node_angles), series_matrix
 
 
-_SAMPLES_PER_BATCH = 128
+_SERIES_SAMPLES_PER_BATCH = 128
 """Number of samples at which a Chebyshev series is evaluated together, in vector registers."""
 
 
@@ -828,11 +828,11 @@ def _multiply_by_chebyshev_series(coefficients, positions, values):
 
     The series has complex ``coefficients`` (k,), and is evaluated by Clenshaw's algorithm.
     """
-    b1_re, b1_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
-    b2_re, b2_im = np.empty(_SAMPLES_PER_BATCH), np.empty(_SAMPLES_PER_BATCH)
-    twice_positions = np.empty(_SAMPLES_PER_BATCH)
-    for batch_begin in range(0, positions.size, _SAMPLES_PER_BATCH):
-        n_samples = min(_SAMPLES_PER_BATCH, positions.size - batch_begin)
+    b1_re, b1_im = np.empty(_SERIES_SAMPLES_PER_BATCH), np.empty(_SERIES_SAMPLES_PER_BATCH)
+    b2_re, b2_im = np.empty(_SERIES_SAMPLES_PER_BATCH), np.empty(_SERIES_SAMPLES_PER_BATCH)
+    twice_positions = np.empty(_SERIES_SAMPLES_PER_BATCH)
+    for batch_begin in range(0, positions.size, _SERIES_SAMPLES_PER_BATCH):
+        n_samples = min(_SERIES_SAMPLES_PER_BATCH, positions.size - batch_begin)
         for n in range(n_samples):
             twice_positions[n] = 2.0 * positions[batch_begin + n]
             b1_re[n] = b1_im[n] = b2_re[n] = b2_im[n] = 0.0

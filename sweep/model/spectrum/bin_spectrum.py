@@ -179,7 +179,7 @@ class FieldWorkspace(NamedTuple):
     line_ends: EndStrengths
     """Strengths of the lines at the record's ends."""
     sources: EndStrengths
-    """Sources that replace the lines in bins far away."""
+    """Equivalent lines, which replace the real ones in the spectrum of bins far away."""
     far_bins: FarBins
     """Quantities of a batch of bins far away."""
     re: np.ndarray

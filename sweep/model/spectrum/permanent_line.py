@@ -44,7 +44,7 @@ class LineTransforms(NamedTuple):
     magnitude_max: np.ndarray
     """(bins,): largest magnitude at any phase."""
     magnitude_rms: np.ndarray
-    """(bins,): root mean square of the magnitude over the phase."""
+    """(bins,): root mean square of the magnitude over all phases of the line."""
 
 
 @lru_cache(maxsize=16)

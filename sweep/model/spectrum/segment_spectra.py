@@ -711,9 +711,11 @@ def _evaluate_batch(
     keeps_magnitudes: bool,
     with_pd: bool,
 ) -> BinSpans:
-    """Compute the spans of a group's points from number ``batch_begin`` on.
+    """Compute the spans of bins around the lines, for the next batch of points of a group.
 
-    The result has as many points as fit into SPAN_BINS_PER_BATCH bins, at least one.
+    The batch begins with the group's point number ``batch_begin``. It has as many points as fit
+    into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
+    shapes.
     ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`;
     ``lowest_levels`` (n,) is |X| [V] below which bins may be left out.
     """
@@ -838,9 +840,19 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _copy_lines(lines, n_lines, shifts):
-    """Replace lines whose powers add by shifted and weighted copies; return their number.
+    """Copy lines to several shifted positions, and return the number of all copies.
 
-    ``shifts`` are :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts`.
+    The powers of the lines add. Their copies average the power spectrum over the shifts.
+
+    Parameters
+    ----------
+    lines
+        :class:`sweep.model.spectrum.bin_spectrum.LineArrays`. The copies are written to it, and the
+        first ``n_lines`` are replaced.
+    n_lines
+        Number of lines.
+    shifts
+        :class:`sweep.model.spectrum.bin_spectrum.AveragingShifts`.
     """
     for copy in range(shifts.offset.size - 1, -1, -1):  # the lines themselves are the first copy
         for line in range(n_lines):

@@ -565,7 +565,7 @@ class FlightSample(StudySample):
             tiles_wanted = math.ceil(
                 n_points / SHOTS_PER_TILE / len(study.scanner_grids) / len(axis_points)
             )
-            shot_numbers = study.get_eyepoint_study(scanner).sample_shots_of_cycles(
+            shot_numbers = study.get_eyepoint_study(scanner).shot_numbers_of_sampled_cycles(
                 max(self.timed_points_max // SHOTS_PER_TILE, tiles_wanted)
             )
             for axis_point in axis_points:

@@ -568,7 +568,9 @@ def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
     }
     for eyepoints in study.eyepoint_studies():
         eyepoints_of_sample = eyepoints_from_arrays(
-            eyepoints.cast_shots(eyepoints.sample_shots_of_tiles(SAMPLED_TILES_PER_SCANNER)),
+            eyepoints.cast_shots(
+                eyepoints.shot_numbers_of_sampled_tiles(SAMPLED_TILES_PER_SCANNER)
+            ),
             eyepoints.beamlet_weights,
         )
         hitting_shots = eyepoints_of_sample.has_target.nonzero()[0]

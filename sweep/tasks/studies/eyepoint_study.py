@@ -183,8 +183,8 @@ class EyepointStudy(BlockStudy):
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def sample_shots_of_tiles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots of `n_tiles` tiles, spread over the flight."""
+    def shot_numbers_of_sampled_tiles(self, n_tiles: int) -> np.ndarray:
+        """Return the numbers of all shots of up to `n_tiles` tiles spread over the flight."""
         last_tile = (self.n_points - 1) // SHOTS_PER_TILE
         first_shots = (
             np.unique(np.linspace(0, last_tile, n_tiles).astype(np.int64)) * SHOTS_PER_TILE
@@ -192,9 +192,11 @@ class EyepointStudy(BlockStudy):
         shot_numbers = (first_shots[:, None] + np.arange(SHOTS_PER_TILE)).ravel()
         return np.asarray(shot_numbers[shot_numbers < self.n_points])
 
-    def sample_shots_of_cycles(self, n_tiles: int) -> np.ndarray:
+    def shot_numbers_of_sampled_cycles(self, n_tiles: int) -> np.ndarray:
         """Return the numbers of all shots of cycles that overlap `n_tiles` tiles of the flight."""
-        cycle_numbers = np.unique(self.sample_shots_of_tiles(n_tiles) // self.shots_per_cycle)
+        cycle_numbers = np.unique(
+            self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle
+        )
         return np.asarray(
             (
                 cycle_numbers[:, None] * self.shots_per_cycle + np.arange(self.shots_per_cycle)
@@ -202,7 +204,11 @@ class EyepointStudy(BlockStudy):
         )
 
     def cast_eyepoints(self, shot_numbers: np.ndarray) -> Eyepoints:
-        """Cast all rays of any shots, given by numbers (n,), at once. Return the eyepoints."""
+        """Cast the rays of the shots with the given numbers (n,) and return their eyepoints.
+
+        Eyepoints are the geometry of the shots, as the rays have found it. All rays are cast
+        together.
+        """
         from sweep.model.pointcloud.eyepoints import observe_eyepoints
 
         world = self.world

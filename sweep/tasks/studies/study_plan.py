@@ -189,7 +189,7 @@ def measure_seconds_per_point(study: GridStudy) -> float:
                 block, _sampled_indices_of_block(study, block, n_geometries)
             )
         start = time.process_time()
-        samples = [_evaluate_sample(study, block, n_geometries) for block in blocks]
+        samples = [_compute_timed_points(study, block, n_geometries) for block in blocks]
         measured_seconds = time.process_time() - start
         points, extrapolated_seconds = (sum(column) for column in zip(*samples, strict=True))
         return TimedRound(points, (measured_seconds + extrapolated_seconds,))
@@ -210,7 +210,7 @@ def _choose_timed_blocks(study: GridStudy) -> list[int]:
     ):  # first and middle block, quarters, and so on
         block = k * last_block // (TIMED_BLOCKS_MAX - 1)
         if block not in blocks:
-            _evaluate_sample(study, block, 1)
+            _compute_timed_points(study, block, 1)
             blocks.append(block)
         if time.process_time() - start > 2 * POINT_TIMING_SECONDS:
             break
@@ -257,7 +257,7 @@ def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -
     return geometry_groups[sampled_groups].ravel()
 
 
-def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
+def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
     """Return the number of points computed, and the estimated time of their omitted draws [s]."""
     spec, extrapolated_seconds = study.spec, 0.0
     local_indices = _sampled_indices_of_block(study, block, n_geometries)
@@ -328,7 +328,7 @@ def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
 
     def time_round(n_tiles: int) -> TimedRound:
         start = time.process_time()
-        shot_numbers = eyepoints.sample_shots_of_cycles(n_tiles)
+        shot_numbers = eyepoints.shot_numbers_of_sampled_cycles(n_tiles)
         shot_arrays = eyepoints.cast_cycles(shot_numbers)
         cast_at = time.process_time()
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
@@ -487,7 +487,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
     axes = tuple(int(axis.size) for axis in study.spec.axes)
     axis_points = list(np.ndindex(axes))
     for eyepoints in study.eyepoint_studies():
-        shot_numbers = eyepoints.sample_shots_of_tiles(SCANNER_TILES_SAMPLED)
+        shot_numbers = eyepoints.shot_numbers_of_sampled_tiles(SCANNER_TILES_SAMPLED)
         sample_eyepoints = eyepoints_from_arrays(
             eyepoints.cast_shots(shot_numbers), eyepoints.beamlet_weights
         )
@@ -740,7 +740,7 @@ def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
     }
     samples = []
     for eyepoints in study.eyepoint_studies():
-        shot_numbers = eyepoints.sample_shots_of_cycles(SCANNER_TILES_SAMPLED)
+        shot_numbers = eyepoints.shot_numbers_of_sampled_cycles(SCANNER_TILES_SAMPLED)
         shot_arrays = eyepoints.cast_cycles(shot_numbers)
         shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
         for corner in sorted(axis_corners):
