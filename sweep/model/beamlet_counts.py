@@ -326,7 +326,7 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
         beam_divergence=position_angles,
         n_beamlets=beamlets_max,
         pattern="line",
-        direction_angle=direction_angles,
+        direction_spread_angle=direction_angles,
     )
     # Beyond the horizon the moments of ranges have no bound; the first-order slope is used there.
     range_rms = np.where(np.isfinite(range_moments.rms), range_moments.rms, slope)

@@ -194,7 +194,7 @@ def plane_footprint(
     pattern: str = "hexagonal",
     radial_velocity: ArrayLike = 0.0,
     transverse_velocity: ArrayLike = 0.0,
-    direction_angle: np.ndarray | None = None,
+    direction_spread_angle: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Compute where the beamlets of a beam meet a flat plane, relative to the range on its axis.
 
@@ -209,7 +209,7 @@ def plane_footprint(
     radial_velocity, transverse_velocity : array_like
         Velocity along the beam, positive when closing, and across it, positive towards the near
         side of the plane [m/s].
-    direction_angle : ndarray (n,), optional
+    direction_spread_angle : ndarray (n,), optional
         Full 1/e^2 angle of the directions along which velocities are seen [rad]; by default
         `beam_divergence`.
 
@@ -244,8 +244,10 @@ def plane_footprint(
         hits_plane, (excess_length * sine - y * cosine) / safe_height_slope, 0.0
     )
     cos_incidence = np.where(hits_plane, height_slope / (1 + excess_length), 0.0)
-    if direction_angle is not None:
-        x, y = (v * (np.asarray(direction_angle, float)[:, None] / 4) for v in (across, along))
+    if direction_spread_angle is not None:
+        x, y = (
+            v * (np.asarray(direction_spread_angle, float)[:, None] / 4) for v in (across, along)
+        )
         excess_length = (squared_angle := x * x + y * y) / (1 + np.sqrt(1 + squared_angle))
     radial_column, transverse_column = (
         np.asarray(v, float)[..., None] for v in (radial_velocity, transverse_velocity)
@@ -296,7 +298,7 @@ def plane_offset_moment_bounds(
     beam_divergence: ArrayLike,
     n_beamlets: int,
     pattern: str,
-    direction_angle: ArrayLike | None = None,
+    direction_spread_angle: ArrayLike | None = None,
 ) -> tuple[OffsetMoments, OffsetMoments]:
     """Return upper bounds on the moments of beamlets' offsets in range and velocity on a plane.
 
@@ -310,7 +312,7 @@ def plane_offset_moment_bounds(
         Full 1/e^2 angle of the positions [rad].
     n_beamlets, pattern
         Number and pattern, as of :func:`place_beamlets`.
-    direction_angle : array_like, optional
+    direction_spread_angle : array_like, optional
         Full 1/e^2 angle of the directions along which velocities are seen [rad]; by default
         `beam_divergence`.
 
@@ -356,8 +358,8 @@ def plane_offset_moment_bounds(
         range_extreme, 1.0
     )  # velocities have bounds beyond the horizon too
     echo_weight_max = upper_factor * upper_factor * upper_factor * np.exp(6 * curvature_term)
-    if direction_angle is not None:
-        sigma = np.asarray(direction_angle, float) / 4
+    if direction_spread_angle is not None:
+        sigma = np.asarray(direction_spread_angle, float) / 4
         curvature_term = (radius * sigma) * (radius * sigma) / 2
     weighted_shift = sigma * (3 * range_rms * echo_weight_max + 8 * radius * curvature_term)
     velocity_moments = OffsetMoments(

@@ -101,13 +101,13 @@ class _PlaneGeometry(NamedTuple):
 
     grazing_angle: np.ndarray
     """Angle between beam and plane [rad]."""
-    position_angle: np.ndarray
+    position_spread_angle: np.ndarray
     """Full 1/e^2 angle over which positions are spread [rad]."""
     radial_velocity: np.ndarray
     """Radial velocity [m/s]; 0 if beamlets have no velocities of their own."""
     transverse_velocity: np.ndarray
     """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
-    direction_angle: np.ndarray | None = None
+    direction_spread_angle: np.ndarray | None = None
     """Full 1/e^2 angle over which directions of the light are spread [rad]."""
     linear_range_loss: np.ndarray | None = None
     """Coefficient b of :func:`sweep.model.beam.range_loss_coefficients`."""
@@ -117,7 +117,11 @@ class _PlaneGeometry(NamedTuple):
     @property
     def direction_sigma(self) -> np.ndarray:
         """Standard deviation of the directions of the light on each axis [rad]."""
-        angle = self.position_angle if self.direction_angle is None else self.direction_angle
+        angle = (
+            self.position_spread_angle
+            if self.direction_spread_angle is None
+            else self.direction_spread_angle
+        )
         return angle / 4
 
 
@@ -196,7 +200,10 @@ class FlatGround:
         curvature_phase = phase_per_speed * geometry.radial_velocity * geometry.direction_sigma**2
         curvature_phase = (
             curvature_phase
-            + 2 * np.pi * np.asarray(delay_cycles, float) * (geometry.position_angle / 4) ** 2
+            + 2
+            * np.pi
+            * np.asarray(delay_cycles, float)
+            * (geometry.position_spread_angle / 4) ** 2
         )
         curvature_factor = 1 / (1 + 1j * curvature_phase)
         mean = (
@@ -210,7 +217,7 @@ class FlatGround:
     def gradients(self) -> "BeamGradients":
         """Changes per standard deviation of the beam, towards the near side of the plane."""
         geometry = self._geometry
-        range_gradient = (geometry.position_angle / 4) / np.tan(geometry.grazing_angle)
+        range_gradient = (geometry.position_spread_angle / 4) / np.tan(geometry.grazing_angle)
         echo_exponent = 3 if self._reflectance_law == "lambert" else 2
         columns = (
             2 / SPEED_OF_LIGHT * geometry.transverse_velocity * geometry.direction_sigma,
@@ -237,12 +244,12 @@ class FlatGround:
         geometry = _PlaneGeometry(*np.stack(columns)[:, first])
         relative_range_offset, cos_incidence, weights, closing_offset = beamlets.plane_footprint(
             grazing_angle=geometry.grazing_angle,
-            beam_divergence=geometry.position_angle,
+            beam_divergence=geometry.position_spread_angle,
             n_beamlets=self._n_beamlets,
             pattern=self._beamlet_pattern,
             radial_velocity=geometry.radial_velocity,
             transverse_velocity=geometry.transverse_velocity,
-            direction_angle=geometry.direction_angle,
+            direction_spread_angle=geometry.direction_spread_angle,
         )
         range_loss = (1 + relative_range_offset) ** 2
         if geometry.linear_range_loss is not None and geometry.quadratic_range_loss is not None:

@@ -66,7 +66,7 @@ _N_PHASE_NODES = 256
 """Number of positions in the record at which the mean phase is subtracted."""
 
 _TINY = 1e-100
-"""Lower limit of the fraction of power that stays in the line, as it is divided by."""
+"""Lower limit of the fraction of power in the line. It keeps divisions by the fraction finite."""
 
 
 class LaserLine(NamedTuple):
@@ -78,14 +78,14 @@ class LaserLine(NamedTuple):
     """(n,): FWHM [Hz] of the Lorentzian line of a laser whose phase is a random walk."""
     pedestal_variance_beside: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
-    pedestal_variance_under: np.ndarray | float = 0.0
+    pedestal_variance_under_line: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
 
     def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
         """Return the line for an echo whose power changes by a factor."""
         return self._replace(
             pedestal_variance_beside=self.pedestal_variance_beside * power_factor,
-            pedestal_variance_under=self.pedestal_variance_under * power_factor,
+            pedestal_variance_under_line=self.pedestal_variance_under_line * power_factor,
         )
 
 
@@ -368,7 +368,11 @@ def apparent_line_and_pedestal(
 
 @lru_cache(maxsize=16)
 def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """Return the window over the record, of sum 1, and its double integral, of end slope 1."""
+    """Return the window at evenly spaced positions, and its double integral.
+
+    Positions are in records, 0..1. The samples, (n,), have the sum 1. The integral is a spline that
+    is scaled so that its slope at the end of the record is 1.
+    """
     from scipy.interpolate import CubicSpline  # slow to import
 
     w, position = (

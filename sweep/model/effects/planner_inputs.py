@@ -162,7 +162,7 @@ class PlannerInputs(LinkBudget):
         return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
     @property
-    def noise_peak_ratio(self) -> float | None:
+    def noise_maximum_ratio(self) -> float | None:
         """Magnitude over sigma that any bin's noise exceeds with a probability of at most 0.001.
 
         None if segments report all peaks that cross the threshold.
@@ -199,7 +199,7 @@ class PlannerInputs(LinkBudget):
         range_moments, velocity_moments = plane_offset_moment_bounds(
             transverse_velocity=self["target.transverse_velocity"],
             radial_velocity=self.target.radial_velocity,
-            direction_angle=self.footprint_angles.directions,
+            direction_spread_angle=self.footprint_angles.directions,
             **geometry,
         )
         echo_ratio = plane_echo_ratio_bound(self.option("target.reflectance_law"), **geometry)
@@ -386,7 +386,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def velocity_spread(self) -> OffsetMoments:
-        """Moments of lines' offsets [bins] due to the velocities of beamlets."""
+        """Mean, rms and extreme of the lines' offsets [bins] due to the velocities of beamlets."""
         return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
 
     @cached_property
