@@ -82,7 +82,7 @@ def exact_means(spec: GridSpec) -> tuple[np.ndarray, float]:
     certain_effects = [effect.name for effect in EFFECTS if not effect.is_random]
     means, integral_error = np.full((4, grid.n_points), np.nan), 0.0
     for index, shots in prepare_shots(parameters, certain_effects):
-        if shots.footprint.n_beamlets != 1 or np.any(shots.laser_line.pedestal_variance_under):
+        if shots.footprint.n_beamlets != 1 or np.any(shots.laser_line.pedestal_variance_under_line):
             raise ValueError("only of one beamlet, without a pedestal, the mean is known")
         signal = evaluate_segments(shots)[:, 2] / shots.line_noise_sigma
         level = shots.threshold / shots.line_noise_sigma

@@ -463,8 +463,8 @@ def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.nda
 
 
 _UNTRUNCATED_FILL_MAX = 0.25
-"""Ratio w_a / a of beam radius to aperture radius up to which truncation is neglected. It costs at
-most 5e-7 of the echo there."""
+"""Ratio w_a / a of beam radius to aperture radius up to which truncation is neglected. Up to this
+ratio truncation takes at most 5e-7 of the echo."""
 _TABLE_MIDDLE_PHASE = 4.0
 """Defocus phase at the rim of the aperture [rad] in the middle of the table's coordinate."""
 _RIM_PHASE_MAX = 60.0

@@ -65,9 +65,8 @@ left."""
 _N_PHASE_NODES = 256
 """Number of positions in the record at which the mean phase is subtracted."""
 
-_TINY = 1e-100
-"""Smallest value used for the fraction of power that stays in the line. It keeps divisions by the
-fraction finite."""
+_LINE_POWER_FRACTION_MIN = 1e-100
+"""Lower limit of the fraction of power in the line. It keeps divisions by the fraction finite."""
 
 
 class LaserLine(NamedTuple):
@@ -79,14 +78,14 @@ class LaserLine(NamedTuple):
     """(n,): FWHM [Hz] of the Lorentzian line of a laser whose phase is a random walk."""
     pedestal_variance_beside: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
-    pedestal_variance_under: np.ndarray | float = 0.0
+    pedestal_variance_under_line: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
 
     def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
         """Return the line for an echo whose power changes by a factor."""
         return self._replace(
             pedestal_variance_beside=self.pedestal_variance_beside * power_factor,
-            pedestal_variance_under=self.pedestal_variance_under * power_factor,
+            pedestal_variance_under_line=self.pedestal_variance_under_line * power_factor,
         )
 
 
@@ -361,7 +360,7 @@ def apparent_line_and_pedestal(
     decorrelated_sum = decorrelated.sum(axis=1) * lag * w.size
     squared_window_sum = window.sum**2
     pedestal = 0.5 * (1 + sums[1] ** 2 - decorrelated_sum) - sums[0] ** 2
-    line_fraction = np.maximum(coherent_fraction * sums[0] ** 2, _TINY)
+    line_fraction = np.maximum(coherent_fraction * sums[0] ** 2, _LINE_POWER_FRACTION_MIN)
     return line_fraction, np.maximum(
         0.5 * power + coherent_fraction * pedestal * squared_window_sum, 0.0
     )
@@ -369,7 +368,11 @@ def apparent_line_and_pedestal(
 
 @lru_cache(maxsize=16)
 def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """Return the window over the record, of sum 1, and its double integral, of end slope 1."""
+    """Return the window at evenly spaced positions, and its double integral.
+
+    Positions are in records, 0..1. The samples, (n,), have the sum 1. The integral is a spline that
+    is scaled so that its slope at the end of the record is 1.
+    """
     from scipy.interpolate import CubicSpline  # slow to import
 
     w, position = (

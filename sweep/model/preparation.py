@@ -300,7 +300,9 @@ class Shots:
     @cached_property
     def line_noise_sigma(self) -> np.ndarray:
         """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
-        return self._noise_sigma_of(self.noise_variance + self.laser_line.pedestal_variance_under)
+        return self._noise_sigma_of(
+            self.noise_variance + self.laser_line.pedestal_variance_under_line
+        )
 
     @cached_property
     def bin_thresholds(self) -> "BinThresholds":
@@ -359,7 +361,9 @@ class Shots:
             noise counts as signal: it fades and is detected with the lines.
         """
         line_snr = np.square(magnitude / self.bin_noise_sigma) / 2
-        return np.asarray(line_snr + self.laser_line.pedestal_variance_under / self.noise_variance)
+        return np.asarray(
+            line_snr + self.laser_line.pedestal_variance_under_line / self.noise_variance
+        )
 
     @cached_property
     def threshold(self) -> np.ndarray:

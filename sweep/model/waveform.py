@@ -337,7 +337,10 @@ FOLD_PENALTY_BINS = 4.0
 chosen."""
 
 N_READINGS = 16
-"""Number of readings of unsigned peaks, as numbered by :func:`beats_of_reading`."""
+"""Number of readings of unsigned peaks: choices of folded peaks, and of half sum or difference.
+
+:func:`beats_of_reading` defines their numbers.
+"""
 
 FAR_READING = 1
 """Number, for :func:`beats_of_reading`, of the reading with |f_d| < f_r, the range beat.

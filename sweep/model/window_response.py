@@ -50,7 +50,8 @@ class WindowResponse(NamedTuple):
     """Bins of the FFT per bin of fs/L, 1/r; ``central_energy_min`` counts as many bins to either
     side."""
     central_energy_min: float
-    """Smallest sum of F over the bins within ``padding_factor`` of a line."""
+    """Smallest sum of the powers F of the bins within ``padding_factor`` bins of a line, for any
+    position of the line between bins."""
     sidelobe_envelope: np.ndarray
     """(cells + 1,): largest magnitude at or beyond distances even in d / (d + knee)."""
     distance_by_octave: np.ndarray

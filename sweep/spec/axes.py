@@ -517,7 +517,7 @@ class Progression:
     number: int = 1
     """Number of values."""
 
-    def scale_and_shift(self, factor: Fraction, offset: Fraction) -> Progression:
+    def apply_affine_transform(self, factor: Fraction, offset: Fraction) -> Progression:
         """Return the progression of ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
@@ -612,7 +612,9 @@ class AxisPiece:
         if self.progression is None or unit.is_logarithmic or self.unit.is_logarithmic:
             return convert_from_si(unit, self.si_values)
         offset = (self.unit.offset - unit.offset) / unit.factor
-        return self.progression.scale_and_shift(self.unit.factor / unit.factor, offset).values()
+        return self.progression.apply_affine_transform(
+            self.unit.factor / unit.factor, offset
+        ).values()
 
     def repeat(self, number: int) -> AxisPiece:
         """Return a single value repeated `number` times."""
@@ -808,7 +810,7 @@ def _progression_values(
     if unit.is_logarithmic:
         si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
         return AxisPiece(si_values, unit, progression)
-    si_progression = progression.scale_and_shift(unit.factor, unit.offset)
+    si_progression = progression.apply_affine_transform(unit.factor, unit.offset)
     if not rule.is_integer:
         return AxisPiece(si_progression.values(), unit, progression)
     if si_progression.start.denominator != 1 or si_progression.increment.denominator != 1:

@@ -677,7 +677,11 @@ def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
 
 
 def _search_band_findings(grid: GridValues) -> Iterator[Finding]:
-    """Yield mistakes in the search band: missing or swapped ends, or counted bins outside."""
+    """Yield mistakes in the search band.
+
+    Its four ends must all be given, or none. Each upper end must exceed the lower one. A band must
+    not be combined with false alarms that are counted in all bins.
+    """
     missing_ends = [path for path in SEARCH_BAND_PATHS if not grid.parameter_values(path).size]
     if 0 < len(missing_ends) < len(SEARCH_BAND_PATHS):
         problem = "is missing, and a beat depends on both range and velocity"

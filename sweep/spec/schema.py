@@ -139,7 +139,11 @@ def _generator_schemas(value_schema: JsonObject) -> Iterator[JsonObject]:
 
 
 def _axes_schema(rules: Mapping[str, Rule]) -> JsonObject:
-    """Return the schema of ``axes``: plain axes by path, zipped axes by other names."""
+    """Return the JSON schema of the section ``axes``.
+
+    The key of an axis is the path of the parameter that it varies. The key of a zipped axis is any
+    other name.
+    """
     value_schemas = {
         path: {
             "anyOf": [_definition_reference(path, "value"), _definition_reference(path, "values")]

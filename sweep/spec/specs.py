@@ -758,7 +758,7 @@ class SceneSpec(BaseSpec):
         return shots_per_cycle(self.scan_pattern(name))
 
     @property
-    def has_navigation(self) -> bool:
+    def has_navigation_solution(self) -> bool:
         """True if at least one scanner has enough shots per cycle for a navigation solution."""
         return any(self.shots_per_cycle(name) >= NAVIGATION_SHOTS_MIN for name in self.scanners)
 
@@ -794,7 +794,7 @@ class SceneSpec(BaseSpec):
                 "record: the standard errors of points on speckled ground, and of navigation, are "
                 "too small there, by 1.2 at 2.5 bins and by 1.7 at 5; shorter records drift less"
             )
-        if not self.has_navigation:
+        if not self.has_navigation_solution:
             return sentences
         if not any(value for _, value in self.error_floor):
             sentences.append(

@@ -139,7 +139,7 @@ def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(s
         middle = np.full(3, np.nan)
         middle[segment] = -off
         drawn.append(
-            speckle_lines.draw_segment_amplitudes(
+            speckle_lines.draw_segment_bin_amplitudes(
                 fan, 0, middle, 0, 1, key=make_point_keys(1)[0], draws=np.arange(number)
             )[:, 0]
         )

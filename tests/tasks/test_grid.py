@@ -176,8 +176,8 @@ def test_files_stay_countable_and_all_cores_have_blocks(points, seconds_per_poin
 @pytest.mark.parametrize("rate", ["0.1 Hz", "10 Hz", "1 kHz"])
 def test_a_flights_blocks_are_cut_for_all_cores(draws, rate):
     """Of 3 to 30,000 shots: small flights are one block, large ones have work for many cores."""
-    scanner_hits = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": rate}}
-    spec = small_scene_spec(scanner_hits=scanner_hits, draws={"number": draws}, storage={}, axes={})
+    scanners = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": rate}}
+    spec = small_scene_spec(scanners=scanners, draws={"number": draws}, storage={}, axes={})
     (grid,) = FlightStudy(spec, parse_location("none.zarr")).grids
     seconds = grid.n_points * worst_cpu_seconds_per_draw(spec)
     assert (grid.n_blocks == 1) == (seconds < 0.5) or grid.n_points // draws <= 256

@@ -38,7 +38,8 @@ JOINED_PROBABILITY_MIN = 1e-9
 """Probability that adjacent bins all cross, below which no further bin is taken to join them."""
 
 EDGE_NOISE_DEVIATION_MIN = 0.01
-"""Smallest deviation [sigma] of an outermost bin's noise, given that its neighbour crosses."""
+"""Lower limit of the standard deviation [sigma] of an outermost bin's noise, under the condition
+that its neighbour crosses the threshold. The deviation is a divisor."""
 
 _EXPONENTIAL_COEFFICIENTS = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Taylor coefficients of e^-z in rising order; the error is 1e-16 for z <= 1/4."""

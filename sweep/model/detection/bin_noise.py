@@ -44,9 +44,13 @@ def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
 
 @lru_cache(maxsize=64)
 def first_circular_bin(window: Window, fft_size: int) -> int:
-    """Return the first bin with circular noise in a real record, counted from DC or Nyquist; >= 1.
+    """Return the distance of the first bin with circular noise from DC or Nyquist [bins]; >= 1.
 
-    Noise in bin k has quadratures of the variances sigma^2 (1 +- |W2(2k)| / W2(0)).
+    Notes
+    -----
+    In a real record, the noise k bins from DC or Nyquist has quadratures of the variances
+    sigma^2 (1 +- |W2(2k)| / W2(0)), with the transform W2 of the squared window. It counts as
+    circular if the ratio is at most :data:`CIRCULAR_RATIO_MAX`, there and in all bins beyond.
     """
     padding_factor, last_noncircular_bin = fft_size / window.length, 0
     for k in range(1, math.ceil(8 * padding_factor), max(int(padding_factor / 16), 1)):

@@ -88,7 +88,7 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 """Default parameters, by dotted path, of detector and estimator in full spectra."""
 
 _TABLE_STEPS = 512
-"""Number of steps per bin in tables of tones between -1 and 1 bin."""
+"""Number of steps per bin between the tabulated offsets, -1..1 bin, of a tone from a bin."""
 _NEIGHBOUR_HEIGHT_MIN = 0.25
 """|X| of the neighbours of a tone on a bin, over the bin's, below which they count as vanishing."""
 _CENTROID_REACH_CELLS = 2

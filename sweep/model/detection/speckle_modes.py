@@ -59,7 +59,7 @@ class ModeTable(NamedTuple):
     neighbour_correlation: np.ndarray
     """(s, N_OFFSETS, k): correlation of the echo's amplitudes in a bin and in the bin below it,
     -1..1."""
-    asymmetry: np.ndarray
+    power_asymmetry: np.ndarray
     """(s, N_OFFSETS): :func:`power_asymmetry` of the three bins about the nearest bin. It rises
     with the offset."""
 
@@ -233,15 +233,15 @@ def locate_in_mode_table(table, line_deviation_bins, asymmetry):
     offset_index = 0
     while (
         offset_index < N_OFFSETS - 2
-        and table.asymmetry[deviation_index, offset_index + 1] <= asymmetry
+        and table.power_asymmetry[deviation_index, offset_index + 1] <= asymmetry
     ):
         offset_index += 1
     asymmetry_step = (
-        table.asymmetry[deviation_index, offset_index + 1]
-        - table.asymmetry[deviation_index, offset_index]
+        table.power_asymmetry[deviation_index, offset_index + 1]
+        - table.power_asymmetry[deviation_index, offset_index]
     )
     offset_weight = (
-        (asymmetry - table.asymmetry[deviation_index, offset_index]) / asymmetry_step
+        (asymmetry - table.power_asymmetry[deviation_index, offset_index]) / asymmetry_step
         if asymmetry_step > 0.0
         else 0.0
     )

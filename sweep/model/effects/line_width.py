@@ -58,13 +58,27 @@ def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
     """Bound the change of the detecting bins if the line width is omitted.
 
+    Parameters
+    ----------
+    points
+        Points for which the bound holds.
+
+    Returns
+    -------
+    ErrorBound or None
+        Bound at each point; None if all lines have the width 0.
+
     Notes
     -----
-    The mean power under a Gaussian line departs from |X|^2 by at most (2 pi s)^2 var_w (sum |w|)^2,
-    with the standard deviation s of the line and the variance var_w of the position in the record
-    under |w|. The pure line of a Lorentzian keeps exp(-g) of its power, g = Gamma min(tau, T_w).
-    The pedestal is in no bin above sum w^2 (fs S(0) + 1 - exp(-g)), and is noise that comes with
-    the signal.
+    Gaussian line: the mean power of a bin departs from |X|^2, that of a pure tone, by at most
+    (2 pi s)^2 var_w (sum |w|)^2. Here w is the window, and s the standard deviation of the line
+    [bins of fs/L]. The variance var_w is that of the position in the record, weighted by |w|.
+
+    Lorentzian line of FWHM dnu: the pure line keeps the fraction exp(-g) of its power. Here
+    g = Gamma min(tau, T_w), with Gamma = 2 pi dnu, the delay tau of the echo and the duration T_w
+    of the record. The pedestal is noise that comes with the signal. No bin holds more of it than
+    sum w^2 (fs S(0) + 1 - exp(-g)). Here fs is the sample rate, and S(0) is the density of the
+    pedestal under the line [1/Hz], :func:`sweep.model.laser_line.pedestal_density_under_line`.
     """
     if not points.any_nonzero(_WIDTH_PATH):
         return None
@@ -179,7 +193,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
         laser_line=LaserLine(
             lorentzian_width=line_width,
             pedestal_variance_beside=line_power * side_pedestal / shots.window.energy,
-            pedestal_variance_under=line_power * 2 * in_phase_pedestal / shots.window.energy,
+            pedestal_variance_under_line=line_power * 2 * in_phase_pedestal / shots.window.energy,
         ),
     )
 

@@ -162,7 +162,7 @@ class PlannerInputs(LinkBudget):
         return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
     @property
-    def noise_peak_ratio(self) -> float | None:
+    def noise_maximum_ratio(self) -> float | None:
         """Magnitude over sigma that any bin's noise exceeds with a probability of at most 0.001.
 
         None if segments report all peaks that cross the threshold.
@@ -386,7 +386,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def velocity_spread(self) -> OffsetMoments:
-        """Moments of lines' offsets [bins] due to the velocities of beamlets."""
+        """Mean, rms and extreme of the lines' offsets [bins] due to the velocities of beamlets."""
         return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
 
     @cached_property

@@ -45,7 +45,8 @@ class EffectPlan(NamedTuple):
     is_kept: np.ndarray
     """(effects, tiles) bool: True if the effect is simulated."""
     omission_error: np.ndarray
-    """(effects, tiles): largest change if the effect is omitted, 0..1."""
+    """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
+    pfa or the relative |X| at any point of the tile, as of :func:`omission_errors`."""
     total_error: np.ndarray
     """(tiles,): sum of the changes of omitted effects, and :attr:`residual_error`. It exceeds the
     tolerance only by the latter, and by effects that are off."""
@@ -263,8 +264,8 @@ def omission_errors(
     """
     signal_ratio_min, signal_ratio_max = signal_ratio_bounds(bounds, points)
     threshold = points.threshold_ratio
-    if points.noise_peak_ratio is not None:  # an echo has to exceed the noise as well
-        threshold = np.maximum(threshold, np.minimum(signal_ratio_max, points.noise_peak_ratio))
+    if points.noise_maximum_ratio is not None:  # an echo has to exceed the noise as well
+        threshold = np.maximum(threshold, np.minimum(signal_ratio_max, points.noise_maximum_ratio))
     b = points.looks.equivalent_threshold_ratio(threshold)
     steepest_signal = 0.5 * (b + np.sqrt(b * b + 2))
     signal = np.minimum(np.maximum(steepest_signal, signal_ratio_min), signal_ratio_max)

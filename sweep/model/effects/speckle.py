@@ -94,7 +94,7 @@ def draw_speckle_factors(
     coherent_fraction: np.ndarray,
     random_phases: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the factors g_b on beamlet amplitudes.
+    """Draw the factors g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b on beamlet amplitudes.
 
     Parameters
     ----------
@@ -103,9 +103,9 @@ def draw_speckle_factors(
     n_beamlets : int
         Number of beamlets.
     coherent_fraction : ndarray
-        Fraction kappa, (n,) or scalar.
+        Coherent fraction kappa of the mean power, 0..1; (n,) or scalar.
     random_phases : bool
-        True if u_b has a uniform phase; else it is 1.
+        True if the coherent part u_b, of modulus 1, has a uniform random phase; else u_b is 1.
 
     Returns
     -------
@@ -114,8 +114,9 @@ def draw_speckle_factors(
 
     Notes
     -----
-    A factor depends only on key, draw and beamlet: pair b of ``STREAM_SPECKLE`` makes z_b, and
-    number b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b.
+    The diffuse part z_b is complex normal, of mean power 1. A factor depends only on key, draw and
+    beamlet b. Pair b of the random stream ``STREAM_SPECKLE`` makes z_b. Number b of
+    ``STREAM_FOOTPRINT_PHASE`` makes the phase of u_b.
     """
     from sweep.model.sampling import philox
 

@@ -158,7 +158,8 @@ class LeakageBins(NamedTuple):
     line_log_amplitude: np.ndarray
     """(N_PHASES, line bins): ln(|X| / sigma) at each phase of the line of leaked light."""
     line_rate_sum: np.ndarray
-    """(m, 3): sum of the rates of the line's bins, at the phase at which it is largest."""
+    """(m, 3): sum over ``line_bins`` of the rates -ln(1 - c), with the crossing probability c. Of
+    the sums at all phases of the line of leaked light it is the largest."""
     excluded_slice: np.ndarray
     """(m, 3, 2) int64: begin and end of each segment in ``excluded_bins``."""
     excluded_bins: np.ndarray

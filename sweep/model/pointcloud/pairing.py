@@ -95,9 +95,9 @@ Exactly one of the first five bits is set. They follow from a comparison with th
 
 
 FALSE_PEAK = -1
-"""Value in the place of the number of a peak's group, for a false peak."""
+"""Group number of a false peak, which belongs to no group of bins."""
 NO_PEAK = -2
-"""Value in the place of the number of a peak's group, if there is no Doppler peak or no segment."""
+"""Group number that stands for no peak: no Doppler peak confirms, or the segment does not exist."""
 
 UP_COLUMN, DOPPLER_COLUMN, DOWN_COLUMN, READING_COLUMN = range(4)
 """Columns of the pairs that :func:`pair_peaks` returns: index of the up peak, of the Doppler peak

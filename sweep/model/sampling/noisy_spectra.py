@@ -87,7 +87,7 @@ from sweep.model.sampling.speckle_lines import (
     FootprintRecord,
     SpeckleLineGrid,
     SpecklePeaks,
-    draw_segment_amplitudes,
+    draw_segment_bin_amplitudes,
     folding_signs,
     speckle_line_grid,
 )
@@ -588,7 +588,7 @@ def draw_bin_speckle(
         first_bin, last_bin = min(first_bin, strongest_bin - 1), max(last_bin, strongest_bin + 1)
         positions = np.full(3, np.nan)
         positions[segment] = position
-        amplitudes = draw_segment_amplitudes(
+        amplitudes = draw_segment_bin_amplitudes(
             line_grid,
             point,
             positions,

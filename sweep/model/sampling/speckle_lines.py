@@ -568,7 +568,7 @@ def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
                 ) + second_of_pair * factor[pair + 1, s, k]
 
 
-def draw_segment_amplitudes(
+def draw_segment_bin_amplitudes(
     grid: SpeckleLineGrid,
     point: int,
     echo_centre: np.ndarray,

@@ -69,7 +69,7 @@ from sweep.model.spectrum.bin_spectrum import (
 )
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
-END_CORRECTION_BINS = 3
+INTEGRAL_END_CORRECTION_BINS = 3
 """Number of bins on either side of the integral's near end that its corrections use."""
 
 END_CORRECTION_ERROR_MAX = 1e-7
@@ -263,7 +263,7 @@ def detect_with_leakage(
         first_bin, last_bin = near_bins.first_bin, near_bins.last_bin
         if not is_integral_negligible:
             first_bin, last_bin = first_bin - extra_bins, last_bin + extra_bins
-            end_bins = extra_bins + END_CORRECTION_BINS
+            end_bins = extra_bins + INTEGRAL_END_CORRECTION_BINS
             first_bin = ZERO if first_bin <= end_bins else first_bin
             last_bin = nyquist_bin if nyquist_bin - last_bin <= end_bins else last_bin
         n_bins = last_bin - first_bin + 1
@@ -713,7 +713,7 @@ def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope
     distance_min = max(crossing_distance, max(smooth_distance, 0.75 * line_extent)) - clearance
     return int(
         min(
-            (max(math.ceil(distance_min), 0.0) + 2 * END_CORRECTION_BINS + 7) // 8 * 8,
+            (max(math.ceil(distance_min), 0.0) + 2 * INTEGRAL_END_CORRECTION_BINS + 7) // 8 * 8,
             layout.fft_size // 2,
         )
     )
@@ -765,11 +765,11 @@ def _leakage_of_span_and_beyond(
         rate_beyond += near_end.correction
         last_terms += near_end.last_term
         end_distance = (
-            centre_bin - first_bin - END_CORRECTION_BINS
+            centre_bin - first_bin - INTEGRAL_END_CORRECTION_BINS
             if side < 0
-            else first_bin + n_bins - 1 - END_CORRECTION_BINS - centre_bin
+            else first_bin + n_bins - 1 - INTEGRAL_END_CORRECTION_BINS - centre_bin
         )
-        n_points = _add_gauss_points(
+        n_points = _append_gauss_points(
             side,
             end_distance,
             centre_bin,
@@ -781,8 +781,8 @@ def _leakage_of_span_and_beyond(
             n_points,
         )
     first_index, end_index = (
-        END_CORRECTION_BINS if goes_on_below else ZERO,
-        n_bins - END_CORRECTION_BINS if goes_on_above else n_bins,
+        INTEGRAL_END_CORRECTION_BINS if goes_on_below else ZERO,
+        n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     exclude_bins_joining_echo(
         span.crossing_probability,
@@ -863,7 +863,7 @@ def _mean_leakage_of_span_and_beyond(
         if not (goes_on_below if side < 0 else goes_on_above):
             continue
         last_near_index = (
-            n_bins - END_CORRECTION_BINS - 1 if side > 0 else END_CORRECTION_BINS
+            n_bins - INTEGRAL_END_CORRECTION_BINS - 1 if side > 0 else INTEGRAL_END_CORRECTION_BINS
         )  # the last bin before the integral
         for offset in range(-2, 4):
             magnitude = span.magnitude[last_near_index + side * offset]
@@ -881,8 +881,8 @@ def _mean_leakage_of_span_and_beyond(
             relative_rates_beyond,
         )
     first_index, end_index = (
-        END_CORRECTION_BINS if goes_on_below else ZERO,
-        n_bins - END_CORRECTION_BINS if goes_on_above else n_bins,
+        INTEGRAL_END_CORRECTION_BINS if goes_on_below else ZERO,
+        n_bins - INTEGRAL_END_CORRECTION_BINS if goes_on_above else n_bins,
     )
     return _mean_leakage_over_speckle(
         first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
@@ -962,7 +962,7 @@ def _near_end_correction(side, n_bins, span):
     probabilities, is_exempt = span.crossing_probability, span.is_exempt
     step = 1 if side > 0 else -1
     i = (
-        n_bins - END_CORRECTION_BINS - 1 if side > 0 else END_CORRECTION_BINS
+        n_bins - INTEGRAL_END_CORRECTION_BINS - 1 if side > 0 else INTEGRAL_END_CORRECTION_BINS
     )  # the last bin before the integral
     for k in range(-2, 4):
         if is_exempt[i + k * step]:
@@ -991,7 +991,7 @@ def _near_end_correction(side, n_bins, span):
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _add_gauss_points(
+def _append_gauss_points(
     side, last_distance, centre_bin, steepness, layout, tangents, cotangents, weights, n_points
 ):
     """Append the Gauss points of the integral on one side of the lines; return their number.

@@ -86,7 +86,8 @@ _RECORD_LENGTH_MIN, _PADDING_MAX = 4096, 8
 integrals."""
 
 _N_FAR_DISTANCES = 48
-"""Number of distances beyond the table at which the envelope is tabulated."""
+"""Number of distances, from the end of a line shape's table to N/2, at which the envelope of the
+line shape is stored."""
 
 _ENVELOPE_MARGIN = 1.05
 """Factor on the envelope that covers what happens between cells."""

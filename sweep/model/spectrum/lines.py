@@ -623,7 +623,12 @@ def replace_lines_by_nodes(lines, n_lines, n_nodes, middle, half_width, scratch,
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _add_chebyshev_moments(scratch, n_nodes):
-    """Add the moments sum_b C_b T_j(x_b), j = 0 .. n_nodes, of one batch of lines."""
+    """Add the Chebyshev moments of one batch of lines to those in ``scratch``.
+
+    The moments are sum_b C_b T_j(x_b), j = 0 .. n_nodes. Line b has the complex amplitude C_b, or
+    the power, and the position x_b, -1..1 over the interval of the nodes. T_j is the Chebyshev
+    polynomial of order j.
+    """
     batch = scratch.batch
     for i in range(LINES_PER_BATCH):
         batch[_EVEN + i] = 1.0

@@ -159,7 +159,7 @@ class ScannerGrid(ParameterGrid, BlockGrid):
         return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
 
     @property
-    def has_navigation(self) -> bool:
+    def has_navigation_solution(self) -> bool:
         """True if a cycle has enough shots for a velocity vector."""
         return self.shots_per_cycle >= NAVIGATION_SHOTS_PER_CYCLE_MIN
 
@@ -292,7 +292,9 @@ class FlightStudy(ExtendableStudy):
             outputs = (
                 GEOMETRY_OUTPUTS | SHOT_STATISTIC_VARIABLES | EFFECT_VARIABLES | POINT_VARIABLES
             )
-            outputs = outputs | NAVIGATION_VARIABLES if scanner_grid.has_navigation else outputs
+            outputs = (
+                outputs | NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else outputs
+            )
             for name, output in outputs.items():
                 dims = output.dims if name in GEOMETRY_OUTPUTS else axis_names + output.dims
                 layouts.append(
@@ -415,7 +417,7 @@ class FlightStudy(ExtendableStudy):
                 simulate_cloud,
             ):
                 _insert_results(results, shot_rows, draw_slice, part_results)
-        if scanner_grid.has_navigation:
+        if scanner_grid.has_navigation_solution:
             is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
             for cycles, draw_slice in _iter_missing_draws(np.asarray(is_missing)):
                 rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()
@@ -430,7 +432,7 @@ class FlightStudy(ExtendableStudy):
         outputs = (
             SHOT_STATISTIC_VARIABLES
             | POINT_VARIABLES
-            | (NAVIGATION_VARIABLES if scanner_grid.has_navigation else {})
+            | (NAVIGATION_VARIABLES if scanner_grid.has_navigation_solution else {})
         )
         sizes = VECTOR_DIM_SIZES | {
             "shot": n_shots, "cycle": n_shots // scanner_grid.shots_per_cycle, "draw": n_draws,
@@ -614,7 +616,7 @@ class FlightStudy(ExtendableStudy):
                 for name in POINT_VARIABLES
             }
             _insert_results(results, shot_rows, draw_column, part_results)
-            if scanner_grid.has_navigation:
+            if scanner_grid.has_navigation_solution:
                 part_results = {
                     name: source_results[name][source_cycle, source_draw]
                     for name in NAVIGATION_VARIABLES

@@ -320,10 +320,10 @@ class EffectPlanner:
         return inactive_bits
 
     def iter_tile_plans(self, tiles: np.ndarray) -> Iterator[tuple[np.ndarray, EffectPlan]]:
-        """Yield indices of tiles in `tiles`, and the plan of these tiles.
+        """Yield batches of tiles: their indices in the array `tiles`, and their effect plan.
 
-        A preview of a few points per tile comes first: if it already keeps all effects, the other
-        points are not planned.
+        A tile is planned from a few of its points first. If that plan simulates every optional
+        effect, it is final. Otherwise the tile is planned again from all its points.
         """
         tile_lengths = [tile_length for tile_length in self.tiles.block_shape if tile_length > 1]
         preview_stride = max(

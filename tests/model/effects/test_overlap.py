@@ -358,7 +358,7 @@ def test_a_lorentzian_line_of_a_late_echo_is_that_of_drawn_phases(table_4_1):
         phase = walk[lag:] - walk[: steps - lag]
         power.append(abs((w * np.exp(1j * phase) * (n >= first)).sum()) ** 2)
     line = (w * (n >= first)).sum() ** 2
-    pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under)[0])
+    pedestal = float(np.ravel(shots.laser_line.pedestal_variance_under_line)[0])
     amplitude = (
         float(np.ravel(plain.link_scales.beat_amplitude)[0]) ** 2 * plain.total_relative_echo[0] / 4
     )

@@ -27,7 +27,7 @@ class GivenInputs:
     """What criteria need of points, given outright."""
 
     ndim, existing_chirp_rates, looks = 1, np.array([[1.0], [0.0], [-1.0]]), SINGLE_LOOK
-    noise_peak_ratio = None
+    noise_maximum_ratio = None
 
     def __init__(self, peak_ratio, threshold_ratio):
         self.peak_ratio = np.broadcast_to(peak_ratio, (3, np.shape(peak_ratio)[-1]))
@@ -240,7 +240,7 @@ def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, e
 def test_an_echo_that_has_to_be_the_strongest_counts_at_any_level_of_noise(signal, least, decades):
     """Its pd is a mean of chances to cross levels from the threshold up to the largest noise."""
     points, share = GivenInputs([[signal]], [least]), 10.0**decades
-    points.noise_peak_ratio = 6.0
+    points.noise_maximum_ratio = 6.0
     (change,) = omission_errors(
         {"one": ErrorBound(magnitude_change=np.array([share]))}, points
     ).values()

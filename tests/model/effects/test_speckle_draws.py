@@ -321,12 +321,13 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
     effects = (*SPECKLED, "line_width")
     (stretch,) = iter_realisations(parameters, effects, keys=make_point_keys(1), draws=50)
     ratio = (
-        stretch.shots.laser_line.pedestal_variance_under / shot_statistics(stretch.shots)["snr_up"]
+        stretch.shots.laser_line.pedestal_variance_under_line
+        / shot_statistics(stretch.shots)["snr_up"]
     )
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # the image's phase moves with it
     assert (
-        np.ptp(stretch.shots.laser_line.pedestal_variance_under)
-        > 0.5 * stretch.shots.laser_line.pedestal_variance_under.mean()
+        np.ptp(stretch.shots.laser_line.pedestal_variance_under_line)
+        > 0.5 * stretch.shots.laser_line.pedestal_variance_under_line.mean()
     )
 
 
