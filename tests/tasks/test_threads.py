@@ -71,14 +71,14 @@ def test_blocks_that_run_at_sigterm_are_committed_and_no_other_begins(undisturbe
         return study.evaluate(block)
 
     outcome = run_serially(small_spec(), tmp_path / "s.zarr", threads=2, evaluate=stop_at_once)
-    assert outcome.stopped == "interrupted"
+    assert outcome.stop_reason == "interrupted"
     assert {0, 1} <= set(receipt_blocks(outcome.store)) and outcome.blocks_done < N_BLOCKS
     assert resume(outcome.store, progress=False).complete
     assert file_digests(outcome.store) == file_digests(undisturbed)
 
 
 def test_blocks_that_outlast_sigterm_do_not_hold_the_run(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(interrupts, "TERMINATION_SECONDS_MAX", 0.5)
+    monkeypatch.setattr(interrupts, "SIGTERM_GRACE_SECONDS", 0.5)
     may_end = threading.Event()
 
     def hang(study, block):
@@ -89,7 +89,7 @@ def test_blocks_that_outlast_sigterm_do_not_hold_the_run(undisturbed, tmp_path, 
 
     start = time.monotonic()
     outcome = run_serially(small_spec(), tmp_path / "s.zarr", threads=2, evaluate=hang)
-    assert outcome.stopped == "stopped at once" and time.monotonic() - start < 20
+    assert outcome.stop_reason == "stopped at once" and time.monotonic() - start < 20
     assert 3 not in receipt_blocks(outcome.store)
     may_end.set()  # the thread now ends its block, while another run computes it too
     assert resume(outcome.store, threads=2, progress=False).complete
@@ -103,7 +103,7 @@ def test_a_store_that_is_removed_meanwhile_ends_the_run(tmp_path):
         return study.evaluate(block)
 
     outcome = run_serially(small_spec(), tmp_path / "s.zarr", threads=2, evaluate=remove_store)
-    assert not outcome.complete and "is no longer there" in outcome.stopped
+    assert not outcome.complete and "is no longer there" in outcome.stop_reason
 
 
 def test_only_as_many_threads_compute_as_memory_suffices_for(tmp_path, monkeypatch):
