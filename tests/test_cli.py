@@ -702,7 +702,7 @@ def test_threads_compute_unless_something_needs_workers(here):
         assert RunOptions(**options).resolve_cluster(small).kind == "local"
     address = RunOptions(scheduler="tcp://10.0.0.5:8786")
     assert address.resolve_cluster(small).kind == "scheduler"
-    with_code = SimpleNamespace(execution=small.execution, user_modules=("mine",))
+    with_code = SimpleNamespace(execution=small.execution, user_module_names=("mine",))
     assert RunOptions().resolve_cluster(with_code).kind == "local"
 
 
