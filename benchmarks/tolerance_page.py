@@ -153,7 +153,7 @@ def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int
 
     `rungs` are the settings.
     """
-    parts = bench.split(bench.size)
+    parts = bench.split_into_parts(bench.size)
     for rung in rungs:  # compiles what there is to compile
         bench.try_setting(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
     bench.clear_caches()
@@ -300,7 +300,7 @@ def reference_check_row(
     bench: StudySample, full_ladder: SettingLadder, timed_trial: Trial, label: str, more_rays: int
 ) -> ToleranceRow:
     """Compare the reference with more rays at a part of the sample; return the row."""
-    reference, part = full_ladder.reference, bench.split(bench.size)[0]
+    reference, part = full_ladder.reference, bench.split_into_parts(bench.size)[0]
     finer = replace(
         reference, name=f"{more_rays} rays", overrides={**reference.overrides, BEAMLETS: more_rays}
     )
