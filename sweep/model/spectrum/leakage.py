@@ -152,8 +152,7 @@ class EnvelopeBeyond(NamedTuple):
 
 
 class NearEndCorrection(NamedTuple):
-    """Euler-Maclaurin correction at the near end of the leakage integral on one side of the lines.
-    """
+    """Euler-Maclaurin correction at the near end of the leakage integral on a side of the lines."""
 
     correction: float
     """Correction added to the sum of the bins' false-alarm rates."""
@@ -661,8 +660,7 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _envelope_beyond(distance_min, envelope):
-    """Return the :class:`EnvelopeBeyond` of a line for distances of ``distance_min`` bins and more.
-    """
+    """Return the :class:`EnvelopeBeyond` of a line from a distance of ``distance_min`` bins on."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
     return EnvelopeBeyond(magnitude, magnitude * magnitude + envelope.square_integral[index])
@@ -930,9 +928,9 @@ def _end_correction_factor(offset):
 def _fill_far_powers(
     n_points, centre_bin, bundle, log_accuracy, shape, layout, tangents, workspace
 ):
-    """Compute the squared magnitude at the integral's points into
-    ``workspace.integral.half_square``.
+    """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
+    The result goes to ``workspace.integral.half_square``.
     The relative error is exp(-``log_accuracy``). ``workspace.integral.cotangent`` contains tan(pi q
     / N) of each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there
     are fewer lines than equivalent lines needed, the lines are summed exactly.

@@ -614,8 +614,7 @@ for _j in range(KERNEL_CELLS):
 
 
 def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
-    """Evaluate the Fourier transform of the spreading kernel at ``theta`` [rad/cell], up to +-pi.
-    """
+    """Evaluate the Fourier transform of the spreading kernel at ``theta`` [rad/cell], up to pi."""
     root = np.sqrt(KERNEL_BETA**2 - (KERNEL_CELLS * theta / 2) ** 2)
     return np.asarray(KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
 
@@ -627,8 +626,7 @@ def table_size(layout: SpectrumLayout) -> int:
 
 
 def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
-    """Allocate the line shapes of all segments, (segments, ...), with the envelope's distances set.
-    """
+    """Allocate the line shapes of all segments, (segments, ...), with the envelope's distances."""
     distance, n_cells = tables.envelope_distance, table_size(tables.layout)
     return LineShape(
         np.empty((segments, n_cells)),
@@ -705,8 +703,7 @@ def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
 
 
 def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
-    """Divide a table by the spreading kernel's transform, and sort it by cell of a bin, then by
-    bin.
+    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
 
     ``values`` (..., places) are at the distances of :func:`_cell_distances`.
     """
@@ -1159,8 +1156,7 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
 
 @njit(cache=True, error_model="numpy")
 def _fill_table(values, layout, table):
-    """Divide a table by the spreading kernel's transform, and sort it by cell of a bin, then by
-    bin.
+    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
 
     ``values`` are at the distances of :func:`_cell_distances`. The result goes to ``table``.
     """

@@ -31,27 +31,32 @@ from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 
 MASK_THRESHOLD_FRACTION = 0.5
-"""Fraction of the threshold from which a bin's line masks it; a smaller line raises few alarms."""
+"""Fraction of the threshold that a permanent line reaches in a bin for the bin to be masked. A
+masked bin raises no alarm; a smaller line raises few alarms."""
 N_PHASES = 16
-"""Number of phases of the line over which alarms are averaged."""
+"""Number of phases of the permanent line over which its false alarms are averaged."""
 
 
 class LineTransforms(NamedTuple):
-    """Line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
+    """Spectrum of a permanent line of amplitude 2.
+
+    Bins are 0 .. N/2 of a real record, 0 .. N - 1 of a complex one, N being the FFT size.
+    """
 
     transforms: np.ndarray
-    """(2, bins) complex: transform of the line at its frequency, and at the negative frequency."""
+    """(2, bins) complex: transform of the line at its own frequency, and at the negative frequency.
+    """
     magnitude_max: np.ndarray
-    """(bins,): largest magnitude at any phase."""
+    """(bins,): magnitude of the line's spectrum at the phase where it is largest."""
     magnitude_rms: np.ndarray
-    """(bins,): root mean square of the magnitude over all phases of the line."""
+    """(bins,): root mean square of the magnitude of the line's spectrum over all its phases."""
 
 
 @lru_cache(maxsize=16)
 def _line_transforms(
     window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
 ) -> LineTransforms:
-    """Return the line at a frequency [bins] without the record's first `n_missing` samples."""
+    """Return the spectrum of a line at ``line_bin`` [bins] without `n_missing` first samples."""
     cycles = line_bin * np.arange(window.length) / fft_size
     record = window_samples(window.name, window.length) * np.exp(
         2j * np.pi * (cycles - np.rint(cycles))
