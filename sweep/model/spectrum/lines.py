@@ -141,7 +141,7 @@ class LineSummary(NamedTuple):
 
 
 class BeamletArrays(NamedTuple):
-    """Range, Doppler ratio and amplitude of all footprints' beamlets, relative to the beam's axis."""
+    """Range, Doppler ratio and amplitude of all beamlets, relative to the beam's axis."""
 
     relative_range_offset: np.ndarray
     """(footprints, beamlets): range of the beamlet minus that on the axis, over the latter."""
@@ -577,7 +577,7 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 def count_nodes(phase_span, tolerance, phase_limits):
     """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
-    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L. ``phase_limits`` is the table of
+    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add. ``phase_limits`` is the table of
     :func:`node_phase_limits`. If all its tolerances are larger than ``tolerance``, its smallest one
     is used. If no number is sufficient, the result is NODES_MAX + 1.
     """
