@@ -577,9 +577,10 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 def count_nodes(phase_span, tolerance, phase_limits):
     """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
-    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add. ``phase_limits`` is the table of
-    :func:`node_phase_limits`. If all its tolerances are larger than ``tolerance``, its smallest one
-    is used. If no number is sufficient, the result is NODES_MAX + 1.
+    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add.
+    ``phase_limits`` is the table of :func:`node_phase_limits`. If all its tolerances are larger
+    than ``tolerance``, its smallest one is used. If no number is sufficient, the result is
+    NODES_MAX + 1.
     """
     limit_row = phase_limits.shape[0] - 1
     while limit_row > 0 and phase_limits[limit_row, 0] > tolerance:

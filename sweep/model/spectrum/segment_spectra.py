@@ -825,8 +825,8 @@ def bin_tangents(fft_size: int) -> np.ndarray:
 def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
     """Return the frequency shifts over which power spectra are averaged.
 
-    The shape is (points, segments, shifts). Shifts result from the laser's line width, and from the drift of lines over looks. Shifts of
-    weight 0 are the last ones.
+    The shape is (points, segments, shifts). Shifts result from the laser's line width, and from the
+    drift of lines over looks. Shifts of weight 0 are the last ones.
     """
     segments = len(shots.waveform_segments)
     if shots.laser_line.gaussian_width is None:

@@ -89,7 +89,8 @@ class LevelProbabilities(NamedTuple):
     exponent: np.ndarray
     """-ln of the probability that the echo exceeds this level."""
     echo_fraction: np.ndarray
-    """Echo's share of the mean power of a bin that exceeds this level as often as the whole echo.
+    """Echo's share of the mean power, noise included, of a bin equivalent to the echo. The bin
+    exceeds this level as often as the whole echo.
     """
 
 
@@ -265,9 +266,10 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 def _joint_excess(exponent_first, exponent_second, squared_correlation):
     """Return by how much correlation raises the joint probability of two Rayleigh magnitudes.
 
-    Each of the two exceeds a level of its own. Alone, the first exceeds its level with the probability exp(-``exponent_first``), the second
-    with exp(-``exponent_second``). The result is their joint probability minus the product of both.
-    ``squared_correlation`` is the square of the correlation of their complex amplitudes.
+    Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
+    probability exp(-``exponent_first``), the second with exp(-``exponent_second``). The result is
+    their joint probability minus the product of both. ``squared_correlation`` is the square of the
+    correlation of their complex amplitudes.
     """
     if squared_correlation <= 0.0 or exponent_first + exponent_second > 700.0:
         return 0.0
