@@ -294,9 +294,10 @@ def apparent_line_and_pedestal(
     window: Window,
     looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power of the line and of the pedestal in the line's bin, as |X| shows them.
+    """Return the power of line and phase-noise pedestal as the spectrum's magnitude shows it.
 
-    A phase common to the full record does not change |X| and is excluded.
+    Both are powers in the line's bin. A phase common to the full record does not change the
+    magnitude and is excluded.
 
     Parameters
     ----------
@@ -418,7 +419,9 @@ def n_phase_walk_steps(*, delay: float, length: int) -> int:
 def phase_walk(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
-    """Return the phase theta(t) - theta(t - tau) [rad] of a laser over a record.
+    """Return a laser's phase minus its phase one delay earlier [rad], over a record.
+
+    The laser's phase theta(t) is a random walk. The result is theta(t) - theta(t - tau).
 
     Parameters
     ----------

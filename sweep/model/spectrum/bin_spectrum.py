@@ -116,7 +116,7 @@ class BinRange(NamedTuple):
 
 
 class DetectedSpan(NamedTuple):
-    """Consecutive FFT bins around the lines of a segment (a span), and the detection in them."""
+    """Adjacent FFT bins around the lines of a segment (a span), and the detection in them."""
 
     first_bin: int
     """FFT bin number of the first bin of the span."""
@@ -224,7 +224,10 @@ class SpanArrays(NamedTuple):
 
 
 class IntegralPoints(NamedTuple):
-    """Gauss quadrature points of the leakage integral over bins far from the lines."""
+    """Quadrature points of an integral over bins far from the lines, which gives their leakage.
+
+    Leakage is the probability of false alarms by the echo's signal.
+    """
 
     cotangent: np.ndarray
     """cot(pi q / N) at q bins from the centre of the lines, with the FFT size N. A later step
@@ -262,7 +265,7 @@ class SpectrumWorkspace(NamedTuple):
     span: SpanArrays
     """Magnitudes and crossing probabilities in the computed bins around the lines."""
     integral: IntegralPoints
-    """Quadrature points of the leakage integral over bins outside the span."""
+    """Quadrature points of the integral over bins outside ``span``, which gives their leakage."""
 
 
 _SCRATCH_BYTES_KEPT_MAX = 1 << 26
@@ -422,7 +425,9 @@ def _add_cells(first_bin, n_bins, batch_bin, n_cells, lap, shape, layout, field)
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def compute_sources(bundle, distance_min, log_accuracy, layout, field):
-    """Compute the lines' strengths at the record's ends, and sources that replace the lines.
+    """Compute the lines' amplitudes at the record's ends, and equivalent lines for far bins.
+
+    Far from the lines, a few equivalent lines (sources) give the same spectrum.
 
     Parameters
     ----------
@@ -532,7 +537,7 @@ def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
 def add_line_by_record_ends(
     begin_offset, end_offset, field_offset, strengths, line, log_accuracy, ends, layout, field
 ):
-    """Add one line or source to F in bins far from it.
+    """Add the spectrum of one line, or equivalent line, to ``field`` in bins far from it.
 
     Parameters
     ----------
@@ -620,7 +625,7 @@ def add_line_by_record_ends(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, tangents, field):
-    """Compute F in ``n_bins`` bins into ``field.re`` and ``field.im``.
+    """Compute the lines' spectrum F in ``n_bins`` bins into ``field.re`` and ``field.im``.
 
     Parameters
     ----------
@@ -934,7 +939,7 @@ def detect_in_span(
     tangents,
     workspace,
 ):
-    """Compute a span of bins around a segment's lines, and detect the echo in it.
+    """Compute the spectrum in the bins around a segment's lines, and detect the echo there.
 
     Parameters
     ----------

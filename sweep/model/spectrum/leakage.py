@@ -70,32 +70,36 @@ from sweep.model.spectrum.bin_spectrum import (
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
 INTEGRAL_END_CORRECTION_BINS = 3
-"""Number of bins on each side of the leakage integral's near end that the end corrections use."""
+"""Number of bins that correct an integral over bins at its end near the lines. They are on each
+side of that end."""
 
 END_CORRECTION_ERROR_MAX = 1e-7
-"""Largest accepted size of the last end correction of the leakage integral. It is relative to the
-whole leakage."""
+"""Largest accepted value of the last end correction of the integral over bins, relative to the
+whole leakage. Leakage is the probability of false alarms by the echo's signal far from its lines.
+"""
 
 GAUSS_POINTS_MAX = 200
-"""Maximum number of Gauss quadrature points of the leakage integral on one side of the lines."""
+"""Maximum number of Gauss points of the integral over bins on one side of the lines."""
 
 AT_BIN, HALF_BIN_BEYOND = np.bool_(False), np.bool_(True)
 """Arguments of :func:`_bin_cotangent`: distance of a whole number of bins, or half a bin more. They
 are NumPy booleans, because numba would compile the function anew for Python's."""
 
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
-"""Leakage of the brightest speckle up to which one speckle power per octave is enough."""
+"""Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
+the probability of false alarms by the echo's signal far from its lines."""
 RATE_MIN = 1e-30
-"""Smallest sum of the bins' false-alarm rates that counts as leakage. Below it the leakage is 0.
-The leakage is 1 - exp(-sum)."""
+"""Lower limit of the bins' summed rate of false alarms by leaked signal. Smaller sums count as this
+value. The probability of at least one false alarm is 1 - exp(-sum)."""
 CERTAIN_LEAKAGE_RATE = 34.5
-"""Sum of the bins' false-alarm rates from which on leakage is certain, 1 - exp(-sum) = 1."""
+"""Upper limit of the bins' summed rate of false alarms by leaked signal. Larger sums count as this
+value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
 _SPECKLE_INTEGRATION_STEPS = 160
 _RELATIVE_ROOT_POWERS = np.arange(1, _SPECKLE_INTEGRATION_STEPS + 1) / _SPECKLE_INTEGRATION_STEPS
 _POWER_NODES = np.concatenate([[0.0], SPECKLE_POWER_MAX * _RELATIVE_ROOT_POWERS**2])
-"""Speckle powers, relative to their mean, at which the mean leakage over speckle is evaluated.
-Small powers are closer together."""
+"""Speckle powers, over their mean, at which a mean over speckle is evaluated. Small powers are
+closer together."""
 _OCTAVES_BELOW_MAX = -2 * np.log2(_RELATIVE_ROOT_POWERS)
 """Distance of each speckle power, except 0, below SPECKLE_POWER_MAX [octaves]."""
 _POWER_WEIGHTS = (
@@ -103,12 +107,12 @@ _POWER_WEIGHTS = (
     * 0.5
     * np.append(_POWER_NODES[2:] - _POWER_NODES[:-2], np.diff(_POWER_NODES[-2:]))
 )
-"""Weight of each speckle power in the mean leakage: the density e^-u of the power u times its
-trapezoidal interval."""
+"""Weight of each speckle power, except 0, in a mean over speckle. It is the density e^-u of the
+power u, times its trapezoidal interval."""
 
 _END_CORRECTION_FACTORS = 1.0 / 24.0, -17.0 / 5760.0, 367.0 / 967680.0
-"""Factors of the first, third and fifth difference of the integrand. Their sum corrects the near
-end of the leakage integral (Euler-Maclaurin)."""
+"""Factors of the integrand's first, third and fifth difference in an Euler-Maclaurin correction. It
+applies at the end, near the lines, of an integral over bins."""
 
 _GAUSS_ORDER_MAX = 12
 _GAUSS_NODES = np.zeros((_GAUSS_ORDER_MAX + 1, _GAUSS_ORDER_MAX))
@@ -152,7 +156,10 @@ class EnvelopeBeyond(NamedTuple):
 
 
 class NearEndCorrection(NamedTuple):
-    """Euler-Maclaurin correction at the near end of the leakage integral on a side of the lines."""
+    """Correction of a sum over bins that is computed as an integral (Euler-Maclaurin).
+
+    It applies at the integral's end near the lines, on one side of them.
+    """
 
     correction: float
     """Correction added to the sum of the bins' false-alarm rates."""
@@ -178,10 +185,11 @@ def detect_with_leakage(
     crossing_series,
     speckle_rates,
 ):
-    """Compute a span of bins around a segment's lines, the detection, and the leakage of all bins.
+    """Compute the bins around a segment's lines, the detection, and the leakage of all bins.
 
-    Parameters and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`,
-    with these differences.
+    Leakage is the probability of false alarms by the echo's signal far from its lines. Parameters
+    and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`, with these
+    differences.
 
     Parameters
     ----------
@@ -321,7 +329,8 @@ def detect_with_leakage(
 def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
     """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
-    The mean is taken over developed speckle if ``speckle_power_max`` is above 1.
+    Leakage is the probability of false alarms by the echo's signal. The mean is taken over
+    developed speckle if ``speckle_power_max`` is above 1.
     """
     if speckle_power_max > 1.0:
         return _mean_leakage_of_bins(n_bins, limits, span, speckle_rates)
@@ -330,10 +339,10 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
-    """Return the leakage of the span, the computed bins around the lines.
+    """Return the probability of a false peak by leaked signal in the bins of a span.
 
-    Magnitudes below ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of
-    the echo.
+    A span is the computed bins around a segment's lines. Magnitudes below
+    ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of the echo.
 
     Parameters
     ----------
@@ -399,7 +408,10 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
-    """Return the mean leakage over developed speckle of the computed bins around the lines."""
+    """Return the probability of a false peak by leaked signal, averaged over speckle.
+
+    The bins are the computed ones around a segment's lines (a span).
+    """
     return _mean_leakage_over_speckle(
         ZERO, n_bins, limits, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
     )
@@ -409,7 +421,9 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
 def _mean_leakage_over_speckle(
     first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
 ):
-    """Return the mean leakage, over developed speckle, of bins of a span and of bins beyond it.
+    """Return the mean probability, over speckle, of a false peak by leaked signal.
+
+    The bins are some of a span, the computed bins around the lines, and all bins beyond it.
 
     Parameters
     ----------
@@ -537,9 +551,9 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
 def _n_powers_per_octave(rate_at_brightest):
     """Return the number of speckle powers per octave at which leakage is computed.
 
-    ``rate_at_brightest`` is the sum of the bins' false-alarm rates in the brightest speckle. If
-    bins join the echo in bright speckle, leakage does not rise with the power. The powers are then
-    closer together.
+    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. If bins join
+    the echo in bright speckle, leakage does not increase with the power. The powers are then closer
+    together.
     """
     return POWERS_PER_OCTAVE_MAX if -math.expm1(-rate_at_brightest) > OCTAVE_STEP_LEAKAGE_MAX else 1
 
@@ -608,7 +622,9 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, envelope):
-    """Bound the leakage of all bins that are ``distance_min`` or more bins away from the lines.
+    """Bound the probability of false alarms by leaked signal in all bins far from the lines.
+
+    The bins are ``distance_min`` or more bins away from the lines.
 
     Parameters
     ----------
@@ -668,12 +684,14 @@ def _envelope_beyond(distance_min, envelope):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_of_span(n_bins, limits, span):
-    """Bound the leakage of the bins of a span from their magnitudes; inf if a bin is too strong.
+    """Bound the leakage of computed bins from their magnitudes; inf if a bin is too strong.
 
-    With x and y as in :func:`_leakage_bound_beyond`, Q_1 is convex in x up to y - 2, because I_2(z)
-    / I_1(z) >= z / (2 + sqrt(z^2 + 4)). Relative to the strongest bin each bin then adds at most
-    the ratio of their powers. The strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2
-    allows for the probability that noise alone stays below the threshold, at least 1 - e^-2.
+    Leakage is the probability of false alarms by the echo's signal. With x = a^2/2 and y = b^2/2,
+    of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2. Q_1 is
+    the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b.
+    Relative to the strongest bin each bin then adds at most the ratio of their powers. The
+    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
+    noise alone stays below the threshold, at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):

@@ -230,7 +230,7 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return |X| of an echo that alone crosses the threshold as often as echo and line together.
+    """Return the magnitude of an echo that alone crosses the threshold as often as with the line.
 
     Parameters
     ----------

@@ -37,11 +37,12 @@ class SearchBand(NamedTuple):
 
 
 def restrict_to_band(shots: Any, spans: Any) -> Any:
-    """Restrict spans of bins to the search band.
+    """Restrict spans, adjacent bins around the lines, to the bins of the search band.
 
     Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
-    outside, the echo is not detected, and only groups of bins about lines of its footprint remain
-    exempt from false alarms. The peak magnitude stays that of the strongest bin of all.
+    outside, the echo is not detected. Only adjacent bins above the threshold at lines of its
+    footprint then remain unable to raise false alarms. The peak magnitude stays that of the
+    strongest bin of all.
 
     Parameters
     ----------
@@ -222,7 +223,7 @@ def _restrict_spans(
     n_exempt,
     leakage,
 ):
-    """Restrict spans of bins to the search band, in place.
+    """Restrict spans, adjacent bins around the lines, to the search band, in place.
 
     Parameters
     ----------

@@ -94,8 +94,8 @@ SPAN_BINS_PER_BATCH = 1 << 21
 range of bins around a segment's lines."""
 
 THRESHOLD_RATIO_STEP = 1e-7
-"""Step of the threshold over the noise sigma, to which it is rounded for leakage in developed
-speckle."""
+"""Step to which the threshold over the noise sigma is rounded. Rates of false alarms by leaked
+signal in developed speckle are tabulated per rounded threshold."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Names of the values that :func:`evaluate_segments` returns for each segment's spectrum."""
@@ -107,7 +107,7 @@ only the computed bins that exceed a level."""
 
 
 SPAN_DOES_NOT_FIT = np.int64(-1)
-"""Result of :func:`_evaluate_segment` if the magnitudes of a span exceed the allocated memory."""
+"""Result of :func:`_evaluate_segment` if a segment's bins exceed the allocated memory."""
 
 
 class BinSpans(NamedTuple):
@@ -140,7 +140,7 @@ class BinSpans(NamedTuple):
     false peak is a group of adjacent bins above the threshold.
     """
     span_start: np.ndarray
-    """Index in ``magnitudes`` and ``is_exempt`` of the span's first bin."""
+    """Index in ``magnitudes`` and ``is_exempt`` of the first bin of each segment and point."""
     magnitudes: np.ndarray
     """(bins,): magnitudes without noise of all spans, one span after the other [V, summed over the
     record].
@@ -204,7 +204,9 @@ class EvaluationSettings(NamedTuple):
     segment_exists: np.ndarray
     """(segments,) bool: true if the up, Doppler or down segment exists."""
     leakage_methods: np.ndarray
-    """(segments,): method for leakage: NO_LEAKAGE, LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN."""
+    """(segments,): method for the probability of false alarms by leaked signal. It is NO_LEAKAGE,
+    LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
+    """
     window_sum: float
     """Sum of the window's samples."""
     rule: DetectionRule
@@ -222,7 +224,7 @@ class EvaluationSettings(NamedTuple):
 
 
 def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
-    """Compute the detection and leakage in each segment's spectrum.
+    """Compute detection and false alarms by leaked signal in each segment's spectrum.
 
     Parameters
     ----------
@@ -266,7 +268,9 @@ def iter_spans(
     ignores_band: bool = False,
     with_pd: bool = True,
 ) -> Iterator[BinSpans]:
-    """Yield the spans of all points, some points at a time, in any order.
+    """Yield the spectra around the lines of all points, some points at a time, in any order.
+
+    The adjacent bins around the lines of a segment are a span.
 
     Parameters
     ----------
@@ -339,7 +343,7 @@ def iter_spans(
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Empty the spans of segments whose echo arrives after the record.
+    """Remove all bins of segments whose echo arrives after the record.
 
     No bin of these segments is searched for the echo.
     """
@@ -442,9 +446,9 @@ def segment_spectrum(
 
 
 def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
-    """Return |X| of all bins of a segment without noise [V], (bins,), by rising frequency.
+    """Return the magnitude of all bins of a segment without noise [V], by rising frequency.
 
-    Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
+    The shape is (bins,). Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
     """
     bins, magnitude = segment_spectrum(shots, point, segment)
     all_magnitudes = np.zeros(shots.n_bins)
@@ -1243,7 +1247,9 @@ def _evaluate_points(
     crossing_series,
     spans,
 ):
-    """Compute the spans of m points, as many as fit; return the number of these points.
+    """Compute the bins around the lines of m points (spans), as many as fit into memory.
+
+    The result is the number of points that fit.
 
     Parameters
     ----------
