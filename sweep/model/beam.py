@@ -90,7 +90,7 @@ FOOTPRINT_ANGLE_MAX = math.pi / 2
 """Upper limit of the full angle of a footprint, seen from the instrument [rad]."""
 
 Parameters = Mapping[str, Any]
-"""Parameters of points by dotted path, (n,) arrays or scalars."""
+"""Type of a mapping of dotted paths to the parameters of points, (n,) arrays or scalars."""
 
 
 class GaussianBeam(NamedTuple):
@@ -163,12 +163,15 @@ class GaussianBeam(NamedTuple):
         return np.asarray(2 * self.waist * np.hypot(defocus, 1 / self.rayleigh_range))
 
     def radius(self, range: ArrayLike) -> np.ndarray:
-        """Return the 1/e^2 radius w(R) [m] at ranges [m] above 0."""
+        """Return the 1/e^2 radius of the beam [m] at ``range`` [m], above 0."""
         return self.full_angle(range) * np.asarray(range, float) / 2
 
 
 def is_single_mode(parameters: Parameters) -> bool:
-    """Return True if the receiver sees a single spatial mode, for points of one category."""
+    """Return True if the receiver detects light of a single spatial mode.
+
+    All points have to be of one category.
+    """
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
@@ -198,7 +201,7 @@ def divergence_from_waist(
 
 
 def far_field_divergence(parameters: Parameters) -> np.ndarray:
-    """Return the full far-field angle [rad] that the transmitted beam has without a focus."""
+    """Return the full 1/e^2 angle [rad] of the transmitted beam in the far field, without focus."""
     stated_divergence, waist = (
         np.asarray(parameters[DIVERGENCE_PATH], float),
         np.asarray(parameters[WAIST_PATH], float),
@@ -238,7 +241,7 @@ def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBe
 
 
 class FootprintAngles(NamedTuple):
-    """Full 1/e^2 angles of the effective footprint, seen from the instrument [rad]."""
+    """Full 1/e^2 angles of the effective footprint [rad], by position and by light direction."""
 
     positions: np.ndarray
     """Full 1/e^2 angle over which positions on the target are spread [rad]."""

@@ -308,9 +308,10 @@ def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
 
 
 def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadBins:
-    """Compute the spread of the footprint's lines in all segments of n points [bins of fs/L].
+    """Compute the :class:`LineSpreadBins` of the footprints of n points [bins of fs/L].
 
-    `beamlets_max` is the largest number of beamlets, which determines how far they reach.
+    `beamlets_max` is the largest number of beamlets. It determines the largest distance of a
+    beamlet from the axis.
     """
     parameters = budget.parameters
     grazing_angle, radial_velocity = (
@@ -724,7 +725,7 @@ def _autocorrelation_peak(window_name: str) -> float:
 
 
 def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:
-    """Return the error of a quadrature's mean of cos(phase x), (phases,).
+    """Return the error of a quadrature's mean of cos(phase x) for normal x, (phases,).
 
     The exact mean is exp(-phase^2 / 2).
     """

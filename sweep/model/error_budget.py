@@ -52,7 +52,7 @@ AUTOMATIC = -1.0
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Tolerance of a study, and its division among the sources of error.
+    """Error tolerance of a study, and its division among the sources of error.
 
     The first five fields are scalars, or arrays with one value for each point.
     """
@@ -64,18 +64,22 @@ class ErrorBudget:
     With draws it takes a hundred times as many."""
 
     confidence: ArrayLike = 0.95
-    """Confidence of the intervals of estimates by draws. The number of draws grows with the square
-    of the normal quantile: 0.99 takes 1.7 times the draws of 0.95."""
+    """Confidence level of intervals for probabilities that are estimated by random draws. The
+    number of draws is proportional to the square of the normal quantile: 0.99 takes 1.7 times the
+    draws of 0.95.
+    """
 
     line_error: ArrayLike = AUTOMATIC
-    """Error of |X| in a bin, over the noise sigma, because few lines represent all beamlets. By
-    default it is `lines_fraction` of the tolerance. A smaller error slowly increases the number of
-    lines of a segment."""
+    """Tolerated error of a bin's magnitude over the noise sigma, if few lines represent all
+    beamlets. By default it is `lines_fraction` of the tolerance. A smaller error slowly increases
+    the number of lines of a segment.
+    """
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Probability that leaked signal raises a false peak in bins far from the lines, as far as it
-    is neglected. By default it is `leakage_fraction` of the tolerance. With a smaller value more
-    bins are evaluated."""
+    """Tolerated probability of a false peak by the echo's signal in bins far from its lines. This
+    part of the leakage is then not evaluated. By default it is `leakage_fraction` of the tolerance.
+    With a smaller value more bins are evaluated.
+    """
 
     leakage_floor: ArrayLike = AUTOMATIC
     """Magnitude of leaked signal in a bin, over the noise sigma, below which the bin counts as
@@ -95,8 +99,9 @@ class ErrorBudget:
     """
 
     effects_fraction: float = 0.8
-    """Fraction of the tolerance for skipped effects and the number of beamlets together. A larger
-    fraction lets more effects be skipped."""
+    """Fraction of the tolerance for effects that are not simulated and for the number of beamlets
+    together. With a larger fraction more effects can be skipped.
+    """
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
@@ -113,13 +118,15 @@ class ErrorBudget:
     """Fraction of the tolerance that is the default of `leakage_error`."""
 
     single_node_line_fraction: float = 0.1
-    """Fraction of the beamlets' tolerance that the error of a single line of nodes across the slope
-    may reach before several lines are tried. With a smaller fraction several lines are tried at
-    more points. The accuracy is the same."""
+    """Part of the beamlets' tolerance that the error of a single line of beamlets may reach. The
+    error is that across the slope. Above it several parallel lines are tried. With a smaller value
+    they are tried at more points. The accuracy is the same.
+    """
 
     beamlets_max: int = 4096
-    """Largest number of beamlets of a footprint on a plane. Points that need more are computed with
-    the number of least error, and their ``beamlets_error`` states the error."""
+    """Largest number of beamlets of a footprint on a plane. Points that need more use the number of
+    least error, and their output ``beamlets_error`` states the error.
+    """
 
     thesis_beamlet_count: int = 109
     """Number of beamlets of [T 3.3.1]. It is used where amplitudes add over a smooth plane. Their
@@ -127,9 +134,10 @@ class ErrorBudget:
     """
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Pairs of a tolerance and the smallest number of rays of a shot of a flight. A pair applies
-    from its tolerance up to that of the pair before. Estimates of the error cannot include objects
-    that no ray hits, and fewer rays miss more small objects."""
+    """Pairs of a tolerance and the smallest number of rays per shot of a flight. A pair applies
+    from its tolerance up to that of the previous pair. Estimates of the error cannot include
+    objects that no ray hits, and fewer rays miss more small objects.
+    """
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
     """Numbers of rays that may be cast for a shot. They are those of full shells of the lattice,
@@ -277,7 +285,8 @@ COUNT_INTERVALS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }
-"""Functions that compute confidence intervals of a probability from counts, by name."""
+"""Functions that compute a probability's confidence interval from counts, by the interval's name.
+"""
 
 
 def bounded_mean_interval(

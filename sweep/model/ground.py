@@ -112,9 +112,9 @@ class _PlaneGeometry(NamedTuple):
     position_spread_angle: np.ndarray
     """Full 1/e^2 angle over which positions on the target are spread [rad]."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s]; 0 if beamlets have no velocities of their own."""
+    """Radial velocity [m/s], positive when closing; 0 if all beamlets share the axis's velocity."""
     transverse_velocity: np.ndarray
-    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
+    """Velocity across the beam [m/s]; 0 if all beamlets share the axis's velocity."""
     direction_spread_angle: np.ndarray | None = None
     """Full 1/e^2 angle over which directions of the light are spread [rad]."""
     linear_range_loss: np.ndarray | None = None
@@ -352,7 +352,7 @@ class FootprintExtent(NamedTuple):
     axis_surface_range_offsets: OffsetMoments
     """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
     velocity_offsets: OffsetMoments
-    """Moments of the beamlets' radial velocities minus that on the axis [m/s]."""
+    """Moments of the beamlets' radial velocities minus that on the beam's axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
     """Largest ratio of the beamlets' total amplitude to that of the single line on the axis.
     Beamlets are in phase, or add as powers.

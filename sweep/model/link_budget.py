@@ -197,7 +197,10 @@ class WaveformSettings:
         return 0.5 * (looks.number - 1) * self.look_period if looks.number > 1 else 0.0
 
     def middle_look_starts(self, looks: Looks) -> tuple[np.ndarray, ...]:
-        """Return the times [s] from the shot's start to each segment's start in the middle look."""
+        """Return the times [s] from the shot's start to each segment's start in the middle look.
+
+        A look is one pass through all segments of the shot.
+        """
         delay = self.middle_look_delay(looks)
         return tuple(start + delay for start in self.segment_starts)
 
@@ -257,9 +260,9 @@ class RecordSettings:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "RecordSettings":
-        """Read the settings of the record from parameters by dotted path.
+        """Return the record's settings for parameters by dotted path.
 
-        All points must have the same number L of samples and the same FFT size N.
+        All points must have the same number of samples and the same FFT size.
         """
         length = waveform.record_length(parameters)
         window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
@@ -502,7 +505,7 @@ class LinkScales(NamedTuple):
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "LinkScales":
-        """Return the scales with factors on the echo's power and on the beat's amplitude."""
+        """Return the scales times factors on the echo's power and on the beat's amplitude."""
         return self._replace(
             echo_power=self.echo_power * power_factor,
             beat_amplitude=self.beat_amplitude * amplitude_factor,
@@ -538,7 +541,7 @@ class LinkBudget:
 
     @cached_property
     def target(self) -> TargetState:
-        """Target on the beam's axis at the start of a shot."""
+        """Range, velocity and acceleration of the target on the beam's axis at the shot's start."""
         return TargetState.from_parameters(self.parameters)
 
     @cached_property
@@ -601,12 +604,12 @@ def threshold(tnr: np.ndarray, bin_noise_sigma: np.ndarray) -> np.ndarray:
 
 
 def samples_iq(parameters: Mapping[str, Any]) -> bool:
-    """Return True if two receivers sample I and Q of a complex record."""
+    """Return True if two receivers sample the I and Q parts of a complex record."""
     return str(parameters[RECORD_PATH]) == "complex"
 
 
 def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the noise variance of the ADC's quantisation [V^2]."""
+    """Return the noise variance [V^2] that quantisation adds at the ADC."""
     full_scale, bits = (parameters[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
     return receiver_chain.quantisation_variance(
         full_scale=full_scale, bits=bits, samples_iq=samples_iq(parameters)

@@ -175,7 +175,7 @@ are names; each variable has one float for each point."""
 NAN_WITHOUT_ECHO_OUTPUTS = tuple(
     name for name, output in GRID_OUTPUTS.items() if NO_ECHO_NOTE in output.comment
 )
-"""Names of outputs that are nan if no light returns."""
+"""Names of outputs that are nan if no light returns to the receiver."""
 
 _SEGMENT_PHRASES = {
     "up": "the up-chirp segment",
@@ -221,7 +221,7 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""Outputs that state the accuracy of estimates by draws, by name; one value for each point."""
+"""Accuracy of estimates by random draws: output variables by name, one value for each point."""
 
 RUNNING_SUMS = "running_sums"
 """Name of the output with the sums over draws, to which later draws can be added."""
@@ -305,8 +305,8 @@ SPECTRA_OUTPUTS: dict[str, OutputVariable] = {
     **_measurement_variables("range", "range", "m"),
     **_measurement_variables("radial_velocity", f"radial velocity, {CLOSING_SIGN_NOTE}", "m s-1"),
 }
-"""Outputs of studies of full spectra, by name; one float for each point. ACCURACY_OUTPUTS and
-DRAW_COUNT_OUTPUTS are stored as well."""
+"""Outputs of studies that draw full spectra: output variables by name, one float for each point.
+ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS are stored as well."""
 
 
 def _with_dims(

@@ -130,7 +130,7 @@ class Shots:
     motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
     """Motion of the target during a shot that affects lines and measured values."""
     echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
-    """Samples of the record before the echo, and phase errors of the echo over the record."""
+    """Number of samples before the echo arrives, and phase errors of the echo over the record."""
     images: LineImages = LineImages()  # noqa: RUF009
     """Images of lines at their negative frequencies, and their amplitudes."""
     laser_line: LaserLine = LaserLine()  # noqa: RUF009
@@ -147,7 +147,7 @@ class Shots:
 
     @property
     def window(self) -> Window:
-        """Window of the record."""
+        """Window that is applied to the samples of the record."""
         return self.record.window
 
     @property
@@ -865,7 +865,10 @@ class Shots:
 
     @property
     def real_fft_size(self) -> int:
-        """FFT size if noise in bins 0 and N/2 is real, as in a real record; else 0."""
+        """FFT size if noise in bins 0 and N/2 is real-valued, as in a real record; otherwise 0.
+
+        N is the FFT size.
+        """
         is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
 
@@ -1062,7 +1065,7 @@ def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...])
 
 
 def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
-    """Return the parameters as arrays, together with ``record``, the record's length in samples."""
+    """Return the parameters as arrays, with the number of samples of the record as ``record``."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
     arrays["record"] = waveform.record_length(arrays)
     return arrays

@@ -135,7 +135,7 @@ class WaveformSegment(NamedTuple):
 
 
 class RangeVelocity(NamedTuple):
-    """Range and radial velocity that follow from the peaks of n shots, (n,) each."""
+    """Range and radial velocity of n shots, (n,) each, as computed from peaks of their spectra."""
 
     range: np.ndarray
     """Range of the target [m]."""
@@ -280,8 +280,8 @@ def beat_frequency(
 
 
 SAMPLE_TIME_TOLERANCE = 1e-6
-"""Tolerance, in sample intervals, within which a sample outside a time limit still counts as
-inside."""
+"""Tolerance for time limits of samples [sample intervals]. A sample outside a limit by less than
+this counts as inside."""
 
 
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:

@@ -158,7 +158,7 @@ def window_samples(name: str, length: int) -> np.ndarray:
 
 
 def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
-    """Compute the samples (length,) of a cosine-sum window, bit for bit as scipy.signal does."""
+    """Return the samples (length,) of a cosine-sum window, identical to those of scipy.signal."""
     c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
         constant_term, _ = c

@@ -44,7 +44,8 @@ from sweep.model.spectrum.lines import (
 )
 
 ZERO = np.int64(0)
-"""0 as an argument of kernels. Numba would compile a kernel anew for a literal 0."""
+"""The integer 0 as an argument of compiled functions. Numba would compile them anew for a literal
+0."""
 
 FAR_BINS_PER_BATCH = 128
 """Number of frequency bins per pass of the calculation far from the lines."""
@@ -83,7 +84,7 @@ class LineBundle(NamedTuple):
     origin_bin: int
     """FFT bin number of the frequency from which line positions are counted."""
     n_lines: int
-    """Number of lines."""
+    """Number of lines from which the spectrum is computed."""
     lowest_position: float
     """Lowest line frequency [bins from ``origin_bin``]."""
     highest_position: float

@@ -141,7 +141,7 @@ class SettledLeakage(NamedTuple):
     """
 
     leakage: float
-    """Probability that leaked signal raises at least one false alarm."""
+    """Probability that the echo's signal far from its lines raises at least one false alarm."""
     is_settled: bool
     """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 

@@ -94,8 +94,8 @@ _RECORD_LENGTH_MIN, _PADDING_MAX = 4096, 8
 samples is computed as an integral."""
 
 _N_FAR_DISTANCES = 48
-"""Number of distances, from the end of a line shape's table to N/2, at which the envelope of the
-line shape is stored."""
+"""Number of distances beyond a line-shape table, up to half the FFT size, at which the envelope of
+the line's spectrum is stored."""
 
 _ENVELOPE_MARGIN = 1.05
 """Safety factor on the envelope of a line's spectrum. It covers maxima between table cells."""
@@ -111,8 +111,8 @@ ZERO_WEIGHT_CELLS = 2
 vectors."""
 
 LENGTH_CLASS_RATIO = math.sqrt(2.0)
-"""Largest ratio of the sample numbers of two late echoes that share a line-shape table. A late echo
-fills only the last samples of its record."""
+"""Largest ratio between the numbers of samples of two late echoes that share a line-shape table. A
+late echo fills only the last samples of its record."""
 
 _LATE_SAMPLES_PER_BIN_MIN = 16
 """Least number of samples of a late echo per bin of its table. A bin is fs/L' wide, L' being the
@@ -222,10 +222,14 @@ class LineShapeTables(NamedTuple):
     layout: SpectrumLayout
     """Sizes of the spectrum and of a line-shape table."""
     mode_transforms: np.ndarray
-    """(modes, places): transform of each mode without the record's first sample: the real part of
-    even modes, the imaginary part of odd ones. Places are the cells at :func:`_cell_distances`. If
-    amplitudes add, the values of a shape's table follow in further places. For late echoes places
-    are u = -U .. U in steps of half a bin of fs/L', and the kernel's transform is divided out."""
+    """(modes, places): Fourier transform of each Chebyshev mode without the record's first sample.
+    It is real for even modes; for odd modes it is the imaginary part.
+
+    Places are the table's cells at :func:`_cell_distances`. If amplitudes add, the values of a
+    shape's table follow in further places. For late echoes places are distances u = -U .. U from
+    the line in steps of half a bin of fs/L', with L' samples of the echo. The spreading kernel's
+    transform is then divided out.
+    """
     first_sample_cosine: np.ndarray
     """(places,): the window's first sample times cos(pi L y / N) at y bins from the line. L is the
     number of samples, N the FFT size. The array is empty for late echoes.
@@ -243,8 +247,9 @@ class LineShapeTables(NamedTuple):
     envelope_cotangent: np.ndarray
     """(m,): cot(pi d / N) of each ``envelope_distance`` d, with the FFT size N."""
     full_table_re: np.ndarray
-    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins; else
-    empty."""
+    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins;
+    otherwise empty.
+    """
     full_table_im: np.ndarray
     """(segments, cells * columns): :attr:`LineShape.table_im` of tables that hold all bins; else
     empty.
@@ -640,7 +645,7 @@ def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def select_segment(shapes, segment):
-    """Select the :class:`LineShape` of one segment; its arrays are views."""
+    """Return the :class:`LineShape` of one segment; its arrays are views of ``shapes``."""
     envelope, ends = shapes.envelope, shapes.ends
     return LineShape(
         shapes.table_re[segment],

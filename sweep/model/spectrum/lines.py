@@ -42,7 +42,8 @@ to the sum of the lines' powers. Where the spectrum's magnitude is zero, it show
 the error."""
 
 NODES_MAX = 128
-"""Maximum number of equivalent lines. Lines that would need more are not replaced."""
+"""Maximum number of equivalent lines that replace all lines. Lines that would need more are kept.
+"""
 
 NODES_PER_BATCH = 128
 """Size of each section of :attr:`LineScratch.batch`. It is constant, so that the compiler knows
@@ -53,9 +54,9 @@ LINES_PER_BATCH = 32
 few lines."""
 
 _X, _EVEN, _ODD, _RE, _IM, _LANES = (NODES_PER_BATCH * section for section in range(6))
-"""First elements of the sections of :attr:`LineScratch.batch`: positions x of lines or nodes,
--1 .. 1; Chebyshev polynomials of even and of odd order at x; real and imaginary parts of weights;
-partial sums."""
+"""Index of the first element of each section of :attr:`LineScratch.batch`. The sections hold
+positions x of lines or nodes, -1 .. 1, and Chebyshev polynomials of even and of odd order at x.
+Real and imaginary parts of weights follow, then partial sums."""
 
 BATCH_SCRATCH_SIZE = 6 * NODES_PER_BATCH
 """Number of elements of :attr:`LineScratch.batch`."""
@@ -79,7 +80,7 @@ class SpectrumLayout(NamedTuple):
     """Sizes of a spectrum and of the line-shape table for computing it."""
 
     fft_size: int
-    """FFT size N."""
+    """FFT size N, the number of samples after zero padding."""
     record_length: int
     """Number of samples of the record. For an echo that arrives late, it is the number of samples
     with the echo.
@@ -152,8 +153,9 @@ class BeamletArrays(NamedTuple):
     axis.
     """
     phase_cycles: np.ndarray
-    """(segments, footprints, beamlets): random phases [cycles]; (0, footprints, beamlets) if there
-    are none."""
+    """(segments, footprints, beamlets): random phase of each beamlet's beat [cycles]. The shape is
+    (0, footprints, beamlets) if there are no random phases.
+    """
 
 
 def beamlet_arrays(beamlet_table: np.ndarray) -> BeamletArrays:
@@ -177,11 +179,11 @@ class PointParameters(NamedTuple):
     beat_amplitude_scale: np.ndarray
     """Amplitude [V] of the beat at the ADC for a line of relative amplitude 1."""
     detector_bandwidth: np.ndarray
-    """Bandwidth of the detector's pole [Hz]."""
+    """3 dB bandwidth of the detector's single-pole low-pass [Hz]."""
     amplifier_bandwidth: np.ndarray
-    """Bandwidth of the amplifier's pole [Hz]."""
+    """3 dB bandwidth of the amplifier's single-pole low-pass [Hz]."""
     sample_rate: np.ndarray
-    """Sample rate fs [Hz]."""
+    """Sample rate of the record [Hz]."""
     record_start: np.ndarray
     """Time from the start of a segment to the first sample of its record [s]."""
     up_carrier: np.ndarray
@@ -275,18 +277,18 @@ class BeatParameters(NamedTuple):
     amplitude: float
     """Amplitude [V] of the beat of a line of relative amplitude 1, in the whitened spectrum."""
     detector_bandwidth: float
-    """Bandwidth of the detector's pole [Hz]."""
+    """3 dB bandwidth of the detector's single-pole low-pass [Hz]."""
     amplifier_bandwidth: float
-    """Bandwidth of the amplifier's pole [Hz]."""
+    """3 dB bandwidth of the amplifier's single-pole low-pass [Hz]."""
     sample_rate: float
-    """Sample rate fs [Hz]."""
+    """Sample rate of the record [Hz]."""
     record_start: float
     """Time from the start of the segment to the first sample that contains the echo [s]."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def beat_parameters_at(point_parameters, segment_parameters, segment, point):
-    """Select the :class:`BeatParameters` of one segment of one point."""
+    """Return the :class:`BeatParameters` of one segment of one point."""
     return BeatParameters(
         point_parameters.range[point],
         segment_parameters.range_decrease[segment, point],
@@ -467,7 +469,7 @@ def compute_lines(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
-    """Append the images of lines at the opposite frequencies; return the number of all lines.
+    """Append images of lines at the opposite frequencies; return the number of lines and images.
 
     ``image_gain`` is the amplitude of an image over that of its line.
     """

@@ -177,7 +177,7 @@ def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarr
 
 
 def axis_line_positions(shots: Any) -> np.ndarray:
-    """Return the positions of the lines on the beam's axis, (segments, n) [bins]."""
+    """Return the positions [FFT bins] of the lines on the beam's axis, (segments, n)."""
     cycles_per_sample = [
         (beat + drift) / shots.sample_rate
         for beat, drift in zip(shots.beat_frequencies, shots.mid_record_drifts, strict=True)

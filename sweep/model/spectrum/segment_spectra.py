@@ -208,7 +208,7 @@ class EvaluationSettings(NamedTuple):
     LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
     """
     window_sum: float
-    """Sum of the window's samples."""
+    """Sum of the window's samples, the peak of its transform."""
     rule: DetectionRule
     """Rule by which the bins of an echo detect it."""
     speckle_table: SpeckleTable
@@ -428,8 +428,8 @@ def segment_spectrum(
 ) -> SegmentSpectrum:
     """Return the spectrum of one point's segment around its lines, without noise.
 
-    Bins whose |X| is below ``level_min`` [V, summed over the record] may be left out; 0 returns all
-    bins.
+    Bins with a magnitude below ``level_min`` [V, summed over the record] may be left out; 0 returns
+    all bins.
     """
     shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
@@ -684,7 +684,10 @@ def _sort_by_shape(
 
 
 def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
-    """Find the distinct line shapes of a batch of points."""
+    """Return one point for each line shape that occurs in a batch of points.
+
+    A line shape is the spectrum of a line of amplitude 1.
+    """
     first_samples = (
         ()
         if shots.echo_record.n_samples_before is None
@@ -739,13 +742,12 @@ def _evaluate_batch(
     keeps_magnitudes: bool,
     with_pd: bool,
 ) -> BinSpans:
-    """Compute the spans of bins around the lines, for the next batch of points of a group.
+    """Compute the spectra around the lines for the next batch of points of a group.
 
     The batch begins with the group's point number ``batch_begin``. It has as many points as fit
     into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
-    shapes.
-    ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`;
-    ``lowest_levels`` (n,) is |X| [V] below which bins may be left out.
+    shapes. ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
     """
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
