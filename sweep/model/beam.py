@@ -252,7 +252,9 @@ class FootprintAngles(NamedTuple):
 
 
 def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
-    """Compute the angles of the effective footprint of points of one category.
+    """Compute the full 1/e^2 angles of the effective footprint, seen from the instrument.
+
+    All points have to be of one category.
 
     Parameters
     ----------
@@ -399,7 +401,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
 
 
 def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diameter and the full angle of view with which background light is collected.
+    """Return the diameter and the full angle of view of the receiver for background light.
 
     Returns
     -------
@@ -449,7 +451,9 @@ def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Return the fraction of a single mode's echo that remains if its two axes are apart, 0..1.
+    """Return the fraction of a single mode's echo that remains if its axes are apart, 0..1.
+
+    The axes are those of the transmitted and the received beam at the target.
 
     Parameters
     ----------

@@ -136,7 +136,9 @@ class LineSpreadBins(NamedTuple):
 def split_with_beamlet_counts(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category, and set the number of beamlets where it follows from the tolerance.
+    """Split points by category, and set the number of beamlets if it is not stated.
+
+    The number then follows from the tolerance.
 
     Parameters
     ----------
@@ -429,7 +431,9 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
 def required_nodes(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the numbers of nodes and of their lines by the error of the largest bin's power.
+    """Choose the number of quadrature nodes, and of parallel lines of nodes, by tolerance.
+
+    A node is a beamlet. The tolerance is that of the largest bin's power.
 
     Parameters
     ----------
@@ -509,9 +513,9 @@ def _cheapest_within_tolerance(
 def _choose_node_lines(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the numbers of nodes and lines for n spreads that need several lines of nodes.
+    """Choose the numbers of nodes and lines of nodes where a single line is too inaccurate.
 
-    The parameters are those of :func:`required_nodes`.
+    A node is a beamlet. The parameters are those of :func:`required_nodes`.
 
     Returns
     -------

@@ -68,7 +68,7 @@ def use_beamlet_velocities(names: Collection[str]) -> bool:
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Prepare shots on a flat plane, in groups that share strings and sizes.
+    """Yield prepared shots on a flat plane, in groups of points that share strings and sizes.
 
     Parameters
     ----------
@@ -134,7 +134,9 @@ def apply_effects(
     effects: Collection[str],
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots with one line each, then apply all effects that are not random.
+    """Return prepared shots with all effects applied that are not random.
+
+    At first each shot has a single line, that on the beam's axis.
 
     Parameters
     ----------
@@ -179,7 +181,7 @@ def evaluate(
     *,
     segment_evaluator: Callable[[Shots], np.ndarray] = evaluate_segments,
 ) -> dict[str, np.ndarray]:
-    """Compute the statistics of n shots on a flat plane.
+    """Compute detection, false-alarm and other statistics of n shots on a flat plane.
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ class _PlaneGeometry(NamedTuple):
 
 
 class FlatGround:
-    """Flat plane for the points of one category.
+    """Flat ground that the beams of one category of points meet.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ class FlatGround:
 
 
 class RayTracedGround:
-    """Footprints of beams by ray tracing.
+    """Ground whose footprints are given by ray tracing.
 
     Parameters
     ----------

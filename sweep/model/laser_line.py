@@ -193,7 +193,7 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 
     Notes
     -----
-    2 (1 - e^-g (1 + g)) / Gamma with g = Gamma tau.
+    2 (1 - e^-g (1 + g)) / Gamma with Gamma = 2 pi dnu and g = Gamma tau.
     """
     gamma = 2 * np.pi * np.asarray(line_width, float)
     g = gamma * delay
@@ -224,8 +224,9 @@ def pedestal_power_under_line(
 
     Notes
     -----
-    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], with the window's autocorrelation r, is summed
-    directly if few lags contribute. Otherwise it is an integral over the lag by Gauss-Legendre
+    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}] runs over the lags T_j [s], with the window's
+    autocorrelation r, Gamma = 2 pi FWHM and the delay tau. It is summed directly if few lags count.
+    Otherwise it is an integral over the lag by Gauss-Legendre
     quadrature, plus a closed-form correction for aliasing of the integrand's kinks at lag 0 and at
     the delay. The result is accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a
     delay below one sample.

@@ -638,7 +638,7 @@ def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Return the relative amplitude of the beat for a relative echo.
+    """Return the beat amplitude, over its scale, for a relative echo [1/sr].
 
     Parameters
     ----------
@@ -664,7 +664,7 @@ def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
 def echo_power_and_beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the echo power and beat current for a backscatter of 1/sr.
+    """Compute the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
 
     Returns
     -------

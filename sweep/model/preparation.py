@@ -364,7 +364,7 @@ class Shots:
         return shape_rows
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the mean signal power over the mean noise power of a bin.
+        """Return the signal-to-noise ratio of a bin, mean signal power over mean noise power.
 
         Parameters
         ----------
@@ -1072,7 +1072,7 @@ def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
 
 
 def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, ground: Ground) -> Shots:
-    """Prepare points of one category with only the echo on the beam's axis and receiver noise.
+    """Return shots of one category with only the axis's echo and the receiver's noise.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def receiver_noise(
 def quantisation_variance(
     *, full_scale: ArrayLike, bits: ArrayLike, samples_iq: bool = False
 ) -> np.ndarray:
-    """Return the variance that rounding adds at the ADC.
+    """Return the noise variance [V^2] that rounding to ADC steps adds.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def quantisation_variance(
 
 
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the noise per quadrature of a bin, [T 3.2].
+    """Return the noise standard deviation per quadrature of an FFT bin [V], [T 3.2].
 
     Parameters
     ----------
@@ -376,7 +376,7 @@ def relative_noise_density(
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the power transmission of a single-pole low-pass over its aliases.
+    """Return the sum of a single-pole low-pass's power transmission over all aliases.
 
     Parameters
     ----------

@@ -220,7 +220,7 @@ def _zero_first_steps(window: Window, step: int) -> Window:
 
 
 def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
-    """Compute the transform W(y) by a direct sum over the samples; slow, for tests.
+    """Compute the window's Fourier transform by a direct sum over samples; slow, for tests.
 
     Parameters
     ----------

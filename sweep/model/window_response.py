@@ -90,7 +90,7 @@ class WindowResponse(NamedTuple):
 
 @lru_cache(maxsize=32)
 def window_response(window_name: str, length: int, fft_size: int) -> WindowResponse:
-    """Return the response of a window over an FFT's bins, prepared once and cached.
+    """Return the magnitude response of a window at FFT bins around a line (cached).
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the magnitude of the main lobe from its series.
+    """Return the main-lobe magnitude of a window's transform from its power series.
 
     Parameters
     ----------

@@ -561,7 +561,8 @@ def add_line_by_record_ends(
 
     Notes
     -----
-    With the strengths a and b at the two ends, and c = cot(pi (k - nu) / N),
+    The line at nu bins has the amplitudes a and b at the two ends of the record. r is the number
+    of samples over the FFT size N. In bin k, with c = cot(pi (k - nu) / N),
 
         F(k) += e^{i pi r k} a A(c) - e^{-i pi r k} b B(c).
 
@@ -637,13 +638,13 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
     bundle
         :class:`LineBundle` of the lines in ``field.lines``.
     negligible_ratio
-        Error of F that is allowed, over the sum of |C_b|.
+        Allowed error of F over the sum of the lines' amplitudes.
     shape
         :class:`sweep.model.spectrum.line_shape.LineShape`.
     layout
         :class:`SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     field
         :class:`FieldWorkspace`.
     """
@@ -963,7 +964,7 @@ def detect_in_span(
     layout
         :class:`SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     workspace
         :class:`SpectrumWorkspace`, whose ``span.magnitude`` and ``span.is_exempt`` are results.
 

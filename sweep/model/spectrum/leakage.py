@@ -629,7 +629,7 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
     Parameters
     ----------
     weight_sum
-        Sum of |C_b| of the lines.
+        Sum of the lines' amplitudes [V].
     distance_min
         Least distance from the lines [bins].
     image_distance
@@ -1040,7 +1040,9 @@ def _near_end_correction(side, n_bins, span):
 def _append_gauss_points(
     side, last_distance, centre_bin, steepness, layout, tangents, cotangents, weights, n_points
 ):
-    """Append the Gauss points of the integral on one side of the lines; return their number.
+    """Append the quadrature points of the leakage integral on one side of the lines.
+
+    The integral is over bins far from the lines. The result is the number of all points.
 
     Parameters
     ----------
@@ -1056,7 +1058,7 @@ def _append_gauss_points(
     layout
         :class:`sweep.model.spectrum.lines.SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     cotangents, weights
         Results: cot(pi q / N) at the distance q from ``centre_bin``, and weights of an integral
         over the cotangent.

@@ -883,7 +883,7 @@ def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynom
 
 @njit(cache=True, error_model="numpy")
 def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
-    """Decompose phase errors into a shift of the line and Chebyshev modes.
+    """Decompose phase errors into a frequency shift of the line and Chebyshev modes.
 
     Parameters
     ----------
@@ -929,7 +929,9 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
 
 @njit(cache=True, error_model="numpy")
 def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
-    """Compute the line shape of one segment as a sum of modes, or copy a table of all bins.
+    """Compute one segment's line shape, the spectrum of a line of amplitude 1.
+
+    It is a sum of Chebyshev modes, or a copy of a table of all bins.
 
     Parameters
     ----------
@@ -948,7 +950,9 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
 
     Notes
     -----
-    With f = w exp(2 pi i psi), the modes a_j and their tabulated transforms M_j,
+    G is the line's spectrum at y bins from the line, w the window, psi the phase error [cycles] and
+    r the number of samples over the FFT size. With f = w exp(2 pi i psi), the mode coefficients a_j
+    and their tabulated transforms M_j,
 
         G(y) = sum_j a_j M_j(y) + (f(-1) e^{i pi r y} - f(1) e^{-i pi r y}) / 2.
 
@@ -1047,13 +1051,16 @@ def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segme
 
 @njit(cache=True, error_model="numpy")
 def build_late_line_shape(segment, shape_index, modes, tables, shape):
-    """Compute the line shape of a late echo, of ``tables.echo_lengths`` samples L'.
+    """Compute the line shape of an echo that arrives after its record has begun.
 
-    Parameters are those of :func:`build_line_shape`.
+    The line shape is the spectrum of a line of amplitude 1. The echo has ``tables.echo_lengths``
+    samples L'. Parameters are those of :func:`build_line_shape`.
 
     Notes
     -----
-    With f = w exp(2 pi i psi) over the echo's samples, r' = L'/N and theta = 2 pi y / N,
+    G is the line's spectrum at y bins from the line, w the window, psi the phase error [cycles], N
+    the FFT size and B the Bernoulli numbers. With f = w exp(2 pi i psi) over the echo's samples,
+    r' = L'/N and theta = 2 pi y / N,
 
         G(y) = L'/2 int f(x) e^{-i pi r' y x} dx + (f(-1) e^{i pi r' y} - f(1) e^{-i pi r' y}) / 2
                + sum_m B_{m+1} / (m+1)! [ d^m / dn^m (f e^{-i theta n}) ] at the ends,

@@ -536,7 +536,7 @@ def summarise_lines(lines, n_lines, adds_powers, batch):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_allowed, threshold):
-    """Return the error that equivalent lines may make, relative to the largest possible peak.
+    """Return the tolerated error of replacing lines, relative to the largest possible peak.
 
     Parameters
     ----------

@@ -275,7 +275,7 @@ def _deposit_lines(
     centre_bin,
     grid,
 ):
-    """Add the lines of m points to their grids: amplitudes or powers.
+    """Add the amplitudes or powers of the lines of m points to the cells of their grids.
 
     Parameters
     ----------

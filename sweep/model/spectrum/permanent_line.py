@@ -149,7 +149,7 @@ def line_alarm_probability(
     amplitude_ratio: float,
     threshold_ratio: float,
 ) -> float:
-    """Return the probability that a line raises an alarm in its bins where noise alone does not.
+    """Return the probability that a permanent line raises a false alarm where noise does not.
 
     Parameters
     ----------
@@ -182,7 +182,9 @@ def line_alarm_probability(
 def line_bin_masks(
     shots: Shots, i: int, line: LineTransforms, *, half_amplitude: float, echo_bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bins of a segment that a line masks, and those in which it raises alarms.
+    """Return the bins that a permanent line masks, and those in which it may raise alarms.
+
+    A masked bin raises no alarm. An echo whose largest bin is masked is not detected.
 
     Parameters
     ----------
@@ -264,7 +266,9 @@ def raised_magnitude(
 
 
 def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
-    """Apply the permanent line to spectra: it masks some bins and raises others.
+    """Apply a permanent line to spectra: mask some bins and raise the magnitude of others.
+
+    The line is light other than the echo that is in every record.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
 
 
 def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return the positions of each beamlet's line in the three spectra, (m, 3, beamlets) [bins].
+    """Return the FFT bin positions of each beamlet's line by segment, (m, 3, beamlets).
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
 
 
 def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarray) -> np.ndarray:
-    """Return the mean positions of the beamlets' lines, weighted by power, (m, 3) [bins].
+    """Return the power-weighted mean FFT bin position of the beamlets' lines, (m, 3).
 
     Parameters
     ----------

@@ -871,9 +871,9 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _copy_lines(lines, n_lines, shifts):
-    """Copy lines to several shifted positions, and return the number of all copies.
+    """Copy lines to several shifted frequencies; return the number of all copies.
 
-    The powers of the lines add. Their copies average the power spectrum over the shifts.
+    The powers of the lines add. The copies average the power spectrum over the shifts.
 
     Parameters
     ----------

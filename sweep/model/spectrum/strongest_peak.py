@@ -97,7 +97,7 @@ class LevelProbabilities(NamedTuple):
 def strongest_peak_probabilities(
     shots: Any, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Compute the outputs of shots whose strongest peak is reported.
+    """Compute detection and wrong-range probabilities if only the strongest peak is reported.
 
     Parameters
     ----------
