@@ -226,10 +226,9 @@ def pedestal_power_under_line(
     -----
     sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}] runs over the lags T_j [s], with the window's
     autocorrelation r, Gamma = 2 pi FWHM and the delay tau. It is summed directly if few lags count.
-    Otherwise it is an integral over the lag by Gauss-Legendre
-    quadrature, plus a closed-form correction for aliasing of the integrand's kinks at lag 0 and at
-    the delay. The result is accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a
-    delay below one sample.
+    Otherwise it is an integral over the lag by Gauss-Legendre quadrature, plus a closed-form
+    correction for aliasing of the integrand's kinks at lag 0 and at the delay. The result is
+    accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a delay below one sample.
     """
     duration = np.asarray(duration, float)
     gamma = 2 * np.pi * np.asarray(line_width, float) * duration

@@ -1,13 +1,13 @@
 """Spectrum of a segment's lines in the bins that matter, without the record or its FFT.
 
-With the weights C_b of the lines, their positions nu_b and their shape G
-(:mod:`sweep.model.spectrum.line_shape`),
+Line b has the complex weight C_b and the position nu_b [bins]. All lines have the shape G
+(:mod:`sweep.model.spectrum.line_shape`). In bin k their spectrum F and the record's spectrum X are
 
     F(k) = sum_b C_b G(k - nu_b),    X[k] = F(k) + conj F(-k)
 
 for a real record, where the second term is the images. The spectrum of a complex record is F alone
-(PHYSICS section 5). The factor e^{-i pi r k}, r = L/N, which all terms share, is dropped. Lines
-whose powers add have |C_b|^2 |G|^2 instead.
+(PHYSICS section 5). All terms share the factor e^{-i pi r k}, which is dropped; r is the
+number L of samples over the FFT size N. Lines whose powers add have |C_b|^2 |G|^2 instead.
 
 In bins near the lines F is computed from the table of G. In bins far from all lines it is computed
 from a few sources that replace the lines. There the ends of the record determine the shape, and the

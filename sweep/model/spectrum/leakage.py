@@ -1,6 +1,8 @@
 """Detection and leakage of a segment, where all bins count but few are computed.
 
-The bins of a span around the lines are computed one by one: all that may cross the threshold, and
+Leakage is the probability of false alarms by the echo's signal far from its lines.
+
+A span, the adjacent bins around the lines, is computed bin by bin: all that may cross the threshold, and
 as many more as it takes for the leaked signal to become smooth. Beyond the span, down to DC and up
 to Nyquist, the probabilities that leaked signal adds are summed as an integral, with an error below
 1e-6 of the leakage. The integral is left out if the envelope of the line shape bounds it below the
@@ -12,8 +14,9 @@ central differences). As |X|^2 is even about DC and Nyquist, the only correction
 half the value there. In v = cot(pi q / N), with the distance q from the lines, the integrand is
 nearly a polynomial: about thirty Gauss points represent sixty thousand bins.
 
-In developed speckle the leaked signal fades with its echo. If the speckle's power is u, of mean 1,
-bins of power u |X|^2 leak with the probability 1 - exp(-R(u)), and the mean is
+In developed speckle the leaked signal fades with its echo. The speckle's power is u, of mean 1. Let
+R(u) be the summed rate of false alarms by bins of power u |X|^2. At least one of them raises a
+false alarm with the probability 1 - exp(-R(u)). The mean is
 
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 

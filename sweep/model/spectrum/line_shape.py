@@ -1,7 +1,8 @@
 """Line shape: the spectrum of one line of amplitude 1 in the bins around it.
 
 All lines of a segment share the window and the phase error psi(t) of the record, so they share one
-shape. With x = -1 .. 1 over the record of L samples, r = L/N, and a distance of y bins of fs/N,
+shape. Let x = -1 .. 1 be the position in the record of L samples, w the window, N the FFT size and
+fs the sample rate. With r = L/N and a distance of y bins of fs/N,
 
     G(y) = sum_n w(x_n) exp(2 pi i psi(x_n)) exp(-i pi r y x_n)
 

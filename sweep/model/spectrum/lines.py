@@ -1,14 +1,14 @@
 """Lines of one segment: frequency, strength and phase of each beamlet's beat.
 
-The beat of a beamlet is a tone at nu bins of fs/N. Its line appears at nu minus a whole number of
-FFT lengths, within -N/2 .. N/2. A real record shows the line and its image at the opposite
-frequency.
+The beat of a beamlet is a tone at nu bins of fs/N, the sample rate over the FFT size. Its line
+appears at nu minus a whole number of FFT lengths, within -N/2 .. N/2. A real record shows the line
+and its image at the opposite frequency.
 
 Many close lines are replaced by a few. The spectrum is band-limited as a function of a line's
-position. Lines within +-h bins are therefore equivalent to J lines at Chebyshev nodes, with J about
-8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has an error of about
-2 J_J(pi h t). This is negligible except at the record's ends, where most windows are small. The
-window weighs the error.
+position. Lines within +-h bins are therefore equivalent to some number J of lines at Chebyshev
+nodes, with J about 8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has
+an error of about 2 J_J(pi h t). This is negligible except at the record's ends, where most windows
+are small. The window weighs the error.
 """
 
 import math

@@ -1,7 +1,8 @@
 """Line of other light than the echo's that is in every record, such as leaked transmitted light.
 
-With the amplitude A of its beat, its delay tau, the window's transform W and the receiver's
-transfer function H, the line is
+The line's beat has the amplitude A, the delay tau and the phase phi. With the window's transform W,
+the receiver's transfer function H, the chirp rate S, the FFT size N and the sample rate fs, its
+spectrum L_k in bin k is
 
     L_k = A H / 2 (e^{j phi} W(k - nu) + e^{-j phi} W(k + nu)),   nu = S tau N / fs
 
