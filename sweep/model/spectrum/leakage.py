@@ -2,11 +2,11 @@
 
 Leakage is the probability of false alarms by the echo's signal far from its lines.
 
-A span, the adjacent bins around the lines, is computed bin by bin: all that may cross the threshold, and
-as many more as it takes for the leaked signal to become smooth. Beyond the span, down to DC and up
-to Nyquist, the probabilities that leaked signal adds are summed as an integral, with an error below
-1e-6 of the leakage. The integral is left out if the envelope of the line shape bounds it below the
-tolerance.
+A span, the adjacent bins around the lines, is computed bin by bin. It contains all bins that may
+cross the threshold, and as many more as it takes for the leaked signal to become smooth. Beyond the
+span, down to DC and up to Nyquist, the probabilities that leaked signal adds are summed as an
+integral, with an error below 1e-6 of the leakage. The integral is left out if the envelope of the
+line shape bounds it below the tolerance.
 
 Without padding the factor e^{i pi k} is a sign, so |X| far from the lines is a smooth function of
 k. Its sum over bins is then an integral plus corrections at its near end (Euler-Maclaurin, in
