@@ -372,10 +372,10 @@ def range_loss_coefficients(
 def effective_collecting_area(parameters: Parameters) -> np.ndarray:
     """Return the area [m^2] of an equivalent aperture that collects all light that mixes.
 
-    At the range R, ``target.range``, an aperture of area A collects A / R^2 of the radiance of a
-    diffuse echo. For the coupling law ``aperture``, A is the area of the real aperture. For a
-    single mode it is lambda^2 R^2 times the overlap integral of both beams' irradiances, each of
-    unit power. This is reduced by :func:`truncation_efficiency` of both beams.
+    An aperture of area A collects light of a diffuse echo at the range R, ``target.range``, in
+    proportion to A / R^2. For the coupling law ``aperture``, A is the area of the real aperture.
+    For a single mode it is lambda^2 R^2 times the overlap integral of both beams' irradiances, each
+    of unit power. It is reduced by :func:`truncation_efficiency` of both beams.
     """
     diameter = np.asarray(parameters[APERTURE_DIAMETER_PATH])
     if not is_single_mode(parameters):

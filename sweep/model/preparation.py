@@ -241,7 +241,10 @@ class Shots:
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
-        """Echo of all beamlets relative to a reflectance of 1 [1/sr], (n,)."""
+        """Sum of the relative echoes of all beamlets [1/sr], (n,).
+
+        The echo power on the detector is proportional to it.
+        """
         relative_echo = (
             self.footprint.relative_amplitude
             if self.waveform.architecture == "direct"

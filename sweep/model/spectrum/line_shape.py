@@ -87,8 +87,8 @@ N_END_COEFFICIENTS = END_DERIVATIVES_MAX + 2
 spectrum far from the line."""
 
 MODE_SIZE_MIN = 1e-13
-"""Coefficient of a Chebyshev mode below which the mode is left out. The amplitude of the record is
-1."""
+"""Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
+with smaller coefficients are left out. The phasor has magnitude 1."""
 
 _RECORD_LENGTH_MIN, _PADDING_MAX = 4096, 8
 """Least number of samples, and largest padding (FFT size over samples), for which a sum over the
