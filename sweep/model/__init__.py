@@ -11,5 +11,5 @@ University, 2017. Points of one category share all settings that are words or si
 """
 
 VERSION = "46"
-"""Version of the physics. It is part of a study's identity and is raised when any result can
+"""Version of the physics model. It is part of a study's identity and is raised when any result can
 change."""

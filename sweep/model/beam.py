@@ -45,30 +45,30 @@ if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
 
 SINGLE_MODE = "single_mode"
-"""Law of coupling in which a receiver sees a single spatial mode."""
+"""Name of the coupling law by which a receiver detects light of a single spatial mode."""
 APERTURE = "aperture"
-"""Law of coupling in which all light in the aperture mixes."""
+"""Name of the coupling law by which all light in the aperture mixes with the local oscillator."""
 COUPLINGS = (SINGLE_MODE, APERTURE)
-"""Names of the laws of coupling."""
+"""Names of the coupling laws, which determine what fraction of the echo mixes."""
 
 COUPLING_PATH = "instrument.telescope.coupling"
-"""Path of the law of coupling, one of `COUPLINGS`."""
+"""Parameter path of the coupling law, one of `COUPLINGS`."""
 APERTURE_DIAMETER_PATH = "instrument.telescope.aperture"
-"""Path of the diameter of the aperture [m]."""
+"""Parameter path of the diameter of the telescope's aperture [m]."""
 WAVELENGTH_PATH = "instrument.laser.wavelength"
-"""Path of the wavelength [m]."""
+"""Parameter path of the laser's wavelength [m]."""
 DIVERGENCE_PATH = "instrument.laser.beam_divergence"
-"""Path of the full far-field 1/e^2 angle of the transmitted beam [rad]."""
+"""Parameter path of the full 1/e^2 angle of the transmitted beam in the far field [rad]."""
 WAIST_PATH = "instrument.laser.beam_waist"
-"""Path of the 1/e^2 radius of the transmitted beam at the telescope [m]."""
+"""Parameter path of the 1/e^2 radius of the transmitted beam at the telescope [m]."""
 QUALITY_PATH = "instrument.laser.beam_quality"
-"""Path of the beam quality M^2 of the transmitted beam."""
+"""Parameter path of the beam quality M^2 of the transmitted beam; 1 for an ideal beam."""
 FOCUS_PATH = "instrument.laser.focus"
-"""Path of the distance at which the beam is focused [m]; 0 for a collimated beam."""
+"""Parameter path of the distance at which the beam is focused [m]; 0 for a collimated beam."""
 OSCILLATOR_WAIST_PATH = "instrument.receiver.local_oscillator_waist"
-"""Path of the 1/e^2 radius of the local oscillator's beam at the telescope [m]."""
+"""Parameter path of the 1/e^2 radius of the local oscillator's beam at the telescope [m]."""
 ARCHITECTURE_PATH = "instrument.receiver.architecture"
-"""Path of the receiver's architecture in the parameters. The values that it may have are
+"""Parameter path of the receiver's architecture. Its value is one of
 `sweep.model.receiver_chain.ARCHITECTURES`."""
 SCAN_RATE_PATH, SEPARATION_PATH, MISALIGNMENT_PATH = (
     f"instrument.telescope.{name}" for name in ("scan_rate", "separation", "misalignment")
@@ -82,17 +82,15 @@ BEAM_DEFAULTS: dict[str, float | str] = {
     FOCUS_PATH: 0.0,
     OSCILLATOR_WAIST_PATH: 0.0,
 }
-"""Default values of a beam's parameters, by dotted path.
-
-A divergence or a waist of 0 means that it is not stated. A focus of 0 means a collimated beam. A
-local oscillator's waist of 0 means that of the transmitted beam.
-"""
+"""Default values of the beam parameters, by dotted path. A divergence or a waist of 0 means that it
+is not stated. A focus of 0 means a collimated beam. A local oscillator's waist of 0 means that of
+the transmitted beam."""
 
 FOOTPRINT_ANGLE_MAX = math.pi / 2
-"""Upper limit [rad] of the full angle of a footprint."""
+"""Upper limit of the full angle of a footprint, seen from the instrument [rad]."""
 
 Parameters = Mapping[str, Any]
-"""Parameters of points by dotted path, (n,) arrays or scalars."""
+"""Type of a mapping of dotted paths to the parameters of points, (n,) arrays or scalars."""
 
 
 class GaussianBeam(NamedTuple):
@@ -104,11 +102,14 @@ class GaussianBeam(NamedTuple):
     """
 
     waist: np.ndarray
-    """1/e^2 radius at the telescope, w_a [m]."""
+    """1/e^2 radius of the beam at the telescope [m]."""
     rayleigh_range: np.ndarray
-    """Rayleigh range z_R = pi w_a^2 / (M^2 lambda) [m]."""
+    """Rayleigh range pi w^2 / (M^2 lambda) [m], with the radius w at the telescope and the beam
+    quality M^2.
+    """
     focus_curvature: np.ndarray | float = 0.0
-    """Reciprocal 1 / f [1/m] of the distance at which the beam is focused; 0 for a collimated beam.
+    """Curvature of the wavefront at the telescope [1/m], 1 over the distance of the focus. It is 0
+    for a collimated beam.
     """
 
     @classmethod
@@ -120,7 +121,7 @@ class GaussianBeam(NamedTuple):
         quality: ArrayLike = 1.0,
         focus: ArrayLike = 0.0,
     ) -> "GaussianBeam":
-        """Make a beam from its radius at the telescope.
+        """Return the beam with a given radius at the telescope.
 
         Parameters
         ----------
@@ -162,12 +163,15 @@ class GaussianBeam(NamedTuple):
         return np.asarray(2 * self.waist * np.hypot(defocus, 1 / self.rayleigh_range))
 
     def radius(self, range: ArrayLike) -> np.ndarray:
-        """Return the 1/e^2 radius w(R) [m] at ranges [m] above 0."""
+        """Return the 1/e^2 radius of the beam [m] at ``range`` [m], above 0."""
         return self.full_angle(range) * np.asarray(range, float) / 2
 
 
 def is_single_mode(parameters: Parameters) -> bool:
-    """Return True if the receiver sees a single spatial mode, for points of one category."""
+    """Return True if the receiver detects light of a single spatial mode.
+
+    All points have to be of one category.
+    """
     return (
         str(parameters[COUPLING_PATH]) == SINGLE_MODE
         and str(parameters[ARCHITECTURE_PATH]) != "direct"
@@ -197,7 +201,7 @@ def divergence_from_waist(
 
 
 def far_field_divergence(parameters: Parameters) -> np.ndarray:
-    """Return the full far-field angle [rad] that the transmitted beam has without a focus."""
+    """Return the full 1/e^2 angle [rad] of the transmitted beam in the far field, without focus."""
     stated_divergence, waist = (
         np.asarray(parameters[DIVERGENCE_PATH], float),
         np.asarray(parameters[WAIST_PATH], float),
@@ -237,17 +241,20 @@ def transmitted_and_oscillator_beams(parameters: Parameters) -> tuple[GaussianBe
 
 
 class FootprintAngles(NamedTuple):
-    """Full 1/e^2 angles of the effective footprint, seen from the instrument [rad]."""
+    """Full 1/e^2 angles of the effective footprint [rad], by position and by light direction."""
 
     positions: np.ndarray
-    """Full angle over which positions on the target are spread [rad]."""
+    """Full 1/e^2 angle over which positions on the target are spread [rad]."""
     directions: np.ndarray
-    """Full angle over which directions of the light are spread [rad]. They determine Doppler
-    shifts."""
+    """Full 1/e^2 angle over which directions of the light are spread [rad]. It determines the
+    spread of Doppler shifts.
+    """
 
 
 def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> FootprintAngles:
-    """Compute the angles of the effective footprint of points of one category.
+    """Compute the full 1/e^2 angles of the effective footprint, seen from the instrument.
+
+    All points have to be of one category.
 
     Parameters
     ----------
@@ -296,7 +303,7 @@ def footprint_angles(parameters: Parameters, range: ArrayLike | None = None) -> 
 
 
 def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
-    """Select the parameters that determine a beam's width at every range, by dotted path."""
+    """Select the parameters, by dotted path, that determine a beam's width at every range."""
     paths = (
         WAVELENGTH_PATH,
         DIVERGENCE_PATH,
@@ -309,9 +316,9 @@ def beam_shape_parameters(parameters: Parameters) -> dict[str, Any]:
 
 
 def has_constant_divergence(parameters: Parameters) -> bool:
-    """Return True if the footprint's width is the divergence times the range, as in [T].
+    """Return True if the footprint's width is the beam divergence times the range, as in [T].
 
-    The points are of one category.
+    All points have to be of one category.
     """
     return not (
         is_single_mode(parameters)
@@ -323,7 +330,7 @@ def has_constant_divergence(parameters: Parameters) -> bool:
 def range_loss_coefficients(
     parameters: Parameters, range: ArrayLike | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (b, c) of the relative range loss 1 + b x + c x^2.
+    """Return coefficients b and c of the range loss 1 + b x + c x^2 for a relative range change x.
 
     Parameters
     ----------
@@ -363,11 +370,12 @@ def range_loss_coefficients(
 
 
 def effective_collecting_area(parameters: Parameters) -> np.ndarray:
-    """Return the area A [m^2] of an aperture whose light from a diffuse echo, A / R^2, would mix.
+    """Return the area [m^2] of an equivalent aperture that collects all light that mixes.
 
-    The range R is ``target.range``. The area is that of the real aperture; or for a single mode
-    lambda^2 R^2 times the integral of I_T I_L, reduced by :func:`truncation_efficiency` of both
-    beams.
+    An aperture of area A collects light of a diffuse echo at the range R, ``target.range``, in
+    proportion to A / R^2. For the coupling law ``aperture``, A is the area of the real aperture.
+    For a single mode it is lambda^2 R^2 times the overlap integral of both beams' irradiances, each
+    of unit power. It is reduced by :func:`truncation_efficiency` of both beams.
     """
     diameter = np.asarray(parameters[APERTURE_DIAMETER_PATH])
     if not is_single_mode(parameters):
@@ -393,7 +401,7 @@ def effective_collecting_area(parameters: Parameters) -> np.ndarray:
 
 
 def receiving_aperture_and_angle(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diameter and the full angle of view with which background light is collected.
+    """Return the diameter and the full angle of view of the receiver for background light.
 
     Returns
     -------
@@ -443,7 +451,9 @@ def axis_offset(parameters: Parameters, range: ArrayLike) -> np.ndarray:
 
 
 def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.ndarray:
-    """Return the fraction of a single mode's echo that remains if its two axes are apart, 0..1.
+    """Return the fraction of a single mode's echo that remains if its axes are apart, 0..1.
+
+    The axes are those of the transmitted and the received beam at the target.
 
     Parameters
     ----------
@@ -463,17 +473,18 @@ def axis_offset_transmission(parameters: Parameters, range: ArrayLike) -> np.nda
 
 
 _UNTRUNCATED_FILL_MAX = 0.25
-"""Ratio w_a / a of beam radius to aperture radius up to which truncation is neglected. Up to this
-ratio truncation takes at most 5e-7 of the echo."""
+"""Ratio of beam radius to aperture radius up to which truncation by the aperture is neglected. Up
+to this ratio truncation takes at most 5e-7 of the echo."""
 _TABLE_MIDDLE_PHASE = 4.0
-"""Defocus phase at the rim of the aperture [rad] in the middle of the table's coordinate."""
+"""Defocus phase at the aperture's rim [rad] at which the coordinate of the truncation table is 1/2.
+"""
 _RIM_PHASE_MAX = 60.0
-"""Largest defocus phase at the rim of the aperture [rad] in the table. Beyond it the efficiency
-changes by less than 2 %."""
+"""Largest defocus phase at the aperture's rim [rad] in the truncation table. Beyond it the
+efficiency changes by less than 2 %."""
 
 
 def truncation_efficiency(fill_ratio: ArrayLike, defocus_phase: ArrayLike = 0.0) -> np.ndarray:
-    """Return the ratio of the echo of a beam that its aperture truncates to that of the full beam.
+    """Return the echo of a beam truncated by its aperture, over that of the full beam.
 
     Parameters
     ----------

@@ -61,68 +61,74 @@ from sweep.model.window import window_samples
 from sweep.model.window_response import WindowResponse, window_response
 
 BEAMLETS_PATH = "footprint.beamlets"
-"""Path of the number of beamlets; 0 if it follows from the tolerance."""
+"""Parameter path of the number of beamlets of a footprint; 0 if it follows from the tolerance."""
 PATTERN_PATH = "footprint.pattern"
-"""Path of the pattern of the beamlets."""
+"""Parameter path of the arrangement of the beamlets in a footprint."""
 
 _RAY_GROWTH_MIN, _RAY_GROWTH_MAX = 2, 10
-"""Smallest and largest ratio of a shot's number of rays to that of its last cast."""
+"""Smallest and largest factor by which a shot's number of rays increases when it is cast again."""
 
 _UNRELIABLE_ERROR_RAYS_MAX = 19
-"""Number of rays up to which the estimated error is unreliable, as smooth ground looks far rougher
-than it is."""
+"""Number of rays up to which the estimated error is unreliable. So few rays make smooth ground look
+far rougher than it is."""
 
 _N_SEGMENTS = 3
-"""Number of segments of a shot, over which errors of pd are summed."""
+"""Number of segments of a shot, over which errors of the detection probability are summed."""
 
 NODE_COUNTS = np.array([
     2, 3, 4, 5, 6, 7, 9, 11, 15, 22, 33, 49, 73, 109, 163, 244, 366, 549, 823, 1234, 1851, 2776,
     4096,
 ])  # fmt: skip
-"""Possible numbers of nodes of a quadrature along the slope. They are in wide steps, as points with
+"""Possible numbers of quadrature nodes along the slope. Steps are wide, because points with
 different numbers are computed separately."""
 
 NODE_COUNTS_ACROSS_SLOPE = np.array([1, 2, 3, 5, 7, 11, 16, 24, 32])
-"""Possible numbers of parallel lines of nodes, across the slope."""
+"""Possible numbers of parallel lines of quadrature nodes, side by side across the slope."""
 
 _UNIFORM_QUADRATURE_ERROR = 1e-10
-"""Error of a quadrature of evenly spaced nodes by the Gaussian's tails beyond them."""
+"""Relative error of evenly spaced quadrature nodes, from the Gaussian's tails outside them."""
 _WINDOW_SAMPLES = 1024
-"""Number of samples of the windows from which tables of errors are computed."""
+"""Number of samples of the windows from which tables of quadrature errors are computed."""
 _N_LAGS = 4096
-"""Number of lags of a window's autocorrelation in tables by spread."""
+"""Number of lags of a window's autocorrelation for quadrature errors by spread of the lines."""
 _N_CURVATURE_LAGS = 512
-"""Number of lags of a window's autocorrelation in tables by curvature."""
+"""Number of lags of a window's autocorrelation for quadrature errors by curvature of the range."""
 _CURVATURES = np.geomspace(1e-6, 100.0, 97)
-"""Curvatures c at which errors are tabulated [bins of fs/L]."""
+"""Curvatures for which quadrature errors are tabulated [bins of fs/L]. A curvature c shifts a line
+by c x^2, with x in standard deviations of the beam."""
 _CURVATURE_PHASES = np.geomspace(1e-6, 1e3, 512)
-"""Phases t c at which errors are tabulated [rad]."""
+"""Coefficients t [rad] of the phase t x^2 for which quadrature errors are tabulated. x is the
+position in the beam [standard deviations]."""
 _CURVATURE_RATIOS = np.geomspace(1e-6, 1e3, 97)
-"""Ratios c / s of curvature to linear spread at which errors are tabulated."""
+"""Ratios of the lines' quadratic to their linear spread for which quadrature errors are tabulated.
+"""
 _CHEBYSHEV_MULTIPLES = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
-"""Distances from the mean [standard deviations] at which Chebyshev's inequality is applied. The
+"""Distances from the mean [standard deviations] at which Chebyshev's inequality is evaluated. The
 best of the resulting bounds is used."""
 
 
 class LineSpreadBins(NamedTuple):
-    """Spread of the positions of a footprint's lines, s y + c (x^2 + y^2) [bins of fs/L].
+    """Spread of the frequencies of a footprint's lines, s y + c (x^2 + y^2) [bins of fs/L].
 
-    x and y are the two coordinates of the beam in its standard deviations, y along the slope.
+    x and y are the two coordinates in the beam, in its standard deviations, y along the slope. s is
+    the linear and c the quadratic spread.
     """
 
     deviation: np.ndarray
-    """(n,): largest standard deviation of the positions in any segment."""
+    """(n,): largest standard deviation of line frequencies of any segment [bins of fs/L]."""
     linear: np.ndarray
-    """(rows, n): |s| of each segment; further rows are that of the phase [cycles] that turns from
-    segment to segment."""
+    """(rows, n): magnitude of the linear spread s of each segment [bins of fs/L]. Further rows are
+    that of the phase [cycles] by which segments differ.
+    """
     quadratic: np.ndarray
-    """(rows, n): |c|, in the rows of `linear`."""
+    """(rows, n): magnitude of the quadratic spread c [bins of fs/L], with the rows of `linear`."""
 
     @property
     def smoothing_deviation(self) -> np.ndarray:
-        """Standard deviation (rows, n) of the Gaussian that smooths errors across the slope.
+        """Standard deviation of the Gaussian that smooths errors across the slope, (rows, n).
 
-        |E exp(i t (s y + c y^2))| <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)), and t <= 2 pi.
+        With the linear spread s, the quadratic spread c and t <= 2 pi, |E exp(i t (s y + c y^2))|
+        <= exp(-(t s)^2 / 2 / (1 + (2 t c)^2)).
         """
         return np.asarray(self.linear / np.sqrt(1 + (4 * np.pi * self.quadratic) ** 2))
 
@@ -130,7 +136,9 @@ class LineSpreadBins(NamedTuple):
 def split_with_beamlet_counts(
     parameters: Parameters, effects: Collection[str], further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category, and set the number of beamlets where it follows from the tolerance.
+    """Split points by category, and set the number of beamlets if it is not stated.
+
+    The number then follows from the tolerance.
 
     Parameters
     ----------
@@ -176,16 +184,16 @@ def split_with_beamlet_counts(
 
 
 def largest_beamlet_count_and_pattern(parameters: Mapping[str, Any]) -> tuple[int, str]:
-    """Return the largest number of beamlets of points of one category, and its pattern."""
+    """Return the largest number of beamlets of points of one category, and the pattern's name."""
     if beamlets_converge(parameters):
         return ErrorBudget.beamlets_max, "line"
     return ErrorBudget.thesis_beamlet_count, ground.beamlet_pattern(parameters)
 
 
 def initial_ray_count(parameters: Mapping[str, Any], error_budget: ErrorBudget) -> int:
-    """Return the number of rays with which each shot of a flight is cast first.
+    """Return the number of rays of each shot of a flight in the first of several casts.
 
-    It is for flights whose number of rays follows from the tolerance.
+    It is used for flights whose number of rays follows from the tolerance.
     """
     if not beamlets_converge(parameters):
         return error_budget.thesis_beamlet_count
@@ -229,7 +237,7 @@ def next_ray_counts(n_rays: int, error: np.ndarray, error_budget: ErrorBudget) -
 
 
 def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
-    """Return the change of probabilities by skipped effects that a study's tolerance allows.
+    """Return the tolerated error of probabilities due to effects that are not simulated.
 
     `n_beamlets` is the stated number of beamlets, 0 if it follows from the tolerance.
     """
@@ -244,14 +252,14 @@ def effects_tolerance(parameters: Mapping[str, Any], n_beamlets: int) -> float:
 def has_numerics_set_by_tolerance(parameters: Mapping[str, Any]) -> np.ndarray:
     """Return True where the number of beamlets, or an error of lines or leakage, is not stated.
 
-    It then follows from the tolerance. The result is (n,) or a scalar.
+    The value then follows from the tolerance. The result is (n,) or a scalar.
     """
     counts_beamlets = ~(parameters[BEAMLETS_PATH] > np.asarray(0))
     return counts_beamlets | ErrorBudget.from_parameters(parameters).has_automatic_errors
 
 
 def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
-    """Return True if the error falls to 0 with more beamlets, for points of one category."""
+    """Return True if the error of points of one category falls to 0 with more beamlets."""
     return ground.beamlets_add_as_powers(parameters) and str(parameters[PATTERN_PATH]) not in (
         "hexagonal",
         "sunflower",
@@ -261,7 +269,7 @@ def beamlets_converge(parameters: Mapping[str, Any]) -> bool:
 def required_beamlets(
     parameters: Mapping[str, np.ndarray], n_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the number of beamlets of points whose powers add.
+    """Compute the number of beamlets needed for the tolerance, for points whose powers add.
 
     Parameters
     ----------
@@ -290,9 +298,10 @@ def required_beamlets(
 
 
 def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
-    """Return an upper bound on the change of pd over the relative change of a bin's power, (n,).
+    """Return a bound on the change of pd per relative change of a bin's power, (n,).
 
-    The changes of all segments are summed. See the module's description.
+    The changes of pd, the probability of detection, are summed over all segments. See the module's
+    description.
     """
     b = budget.looks.amplitude_gain_max * budget.threshold_ratio
     a = 0.5 * (b + np.sqrt(b * b + 2))
@@ -301,9 +310,10 @@ def _pd_change_per_power(budget: LinkBudget) -> np.ndarray:
 
 
 def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSpreadBins:
-    """Compute the spread of the footprint's lines in all segments of n points [bins of fs/L].
+    """Compute the :class:`LineSpreadBins` of the footprints of n points [bins of fs/L].
 
-    `beamlets_max` is the largest number of beamlets, which determines how far they reach.
+    `beamlets_max` is the largest number of beamlets. It determines the largest distance of a
+    beamlet from the axis.
     """
     parameters = budget.parameters
     grazing_angle, radial_velocity = (
@@ -404,9 +414,9 @@ def _line_spread(budget: LinkBudget, n_points: int, beamlets_max: int) -> LineSp
 
 
 def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
-    """Return the largest difference between segments of the optical frequency in mid-record [Hz].
+    """Return the largest difference of mid-record optical frequencies between segments [Hz].
 
-    Equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
+    See equation (1) of :mod:`sweep.model.detection.speckle_correlation`.
     """
     settings = budget.waveform
     record_middle = budget.record.acquisition_delay + budget.record.duration / 2
@@ -421,7 +431,9 @@ def _carrier_difference_max(budget: LinkBudget) -> np.ndarray:
 def required_nodes(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, error_budget: ErrorBudget
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the numbers of nodes and of their lines by the error of the largest bin's power.
+    """Choose the number of quadrature nodes, and of parallel lines of nodes, by tolerance.
+
+    A node is a beamlet. The tolerance is that of the largest bin's power.
 
     Parameters
     ----------
@@ -501,9 +513,9 @@ def _cheapest_within_tolerance(
 def _choose_node_lines(
     window_name: str, spread: LineSpreadBins, tolerance: np.ndarray, beamlets_max: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the numbers of nodes and lines for n spreads that need several lines of nodes.
+    """Choose the numbers of nodes and lines of nodes where a single line is too inaccurate.
 
-    The parameters are those of :func:`required_nodes`.
+    A node is a beamlet. The parameters are those of :func:`required_nodes`.
 
     Returns
     -------
@@ -550,10 +562,10 @@ def _choose_node_lines(
 
 
 def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndarray:
-    """Return the error by curvature of a single line of nodes, (n,).
+    """Return the quadrature error of a single line of nodes due to curvature, (n,).
 
-    It is in units of the power that a spectral line has in a bin on which it is centred. The factor
-    2 includes the equal error along the slope with the fewest nodes.
+    It is in units of the power of a bin on which a spectral line is centred. The factor 2 includes
+    the equal error along the slope with the fewest nodes.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         density = _autocorrelation_peak(window_name) / (2 * np.pi * spread.smoothing_deviation)
@@ -568,7 +580,7 @@ def _single_node_line_error(window_name: str, spread: LineSpreadBins) -> np.ndar
 
 @lru_cache(maxsize=32)
 def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate the error of each number of nodes by the standard deviation of the lines' positions.
+    """Tabulate the error of each number of nodes by the standard deviation of line frequencies.
 
     Returns
     -------
@@ -605,18 +617,18 @@ def _quadrature_errors_by_spread(window_name: str) -> tuple[np.ndarray, np.ndarr
 
 
 def _substitute_error(spread: ArrayLike, n_nodes: int) -> np.ndarray:
-    """Return the distance between nodes [bins], at least 1, as a substitute for unbounded errors.
+    """Return the distance between nodes [bins], at least 1, in place of an unbounded error.
 
-    It makes more nodes preferable where no error has a bound.
+    More nodes are then preferred where no error has a bound.
     """
     return np.maximum(1.0, 2 * UNIFORM_QUADRATURE_RADIUS_SIGMA * np.asarray(spread) / n_nodes)
 
 
 @lru_cache(maxsize=32)
 def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate the error of each number of nodes and of lines by curvature.
+    """Tabulate the quadrature errors of numbers of nodes and of node lines by curvature.
 
-    Errors are over the power of one line centred on a bin.
+    Errors are relative to the power of a bin on which a spectral line is centred.
 
     Returns
     -------
@@ -630,7 +642,10 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
     phase = 2 * np.pi * lag * _CURVATURES[:, None]
 
     def errors_of_rule(n_nodes: int) -> np.ndarray:
-        """Return the errors of a quadrature at _CURVATURES, and beyond the largest, (m + 1,)."""
+        """Return the errors of a quadrature with `n_nodes` nodes, (m + 1,).
+
+        They apply at _CURVATURES; the last one applies beyond the largest curvature.
+        """
         rule_errors = (
             weight
             * np.interp(phase, _CURVATURE_PHASES, _quadrature_error_for_quadratic_phase(n_nodes))
@@ -647,10 +662,10 @@ def _quadrature_errors_by_curvature(window_name: str) -> tuple[np.ndarray, np.nd
 
 @lru_cache(maxsize=1)
 def _smoothed_errors_by_curvature() -> np.ndarray:
-    """Tabulate errors by curvature that a linear spread smooths, (lines, ratios + 1).
+    """Tabulate errors of node lines by curvature, smoothed by a linear spread.
 
-    Rows are NODE_COUNTS_ACROSS_SLOPE, columns are _CURVATURE_RATIOS and beyond. Errors are means
-    over a Gaussian.
+    Rows are NODE_COUNTS_ACROSS_SLOPE. Columns are _CURVATURE_RATIOS and one for larger ratios.
+    Errors are means over a Gaussian.
     """
     phase = np.linspace(0.0, 8.0, 801)[1:]
     weight = np.exp(-0.5 * phase**2) * (phase[1] - phase[0])
@@ -669,7 +684,8 @@ def _smoothed_errors_by_curvature() -> np.ndarray:
 def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
     """Return the largest error of a quadrature's mean of exp(i t x^2) up to each phase t.
 
-    The phases are _CURVATURE_PHASES. The exact mean is 1 / sqrt(1 - 2 i t).
+    x is normally distributed. The phases t are _CURVATURE_PHASES. The exact mean is 1 / sqrt(1 - 2
+    i t).
     """
     x, w = gaussian_quadrature(n_nodes)
     rule_mean = np.array(
@@ -679,9 +695,9 @@ def _quadrature_error_for_quadratic_phase(n_nodes: int) -> np.ndarray:
 
 
 def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.ndarray:
-    """Return a lower bound on the largest bin's power, over that of all lines centred on a bin.
+    """Return a lower bound on the largest bin's power, over that of all lines at one bin's centre.
 
-    `deviation` is the standard deviation of the lines' positions [bins of fs/L]. See
+    `deviation` is the standard deviation of line frequencies [bins of fs/L]. See
     :meth:`sweep.model.effects.planner_inputs.PlannerInputs.peak_power_bounds_for`.
     """
     narrow = lobe_shape.scalloping_gain_min**2 - 0.5 * lobe_shape.curvature_max * deviation**2
@@ -695,9 +711,9 @@ def _largest_bin_power(lobe_shape: WindowResponse, deviation: np.ndarray) -> np.
 
 
 def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
-    """Return the magnitude of a window's autocorrelation at lags [records].
+    """Return the magnitude of a window's autocorrelation at lags [record lengths].
 
-    It is normalised by the sum over the lags, with its sign.
+    It is divided by the signed sum of the autocorrelation over all lags.
     """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     r = np.fft.irfft(np.abs(np.fft.rfft(w, 2 * _WINDOW_SAMPLES)) ** 2)[: _WINDOW_SAMPLES + 1]
@@ -707,16 +723,13 @@ def _window_autocorrelation(window_name: str, lag: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _autocorrelation_peak(window_name: str) -> float:
-    """Return the largest density of a window's autocorrelation over lags [1/record].
-
-    The integral of the density over lags is 1.
-    """
+    """Return the largest density of a window's autocorrelation over lags [1/record length]."""
     lag = (np.arange(_N_LAGS) + 0.5) / _N_LAGS
     return float(_window_autocorrelation(window_name, lag).max()) * _N_LAGS
 
 
 def _quadrature_error_for_cosine(n_nodes: int, phase: np.ndarray) -> np.ndarray:
-    """Return the error of a quadrature's mean of cos(phase x), (phases,).
+    """Return the error of a quadrature's mean of cos(phase x) for normal x, (phases,).
 
     The exact mean is exp(-phase^2 / 2).
     """

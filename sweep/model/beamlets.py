@@ -28,32 +28,33 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 BEAMLET_PATTERNS = ("hexagonal", "sunflower", "line", "square")
-"""Names of patterns. ``3 lines``, or another number, is a further name: parallel lines of
-beamlets."""
+"""Names of beamlet patterns. ``3 lines``, or another number of lines, is a further pattern:
+parallel lines of beamlets."""
 
 PATTERN_RADIUS_SIGMA = 3.0
-"""Radius of a pattern before it is mapped to the beam's covariance [standard deviations of the
-beam]. 98.9 % of the power is within it."""
+"""Radius of a pattern [standard deviations of the beam], before it is mapped to the beam's
+covariance. The beam has 98.9 % of its power within this radius."""
 
 SQUARED_RADIUS_GROWTH = 2.9
-"""Growth of a lattice's squared radius with the natural logarithm of its number of beamlets.
+"""Increase of a lattice's squared radius per natural logarithm of its number of beamlets. It
+applies from 19 beamlets on.
 
-It applies from 19 beamlets on. A lattice errs by the power outside its radius and by its spacing. A
-growing radius reduces both as beamlets are added: 3.3 standard deviations for 37 beamlets, 3.8 for
-109, 4.7 for 2,029.
-"""
+A lattice's error depends on the power outside its radius and on its spacing. A radius that grows
+with the number of beamlets reduces both: 3.3 standard deviations for 37 beamlets, 3.8 for 109, 4.7
+for 2,029."""
 
 _LATTICE_ROTATION = 0.191
-"""Rotation [rad] of the lattice relative to the slope, so that no two rows project onto each other.
-"""
+"""Rotation [rad] of the lattice relative to the slope, so that no two rows have the same coordinate
+along it."""
 
 
 GAUSS_HERMITE_NODES_MAX = 15
-"""Largest number of nodes of a Gauss-Hermite quadrature. More nodes are evenly spaced."""
+"""Largest number of nodes for which a Gauss-Hermite quadrature is used. Quadratures with more nodes
+have evenly spaced ones."""
 
 UNIFORM_QUADRATURE_RADIUS_SIGMA = 7.0
-"""Distance of the outermost of evenly spaced nodes from the middle [standard deviations]. 3e-12 of
-the distribution is outside."""
+"""Distance of the outermost evenly spaced node from the middle [standard deviations]. A fraction of
+3e-12 of the normal distribution lies outside."""
 
 
 @lru_cache(maxsize=64)
@@ -125,7 +126,7 @@ def place_beamlets(n_beamlets: int, pattern: str = "hexagonal") -> tuple[np.ndar
 
 
 def _hexagonal_lattice(n_points: int) -> np.ndarray:
-    """Return a hexagonal lattice's points nearest to one of its points, (2, n_points).
+    """Return the `n_points` points of a hexagonal lattice nearest to one of them, (2, n_points).
 
     Coordinates are in standard deviations of the beam.
     """
@@ -154,9 +155,9 @@ def lattice_radius(n_beamlets: int) -> float:
 
 
 def _sunflower_pattern(n_points: int) -> np.ndarray:
-    """Return the points of a sunflower, (2, n_points) [standard deviations of the beam].
+    """Return the points of a sunflower pattern, (2, n_points) [standard deviations of the beam].
 
-    All points have equal areas of a circle. The golden angle is between successive points.
+    All points represent equal areas of a circle. Successive points differ by the golden angle.
     """
     k = np.arange(n_points) + 0.5
     radius, angle = PATTERN_RADIUS_SIGMA * np.sqrt(k / n_points), k * math.pi * (3 - math.sqrt(5))
@@ -164,9 +165,10 @@ def _sunflower_pattern(n_points: int) -> np.ndarray:
 
 
 def _product_quadrature(pattern: str, n_beamlets: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions and weights, as of `place_beamlets`, of a product of two quadratures.
+    """Return beamlet directions and weights of a product of two quadratures.
 
-    One quadrature runs along the slope, the other across it.
+    One quadrature runs along the slope, the other across it. The results are as of
+    `place_beamlets`.
     """
     if pattern == "square":
         nodes_per_side = max(math.isqrt(n_beamlets), 2)
@@ -257,32 +259,41 @@ def plane_footprint(
 
 
 class OffsetMoments(NamedTuple):
-    """Moments of beamlets' offsets from the beam's axis, weighted by echo power."""
+    """Moments of beamlets' offsets from the beam's axis in range or velocity.
+
+    They are weighted by echo power.
+    """
 
     mean: np.ndarray | float
-    """Magnitude of the mean offset."""
+    """Magnitude of the mean offset from the axis, in the unit of the offsets."""
     rms: np.ndarray | float
-    """Root mean square offset."""
+    """Root mean square offset from the axis, in the unit of the offsets."""
     extreme: np.ndarray | float
-    """Largest magnitude of an offset."""
+    """Largest magnitude of an offset from the axis, in the unit of the offsets."""
 
     def scaled_by(self, factor: np.ndarray) -> "OffsetMoments":
-        """Return the moments of the offsets times a factor. Infinite moments times 0 give 0."""
+        """Return the moments of the offsets times a factor.
+
+        An infinite moment times 0 gives 0.
+        """
         return OffsetMoments(*(np.minimum(value, 1e200) * factor for value in self))
 
     def sum_bound(self, other: "OffsetMoments") -> "OffsetMoments":
-        """Return upper bounds on the moments of the sum of two offsets."""
+        """Return upper bounds on the moments of the sum of two offsets.
+
+        ``other`` are the moments of the second offset.
+        """
         return OffsetMoments(
             *(value + other_value for value, other_value in zip(self, other, strict=True))
         )
 
 
 NO_SPREAD = OffsetMoments(0.0, 0.0, 0.0)
-"""Moments of offsets that are all 0."""
+"""Moments of offsets that are all 0, as for a single beamlet on the axis."""
 
 
 def pattern_radius(n_beamlets: int, pattern: str) -> float:
-    """Return the largest angle of a beamlet off the axis [standard deviations of the beam].
+    """Return the largest angle between a beamlet and the axis [standard deviations of the beam].
 
     `n_beamlets` and `pattern` are as of :func:`place_beamlets`.
     """
@@ -412,7 +423,7 @@ def plane_echo_ratio_bound(
 def bins_per_velocity(
     *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
 ) -> np.ndarray:
-    """Return by how many bins a line shifts for 1 m/s of radial velocity.
+    """Return the shift of a line [bins] per radial velocity of 1 m/s.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light in vacuum c [m/s]."""
 ELEMENTARY_CHARGE = 1.602176634e-19
-"""Elementary charge q [C]."""
+"""Charge of the electron, as a magnitude, q [C]."""
 PLANCK = 6.62607015e-34
 """Planck constant h [J s]."""
 BOLTZMANN = 1.380649e-23

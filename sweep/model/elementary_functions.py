@@ -51,7 +51,7 @@ def exact_product(a, b):
 
 @njit(inline="always")
 def fraction_of_cycle(x):
-    """Return a phase [cycles] without its whole cycles, in [-1/2, 1/2]."""
+    """Return the phase ``x`` [cycles] minus the nearest whole number of cycles, in [-1/2, 1/2]."""
     return x - math.floor(x + 0.5)
 
 
@@ -83,7 +83,7 @@ def product_cycle_fraction(high, low, x):
 
 @njit(inline="always")
 def exact_quotient(numerator, denominator):
-    """Return the quotient numerator / denominator as the sum of two doubles, high and low."""
+    """Return the quotient of two doubles as the sum of two doubles, high and low."""
     high = numerator / denominator
     product, remainder = exact_product(high, denominator)
     return high, ((numerator - product) - remainder) / denominator

@@ -47,12 +47,12 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri
 
 AUTOMATIC = -1.0
-"""Value of an error in :class:`ErrorBudget` that means: derive it from the tolerance."""
+"""Value of an error setting in :class:`ErrorBudget` that means: compute it from the tolerance."""
 
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Tolerance of a study, and its division among the sources of error.
+    """Error tolerance of a study, and its division among the sources of error.
 
     The first five fields are scalars, or arrays with one value for each point.
     """
@@ -64,23 +64,28 @@ class ErrorBudget:
     With draws it takes a hundred times as many."""
 
     confidence: ArrayLike = 0.95
-    """Confidence of the intervals of estimates by draws. The number of draws grows with the square
-    of the normal quantile: 0.99 takes 1.7 times the draws of 0.95."""
+    """Confidence level of intervals for probabilities that are estimated by random draws. The
+    number of draws is proportional to the square of the normal quantile: 0.99 takes 1.7 times the
+    draws of 0.95.
+    """
 
     line_error: ArrayLike = AUTOMATIC
-    """Error of |X| in a bin, over the noise sigma, because few lines represent all beamlets. By
-    default it is `lines_fraction` of the tolerance. A smaller error slowly increases the number of
-    lines of a segment."""
+    """Tolerated error of a bin's magnitude over the noise sigma, if few lines represent all
+    beamlets. By default it is `lines_fraction` of the tolerance. A smaller error slowly increases
+    the number of lines of a segment.
+    """
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Probability that leaked signal raises a false peak in bins far from the lines, as far as it
-    is neglected. By default it is `leakage_fraction` of the tolerance. With a smaller value more
-    bins are evaluated."""
+    """Tolerated probability of a false peak by the echo's signal in bins far from its lines. This
+    part of the leakage is then not evaluated. By default it is `leakage_fraction` of the tolerance.
+    With a smaller value more bins are evaluated.
+    """
 
     leakage_floor: ArrayLike = AUTOMATIC
-    """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. It
-    applies to bins that are evaluated one by one. By default it follows from `leakage_error`. With
-    a lower value more bins are evaluated."""
+    """Magnitude of leaked signal in a bin, over the noise sigma, below which the bin counts as
+    noise alone. It applies to bins that are evaluated one by one. By default it follows from
+    `leakage_error`. With a lower value more bins are evaluated.
+    """
 
     interval: str = "clopper_pearson"
     """Kind of confidence interval for a probability that is estimated by counting draws, one of
@@ -88,42 +93,51 @@ class ErrorBudget:
     Wilson's takes fewer draws, and has the stated coverage on average."""
 
     stopping_check_growth: float = 1.25
-    """Ratio of the numbers of draws at successive checks of the half-widths. With a ratio nearer 1
-    fewer draws are wasted, but the more frequent checks reduce the coverage of the intervals."""
+    """Ratio of the numbers of draws at successive checks of the confidence intervals. With a ratio
+    nearer 1 fewer draws are wasted, but the more frequent checks reduce the coverage of the
+    intervals.
+    """
 
     effects_fraction: float = 0.8
-    """Fraction of the tolerance for skipped effects and the number of beamlets together. A larger
-    fraction lets more effects be skipped."""
+    """Fraction of the tolerance for effects that are not simulated and for the number of beamlets
+    together. With a larger fraction more effects can be skipped.
+    """
 
     beamlets_fraction: float = 0.25
     """Fraction of the tolerance for the number of beamlets, if that number follows from the
-    tolerance. It is a part of `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
-    at most points."""
+    tolerance. It is included in `effects_fraction`. Half of it costs one more step of `NODE_COUNTS`
+    at most points.
+    """
 
     lines_fraction: float = 1.0
-    """Fraction of the tolerance for `line_error`. It is 1, as bounds on this error are worst cases
-    over lines and bins."""
+    """Fraction of the tolerance that is the default of `line_error`. It is 1, because bounds on
+    this error are worst cases over lines and bins.
+    """
 
     leakage_fraction: float = 0.5
-    """Fraction of the tolerance for `leakage_error`."""
+    """Fraction of the tolerance that is the default of `leakage_error`."""
 
     single_node_line_fraction: float = 0.1
-    """Fraction of the beamlets' tolerance that the error of a single line of nodes across the slope
-    may reach before several lines are tried. With a smaller fraction several lines are tried at
-    more points. The accuracy is the same."""
+    """Part of the beamlets' tolerance that the error of a single line of beamlets may reach. The
+    error is that across the slope. Above it several parallel lines are tried. With a smaller value
+    they are tried at more points. The accuracy is the same.
+    """
 
     beamlets_max: int = 4096
-    """Largest number of beamlets of a footprint on a plane. Points that need more are computed with
-    the number of least error, and their ``beamlets_error`` states the error."""
+    """Largest number of beamlets of a footprint on a plane. Points that need more use the number of
+    least error, and their output ``beamlets_error`` states the error.
+    """
 
     thesis_beamlet_count: int = 109
-    """Number of beamlets of [T 3.3.1]. It is used where no number is enough, because amplitudes add
-    over a smooth plane and their sum almost cancels."""
+    """Number of beamlets of [T 3.3.1]. It is used where amplitudes add over a smooth plane. Their
+    sum almost cancels, so that no number of beamlets is enough for the tolerance.
+    """
 
     min_rays_by_tolerance: tuple[tuple[float, int], ...] = ((1e-2, 19), (1e-5, 37), (0.0, 109))
-    """Pairs of a tolerance and the smallest number of rays of a shot of a flight. A pair applies
-    from its tolerance up to that of the pair before. Estimates of the error cannot include objects
-    that no ray hits, and fewer rays miss more small objects."""
+    """Pairs of a tolerance and the smallest number of rays per shot of a flight. A pair applies
+    from its tolerance up to that of the previous pair. Estimates of the error cannot include
+    objects that no ray hits, and fewer rays miss more small objects.
+    """
 
     ray_counts: tuple[int, ...] = (19, 37, 109, 439, 2029, 8017, 31987, 127999)
     """Numbers of rays that may be cast for a shot. They are those of full shells of the lattice,
@@ -131,13 +145,13 @@ class ErrorBudget:
     first number is the smallest from which an error can be estimated. Each ray costs some 80 ns."""
 
     rays_tolerance_min: float = 1e-6
-    """Tolerance below which the number of rays does not increase further."""
+    """Tolerance below which the number of rays per shot does not increase further."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any], **overrides: Any) -> "ErrorBudget":
-        """Return the budget that parameters by dotted path state, under ``accuracy.``.
+        """Return the budget that the parameters under ``accuracy.`` state.
 
-        `overrides` are values of further fields, by name.
+        `parameters` has dotted paths as keys. `overrides` are values of further fields, by name.
         """
         names = ("tolerance", "confidence", "line_error", "leakage_error", "leakage_floor")
         stated_values = {name: parameters[f"accuracy.{name}"] for name in names
@@ -145,7 +159,7 @@ class ErrorBudget:
         return cls(**stated_values, **overrides)
 
     def select(self, point_indices: np.ndarray, n_points: int) -> "ErrorBudget":
-        """Return the budget of selected points: tolerance and confidence have one value for each.
+        """Return the budget of selected points; tolerance and confidence have one value for each.
 
         `point_indices` select from `n_points` points.
         """
@@ -157,21 +171,24 @@ class ErrorBudget:
 
     @property
     def allowed_line_error(self) -> np.ndarray:
-        """Tolerated error of |X| in a bin over the noise sigma, because few lines stand for all."""
+        """Tolerated error of a bin's magnitude, over the noise sigma, due to approximated lines.
+
+        Few lines then represent all beamlets.
+        """
         return self._stated_or_fraction(self.line_error, self.lines_fraction)
 
     @property
     def allowed_leakage(self) -> np.ndarray:
-        """Probability of a false peak by leaked signal that may be neglected."""
+        """Tolerated probability of a false peak by leaked signal that is not evaluated."""
         return self._stated_or_fraction(self.leakage_error, self.leakage_fraction)
 
     @property
     def allowed_beamlets_error(self) -> np.ndarray:
-        """Tolerated error of pd due to the number of beamlets."""
+        """Tolerated error of the detection probability due to the number of beamlets."""
         return self.beamlets_fraction * np.asarray(self.tolerance, float)
 
     def allowed_effects_error(self, *, counts_beamlets: bool) -> np.ndarray:
-        """Return the tolerated change of a probability by all effects that are skipped.
+        """Return the tolerated error of a probability due to all effects that are not simulated.
 
         `counts_beamlets` is True if the number of beamlets follows from the tolerance. Its part of
         the tolerance is then subtracted.
@@ -181,7 +198,7 @@ class ErrorBudget:
 
     @property
     def allowed_rays_error(self) -> float:
-        """Tolerated error of pd due to the number of rays of a flight's shot."""
+        """Tolerated error of the detection probability due to the rays per shot of a flight."""
         return max(float(np.asarray(self.tolerance)), self.rays_tolerance_min)
 
     @property
@@ -191,18 +208,18 @@ class ErrorBudget:
         return np.logical_or(*(error == AUTOMATIC for error in errors))
 
     def _stated_or_fraction(self, stated: ArrayLike, fraction: float) -> np.ndarray:
-        """Return a stated error, with a fraction of the tolerance where it is `AUTOMATIC`."""
+        """Return a stated error, or a fraction of the tolerance where it is `AUTOMATIC`."""
         allowed = fraction * np.asarray(self.tolerance, float)
         return np.where(np.asarray(stated, float) == AUTOMATIC, allowed, stated)
 
 
 class ConfidenceInterval(NamedTuple):
-    """Ends of the confidence intervals of probabilities, 0..1, in the shape of the estimates."""
+    """Lower and upper ends of probabilities' confidence intervals, shaped like the estimates."""
 
     low: np.ndarray
-    """Lower ends."""
+    """Lower end of each confidence interval, 0..1."""
     high: np.ndarray
-    """Upper ends."""
+    """Upper end of each confidence interval, 0..1."""
 
 
 def wilson_interval(
@@ -268,7 +285,8 @@ COUNT_INTERVALS: dict[str, Callable[..., ConfidenceInterval]] = {
     "clopper_pearson": clopper_pearson_interval,
     "wilson": wilson_interval,
 }
-"""Functions that compute confidence intervals of a probability from counts, by name."""
+"""Functions that compute a probability's confidence interval from counts, by the interval's name.
+"""
 
 
 def bounded_mean_interval(
@@ -296,9 +314,10 @@ def bounded_mean_interval(
     variance_term = z * z * n * np.where(n > 1, variance, 0.0)
 
     def half_length(distance_to_end: np.ndarray) -> np.ndarray:
-        """Return the distance d from the mean to one end of the interval.
+        """Return the distance from the mean to one end of the confidence interval.
 
-        `distance_to_end` is q of the module's equation.
+        `distance_to_end` is the distance from the mean to 0 or 1 on the same side (q in the
+        module's equation).
         """
         linear_term = distance_to_end * z * z / 2
         return (linear_term + np.sqrt(variance_term + linear_term * linear_term)) / n
@@ -321,10 +340,13 @@ def interval_half_width(estimate: ArrayLike, interval: ConfidenceInterval) -> np
 
 
 def _two_sided_normal_quantile(confidence: ArrayLike) -> np.ndarray:
-    """Return the z for which a standard normal |Z| <= z with probability `confidence`."""
+    """Return the z for which a standard normal variable lies within +-z with a given probability.
+
+    ``confidence`` is this probability, 0..1.
+    """
     return np.asarray(ndtri(0.5 + np.asarray(confidence, float) / 2))
 
 
 def _clip_interval(low: np.ndarray, high: np.ndarray) -> ConfidenceInterval:
-    """Clip the ends of an interval to 0..1."""
+    """Return the confidence interval with its ends clipped to 0..1."""
     return ConfidenceInterval(np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0))

@@ -46,7 +46,7 @@ __all__ = [
 
 
 def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
-    """Return the named effects in the order of their application.
+    """Return the named effects in the order in which they are applied to shots.
 
     Raises
     ------
@@ -61,14 +61,14 @@ def select_effects(names: Collection[str]) -> tuple[Effect, ...]:
 
 
 def use_beamlet_velocities(names: Collection[str]) -> bool:
-    """Return True if any of the named effects reads the radial velocities of single beamlets."""
+    """Return True if any of the named effects uses the radial velocities of single beamlets."""
     return any(effect.uses_beamlet_velocities for effect in EFFECTS if effect.name in names)
 
 
 def prepare_shots(
     parameters: Parameters, effects: Collection[str] = DEFAULT_EFFECTS
 ) -> Iterator[tuple[np.ndarray, Shots]]:
-    """Prepare shots on a flat plane, in groups that share strings and sizes.
+    """Yield prepared shots on a flat plane, in groups of points that share strings and sizes.
 
     Parameters
     ----------
@@ -134,7 +134,9 @@ def apply_effects(
     effects: Collection[str],
     effect_flags: np.ndarray | None = None,
 ) -> Shots:
-    """Prepare shots with one line each, then apply all effects that are not random.
+    """Return prepared shots with all effects applied that are not random.
+
+    At first each shot has a single line, that on the beam's axis.
 
     Parameters
     ----------
@@ -161,7 +163,10 @@ def apply_effects(
 
 
 def _effect_masks(effects: Collection[str], effect_flags: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks (n,) of the effects that only some shots have: 1.0 where enabled, else 0.0."""
+    """Return masks (n,) of the effects that only some shots have: 1.0 where enabled, else 0.0.
+
+    ``effect_flags`` (n,) is the bit mask of each shot's enabled effects.
+    """
     missing_bits = int(np.bitwise_or.reduce(~effect_flags)) if effect_flags.size else 0
     return {
         effect.name: (effect_flags >> k & 1).astype(float)
@@ -176,7 +181,7 @@ def evaluate(
     *,
     segment_evaluator: Callable[[Shots], np.ndarray] = evaluate_segments,
 ) -> dict[str, np.ndarray]:
-    """Compute the statistics of n shots on a flat plane.
+    """Compute detection, false-alarm and other statistics of n shots on a flat plane.
 
     Parameters
     ----------
@@ -265,7 +270,7 @@ def shot_statistics(
 
 
 def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> waveform.RangeVelocity:
-    """Return the range and radial velocity that follow from the strongest bins of the segments.
+    """Return the range and radial velocity that the strongest bins of the segments give.
 
     Parameters
     ----------
@@ -298,12 +303,12 @@ def measure_range_velocity(shots: Shots, segment_results: np.ndarray) -> wavefor
 
 
 MISREAD_TOLERANCE_BINS = 4
-"""Tolerated error [bins] of a measured range or velocity, due to rounding of three peaks and to
-motion between and within records."""
+"""Tolerated error of a measured range or velocity [bins], before it counts as misread. Causes are
+rounding of three peaks to bins, and motion between and within records."""
 
 
 def find_misread(shots: Shots, measured: waveform.RangeVelocity) -> np.ndarray:
-    """Test if noiseless spectra give a range or a radial velocity other than the echo's.
+    """Return whether noiseless spectra give a wrong range or radial velocity of the echo.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ from sweep.model.beamlets import OffsetMoments
 from sweep.model.constants import SPEED_OF_LIGHT
 
 REFLECTANCE_LAWS = ("thesis", "lambert", "lommel_seeliger")
-"""Names of the reflectance laws, as of :func:`backscatter`."""
+"""Names of the reflectance laws that :func:`backscatter` evaluates."""
 
 
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
@@ -68,55 +68,63 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
 
 
 class BeamletTable(NamedTuple):
-    """Offsets and echoes of the beamlets of n points. Points of equal geometry share a row."""
+    """Range offsets, Doppler offsets and echoes of the beamlets of n points.
+
+    Points of equal geometry share a row.
+    """
 
     row_of_point: np.ndarray
-    """(n,) int64: the row of each point."""
+    """(n,) int64: index of the row of each point."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of a beamlet minus that on the axis, over the latter: (R_b - R_0) /
-    R_0."""
+    """(rows, beamlets): range of a beamlet minus that on the axis, over the latter."""
     doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis."""
+    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the axis. v_r is the
+    radial velocity.
+    """
     relative_echo: np.ndarray
-    """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]: power fraction times
-    backscatter, over the range loss from R_0 to R_b."""
+    """(rows, beamlets): echo of a beamlet for reflectance 1 [1/sr]. It is the power fraction times
+    the backscatter, over the range loss between the axis's range and the beamlet's.
+    """
 
 
 class BeamGradients(NamedTuple):
-    """Changes across a footprint per standard deviation of the beam, (n,) each."""
+    """Changes of Doppler ratio, range and echo across a footprint.
+
+    They are per standard deviation of the beam, (n,) each.
+    """
 
     doppler_ratio: np.ndarray
-    """(n,): change of the Doppler ratio 2 v_r / c."""
+    """(n,): change of the Doppler ratio 2 v_r / c per standard deviation of the beam."""
     relative_range: np.ndarray
-    """(n,): relative change of the range."""
+    """(n,): relative change of the range per standard deviation of the beam."""
     relative_echo: np.ndarray
-    """(n,): relative change of the echo power."""
+    """(n,): relative change of the echo power per standard deviation of the beam."""
 
 
 class _PlaneGeometry(NamedTuple):
-    """Geometry of beams on a plane, (n,) each.
+    """Angles, velocities and range losses of beams on a plane, (n,) each.
 
     The last three fields are None if the beam has a constant divergence.
     """
 
     grazing_angle: np.ndarray
-    """Angle between beam and plane [rad]."""
+    """Angle between beam and plane [rad], pi/2 at normal incidence."""
     position_spread_angle: np.ndarray
-    """Full 1/e^2 angle over which positions are spread [rad]."""
+    """Full 1/e^2 angle over which positions on the target are spread [rad]."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s]; 0 if beamlets have no velocities of their own."""
+    """Radial velocity [m/s], positive when closing; 0 if all beamlets share the axis's velocity."""
     transverse_velocity: np.ndarray
-    """Velocity across the beam [m/s]; 0 if beamlets have no velocities of their own."""
+    """Velocity across the beam [m/s]; 0 if all beamlets share the axis's velocity."""
     direction_spread_angle: np.ndarray | None = None
     """Full 1/e^2 angle over which directions of the light are spread [rad]."""
     linear_range_loss: np.ndarray | None = None
-    """Coefficient b of :func:`sweep.model.beam.range_loss_coefficients`."""
+    """Coefficient b of the range loss 1 + b x + c x^2 for a relative range change x."""
     quadratic_range_loss: np.ndarray | None = None
-    """Coefficient c of :func:`sweep.model.beam.range_loss_coefficients`."""
+    """Coefficient c of the range loss 1 + b x + c x^2 for a relative range change x."""
 
     @property
     def direction_sigma(self) -> np.ndarray:
-        """Standard deviation of the directions of the light on each axis [rad]."""
+        """Standard deviation of the directions of the light, per axis [rad]."""
         angle = (
             self.position_spread_angle
             if self.direction_spread_angle is None
@@ -126,7 +134,7 @@ class _PlaneGeometry(NamedTuple):
 
 
 class FlatGround:
-    """Flat plane for the points of one category.
+    """Flat ground that the beams of one category of points meet.
 
     Parameters
     ----------
@@ -140,7 +148,9 @@ class FlatGround:
     """
 
     off_axis_surface = None
-    """Beamlets on other surfaces than the beam's axis; None, as a plane is a single surface."""
+    """Mask of beamlets that hit another surface than the beam's axis does. It is None, because a
+    plane is a single surface.
+    """
 
     def __init__(
         self, parameters: Mapping[str, np.ndarray], n_points: int, *, has_velocities: bool = True
@@ -218,7 +228,10 @@ class FlatGround:
 
     @property
     def gradients(self) -> "BeamGradients":
-        """Changes per standard deviation of the beam, towards the near side of the plane."""
+        """Changes of Doppler ratio, range and echo towards the near side of the plane.
+
+        They are per standard deviation of the beam.
+        """
         geometry = self._geometry
         range_gradient = (geometry.position_spread_angle / 4) / np.tan(geometry.grazing_angle)
         echo_exponent = 3 if self._reflectance_law == "lambert" else 2
@@ -230,9 +243,9 @@ class FlatGround:
         return BeamGradients(*(np.broadcast_to(column, self._n_points) for column in columns))
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """Return the line on the beam's axis, as one beamlet, for each of `n_points` points.
+        """Return a table with one beamlet per footprint, the line on the beam's axis.
 
-        The table has a row for each distinct grazing angle.
+        The table has one row for each distinct grazing angle and `n_points` points.
         """
         grazing_angles, angle_index = np.unique(self._geometry.grazing_angle, return_inverse=True)
         relative_echo = backscatter(self._reflectance_law, np.sin(grazing_angles))[:, None]
@@ -241,7 +254,7 @@ class FlatGround:
 
     @cached_property
     def beamlets(self) -> BeamletTable:
-        """All beamlets of the footprints. The table has a row for each distinct geometry."""
+        """Table of all beamlets of the footprints, with one row for each distinct geometry."""
         columns = [column for column in self._geometry if column is not None]
         first, geometry_of_point = distinct_rows(columns)
         geometry = _PlaneGeometry(*np.stack(columns)[:, first])
@@ -270,7 +283,7 @@ class FlatGround:
 
 
 class RayTracedGround:
-    """Footprints of beams by ray tracing.
+    """Ground whose footprints are given by ray tracing.
 
     Parameters
     ----------
@@ -286,9 +299,9 @@ class RayTracedGround:
         self.beamlets, self.off_axis_surface = beamlet_table, off_axis_surface
 
     def axis_line(self, n_points: int) -> BeamletTable:
-        """Return one line on the beam's axis for each of `n_points` points.
+        """Return a table with one beamlet per footprint, on the beam's axis, for `n_points` points.
 
-        It has the total echo of the point's beamlets.
+        The beamlet has the total echo of the point's beamlets.
         """
         total_echo = self.beamlets.relative_echo.sum(axis=1)[:, None]
         zeros = np.zeros_like(total_echo)
@@ -296,11 +309,14 @@ class RayTracedGround:
 
 
 Ground = FlatGround | RayTracedGround
-"""Ground that the beams of n points meet."""
+"""Type of the ground that the beams of n points meet."""
 
 
 def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
-    """Return True if beamlets add as powers, False if as amplitudes; for points of one category."""
+    """Return True if beamlets add as powers, False if as amplitudes.
+
+    All points have to be of one category.
+    """
     incoherent = str(parameters["footprint.phases"]) == "incoherent"
     return incoherent and str(parameters["instrument.receiver.architecture"]) != "direct"
 
@@ -308,7 +324,7 @@ def beamlets_add_as_powers(parameters: Mapping[str, Any]) -> bool:
 def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
     """Return the name of the beamlets' pattern, one of `sweep.model.beamlets.BEAMLET_PATTERNS`.
 
-    If it is not stated, it is hexagonal where powers add, else a sunflower, which has no symmetry.
+    By default it is hexagonal where powers add, otherwise a sunflower, which has no symmetry.
     """
     stated = str(parameters["footprint.pattern"])
     if stated != "auto":
@@ -317,34 +333,39 @@ def beamlet_pattern(parameters: Mapping[str, Any]) -> str:
 
 
 def _row_indices(row_of_point: np.ndarray, n_points: int) -> np.ndarray:
-    """Broadcast the rows of points, (n,) or one row for all, to n points, (n,) int64."""
+    """Return the table row of each of n points, (n,) int64.
+
+    ``row_of_point`` is (n,), or one row for all points.
+    """
     return np.broadcast_to(row_of_point.ravel(), n_points).astype(np.int64)
 
 
 class FootprintExtent(NamedTuple):
-    """Extent and echo of the footprints of n points, (n,) each."""
+    """Echoes of n points' footprints, and spread of their ranges and velocities, (n,) each."""
 
     axis_echo: np.ndarray
-    """Echo, for reflectance 1, of a single line on the beam's axis [1/sr]."""
+    """Echo of a single line on the beam's axis for reflectance 1 [1/sr]."""
     total_echo_ratio: np.ndarray | float
-    """Echo of all beamlets over `axis_echo`."""
+    """Echo of all beamlets, over that of a single line on the beam's axis."""
     range_offsets: OffsetMoments
-    """Moments of the beamlets' relative range offsets (R_b - R_0) / R_0."""
+    """Moments of the beamlets' relative range offsets: range minus the axis's, over the latter."""
     axis_surface_range_offsets: OffsetMoments
-    """Moments of the same offsets, of the beamlets on the surface that the axis hits."""
+    """Moments of the relative range offsets of those beamlets on the same surface as the axis."""
     velocity_offsets: OffsetMoments
-    """Moments of the beamlets' radial velocities minus that on the axis [m/s]."""
+    """Moments of the beamlets' radial velocities minus that on the beam's axis [m/s]."""
     amplitude_gain_max: np.ndarray | float = 1.0
-    """Largest ratio of the beamlets' summed amplitude, in phase or as powers, to the amplitude of
-    the single line."""
+    """Largest ratio of the beamlets' total amplitude to that of the single line on the axis.
+    Beamlets are in phase, or add as powers.
+    """
     off_axis_fraction: np.ndarray | float = 0.0
-    """Fraction of the echo from other surfaces than that which the axis hits, 0..1."""
+    """Fraction of the echo from other surfaces than the one on the beam's axis, 0..1."""
     off_axis_range_offset_max: np.ndarray | float = 0.0
-    """Largest |R_b - R_0| / R_0 on these other surfaces."""
+    """Largest relative range offset, as a magnitude, of beamlets on other surfaces than the axis's.
+    """
 
 
 def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
-    """Compute the extent of footprints by ray tracing."""
+    """Compute the :class:`FootprintExtent` of footprints by ray tracing."""
     _, relative_range_offset, doppler_ratio_offset, relative_echo = ground.beamlets
     off_axis_surface = ground.off_axis_surface
     total_echo = relative_echo.sum(axis=1)
@@ -381,7 +402,10 @@ def extent_of_ray_traced_ground(ground: RayTracedGround) -> FootprintExtent:
 
 
 def _weighted_moments(values: np.ndarray, weights: np.ndarray) -> OffsetMoments:
-    """Return the moments (n,) of values (n, m) with weights (n, m) that sum to 1 in each row."""
+    """Return the :class:`OffsetMoments` (n,) of ``values`` (n, m).
+
+    ``weights`` (n, m) sum to 1 in each row.
+    """
     weighted = weights * values
     extreme = np.where(weights > 0, np.abs(values), 0.0).max(axis=1)
     return OffsetMoments(

@@ -44,45 +44,53 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 DEVIATION_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
-"""Standard deviation of a Gaussian over its full width at half maximum."""
+"""Standard deviation of a Gaussian over its full width at half maximum (FWHM)."""
 
 MEAN_POWER_TOLERANCE = 1e-12
-"""Error of a mean power from a sum over shifts, relative to the power at the line's peak."""
+"""Error of a mean power computed as a sum over frequency shifts, relative to the power at the
+line's peak."""
 
 LINE_DEVIATION_MAX_WINDOW_BINS = 500
-"""Largest standard deviation of a Gaussian line [bins of fs/L] that can be simulated."""
+"""Largest standard deviation of a Gaussian laser line [bins of fs/L] that can be simulated. fs is
+the sample rate, L the number of samples."""
 
 
 _gauss_legendre = lru_cache(maxsize=1)(np.polynomial.legendre.leggauss)
 
 _DECAY_EXPONENT_MAX = 40.0
-"""Gamma T from which exp(-Gamma T) is neglected."""
+"""Exponent from which on the decay exp(-exponent) of the laser's coherence is neglected."""
 
 _DECAY_PER_SAMPLE_MIN = 0.1
-"""Gamma over the sample rate above which lags are summed one by one; after 400 lags nothing is
-left."""
+"""Decay exponent of the laser's coherence per sample above which lags are summed one by one. After
+400 lags the remaining terms are negligible."""
 
 _N_PHASE_NODES = 256
-"""Number of positions in the record at which the mean phase is subtracted."""
+"""Number of positions in the record for computing the phase's mean under the window, which is
+subtracted."""
 
 _LINE_POWER_FRACTION_MIN = 1e-100
-"""Lower limit of the fraction of power in the line. It keeps divisions by the fraction finite."""
+"""Lower limit of the fraction of power in the pure line. It keeps divisions by the fraction finite.
+"""
 
 
 class LaserLine(NamedTuple):
-    """Line of the laser, as beats and bins show it; a pure tone by default."""
+    """Line width of the laser and noise of its phase-noise pedestal; a pure tone by default."""
 
     gaussian_width: np.ndarray | None = None
-    """(n,): FWHM [Hz] of the beat's Gaussian line; None without one."""
+    """(n,): full width at half maximum [Hz] of the beat's Gaussian line; None without a Gaussian
+    line.
+    """
     lorentzian_width: np.ndarray | float = 0.0
-    """(n,): FWHM [Hz] of the Lorentzian line of a laser whose phase is a random walk."""
+    """(n,): full width at half maximum [Hz] of the laser's Lorentzian line, from a random walk of
+    its phase.
+    """
     pedestal_variance_beside: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] of the phase-noise pedestal, in bins next to the lines."""
+    """Phase-noise pedestal as noise variance at the ADC [V^2], in bins next to the lines."""
     pedestal_variance_under_line: np.ndarray | float = 0.0
-    """Noise variance at the ADC [V^2] of the phase-noise pedestal, only in bins that hold lines."""
+    """Phase-noise pedestal as noise variance at the ADC [V^2], only in bins that contain lines."""
 
     def scale_pedestal(self, power_factor: np.ndarray) -> "LaserLine":
-        """Return the line for an echo whose power changes by a factor."""
+        """Return the laser line with a pedestal for an echo whose power changes by a factor."""
         return self._replace(
             pedestal_variance_beside=self.pedestal_variance_beside * power_factor,
             pedestal_variance_under_line=self.pedestal_variance_under_line * power_factor,
@@ -90,16 +98,16 @@ class LaserLine(NamedTuple):
 
 
 class FrequencyShifts(NamedTuple):
-    """Frequency shifts over which |X|^2 is averaged."""
+    """Frequency shifts of all lines, with weights, over which the power spectrum is averaged."""
 
     offset_window_bins: np.ndarray
-    """(n, k): shifts of all lines [bins of fs/L]."""
+    """(n, k): shift of all lines [bins of fs/L, sample rate over number of samples]."""
     weight: np.ndarray
-    """(n, k): weights of the powers, >= 0, sum 1."""
+    """(n, k): weight of the power spectrum at each shift, >= 0; the sum is 1."""
 
 
 def gaussian_frequency_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> FrequencyShifts:
-    """Return shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
+    """Return frequency shifts whose weighted mean power equals that of a Gaussian laser line.
 
     Parameters
     ----------
@@ -174,7 +182,7 @@ def pure_line_power_fraction(
 
 
 def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """Return the power density of the pedestal under a line of power 1 [1/Hz].
+    """Return the power density of the phase-noise pedestal under a line of power 1 [1/Hz].
 
     Parameters
     ----------
@@ -185,7 +193,7 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 
     Notes
     -----
-    2 (1 - e^-g (1 + g)) / Gamma with g = Gamma tau.
+    2 (1 - e^-g (1 + g)) / Gamma with Gamma = 2 pi dnu and g = Gamma tau.
     """
     gamma = 2 * np.pi * np.asarray(line_width, float)
     g = gamma * delay
@@ -198,7 +206,7 @@ def pedestal_density_under_line(*, line_width: np.ndarray, delay: np.ndarray) ->
 def pedestal_power_under_line(
     *, line_width: np.ndarray, delay: np.ndarray, duration: np.ndarray, window: Window
 ) -> np.ndarray:
-    """Return the mean |X|^2 of the pedestal in its line's bin, over |C|^2 of the line.
+    """Return the pedestal's mean power in its line's bin, over the line's squared amplitude.
 
     Parameters
     ----------
@@ -216,11 +224,11 @@ def pedestal_power_under_line(
 
     Notes
     -----
-    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], with the window's autocorrelation r, is summed
-    directly if few lags contribute. Otherwise it is an integral over the lag by Gauss-Legendre
-    quadrature, plus a closed-form correction for aliasing of the integrand's kinks at lag 0 and at
-    the delay. The result is accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a
-    delay below one sample.
+    sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}] runs over the lags T_j [s], with the window's
+    autocorrelation r, Gamma = 2 pi FWHM and the delay tau. It is summed directly if few lags count.
+    Otherwise it is an integral over the lag by Gauss-Legendre quadrature, plus a closed-form
+    correction for aliasing of the integrand's kinks at lag 0 and at the delay. The result is
+    accurate to 2e-5 for delays of 20 samples or more, and to 1 % for a delay below one sample.
     """
     duration = np.asarray(duration, float)
     gamma = 2 * np.pi * np.asarray(line_width, float) * duration
@@ -237,7 +245,11 @@ def pedestal_power_under_line(
 
 
 def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Sum over the lags directly, up to where the terms have decayed."""
+    """Return the pedestal's power as a sum over lags, up to where the terms have decayed.
+
+    ``gamma`` is the decay exponent of the laser's coherence over a record, ``lag`` the largest lag
+    [record lengths].
+    """
     j = np.arange(min(int(_DECAY_EXPONENT_MAX / _DECAY_PER_SAMPLE_MIN), window.length))
     decay = (gamma / window.length)[:, None] * j
     decay_left = np.maximum((gamma * lag)[:, None] - decay, 0.0)
@@ -247,10 +259,10 @@ def _pedestal_power_by_lags(gamma: np.ndarray, lag: np.ndarray, window: Window) 
 
 
 def _pedestal_power_by_integral(gamma: np.ndarray, lag: np.ndarray, window: Window) -> np.ndarray:
-    """Integrate over the lag, and correct for the aliasing of the integrand's kinks.
+    """Return the pedestal's power as an integral over the lag, with a correction for sampling.
 
-    The sum over m != 0 of cos(2 pi m x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with B_2(x) = x^2 -
-    x + 1/6.
+    The correction is for the aliasing of the integrand's kinks. The sum over m != 0 of cos(2 pi m
+    x) / (2 pi m)^2 is B_2(x - floor(x)) / 2, with the Bernoulli polynomial B_2(x) = x^2 - x + 1/6.
     """
     length = window.length
     lag_max = np.minimum(lag, _DECAY_EXPONENT_MAX / np.maximum(gamma, 1e-300))
@@ -282,9 +294,10 @@ def apparent_line_and_pedestal(
     window: Window,
     looks: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power of the line and of the pedestal in the line's bin, as |X| shows them.
+    """Return the power of line and phase-noise pedestal as the spectrum's magnitude shows it.
 
-    A phase common to the full record does not change |X| and is excluded.
+    Both are powers in the line's bin. A phase common to the full record does not change the
+    magnitude and is excluded.
 
     Parameters
     ----------
@@ -324,7 +337,10 @@ def apparent_line_and_pedestal(
     )
 
     def double_integral_at(t: np.ndarray) -> np.ndarray:
-        """Return the window's double integral at t [records], extended linearly past the record."""
+        """Return the window's double integral at t [record lengths].
+
+        Outside the record it is extended linearly.
+        """
         return np.where(
             t > 1,
             double_integral(1.0) + (t - 1) * double_integral(1.0, 1),
@@ -368,10 +384,10 @@ def apparent_line_and_pedestal(
 
 @lru_cache(maxsize=16)
 def _window_at_nodes(window: Window) -> "tuple[np.ndarray, CubicSpline]":
-    """Return the window at evenly spaced positions, and its double integral.
+    """Return the window at evenly spaced positions in the record, and its double integral.
 
-    Positions are in records, 0..1. The samples, (n,), have the sum 1. The integral is a spline that
-    is scaled so that its slope at the end of the record is 1.
+    Positions are in record lengths, 0..1. The samples, (n,), have the sum 1. The integral is a
+    spline that is scaled so that its slope at the end of the record is 1.
     """
     from scipy.interpolate import CubicSpline  # slow to import
 
@@ -403,7 +419,9 @@ def n_phase_walk_steps(*, delay: float, length: int) -> int:
 def phase_walk(
     steps: np.ndarray, *, variance_per_sample: float, delay: float, from_first_sample: bool = False
 ) -> np.ndarray:
-    """Return the phase theta(t) - theta(t - tau) [rad] of a laser over a record.
+    """Return a laser's phase minus its phase one delay earlier [rad], over a record.
+
+    The laser's phase theta(t) is a random walk. The result is theta(t) - theta(t - tau).
 
     Parameters
     ----------
@@ -442,7 +460,10 @@ def phase_walk(
 
 @lru_cache(maxsize=16)
 def window_autocorrelation(window: Window) -> "CubicSpline":
-    """Return the function sum_n w_n w_(n+j) of the lag j, 0..L [samples], as a spline."""
+    """Return the sum over n of w_n w_(n+j) as a spline over the lag j, 0..L [samples].
+
+    w are the L samples of the window.
+    """
     from scipy.interpolate import CubicSpline  # slow to import
 
     spectrum = np.abs(np.fft.rfft(window.samples(), 2 * window.length)) ** 2

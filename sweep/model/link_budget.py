@@ -27,38 +27,40 @@ LASER_PREFIX, CHIRP_PREFIX, TELESCOPE_PREFIX, RECEIVER_PREFIX, PROCESSING_PREFIX
     for section in ("laser", "chirp", "telescope", "receiver", "processing")
 )
 RECORD_PATH = RECEIVER_PREFIX + "record"
-"""Path of the kind of samples of a record: ``real``, or ``complex`` from I and Q."""
+"""Parameter path of the record's kind of samples: ``real``, or ``complex`` from I and Q."""
 
 BEAM_ELEVATION_PATH = "path.elevation"
-"""Path of the angle of the beam below the horizon [rad], by shot; present only in scenes."""
+"""Parameter path of the beam's angle below the horizon [rad], one value per shot. It is present
+only in scenes."""
 
 APPROACH_SPEED_PATH = "target.approach"
-"""Path of the speed [m/s] at which the range along the beam falls, present if it was found by ray
-tracing."""
+"""Parameter path of the speed [m/s] at which the range along the beam decreases. It is present only
+if ray tracing has computed the speed."""
 
 ADC_NOISE_SOURCE = "quantisation"
-"""Noise source that does not pass the receiver."""
+"""Name of the noise source that is added after the receiver: the ADC's quantisation."""
 
 ECHO_NOISE_SOURCES = frozenset({"signal_shot"})
-"""Noise sources that are present only with an echo; the threshold does not depend on them."""
+"""Names of noise sources that are present only with an echo. The threshold does not depend on them.
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TargetState:
-    """Target on the beam's axis at the start of a shot."""
+    """Range, velocity and acceleration of the target on the beam's axis at the start of a shot."""
 
     range: np.ndarray
-    """Range [m]."""
+    """Range along the beam [m]."""
     radial_velocity: np.ndarray
     """Radial velocity [m/s], positive when closing."""
     acceleration: np.ndarray
-    """Rate at which the radial velocity grows [m/s^2]."""
+    """Increase of the radial velocity per time [m/s^2]."""
     approach_speed: np.ndarray
-    """Speed [m/s] at which the range along the beam falls (:func:`approach_speed`)."""
+    """Speed [m/s] at which the range along the beam decreases (:func:`approach_speed`)."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, np.ndarray]) -> "TargetState":
-        """Return the target of parameters by dotted path."""
+        """Return the target's state from a mapping of dotted paths to parameter values."""
         return cls(
             range=parameters["target.range"],
             radial_velocity=parameters["target.radial_velocity"],
@@ -68,56 +70,70 @@ class TargetState:
 
     @property
     def delay(self) -> np.ndarray:
-        """Delay of the echo 2 R / c [s]."""
+        """Delay of the echo [s], twice the range over the speed of light."""
         return 2 / SPEED_OF_LIGHT * self.range
 
     @property
     def doppler_ratio(self) -> np.ndarray:
-        """Doppler ratio 2 v_r / c."""
+        """Doppler ratio 2 v_r / c, with the radial velocity v_r and the speed of light c."""
         return doppler_ratio(self.radial_velocity)
 
 
 class LineMotion(NamedTuple):
-    """Motion of the target that lines and measurement include, (n,) or scalars; none by default."""
+    """Motion of the target during a shot that affects spectral lines and measured values.
+
+    Fields are (n,) or scalars. By default there is no motion.
+    """
 
     doppler_ratio: np.ndarray | float = 0.0
-    """Doppler ratio 2 v_r / c of the line on the axis at the shot's start."""
+    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the shot."""
     segment_starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
-    """Time [s] from the shot's start to the start of each segment, during which the target moves;
-    0 if the target does not move between segments."""
+    """Time [s] from the start of the shot to that of each segment, during which the target moves.
+    The values are 0 if motion between segments is neglected.
+    """
     line_drift_per_look: np.ndarray | float = 0.0
-    """(3, n): shift of the lines from look to look [bins of fs/N]."""
+    """(3, n): frequency shift of each segment's lines from one look to the next [bins of fs/N]. A
+    look is one of several records of the same segment.
+    """
     range_walk_time: np.ndarray | float = 0.0
-    """Time of closing [s] by which the beats' range is below the range at the shot's start."""
+    """Time [s] of closing between the start of the shot and the instant of the range that beats
+    measure.
+    """
     velocity_drift_time: np.ndarray | float = 0.0
-    """Time of acceleration [s] by which a beat's velocity is above that at its segment's start."""
+    """Time [s] of acceleration between the start of a segment and the instant of the velocity that
+    its beat measures.
+    """
     velocity_bias_fraction: np.ndarray | float = 0.0
-    """Fractional underestimation of the radial velocity by the beats."""
+    """Fraction of the radial velocity by which beats underestimate it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WaveformSettings:
-    """Segments of a shot: chirp rates, carriers and times."""
+    """Waveform of a shot: chirp rates, frequencies and times of its segments."""
 
     architecture: str
     """Receiver architecture: ``homodyne``, ``heterodyne`` or ``direct``."""
     segment_order: tuple[str, ...]
-    """Names of the segments that exist, in the order of time."""
+    """Names of the existing segments, in the order of time."""
     chirp_slopes: tuple[Any, ...]
-    """Chirp rates of the three segments over :attr:`chirp_rate`, signed: numbers, or arrays if
-    points differ."""
+    """Signed chirp rates of up, Doppler and down segment, each over the up-chirp's
+    :attr:`chirp_rate`. They are numbers, or arrays if points differ.
+    """
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """Frequency of each segment that the delay turns into phase [Hz]."""
+    """Frequency at the start of each segment [Hz], by which the echo's delay makes a phase."""
     chirp_bandwidth: np.ndarray
-    """Bandwidth B of the up-chirp [Hz]."""
+    """Bandwidth of the up-chirp [Hz]."""
     chirp_duration: np.ndarray
-    """Duration T of each segment [s]."""
+    """Duration of each segment [s]."""
     segment_gap: np.ndarray
-    """Time from a segment's end to the start of the next segment [s]."""
+    """Time from the end of a segment to the start of the next one [s]."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "WaveformSettings":
-        """Return the waveform of parameters by dotted path; chirp slopes may differ by point."""
+        """Return the waveform from a mapping of dotted paths to parameter values.
+
+        Chirp slopes may differ by point.
+        """
         architecture = str(parameters[RECEIVER_PREFIX + "architecture"])
         chirp_slopes: tuple[Any, ...] = (
             1.0,
@@ -147,32 +163,44 @@ class WaveformSettings:
 
     @property
     def chirp_rate(self) -> np.ndarray:
-        """Chirp rate of the up-chirp S = B/T [Hz/s]."""
+        """Chirp rate of the up-chirp [Hz/s], bandwidth over duration."""
         return self.chirp_bandwidth / self.chirp_duration
 
     @property
     def has_segment(self) -> np.ndarray:
-        """(3,) bool: existence of up, Doppler and down segment."""
+        """(3,) bool: true for existing segments, in the order up, Doppler, down."""
         return np.array([name in self.segment_order for name in waveform.SEGMENT_NAMES])
 
     @property
     def segment_starts(self) -> tuple[np.ndarray, ...]:
-        """Times [s] from the start of a look to the start of each of its segments."""
+        """Times [s] from the start of a look to the start of each of its segments.
+
+        A look is one pass through all segments of the shot.
+        """
         return waveform.segment_starts(
             self.segment_order, duration=self.chirp_duration, gap=self.segment_gap
         )
 
     @property
     def look_period(self) -> np.ndarray:
-        """Time [s] from one look to the next: the duration of all segments and gaps."""
+        """Time [s] from the start of one look to that of the next.
+
+        It is the duration of all segments and gaps of the shot.
+        """
         return len(self.segment_order) * (self.chirp_duration + self.segment_gap)
 
     def middle_look_delay(self, looks: Looks) -> np.ndarray | float:
-        """Return the time [s] from the start of the first look to that of the middle look."""
+        """Return the time [s] from the start of the first look to that of the middle look.
+
+        A look is one pass through all segments of the shot.
+        """
         return 0.5 * (looks.number - 1) * self.look_period if looks.number > 1 else 0.0
 
     def middle_look_starts(self, looks: Looks) -> tuple[np.ndarray, ...]:
-        """Return the times [s] from the shot's start to each segment's start in the middle look."""
+        """Return the times [s] from the shot's start to each segment's start in the middle look.
+
+        A look is one pass through all segments of the shot.
+        """
         delay = self.middle_look_delay(looks)
         return tuple(start + delay for start in self.segment_starts)
 
@@ -215,24 +243,26 @@ class WaveformSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordSettings:
-    """Samples of a segment that are recorded, their window and FFT."""
+    """Recorded samples of a segment: window, FFT size, sample rate and start of the record."""
 
     window: Window
-    """Window of the record, of L samples."""
+    """Window that is applied to the samples of the record."""
     fft_size: int
-    """FFT size N."""
+    """FFT size N, the number of samples after zero padding."""
     sample_rate: np.ndarray
-    """Sample rate f_s [Hz]."""
+    """Sample rate f_s of the record [Hz]."""
     acquisition_delay: np.ndarray
     """Time from a segment's start to the start of its record [s]."""
     is_complex: bool
-    """True if the record is I + iQ; its spectrum then has signed bins and no images."""
+    """True if the record consists of complex samples I + iQ. Its spectrum then has bins of signed
+    frequency and no images of lines.
+    """
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "RecordSettings":
-        """Read the settings of the record from parameters by dotted path.
+        """Return the record's settings for parameters by dotted path.
 
-        All points must have the same number L of samples and the same FFT size N.
+        All points must have the same number of samples and the same FFT size.
         """
         length = waveform.record_length(parameters)
         window_name = canonical_window_name(str(parameters[PROCESSING_PREFIX + "window"]))
@@ -246,18 +276,19 @@ class RecordSettings:
 
     @property
     def bin_width(self) -> np.ndarray:
-        """Width of a bin f_s/N [Hz]."""
+        """Width of an FFT bin [Hz], sample rate over FFT size."""
         return self.sample_rate / self.fft_size
 
     @property
     def duration(self) -> np.ndarray:
-        """Length of the record L/f_s [s]."""
+        """Duration of the record [s], number of samples over sample rate."""
         return self.window.length / self.sample_rate
 
     def bin_noise_sigma(self, noise_variance: np.ndarray, looks: Looks) -> np.ndarray:
-        """Return a bin's noise sigma per quadrature [V] for a noise variance at the ADC [V^2].
+        """Return the noise standard deviation per quadrature of an FFT bin [V].
 
-        Records that are added in amplitude are averaged, and have the variance of their mean.
+        ``noise_variance`` is the variance of a sample at the ADC [V^2]. Records of several looks
+        that are added in amplitude are averaged, and have the variance of their mean.
         """
         return receiver_chain.bin_noise_sigma(
             noise_variance=noise_variance / looks.n_coherent,
@@ -267,7 +298,7 @@ class RecordSettings:
     def count_samples_before_echo(
         self, segment: WaveformSegment, range: np.ndarray | float
     ) -> np.ndarray:
-        """Return the number of samples of a segment's record before the echo arrives, 0..L.
+        """Return the number of samples in a segment's record before the echo arrives.
 
         Parameters
         ----------
@@ -287,23 +318,25 @@ class RecordSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReceiverFilter:
-    """Poles and anti-alias filter of the receiver, by which signals and noise are shaped."""
+    """Low-pass poles and anti-alias filter of the receiver, which filter signals and noise."""
 
     detector_bandwidth: np.ndarray
-    """Bandwidth of the detector's pole [Hz]."""
+    """3 dB bandwidth of the detector's single-pole low-pass [Hz]."""
     amplifier_bandwidth: np.ndarray
-    """Bandwidth of the amplifier's pole [Hz]."""
+    """3 dB bandwidth of the amplifier's single-pole low-pass [Hz]."""
     sample_rate: np.ndarray
-    """Sample rate f_s [Hz]."""
+    """Sample rate of the ADC [Hz]."""
     noise_shape: str
-    """Shape of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
-    [T]."""
+    """Spectrum of the noise: ``receiver``, filtered as signals are, or ``white``, unfiltered, as in
+    [T].
+    """
     antialias_filter: dict[str, np.ndarray] = field(default_factory=dict)
-    """Bandwidth [Hz] and order of the anti-alias filter; empty without one."""
+    """Bandwidth [Hz] and order of the anti-alias filter by parameter name; empty without a filter.
+    """
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "ReceiverFilter":
-        """Return the filter of parameters by dotted path."""
+        """Return the filter from a mapping of dotted paths to parameter values."""
         return cls(
             detector_bandwidth=parameters[RECEIVER_PREFIX + "detector_bandwidth"],
             amplifier_bandwidth=parameters[RECEIVER_PREFIX + "amplifier_bandwidth"],
@@ -315,7 +348,7 @@ class ReceiverFilter:
         )
 
     def pole_gain(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the gain of a signal by detector and amplifier, relative to DC.
+        """Return the amplitude gain of detector and amplifier for a signal, relative to DC.
 
         Parameters
         ----------
@@ -325,7 +358,10 @@ class ReceiverFilter:
         return np.abs(self._pole_transfer(frequency))
 
     def _pole_transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the complex transfer function of detector and amplifier, relative to DC."""
+        """Return the complex transfer function of detector and amplifier, relative to DC.
+
+        ``frequency`` is signed [Hz].
+        """
         return receiver_chain.receiver_transfer(
             frequency,
             detector_bandwidth=self.detector_bandwidth,
@@ -333,7 +369,7 @@ class ReceiverFilter:
         )
 
     def antialias_gain(self, frequency: np.ndarray) -> np.ndarray | float:
-        """Return the gain of a signal by the anti-alias filter; 1 without one.
+        """Return the amplitude gain of the anti-alias filter for a signal; 1 without a filter.
 
         Parameters
         ----------
@@ -347,7 +383,7 @@ class ReceiverFilter:
         )
 
     def gain(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the gain of a signal by poles and anti-alias filter, relative to DC.
+        """Return the amplitude gain of poles and anti-alias filter for a signal, relative to DC.
 
         Parameters
         ----------
@@ -357,7 +393,7 @@ class ReceiverFilter:
         return np.abs(self._pole_transfer(frequency) * self.antialias_gain(frequency))
 
     def relative_noise_density(self, frequency: np.ndarray) -> np.ndarray | float:
-        """Return the density of the receiver's noise over that of white noise of the same variance.
+        """Return the receiver's noise density, over that of white noise of the same variance.
 
         Parameters
         ----------
@@ -380,7 +416,10 @@ class ReceiverFilter:
         adc_noise_fraction: np.ndarray | float,
         bin_frequency: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the gain of a line after the noise of the spectrum is whitened.
+        """Return the amplitude gain of a line in a spectrum whose noise is whitened.
+
+        Whitening divides the spectrum by the square root of the noise's relative density, so that
+        all bins have the same noise.
 
         Parameters
         ----------
@@ -414,49 +453,59 @@ class ReceiverFilter:
 
 @dataclass(frozen=True, eq=False)
 class NoiseBudget:
-    """Noise at the ADC, by source."""
+    """Noise variance at the ADC by source, and its later changes."""
 
     variances: dict[str, np.ndarray]
-    """Noise variance [V^2] by source."""
+    """Noise variance of a sample [V^2] by name of the source."""
     gain: np.ndarray | float = 1.0
-    """Factor on the noise variance by changes of the record after the threshold was set."""
+    """Factor on the total noise variance. It accounts for changes of the record after the threshold
+    was set.
+    """
 
     def with_sources(self, **variances: np.ndarray) -> "NoiseBudget":
-        """Return the budget with sources added or replaced: variances [V^2] by source."""
+        """Return the budget with sources added or replaced.
+
+        ``variances`` are noise variances [V^2] by name of the source.
+        """
         return NoiseBudget(self.variances | variances, self.gain)
 
     @cached_property
     def variance_without_echo(self) -> np.ndarray:
-        """Noise variance without an echo [V^2], which sets the threshold."""
+        """Noise variance of a sample without an echo [V^2]; the threshold depends on it."""
         variances = (v for name, v in self.variances.items() if name not in ECHO_NOISE_SOURCES)
         return np.asarray(sum(variances))
 
     @cached_property
     def variance(self) -> np.ndarray:
-        """Noise variance sigma_x^2 [V^2] of all sources."""
+        """Noise variance of a sample [V^2], sum over all sources."""
         echo_variances = (v for name, v in self.variances.items() if name in ECHO_NOISE_SOURCES)
         return (self.variance_without_echo + sum(echo_variances)) * self.gain
 
     @property
     def adc_noise_fraction(self) -> np.ndarray | float:
-        """Fraction of the noise variance without an echo that the ADC adds."""
+        """ADC's fraction of the noise variance without an echo, 0..1."""
         return self.variances.get(ADC_NOISE_SOURCE, 0.0) / self.variance_without_echo
 
 
 class LinkScales(NamedTuple):
-    """Light and beat of a relative echo of one, and losses on the way from the ground."""
+    """Echo power and beat amplitude per relative echo, and transmission of light from the ground.
+
+    The relative echo is the backscatter of the beamlets [1/sr].
+    """
 
     echo_power: np.ndarray
-    """Echo power [W] for a relative echo of 1/sr."""
+    """Echo power on the detector [W] for a relative echo of 1/sr."""
     beat_amplitude: np.ndarray
-    """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, before the poles."""
+    """Amplitude of the beat at the ADC [V] for a relative amplitude of 1, before the receiver's
+    poles.
+    """
     ground_transmission: np.ndarray | float = 1.0
     """Fraction of light from the ground, such as sunlight, that reaches the receiver."""
 
     def scale_echo(
         self, *, power_factor: np.ndarray | float = 1.0, amplitude_factor: np.ndarray | float
     ) -> "LinkScales":
-        """Return the scales with factors on the echo's power and on the beat's amplitude."""
+        """Return the scales times factors on the echo's power and on the beat's amplitude."""
         return self._replace(
             echo_power=self.echo_power * power_factor,
             beat_amplitude=self.beat_amplitude * amplitude_factor,
@@ -464,7 +513,7 @@ class LinkScales(NamedTuple):
 
 
 class LinkBudget:
-    """Link budget of points that share text parameters; each part is derived on first use.
+    """Link budget of points that share text parameters; each part is computed on first use.
 
     Parameters
     ----------
@@ -477,32 +526,32 @@ class LinkBudget:
 
     @cached_property
     def waveform(self) -> WaveformSettings:
-        """Segments of a shot."""
+        """Waveform of a shot: chirp rates, frequencies and times of its segments."""
         return WaveformSettings.from_parameters(self.parameters)
 
     @cached_property
     def record(self) -> RecordSettings:
-        """Samples, window and FFT of a segment."""
+        """Recorded samples of a segment: window, FFT size and sample rate."""
         return RecordSettings.from_parameters(self.parameters)
 
     @cached_property
     def receiver_filter(self) -> ReceiverFilter:
-        """Poles and anti-alias filter."""
+        """Low-pass poles and anti-alias filter of the receiver."""
         return ReceiverFilter.from_parameters(self.parameters)
 
     @cached_property
     def target(self) -> TargetState:
-        """Target on the beam's axis at the start of a shot."""
+        """Range, velocity and acceleration of the target on the beam's axis at the shot's start."""
         return TargetState.from_parameters(self.parameters)
 
     @cached_property
     def looks(self) -> Looks:
-        """Number of records of each segment, and their combination."""
+        """Number of looks, the records of each segment, and the way they are combined."""
         return Looks.from_parameters(self.parameters)
 
     @cached_property
     def link_scales(self) -> LinkScales:
-        """Echo power and beat amplitude of a relative echo of one."""
+        """Echo power and beat amplitude for a relative echo of 1/sr."""
         echo_power, current = echo_power_and_beat_current(
             self.waveform.architecture, self.parameters
         )
@@ -510,7 +559,7 @@ class LinkBudget:
 
     @cached_property
     def receiver_noise(self) -> receiver_chain.ReceiverNoise:
-        """Noise variances of the receiver at the ADC [V^2]."""
+        """Noise variances at the ADC [V^2] of the receiver's own sources."""
         return receiver_chain.receiver_noise(
             self.waveform.architecture,
             receiver_chain.receiver_parameters(self.parameters),
@@ -519,22 +568,28 @@ class LinkBudget:
 
     @cached_property
     def noise(self) -> NoiseBudget:
-        """Noise of the receiver's own sources."""
+        """Noise budget at the ADC of the receiver's own sources."""
         return NoiseBudget(self.receiver_noise.variances)
 
     @cached_property
     def tnr(self) -> np.ndarray:
-        """Threshold-to-noise ratio."""
+        """Threshold-to-noise ratio, as set by the processing parameters.
+
+        It is the threshold over the standard deviation of a bin's magnitude with noise alone.
+        """
         return tnr_from_parameters(self.parameters)
 
     @cached_property
     def threshold_ratio(self) -> np.ndarray:
-        """Threshold on |X| over the noise sigma of a bin without an echo."""
+        """Ratio of the threshold on a bin's magnitude to the noise sigma per quadrature.
+
+        The noise is that of a bin without an echo.
+        """
         return np.asarray(threshold(self.tnr, np.asarray(1.0)))
 
 
 def threshold(tnr: np.ndarray, bin_noise_sigma: np.ndarray) -> np.ndarray:
-    """Return the threshold on |X| [V].
+    """Return the threshold on a bin's magnitude [V].
 
     Parameters
     ----------
@@ -549,12 +604,12 @@ def threshold(tnr: np.ndarray, bin_noise_sigma: np.ndarray) -> np.ndarray:
 
 
 def samples_iq(parameters: Mapping[str, Any]) -> bool:
-    """Return True if two receivers sample I and Q of a complex record."""
+    """Return True if two receivers sample the I and Q parts of a complex record."""
     return str(parameters[RECORD_PATH]) == "complex"
 
 
 def adc_noise_variance(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the noise variance of the ADC's quantisation [V^2]."""
+    """Return the noise variance [V^2] that quantisation adds at the ADC."""
     full_scale, bits = (parameters[PROCESSING_PREFIX + name] for name in ("full_scale", "bits"))
     return receiver_chain.quantisation_variance(
         full_scale=full_scale, bits=bits, samples_iq=samples_iq(parameters)
@@ -583,7 +638,7 @@ def approach_speed(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarray:
-    """Return the relative amplitude of the beat for a relative echo.
+    """Return the beat amplitude, over its scale, for a relative echo [1/sr].
 
     Parameters
     ----------
@@ -602,14 +657,14 @@ def relative_amplitude(architecture: str, relative_echo: np.ndarray) -> np.ndarr
 
 
 def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
-    """Return the Doppler ratio beta = 2 v_r / c of a radial velocity [m/s]."""
+    """Return the Doppler ratio 2 v_r / c of a radial velocity v_r [m/s]."""
     return 2 * radial_velocity / SPEED_OF_LIGHT
 
 
 def echo_power_and_beat_current(
     architecture: str, parameters: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the echo power and beat current for a backscatter of 1/sr.
+    """Compute the echo power [W] and the beat photocurrent [A] for a backscatter of 1/sr.
 
     Returns
     -------

@@ -6,43 +6,44 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 NO_DOPPLER_NOTE = "nan without a Doppler segment, which direct detection never has"
-"""Comment of outputs of the Doppler segment."""
+"""Comment stored with outputs of the Doppler segment."""
 NO_ECHO_NOTE = "nan where no light comes back"
-"""Comment of outputs that need an echo."""
+"""Comment stored with outputs that need an echo."""
 NO_FREE_BIN_NOTE = (
     "-inf where the detection occupies every bin, so that none is left to raise an alarm"
 )
-"""Comment of logarithms of probabilities of a false alarm."""
+"""Comment stored with logarithms of false-alarm probabilities."""
 CLOSING_SIGN_NOTE = "positive when closing"
-"""Comment that states the sign of radial velocities."""
+"""Comment stored with radial velocities; it states their sign."""
 
 XYZ_DIM = "xyz"
-"""Name of the dimension of the world's axes."""
+"""Name of the store dimension of the world's axes x, y, z."""
 SECOND_XYZ_DIM = "xyz_again"
-"""Name of the second dimension of the world's axes in covariances."""
+"""Name of the second dimension of the world's axes in covariance matrices."""
 
 
 @dataclass(frozen=True)
 class OutputVariable:
-    """Name, units and meaning of an output variable of a store.
-
-    Missing values are nan for floats, -1 for signed integers, and 0 for flags.
-    """
+    """Name, units and meaning of an output variable in a results store."""
 
     units: str
-    """Units; "1" if dimensionless."""
+    """Physical units of the variable; "1" if it is dimensionless."""
     long_name: str
-    """Name in words."""
+    """Name of the variable in words, for readers of the store."""
     comment: str = ""
-    """Comment in words, optional."""
+    """Further explanation of the variable in words; empty if there is none."""
     dtype: str = "float64"
-    """NumPy's name of the data type."""
+    """NumPy name of the data type, such as ``float64``."""
     dims: tuple[str, ...] = ()
-    """Dimensions in addition to the study's axes. ``shot``, ``beamlet``, ``cycle``, ``draw`` and
-    ``return_number`` count from 0; ``xyz`` are the axes of the world."""
+    """Names of dimensions in addition to the study's axes. ``shot``, ``beamlet``, ``cycle``,
+    ``draw`` and ``return_number`` count from 0; ``xyz`` are the axes of the world.
+    """
 
     def empty(self, sizes: Mapping[str, int]) -> np.ndarray:
-        """Return an uninitialised array; `sizes` gives the size of each dimension."""
+        """Return an uninitialised array for the variable.
+
+        `sizes` has the length of each dimension, by name.
+        """
         return np.empty(tuple(sizes[dim] for dim in self.dims), self.dtype)
 
 
@@ -158,7 +159,7 @@ GRID_OUTPUTS: dict[str, OutputVariable] = {
         f"What is detected then has a wrong range or velocity; {NO_ECHO_NOTE}",
     ),
 }
-"""Outputs of the points of a grid, by name; one float for each point."""
+"""Output variables of a grid study, by name; one float for each point."""
 
 STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "p_wrong_range_{}",
@@ -168,13 +169,13 @@ STRONGEST_PEAK_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     shot_comment="both chirps report a peak, and one of the echo not both; or both do and are "
     "misread",
 )
-"""Additional outputs of studies that report only the strongest peak of a segment, by name; one
-float for each point."""
+"""Additional output variables of studies in which a segment reports only its strongest peak. Keys
+are names; each variable has one float for each point."""
 
 NAN_WITHOUT_ECHO_OUTPUTS = tuple(
     name for name, output in GRID_OUTPUTS.items() if NO_ECHO_NOTE in output.comment
 )
-"""Names of outputs that are nan if no light returns."""
+"""Names of outputs that are nan if no light returns to the receiver."""
 
 _SEGMENT_PHRASES = {
     "up": "the up-chirp segment",
@@ -192,7 +193,7 @@ DRAW_COUNT_OUTPUTS: dict[str, OutputVariable] = {
     for segment, segment_phrase in {**_SEGMENT_PHRASES, joint_name: "both chirp segments"}.items()
     if (name, segment) != ("false_alarm", "doppler")
 }
-"""Numbers of draws with a detection or a false alarm, by name."""
+"""Numbers of draws with a detection or a false alarm: output variables by name."""
 
 STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "pd_{}_error",
@@ -200,11 +201,11 @@ STANDARD_ERROR_OUTPUTS: dict[str, OutputVariable] = _segment_variables(
     "over draws; 0 where nothing random is simulated, nan with a single draw",
     separator="; ",
 )
-"""Standard errors of outputs in studies with draws. The name is that of the output with ``_error``;
-one float for each point."""
+"""Standard errors of outputs in studies with draws: output variables by name. The name is that of
+the output with ``_error``. Each has one float for each point."""
 
 PD_OUTPUTS = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
-"""Names of the outputs to which the tolerance of a study applies when draws are made."""
+"""Names of the detection probabilities that a study's tolerance applies to when draws are made."""
 
 ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
     "n_draws": OutputVariable("1", "number of draws", dtype="int64"),
@@ -220,34 +221,35 @@ ACCURACY_OUTPUTS: dict[str, OutputVariable] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""Outputs that state the accuracy of estimates by draws, by name; one value for each point."""
+"""Accuracy of estimates by random draws: output variables by name, one value for each point."""
 
 RUNNING_SUMS = "running_sums"
-"""Name of the output that holds the sums to which further draws are added."""
+"""Name of the output with the sums over draws, to which later draws can be added."""
 
 RUNNING_SUM_OUTPUTS: dict[str, OutputVariable] = {
     RUNNING_SUMS: OutputVariable(
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""Sums over draws of random effects, to which further draws are added; one row for each point."""
+"""Output variable of the sums over draws of random effects, one row for each point. Later draws can
+be added to these sums."""
 
 IS_LOGARITHM = np.array([name.startswith("log10_") for name in GRID_OUTPUTS])
 """(outputs,) bool: True for those of GRID_OUTPUTS that are logarithms."""
 KEEPS_SPREAD = IS_LOGARITHM | np.array(
     [f"{name}_error" in STANDARD_ERROR_OUTPUTS for name in GRID_OUTPUTS]
 )
-"""(outputs,) bool: True for those of GRID_OUTPUTS whose sum of squared deviations over draws is
-kept. """
+"""(outputs,) bool: True for those of GRID_OUTPUTS whose squared deviations from the mean are summed
+over draws."""
 
 N_RUNNING_SUMS = len(GRID_OUTPUTS) + int(KEEPS_SPREAD.sum()) + int(IS_LOGARITHM.sum())
-"""Length of a row of running sums. Besides the means of a store, further draws need numbers of
-values, sums of squared deviations, and the largest logarithms."""
+"""Number of values in a row of running sums. The row contains what further draws need in addition
+to the stored means: numbers of values, sums of squared deviations, and the largest logarithms."""
 
 DETECTOR_INDEPENDENT_OUTPUTS = (
     "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",
 )  # fmt: skip
-"""Names of :data:`GRID_OUTPUTS` that do not depend on the detector."""
+"""Names of those :data:`GRID_OUTPUTS` that do not depend on the detector."""
 
 _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that the signal occupies"
 
@@ -255,9 +257,10 @@ _FALSE_ALARM_GROUP_NOTE = "adjacent flagged bins, none of them among those that 
 def _measurement_variables(
     quantity: str, quantity_label: str, units: str
 ) -> dict[str, OutputVariable]:
-    """Return the output variables of a measured quantity: bias, its error, RMSE, and bound.
+    """Return a measured quantity's output variables by name: bias, its error, RMSE, bound.
 
-    `quantity` is the beginning of their names, and `quantity_label` the quantity in words.
+    `quantity` is the beginning of their names, `quantity_label` the quantity in words, `units` its
+    units.
     """
     detection_note = "over draws in which every segment has a detection; nan with none"
     bound_note = (
@@ -302,14 +305,14 @@ SPECTRA_OUTPUTS: dict[str, OutputVariable] = {
     **_measurement_variables("range", "range", "m"),
     **_measurement_variables("radial_velocity", f"radial velocity, {CLOSING_SIGN_NOTE}", "m s-1"),
 }
-"""Outputs of studies of full spectra, by name; one float for each point. ACCURACY_OUTPUTS and
-DRAW_COUNT_OUTPUTS are stored as well."""
+"""Outputs of studies that draw full spectra: output variables by name, one float for each point.
+ACCURACY_OUTPUTS and DRAW_COUNT_OUTPUTS are stored as well."""
 
 
 def _with_dims(
     dims: tuple[str, ...], variables: dict[str, OutputVariable]
 ) -> dict[str, OutputVariable]:
-    """Return output variables with further dimensions before their own."""
+    """Return output variables with the dimensions `dims` placed before their own."""
     return {
         name: replace(variable, dims=(*dims, *variable.dims))
         for name, variable in variables.items()
@@ -364,7 +367,7 @@ SHOT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""True geometry of each shot of a flight, which all draws share, by name."""
+"""True geometry of each shot of a flight: output variables by name. All draws share it."""
 
 CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
     "cycle_time": OutputVariable("s", "start of the measurement cycle"),
@@ -376,7 +379,7 @@ CYCLE_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle",), {
         "at the cycle's start; inf where there is none",
     ),
 })  # fmt: skip
-"""True motion of the instrument in each measurement cycle, by name."""
+"""True motion of the instrument in each measurement cycle: output variables by name."""
 
 BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "offset": OutputVariable("m", "range less that of the reference beamlet"),
@@ -386,11 +389,13 @@ BEAMLET_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot", "beamlet"), {
     "cos_incidence": OutputVariable("1", "cosine of the incidence angle"),
     "surface": OutputVariable("1", "surface hit", dtype="int16"),
 })  # fmt: skip
-"""Arrays of an eyepoint store for each beamlet of each shot, by name. SHOT_VARIABLES and
-CYCLE_VARIABLES are stored as well."""
+"""Geometry of each beamlet of each shot: output variables by name. They belong to an eyepoint
+store, which holds the ray-traced geometry of a flight's shots, and also SHOT_VARIABLES and
+CYCLE_VARIABLES."""
 
 BEAMLET_WEIGHT_VARIABLE = OutputVariable("1", "power fraction of the beamlet", dims=("beamlet",))
-"""Output variable of an eyepoint store: the power fraction of each beamlet."""
+"""Power fraction of each beamlet, an output variable of an eyepoint store. Such a store holds the
+ray-traced geometry of a flight's shots."""
 
 SHOT_STATISTIC_VARIABLES: dict[str, OutputVariable] = _with_dims(
     ("shot",),
@@ -441,7 +446,8 @@ EFFECT_VARIABLES: dict[str, OutputVariable] = _with_dims(("shot",), {
         "overlap leaves of beamlets farther and nearer than the beam's axis",
     ),
 })  # fmt: skip
-"""Effects that were simulated in each shot, by name; none in a shot that hits nothing."""
+"""Effects that were simulated in each shot, by name. A shot whose rays hit nothing has no effects.
+"""
 
 _NAN_IF_FALSE_NOTE = "nan: a false one"
 
@@ -500,7 +506,8 @@ POINT_VARIABLES: dict[str, OutputVariable] = _with_dims(
         ),
     },
 )
-"""Points of a point cloud, by name. Each shot and draw has at most a study's number of returns."""
+"""Points of a point cloud: output variables by name. Each shot and draw has at most as many points
+as the study's number of returns."""
 
 NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), {
     "velocity": OutputVariable("m s-1", "velocity vector of the instrument", dims=_VECTOR_DIMS),
@@ -514,8 +521,8 @@ NAVIGATION_VARIABLES: dict[str, OutputVariable] = _with_dims(("cycle", "draw"), 
     "altitude_status": OutputVariable("1", "how the altitude was solved", dtype="int8"),
     "altitude_beams": OutputVariable("1", "beams in the altitude's solution", dtype="int16"),
 })  # fmt: skip
-"""Velocity and altitude of each measurement cycle and draw, by name. They are stored if a cycle has
-three shots or more."""
+"""Velocity and altitude of each measurement cycle and draw: output variables by name. They are
+stored if a cycle has three shots or more."""
 
 GRID_VARIABLE_NAMES = frozenset().union(
     GRID_OUTPUTS,

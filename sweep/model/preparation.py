@@ -63,11 +63,12 @@ if TYPE_CHECKING:
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
 BEAMLETS_ERROR_PATH = "footprint.beamlets_error"
-"""Path of the error of pd due to the number of beamlets, present if that number follows from the
-tolerance."""
+"""Parameter path of the error of the detection probability due to the number of beamlets. It is
+present if that number follows from the tolerance."""
 
 CHIRP_SLOPE_PATHS = waveform.DOPPLER_SLOPE_PATH, waveform.DOWN_SLOPE_PATH
-"""Paths of the chirp rates of Doppler segment and down-chirp over that of the up-chirp."""
+"""Parameter paths of the chirp rates of Doppler segment and down-chirp, over that of the up-chirp.
+"""
 CATEGORY_PATHS = (
     PROCESSING_PREFIX + "fft_size",
     "footprint.beamlets",
@@ -76,12 +77,12 @@ CATEGORY_PATHS = (
     LOOKS_VOTES_PATH,
     *CHIRP_SLOPE_PATHS,
 )
-"""Paths of numeric parameters that points must share to be prepared together. They must share all
+"""Paths of numeric parameters that points must share to be computed together. They must share all
 text parameters as well."""
 
 LINE_APPROXIMATIONS_MAX = 2
-"""Largest number of approximations in one sum of lines. The tolerated error is divided equally
-among them."""
+"""Largest number of approximations in one sum of lines. The tolerated error of a bin's magnitude is
+divided equally among them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,87 +100,98 @@ class Shots:
     """
 
     waveform: WaveformSettings
-    """Segments of a shot: chirp rates, carriers and times; slopes are numbers, shared by all
-    points."""
+    """Waveform of a shot: chirp rates, frequencies and times of its segments. Chirp slopes are
+    numbers that all points share.
+    """
     record: RecordSettings
-    """Samples of a segment that are recorded, their window and FFT; sample rates are (n,)."""
+    """Recorded samples of a segment, their window and FFT; sample rates are (n,)."""
     receiver_filter: ReceiverFilter
-    """Poles and anti-alias filter of the receiver."""
+    """Low-pass poles and anti-alias filter of the receiver."""
     target: TargetState
-    """Target on the beam's axis at the shot's start; range and radial velocity are (n,), and the
-    lines use the Doppler ratio of :attr:`motion`."""
+    """Range and velocity of the target on the beam's axis at the shot's start, (n,) each. Lines use
+    the Doppler ratio of :attr:`motion` instead.
+    """
     link_scales: LinkScales
-    """Light and beat of a relative echo of one."""
+    """Echo power and beat amplitude for a relative echo of 1/sr."""
     receiver_noise: ReceiverNoise
-    """Noise variances at the ADC of the receiver's own sources, of 1 A^2 of current and of the shot
-    noise of 1 W of light."""
+    """Noise at the ADC: variances of the receiver's own sources [V^2], and variances per noise
+    current in the detector [V^2/A^2] and per power of light [V^2/W].
+    """
     noise: NoiseBudget
-    """Noise at the ADC, by source."""
+    """Noise variance at the ADC by source."""
     footprint: FootprintLines
-    """Lines of the beamlets, relative to the line on the beam's axis."""
+    """Ranges, Doppler ratios and amplitudes of the beamlets, relative to the beam's axis."""
     detection_settings: DetectionSettings
-    """Threshold, searched bins, and rules of detection."""
+    """Detection threshold, searched bins, and rules of detection."""
     looks: Looks
-    """Number of records of each segment, and their combination."""
+    """Number of looks, the records of each segment, and the way they are combined."""
     tolerances: ErrorTolerances
-    """Errors that the evaluation of spectra may make."""
+    """Errors of magnitudes and probabilities that the evaluation of spectra may cause."""
     motion: LineMotion = LineMotion()  # noqa: RUF009  # a tuple, as all records below
-    """Motion of the target that the lines and the measurement include."""
+    """Motion of the target during a shot that affects lines and measured values."""
     echo_record: EchoRecord = EchoRecord()  # noqa: RUF009
-    """Samples of the record before the echo, and phase errors of the echo over the record."""
+    """Number of samples before the echo arrives, and phase errors of the echo over the record."""
     images: LineImages = LineImages()  # noqa: RUF009
-    """Images of lines at their negative frequencies."""
+    """Images of lines at their negative frequencies, and their amplitudes."""
     laser_line: LaserLine = LaserLine()  # noqa: RUF009
-    """Line of the laser."""
+    """Line width of the laser and its phase-noise pedestal."""
     speckle: EchoSpeckle = EchoSpeckle()  # noqa: RUF009
-    """Speckle of an echo that fades."""
+    """Speckle of an echo that fades; none by default."""
     permanent_line: PermanentLine | None = None
-    """Line of other light than the echo's that is in every record; None without one."""
+    """Beat of other light than the echo's that is in every record; None without it."""
 
     @property
     def range(self) -> np.ndarray:
-        """(n,): range of the target on the beam's axis [m]."""
+        """(n,): range of the target on the beam's axis at the start of the shot [m]."""
         return self.target.range
 
     @property
     def window(self) -> Window:
-        """Window of the record."""
+        """Window that is applied to the samples of the record."""
         return self.record.window
 
     @property
     def fft_size(self) -> int:
-        """FFT size N."""
+        """FFT size N, the number of samples after zero padding."""
         return self.record.fft_size
 
     @property
     def sample_rate(self) -> np.ndarray:
-        """(n,): sample rate f_s [Hz]."""
+        """(n,): sample rate f_s of the record [Hz]."""
         return self.record.sample_rate
 
     @property
     def complex_record(self) -> bool:
-        """True if the record is I + iQ; its spectrum then has signed bins and no images."""
+        """True if the record consists of complex samples I + iQ.
+
+        Its spectrum then has bins of signed frequency and no images of lines.
+        """
         return self.record.is_complex
 
     @property
     def has_segment(self) -> np.ndarray:
-        """(3,) bool: existence of up, Doppler and down segment."""
+        """(3,) bool: true for existing segments, in the order up, Doppler, down."""
         return self.waveform.has_segment
 
     @property
     def size(self) -> int:
-        """Number of points."""
+        """Number n of points."""
         return self.range.size
 
     @property
     def n_bins(self) -> int:
-        """Number of bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
+        """Number of bins of a spectrum.
+
+        Bins are 0 .. N/2 of a real record and -N/2 .. N/2 - 1 of a complex one, with the FFT size
+        N.
+        """
         return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
     def to_signed_bins(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return bin numbers by signed frequency: 0..N/2, of a complex record -N/2..N/2 - 1.
+        """Return bin numbers 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record.
 
-        Bin numbers of a complex record are periodic in N: any integer is accepted.
+        N is the FFT size. Bin numbers of a complex record are periodic in N, so that any integer is
+        accepted.
         """
         if not self.complex_record:
             return np.asarray(bin_numbers)
@@ -187,24 +199,25 @@ class Shots:
         return np.asarray((np.asarray(bin_numbers) + nyquist_bin) % self.fft_size - nyquist_bin)
 
     def bin_indices(self, bin_numbers: np.ndarray) -> np.ndarray:
-        """Return the indices of bins in a spectrum sorted by frequency.
+        """Return the indices of bins in an array of the spectrum sorted by frequency.
 
-        The bin of frequency 0 has the index 0; in a complex record it has the index N/2.
+        The bin of frequency 0 has the index 0; in a complex record it has the index N/2, with the
+        FFT size N.
         """
         zero_frequency_index = self.fft_size // 2 if self.complex_record else 0
         return self.to_signed_bins(bin_numbers) + zero_frequency_index
 
     @property
     def all_signed_bins(self) -> np.ndarray:
-        """All bins of a spectrum in the order of their frequencies, (bins,)."""
+        """Numbers of all bins of a spectrum in the order of their frequencies, (bins,)."""
         return self.to_signed_bins(np.arange(self.n_bins) - self.bin_indices(np.zeros((), int)))
 
     @property
     def echo_record_times(self) -> dict[str, Any]:
-        """Start and duration [s] of the part of the record that holds the echo.
+        """Start and duration [s] of the part of the record that contains the echo.
 
-        ``start`` counts from the segment's start. Both are (n,) or scalars; or tuples by segment,
-        if the echo does not fill the record.
+        ``start`` counts from the segment's start. Both are (n,) or scalars. If the echo does not
+        fill the record, both are tuples by segment.
         """
         if self.echo_record.n_samples_before is None:
             return {"start": self.record.acquisition_delay, "duration": self.record.duration}
@@ -221,14 +234,17 @@ class Shots:
         }
 
     def echo_window_energy(self, segment: int) -> np.ndarray:
-        """Return the sum of w^2 over the samples that hold the echo in one segment, (n,)."""
+        """Return the sum of the squared window over one segment's samples with the echo, (n,)."""
         if self.echo_record.n_samples_before is None:
             return np.full(self.size, self.window.energy)
         return window_energy_from_sample(self.window)[self.echo_record.n_samples_before[segment]]
 
     @cached_property
     def total_relative_echo(self) -> np.ndarray:
-        """Relative echo of all beamlets [1/sr], (n,)."""
+        """Sum of the relative echoes of all beamlets [1/sr], (n,).
+
+        The echo power on the detector is proportional to it.
+        """
         relative_echo = (
             self.footprint.relative_amplitude
             if self.waveform.architecture == "direct"
@@ -243,16 +259,16 @@ class Shots:
 
     @cached_property
     def noise_variance_without_echo(self) -> np.ndarray:
-        """Noise variance at the ADC without an echo, which sets the threshold [V^2], (n,)."""
+        """Noise variance of a sample without an echo [V^2], (n,); the threshold depends on it."""
         return self.noise.variance_without_echo + np.zeros(self.size)
 
     @cached_property
     def whitening_gain(self) -> np.ndarray:
-        """Factor on the amplitude of each segment's lines by whitening the noise, (segments, n).
+        """Factor on the amplitude of each segment's lines when noise is whitened, (segments, n).
 
-        To whiten the noise, the spectrum is divided by the root of the noise's relative power
-        density. It is the density over that of white noise. Noise added by the ADC is white
-        already. The factor varies little over an echo, and is that of the line on the beam's axis.
+        Whitening divides the spectrum by the square root of the noise density over that of white
+        noise. Noise added by the ADC is white already. The factor varies little over an echo. It is
+        computed for the line on the beam's axis.
         """
         return broadcast_rows(
             [self.whitening_gain_at(beat_frequency) for beat_frequency in self.beat_frequencies],
@@ -261,13 +277,13 @@ class Shots:
 
     @property
     def beat_frequencies(self) -> tuple[np.ndarray, ...]:
-        """Signed beat frequency [Hz] of the line on the beam's axis, by segment."""
+        """Signed beat frequencies [Hz] of the line on the beam's axis, one array per segment."""
         return tuple(segment.beat_frequency(self.range) for segment in self.waveform_segments)
 
     def whitening_gain_at(
         self, beat_frequency: np.ndarray, bin_frequency: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the gain of a line after the noise of the spectrum is whitened.
+        """Return the amplitude gain of a line in a spectrum whose noise is whitened.
 
         Parameters
         ----------
@@ -289,24 +305,24 @@ class Shots:
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
-        """Noise variance sigma_x^2 at the ADC [V^2], (n,)."""
+        """Noise variance of a sample at the ADC [V^2], (n,)."""
         return np.asarray(self.noise.variance + np.zeros(self.size))
 
     @cached_property
     def bin_noise_sigma(self) -> np.ndarray:
-        """Noise sigma of a bin, per quadrature [V], (n,)."""
+        """Noise standard deviation per quadrature of a bin [V, summed over the record], (n,)."""
         return self._noise_sigma_of(self.noise_variance)
 
     @cached_property
     def line_noise_sigma(self) -> np.ndarray:
-        """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
+        """Noise standard deviation per quadrature of a bin with lines [V], (n,)."""
         return self._noise_sigma_of(
             self.noise_variance + self.laser_line.pedestal_variance_under_line
         )
 
     @cached_property
     def bin_thresholds(self) -> "BinThresholds":
-        """Thresholds and noise of each point's bins."""
+        """Thresholds and noise sigmas of each point's bins."""
         from sweep.model.detection.echo_detection import BinThresholds
 
         side_noise_sigma = self._noise_sigma_of(
@@ -323,7 +339,11 @@ class Shots:
 
     @property
     def _pedestal_shape_rows(self) -> np.ndarray:
-        """Shape of the phase-noise pedestal, (3, n); 0 where it adds no bins that detect."""
+        """Reach [bins], line width [bins] and delay [N/fs] of the phase-noise pedestal, (3, n).
+
+        The pedestal is the laser's phase noise around a line. The reach is the distance from the
+        lines up to which it counts as echo. It is 0 where it adds no bins that detect the echo.
+        """
         shape_rows = np.zeros((3, self.size))
         if (
             self.detection_settings.echo_bins == "peak_bin"
@@ -347,7 +367,7 @@ class Shots:
         return shape_rows
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the mean signal power over the mean noise power of a bin.
+        """Return the signal-to-noise ratio of a bin, mean signal power over mean noise power.
 
         Parameters
         ----------
@@ -367,14 +387,17 @@ class Shots:
 
     @cached_property
     def threshold(self) -> np.ndarray:
-        """Threshold on |X| [V], (n,)."""
+        """Threshold on a bin's magnitude [V, summed over the record], (n,)."""
         return threshold(
             self.detection_settings.tnr, self._noise_sigma_of(self.noise_variance_without_echo)
         )
 
     @property
     def negligible_signal_ratio(self) -> np.ndarray:
-        """Leaked signal over sigma below which a singly evaluated bin counts as noise alone."""
+        """Leaked signal, over the noise sigma, below which a bin counts as noise alone.
+
+        It applies to bins that are evaluated one by one.
+        """
         from sweep.model.detection import echo_detection
 
         stated_floor, n_bins = self.tolerances.leakage_floor, self.n_bins
@@ -474,7 +497,7 @@ class Shots:
     def detection_equivalent_bins(
         self, probabilities: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
     ) -> np.ndarray | float:
-        """Return the number of independent bins equivalent to an echo.
+        """Return the number of independent bins that detect as often as an echo's correlated bins.
 
         It is the geometric mean over the segments.
 
@@ -500,7 +523,7 @@ class Shots:
 
     @property
     def any_two(self) -> bool:
-        """True if a shot is detected by any two of three segments."""
+        """True if a shot counts as detected when any two of its three segments detect it."""
         return (
             self.detection_settings.shot_rule == waveform.ANY_TWO
             and len(self.waveform.segment_order) == 3
@@ -513,6 +536,8 @@ class Shots:
         point_indices: np.ndarray | slice = slice(None),
     ) -> DetectionArrays:
         """Return the probabilities that a bin is detected in several looks, and that it is missed.
+
+        A look is one of several records of the same segment.
 
         Parameters
         ----------
@@ -552,7 +577,11 @@ class Shots:
     def _pd_in_looks_far_from_ends(
         self, signal_up: np.ndarray, signal_down: np.ndarray, threshold_ratio: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute pd of up and down segment in several looks as far from DC and Nyquist."""
+        """Return pd of up and down segment over several looks.
+
+        Bins are treated as if DC and Nyquist were far away. Signals and threshold are relative to
+        the noise sigma.
+        """
         signals = np.nan_to_num(np.stack([signal_up, 0 * signal_up, signal_down], axis=-2))
         pd_up, _, pd_down = np.moveaxis(
             self.looks.pd_and_miss_in_speckle(
@@ -570,7 +599,10 @@ class Shots:
         bins: np.ndarray,
         point_indices: np.ndarray | slice,
     ) -> DetectionArrays:
-        """Compute pd and 1 - pd in developed speckle, from signal and threshold over the noise."""
+        """Return pd and 1 - pd of bins in developed speckle.
+
+        Signal and threshold are relative to the noise sigma.
+        """
         from sweep.model.detection.pseudo_variance import multilook_pd_and_miss_near_ends
 
         look_speckle = (
@@ -618,7 +650,11 @@ class Shots:
         return DetectionArrays(pd, miss)
 
     def _look_amplitude_covariance(self, segment: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Return the covariance of an echo's amplitudes over k looks, (m, k, k) for m segments."""
+        """Return the covariance of an echo's amplitudes over k looks, (m, k, k).
+
+        A look is one of several records of the same segment. ``segment`` and ``point`` have m
+        elements.
+        """
         from sweep.model.detection.look_speckle import phase_rotated_look_covariances
 
         n_looks = self.looks.number
@@ -639,12 +675,19 @@ class Shots:
         return phase_rotated_look_covariances(correlation_by_lag, look_power, cycles_per_look)
 
     def _noise_sigma_of(self, variance: np.ndarray) -> np.ndarray:
-        """Return a bin's noise sigma per quadrature [V] for a noise variance at the ADC [V^2]."""
+        """Return the noise standard deviation per quadrature of a bin [V].
+
+        ``variance`` is the noise variance of a sample at the ADC [V^2].
+        """
         return self.record.bin_noise_sigma(variance, self.looks)
 
     @cached_property
     def beamlet_table(self) -> np.ndarray:
-        """(R_b - R_0)/R_0, beta_b - beta_0, amplitude, phases if any: (3 or 6, rows, beamlets)."""
+        """Beamlets' ranges, Doppler ratios, amplitudes and phases, relative to the beam's axis.
+
+        Rows are (R_b - R_0) / R_0 of the range R, the difference of the Doppler ratio, the relative
+        amplitude, and three phases if there are any. The shape is (3 or 6, rows, beamlets).
+        """
         phases = self.footprint.phase_cycles if self.footprint.phase_cycles.size else ()
         return np.stack(
             [
@@ -657,12 +700,15 @@ class Shots:
 
     @cached_property
     def waveform_segments(self) -> tuple[WaveformSegment, ...]:
-        """Segments of the waveform, with range and velocity of the target at their starts."""
+        """The three segments of a shot, with the target's range and velocity at their starts."""
         return self.waveform.segments(self.target, self.motion)
 
     @property
     def motion_by_segment(self) -> dict[str, Any]:
-        """Range [m] and radial velocity [m/s], (n,); tuples by segment where segments differ."""
+        """Range [m] and radial velocity [m/s] of the target, (n,).
+
+        They are tuples by segment where the target moves between segments.
+        """
         motion: dict[str, Any] = {
             "range": self.range,
             "radial_velocity": self.target.radial_velocity,
@@ -680,7 +726,10 @@ class Shots:
 
     @property
     def record_middle_time(self) -> np.ndarray:
-        """Time from a segment's start to its record's middle [s], (n,); 0 without range walk."""
+        """Time from a segment's start to the middle of its record [s], (n,).
+
+        It is 0 if motion within the record (range walk) is not simulated.
+        """
         return (
             np.asarray(
                 self.motion.range_walk_time
@@ -691,7 +740,7 @@ class Shots:
 
     @property
     def mid_record_drifts(self) -> tuple[np.ndarray, ...]:
-        """Drift [Hz] of each segment's lines at the middle of its record, (n,) each."""
+        """Frequency drift [Hz] of each segment's lines from its start to mid-record, (n,) each."""
         return tuple(
             self._frequency_drift(segment, self.record_middle_time, self.motion.velocity_drift_time)
             for segment in self.waveform_segments
@@ -699,7 +748,7 @@ class Shots:
 
     @property
     def frequency_drift_rates(self) -> tuple[np.ndarray, ...]:
-        """Drift rate [Hz/s] of each segment's lines within its record, (n,) each."""
+        """Frequency drift per time [Hz/s] of each segment's lines within its record, (n,) each."""
         walk_sign, drift_sign = (
             np.sign(self.record_middle_time),
             np.sign(self.motion.velocity_drift_time),
@@ -712,9 +761,9 @@ class Shots:
     def _frequency_drift(
         self, segment: WaveformSegment, walk_time: np.ndarray, drift_time: np.ndarray | float
     ) -> np.ndarray:
-        """Compute the drift [Hz] of a segment's lines in given times [s] of walk and acceleration.
+        """Return the frequency drift [Hz] of a segment's lines in given times.
 
-        `walk_time` is the time of range walk, `drift_time` that of acceleration.
+        `walk_time` [s] is the time of range walk, `drift_time` [s] that of acceleration.
         """
         closing_speed = self.target.radial_velocity + self.target.approach_speed
         closing_speed = closing_speed + self.target.acceleration * (
@@ -727,11 +776,11 @@ class Shots:
 
     @property
     def beat_coefficients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients of each segment's beat, (3, n) each: carriers [Hz] and chirp rates [Hz/s].
+        """Frequencies [Hz] and chirp rates [Hz/s] of the beats' linear equation, (3, n) each.
 
-        A beat is the carrier times the Doppler ratio minus the chirp rate times 2R/c. Both refer to
-        the shot's start and to a target at constant speed. A record measures the delay at its
-        middle; the curvature of the phase doubles that time.
+        A beat is the frequency times the Doppler ratio, minus the chirp rate times the delay 2R/c.
+        Both refer to the shot's start and to a target at constant speed. A record measures the
+        delay at its middle. The curvature of the phase doubles that time.
         """
         starts, chirp_slopes, carriers, walk_time, chirp_rate = (
             np.array([np.broadcast_to(v, self.size) for v in values])
@@ -747,7 +796,11 @@ class Shots:
         return carriers + chirp_slopes * chirp_rate * delay_times, chirp_slopes * chirp_rate
 
     def split_by_look(self) -> "list[Shots]":
-        """Return the shots as each look sees them; the same shots if lines do not drift."""
+        """Return one set of shots for each look, with the lines where that look observes them.
+
+        A look is one of several records of a segment. If lines do not drift, the shots are
+        unchanged.
+        """
         if not np.any(self.motion.line_drift_per_look):
             return [self] * self.looks.number
         looks_from_middle = np.arange(self.looks.number) - (self.looks.number - 1) / 2
@@ -767,11 +820,11 @@ class Shots:
 
     @property
     def target_moves_between_segments(self) -> bool:
-        """True if the target moves between segments."""
+        """True if the target's motion between segments is simulated."""
         return any(np.any(start) for start in self.motion.segment_starts)
 
     def point_parameter_table(self) -> np.ndarray:
-        """Return the parameters of each point that kernels take.
+        """Return the table of point parameters for the compiled kernels.
 
         Returns
         -------
@@ -815,25 +868,28 @@ class Shots:
 
     @property
     def real_fft_size(self) -> int:
-        """FFT size if noise in bins 0 and N/2 is real, as in a real record; else 0."""
+        """FFT size if noise in bins 0 and N/2 is real-valued, as in a real record; otherwise 0.
+
+        N is the FFT size.
+        """
         is_real = self.detection_settings.noise_bins == "correlated" and not self.complex_record
         return self.fft_size if is_real else 0
 
     @property
     def first_searched_bin(self) -> int:
-        """First bin searched for alarms, counted from DC and from Nyquist."""
+        """Number of the first bin that is searched for false alarms, from DC and from Nyquist."""
         return bin_noise.first_circular_bin(self.window, self.fft_size) if self.real_fft_size else 1
 
     @property
     def noise_bin_correlation(self) -> float:
-        """Correlation of the noise of adjacent bins, 0..1."""
+        """Correlation coefficient of the noise of adjacent bins, 0..1."""
         if self.detection_settings.noise_bins == "independent":
             return 0.0
         return bin_noise.neighbour_noise_correlation(self.window, self.fft_size)
 
     @property
     def detection_rule(self) -> "DetectionRule":
-        """Rule of detection of one record's bins."""
+        """Rule by which the bins of one record detect an echo."""
         from sweep.model.detection.echo_detection import DetectionRule
         from sweep.model.detection.joint_tail import joint_tail_rule
         from sweep.model.detection.pseudo_variance import noise_pseudo_variance_ratio
@@ -871,7 +927,7 @@ class Shots:
 
     @cached_property
     def speckle_table(self) -> "SpeckleTable":
-        """Speckle in the bins of each segment."""
+        """Speckle parameters of the bins of each segment."""
         from sweep.model.detection.echo_detection import SpeckleTable
         from sweep.model.detection.pseudo_variance import signal_pseudo_variance
 
@@ -931,7 +987,7 @@ class Shots:
     def alarm_equivalent_bins(
         self, n_exempt: np.ndarray, point_indices: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Return the number of independent bins that alarm as often as the searched bins.
+        """Return the number of independent bins with the searched bins' false-alarm probability.
 
         Parameters
         ----------
@@ -957,7 +1013,7 @@ class Shots:
 def split_by_category(
     parameters: Parameters, further_paths: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Split points by category.
+    """Split points into categories whose points share strings and sizes.
 
     Parameters
     ----------
@@ -1004,7 +1060,7 @@ def split_by_category(
 
 
 def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.ndarray:
-    """Return values broadcast to a shape as the rows of one array."""
+    """Return values, each broadcast to ``shape``, as the rows of one array."""
     rows = np.empty((len(values), *shape))
     for row, value in zip(rows, values, strict=True):
         row[...] = value
@@ -1012,14 +1068,14 @@ def broadcast_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...])
 
 
 def parameters_as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
-    """Return the parameters as arrays, together with ``record``, the record's length in samples."""
+    """Return the parameters as arrays, with the number of samples of the record as ``record``."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
     arrays["record"] = waveform.record_length(arrays)
     return arrays
 
 
 def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, ground: Ground) -> Shots:
-    """Prepare points of one category with only the echo on the beam's axis and receiver noise.
+    """Return shots of one category with only the axis's echo and the receiver's noise.
 
     Parameters
     ----------
@@ -1064,7 +1120,10 @@ def prepare_axis_line(parameters: Mapping[str, np.ndarray], n_points: int, groun
 
 @lru_cache(maxsize=8)
 def window_energy_from_sample(window: Window) -> np.ndarray:
-    """Return the sum of w^2 from each sample to the last, (L + 1,)."""
+    """Return the sum of the squared window from each sample to the last, (L + 1,).
+
+    L is the number of samples of the window.
+    """
     return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
 
 
@@ -1078,17 +1137,19 @@ _POINT_FIELD_LABELS = {
     "bin_noise_sigma": "noise",
     "threshold": "threshold",
 }
-"""Fields of `Shots`, one value a point, that have to be finite, and their names in messages."""
+"""Fields of `Shots`, with one value per point, that have to be finite, and their names in messages.
+"""
 _BEAMLET_FIELD_LABELS = {
     "footprint.relative_range_offset": "beamlets' ranges",
     "footprint.doppler_ratio_offset": "beamlets' velocities",
     "footprint.relative_amplitude": "beamlets' echoes",
 }
-"""Fields of `Shots`, one value a beamlet, that have to be finite, and their names in messages."""
+"""Fields of `Shots`, with one value per beamlet, that have to be finite, and their names in
+messages."""
 
 
 def require_finite(shots: Shots) -> None:
-    """Raise an error if a number of the shots is not finite, as their spectrum would have no peak.
+    """Raise an error if a number of the shots is not finite, as the spectrum would have no peak.
 
     Raises
     ------

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 
 RECEIVER_PREFIX = "instrument.receiver."
-"""Prefix of the paths of the receiver's parameters."""
+"""Common beginning of the dotted paths of the receiver's parameters."""
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-"""Names of receiver architectures."""
+"""Names of the receiver architectures that can be simulated."""
 
 
 def aperture_area(diameter: np.ndarray) -> np.ndarray:
-    """Return the area [m^2] of a circular aperture from its diameter [m], [T 4.3]."""
+    """Return the area [m^2] of a circular aperture from its ``diameter`` [m], [T 4.3]."""
     return math.pi * (np.asarray(diameter) / 2) ** 2
 
 
@@ -51,33 +51,33 @@ def shot_noise_current_variance(
 
 
 class ReceiverNoise(NamedTuple):
-    """Variances of the receiver's noise at the ADC [V^2]."""
+    """Noise variances at the ADC: by source, per noise current, and per power of light."""
 
     variance_per_square_ampere: np.ndarray
-    """Variance of the voltage over the variance of a noise current in the detector [V^2/A^2]."""
+    """Variance of the voltage at the ADC per variance of a noise current in the detector [V^2/A^2].
+    """
     shot_noise_variance_per_watt: np.ndarray
-    """Variance of the shot noise over the power of the light on the detector [V^2/W]."""
+    """Variance of the shot noise at the ADC per power of light on the detector [V^2/W]."""
     variances: dict[str, np.ndarray]
-    """Variance [V^2] of each noise source of the receiver itself, by name."""
+    """Variance at the ADC [V^2] of each noise source of the receiver itself, by name."""
 
 
 ANTIALIAS_DEFAULTS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
-"""Default values of the anti-alias filter's parameters, by name. A bandwidth of 0 means no
-filter."""
+"""Default bandwidth [Hz] and order of the anti-alias filter, by parameter name. A bandwidth of 0
+means no filter."""
 
 _ALIASES_PER_SIDE = 32
-"""Number of aliases on either side over which the noise behind an anti-alias filter is summed. With
-order 3 and a bandwidth of the full sample rate, further aliases have 1e-8 of the density."""
+"""Number of aliases on each side over which the noise after an anti-alias filter is summed. With
+order 3 and a bandwidth of the full sample rate, further aliases have 1e-8 of the noise density."""
 
 _LOG_ATTENUATION_MAX = 345.0
-"""Natural logarithm of the largest attenuation of power by the filter, so that no power becomes 0.
-"""
+"""Natural logarithm of the filter's largest power attenuation. The limit keeps powers above 0."""
 
 
 def receiver_noise(
     architecture: str, receiver: Mapping[str, np.ndarray], samples_iq: bool = False
 ) -> ReceiverNoise:
-    """Compute the noise of a receiver at the ADC.
+    """Compute the noise variances of a receiver at the ADC.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def receiver_noise(
 def quantisation_variance(
     *, full_scale: ArrayLike, bits: ArrayLike, samples_iq: bool = False
 ) -> np.ndarray:
-    """Return the variance that rounding adds at the ADC.
+    """Return the noise variance [V^2] that rounding to ADC steps adds.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def quantisation_variance(
 
 
 def bin_noise_sigma(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the noise per quadrature of a bin, [T 3.2].
+    """Return the noise standard deviation per quadrature of an FFT bin [V], [T 3.2].
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def receiver_transfer(
 
 
 def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the noise bandwidth B_e [Hz]: the bandwidth of the narrowest stage of the receiver.
+    """Return the noise bandwidth [Hz], the smallest bandwidth of the receiver's stages.
 
     The stages are detector, amplifier and anti-alias filter, if there is one. [T] states one
     bandwidth for detector and amplifier, and uses it as the noise bandwidth.
@@ -258,7 +258,7 @@ def electrical_bandwidth(receiver: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Select the receiver's parameters, and name them without the prefix of their paths."""
+    """Return the receiver's parameters by their names, without the prefix RECEIVER_PREFIX."""
     return {
         path.removeprefix(RECEIVER_PREFIX): value
         for path, value in parameters.items()
@@ -267,7 +267,7 @@ def receiver_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def antialias_filter_parameters(receiver: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Select the anti-alias filter's parameters from the receiver's; none without a filter."""
+    """Return the anti-alias filter's parameters from the receiver's; empty without a filter."""
     filter_parameters = {
         name: np.asarray(receiver.get(name, default))
         for name, default in ANTIALIAS_DEFAULTS.items()
@@ -314,7 +314,7 @@ def antialias_power_transmission(
 def relative_noise_density(
     frequency: np.ndarray, *, sample_rate: np.ndarray, **filters: np.ndarray
 ) -> np.ndarray:
-    """Return the density of the noise in a record relative to white noise of the same sources.
+    """Return the noise density of a record, over that of white noise of the same sources.
 
     Parameters
     ----------
@@ -376,7 +376,7 @@ def relative_noise_density(
 
 
 def _single_pole_alias_sum(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the power transmission of a single-pole low-pass over its aliases.
+    """Return the sum of a single-pole low-pass's power transmission over all aliases.
 
     Parameters
     ----------

@@ -26,26 +26,33 @@ if TYPE_CHECKING:
 
 
 class FootprintLines(NamedTuple):
-    """Lines of the beamlets of a footprint, relative to the line on the beam's axis.
+    """Ranges, Doppler ratios and amplitudes of a footprint's beamlets, relative to the axis.
 
     Points with equal footprints share a row of the arrays (rows, beamlets).
     """
 
     row_of_point: np.ndarray
-    """(n,) int64: row of each point."""
+    """(n,) int64: index of each point's row in the arrays."""
     relative_range_offset: np.ndarray
-    """(rows, beamlets): range of each beamlet relative to the axis's, (R_b - R_0) / R_0."""
+    """(rows, beamlets): range of a beamlet minus that on the beam's axis, over the latter."""
     doppler_ratio_offset: np.ndarray
-    """(rows, beamlets): Doppler ratio minus the axis's, beta_b - beta_0, beta = 2 v_r / c."""
+    """(rows, beamlets): Doppler ratio 2 v_r / c of a beamlet minus that on the beam's axis. v_r is
+    the radial velocity.
+    """
     relative_amplitude: np.ndarray
-    """(rows, beamlets): square root of the relative echo; for direct detection the relative echo.
+    """(rows, beamlets): amplitude of a beamlet's beat for a beat amplitude scale of 1. It is the
+    square root of the relative echo [1/sr]; for direct detection it is the relative echo itself.
     """
     adds_powers: bool = True
-    """True if beamlets add as powers, False if as amplitudes."""
+    """True if the powers of beamlets add, False if their amplitudes do."""
     phase_cycles: np.ndarray = np.empty((3, 0, 0))  # never written to
-    """(3, rows, beamlets): additional phases [cycles] in up, Doppler and down segment; or empty."""
+    """(3, rows, beamlets): random phases of beamlets [cycles] in up, Doppler and down segment; or
+    empty.
+    """
     beamlets_error: np.ndarray | float = math.nan
-    """Error of pd due to the number of beamlets; nan where it was not estimated."""
+    """Error of the detection probability due to the number of beamlets; nan where it is not
+    estimated.
+    """
 
     @property
     def n_beamlets(self) -> int:
@@ -54,35 +61,49 @@ class FootprintLines(NamedTuple):
 
 
 class DetectionSettings(NamedTuple):
-    """Threshold, searched bins, and rules of detection; words are shared by all points."""
+    """Detection threshold, searched bins, and rules of detection.
+
+    Text values are shared by all points.
+    """
 
     tnr: np.ndarray
-    """Threshold-to-noise ratio."""
+    """Threshold-to-noise ratio: threshold over the standard deviation of a noise-only bin's
+    magnitude.
+    """
     echo_bins: str
-    """Bins that detect an echo: ``any_bin`` of the echo, or ``peak_bin``, its largest alone, as in
-    [T]."""
+    """Bins that can detect an echo: ``any_bin`` of the echo, or ``peak_bin``, only its largest, as
+    in [T].
+    """
     shot_rule: str
-    """Segments that must detect a shot: ``both_chirps``, or ``any_two`` of the segments."""
+    """Segments that must detect an echo for the shot to be detected: ``both_chirps``, or
+    ``any_two``.
+    """
     reported_peaks: str
-    """Peaks that a segment reports: ``all`` crossings, or only the ``strongest``."""
+    """Peaks that a segment reports: ``all`` above the threshold, or only the ``strongest``."""
     two_beat_assumption: str
-    """Assumption that resolves two beats of real records: ``far`` or ``fast``."""
+    """Assumption that resolves two beats of unknown sign: ``far``, the range beat exceeds the
+    Doppler shift, or ``fast``, the opposite.
+    """
     noise_bins: str
-    """Noise of adjacent bins: ``correlated``, as the record makes it, or ``independent``, as in
-    [T]."""
+    """Treatment of noise in adjacent bins: ``correlated``, as in a record, or ``independent``, as
+    in [T].
+    """
     bins_counted: str
-    """Bins that count for false alarms: ``half``, those of the spectrum; ``all`` N of the FFT."""
+    """Bins that count for false alarms: ``half``, those of a real spectrum, or ``all`` N bins of
+    the FFT.
+    """
     search_band: np.ndarray | None = None
-    """(3, 2, n) int64: first bin and number of bins of the search band; None if all bins are
-    searched."""
+    """(3, 2, n) int64: first bin and number of bins of the search band, by segment. It is None if
+    all bins are searched.
+    """
     includes_leakage: bool = False
-    """True if bins next to the detection are searched for groups of leaked signal."""
+    """True if the echo's signal far from its lines (leakage) can raise false alarms."""
 
     @classmethod
     def from_parameters(
         cls, parameters: Mapping[str, np.ndarray], tnr: np.ndarray, n_points: int
     ) -> "DetectionSettings":
-        """Return the settings of n points of one category.
+        """Return the settings of n points that share text parameters and array sizes.
 
         Parameters
         ----------
@@ -106,21 +127,25 @@ class DetectionSettings(NamedTuple):
 
 
 class ErrorTolerances(NamedTuple):
-    """Errors that the evaluation of spectra may make."""
+    """Tolerated errors of bin magnitudes and leakage in the evaluation of spectra."""
 
     line_error: np.ndarray
-    """Error of a bin [sigma] due to few lines in place of one for each beamlet."""
+    """Tolerated error of a bin's magnitude, over the noise sigma, if few lines represent all
+    beamlets.
+    """
     leakage_probability: np.ndarray
-    """Probability of leakage, over all bins far from the lines, that may be neglected."""
+    """Probability of false alarms by leaked signal far from the lines that may be neglected."""
     leakage_floor: np.ndarray
-    """Leaked signal [sigma] below which a bin counts as noise alone;
-    :data:`sweep.model.error_budget.AUTOMATIC` if it follows from the probability."""
+    """Leaked signal in a bin, over the noise sigma, below which the bin counts as noise alone. The
+    value :data:`sweep.model.error_budget.AUTOMATIC` means that it follows from
+    ``leakage_probability``.
+    """
 
     @classmethod
     def from_parameters(
         cls, parameters: Mapping[str, np.ndarray], looks: "Looks"
     ) -> "ErrorTolerances":
-        """Return the tolerances for parameters by dotted path and the number of looks."""
+        """Return the tolerances for parameters by dotted path, and for the looks of a shot."""
         budget = ErrorBudget.from_parameters(parameters)
         return cls(
             line_error=budget.allowed_line_error / math.sqrt(looks.n_power_averaged),
@@ -130,13 +155,14 @@ class ErrorTolerances(NamedTuple):
 
 
 class PhaseError(NamedTuple):
-    """Deterministic phase error over the record, common to the lines of a footprint."""
+    """Deterministic phase error over the record, common to all lines of a footprint."""
 
     phase: Callable[..., np.ndarray]
-    """Function of positions x (m,) in the record, ``sign`` and `arguments`; returns the phase
-    [cycles], (n, m)."""
+    """Function that returns the phase error [cycles], (n, m). It takes positions x (m,) in the
+    record, -1 .. 1, ``sign`` and `arguments`.
+    """
     arguments: dict[str, Any]
-    """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
+    """Arguments of ``phase`` by name, (n,) or scalars; a tuple has one element for each segment."""
 
     def select_arguments(self, segment: int, point_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of selected points in one segment, (points,) each.
@@ -160,31 +186,33 @@ class PhaseError(NamedTuple):
 
 
 class EchoRecord(NamedTuple):
-    """Samples of a segment's record before the echo, and phase errors of the echo."""
+    """Number of samples before the echo arrives, and phase errors of the echo over the record."""
 
     n_samples_before: np.ndarray | None = None
-    """(3, n) int64: samples of the record before the echo arrives, up to all; None where echoes
-    fill records."""
+    """(3, n) int64: number of the record's samples before the echo arrives, at most all. It is None
+    if echoes fill their records.
+    """
     phase_errors: tuple[PhaseError, ...] = ()
-    """Deterministic phase errors, which add."""
+    """Deterministic phase errors of the echo; their phases are summed."""
     shares_phase_errors: bool = False
-    """True if many shots have equal phase errors, as on a grid; False for those of a flight."""
+    """True if many shots have the same phase errors, as on a grid; False for shots of a flight."""
 
 
 class LineImages(NamedTuple):
-    """Images of lines at their negative frequencies."""
+    """Images of lines at their negative frequencies, and their amplitudes."""
 
     are_summed: bool = False
-    """True if a real record's images are summed with its lines."""
+    """True if the images in a real record's spectrum are summed with its lines."""
     iq_gain: np.ndarray | float = 0.0
-    """(n,): amplitude, 0..1, of the image of a line in a complex record, due to imbalance of I and
-    Q."""
+    """(n,): amplitude of a line's image over that of the line, 0..1, in a complex record. It is due
+    to imbalance of I and Q.
+    """
 
 
 class PermanentLine(NamedTuple):
-    """Beat of light that is in every record (:mod:`sweep.model.spectrum.permanent_line`).
+    """Beat of light other than the echo that is present in every record.
 
-    Arrays are (n,) or scalars.
+    Its spectrum is that of :mod:`sweep.model.spectrum.permanent_line`. Arrays are (n,) or scalars.
     """
 
     amplitude: np.ndarray
@@ -194,15 +222,17 @@ class PermanentLine(NamedTuple):
 
 
 class EchoSpeckle(NamedTuple):
-    """Developed speckle of an echo, in which it fades; none by default."""
+    """Developed speckle of an echo that fades; by default there is none."""
 
     segment_correlations: "SegmentCorrelations | None" = None
-    """Correlations between segments of echoes in developed speckle; None without speckle."""
+    """Correlations of the speckle between the segments of a shot; None without speckle."""
     line_deviation_bins: np.ndarray | float = 0.0
-    """(3, n): standard deviation of the lines of an echo [bins of fs/N]."""
+    """(3, n): standard deviation of the frequencies of an echo's lines [bins of fs/N]."""
     line_gradients: "LineGradients | None" = None
-    """Gradients across the footprint of the lines of an echo, for draws of speckle."""
+    """Changes of an echo's lines across the footprint, for random draws of speckle."""
     look_speckle: "LookSpeckle | None" = None
-    """Speckle of looks that share it partly; None if looks have equal or independent speckle."""
+    """Speckle of looks that share it in part; None if looks have equal or independent speckle. A
+    look is one of several records of a segment.
+    """
     phase_cycles_per_look: np.ndarray | None = None
-    """(3, n): phase [cycles] by which a line turns from one look to the next."""
+    """(3, n): phase [cycles] by which a line advances from one look to the next."""

@@ -50,10 +50,10 @@ PROCESSING_PREFIX = "instrument.processing."
         "design_pfa_shot",
     )
 )
-"""Paths of the parameters that set the threshold; exactly one of them is given."""
+"""Parameter paths of five ways to set the detection threshold; exactly one of them is given."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
-"""Mean of |X| in a noise-only bin, in units of sigma (per quadrature)."""
+"""Mean magnitude of a bin with noise alone, over the noise standard deviation per quadrature."""
 
 
 def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
@@ -116,15 +116,15 @@ def tnr_from_parameters(parameters: Mapping[str, Any]) -> np.ndarray:
 
 
 class NoiseBins(NamedTuple):
-    """Bins of a segment in which noise may raise alarms."""
+    """Number of a segment's bins in which noise may raise false alarms, and their correlation."""
 
     n_bins: float | np.ndarray
-    """Number of bins; (n,) if a search band is set, else one number for all points."""
+    """Number of bins. It is (n,) if a search band is set, otherwise one number for all points."""
     neighbour_correlation: float
-    """Correlation of the noise of neighbouring bins; 0 if bins count as independent."""
+    """Correlation coefficient of the noise of adjacent bins; 0 if bins count as independent."""
 
     def alarm_equivalent_bins(self, threshold_ratio: np.ndarray, looks: Looks) -> np.ndarray:
-        """Return the number of independent bins that raise an alarm as often as these bins."""
+        """Return the number of independent bins with these bins' false-alarm probability."""
         return bin_noise.alarm_equivalent_bins(
             self.n_bins,
             threshold_ratio=threshold_ratio,
@@ -137,16 +137,20 @@ class NoiseBins(NamedTuple):
 def _common_threshold_ratio(
     log_pfa: float, looks: Looks, noise_bins: tuple[NoiseBins, ...]
 ) -> np.ndarray:
-    """Return the threshold over sigma for a log false-alarm probability of segments (cached)."""
+    """Return the threshold over the noise sigma for a given probability of false alarm (cached).
+
+    ``log_pfa`` is the natural logarithm of the probability that noise raises an alarm in any
+    segment.
+    """
     return solve_threshold_ratio(np.asarray(log_pfa), _log_pfa_law(looks, noise_bins))
 
 
 def _log_pfa_law(
     looks: Looks, noise_bins: Sequence[NoiseBins]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from b to the log probability that noise raises an alarm in any segment.
+    """Return a function that gives the log probability of a false alarm in any segment.
 
-    ``noise_bins`` are the bins of the segments.
+    Its argument is the threshold over the noise sigma. ``noise_bins`` are the bins of the segments.
     """
     from sweep.model.detection.marcum import log_at_least_one_probability, log_either_probability
 
@@ -165,7 +169,7 @@ def _log_pfa_law(
 def segment_alarm_bins(
     parameters: Mapping[str, Any], threshold_ratio: np.ndarray, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent bins that raise an alarm as often as a segment of noise.
+    """Return the number of independent bins with the false-alarm probability of a segment.
 
     Parameters
     ----------
@@ -186,7 +190,7 @@ def segment_alarm_bins(
 
 
 def _noise_bins(parameters: Mapping[str, Any], segment: str) -> NoiseBins:
-    """Return the bins of a segment in which noise may raise alarms."""
+    """Return the number and noise correlation of a segment's bins that may raise false alarms."""
     fft_size = int(np.max(parameters[PROCESSING_PREFIX + "fft_size"]))
     is_complex_record = str(parameters.get("instrument.receiver.record", "real")) == "complex"
     counts_all_bins = is_complex_record or (

@@ -30,7 +30,7 @@ def time_domain_spectrum(
     with_acceleration: bool = False,
     laser_phase: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Compute the magnitudes |X[k]| of the noiseless spectrum of one segment of one point.
+    """Compute the magnitudes of the noiseless spectrum of one segment of one point.
 
     Parameters
     ----------
@@ -241,8 +241,9 @@ def _start_phase(
 ) -> float:
     """Compute the phase of a beamlet's beat at the segment's start [cycles], in exact fractions.
 
-    It is -f tau_0 + s S tau_0^2 / 2, with the delay tau_0 = 2 (R + dR - decrease) / c, the carrier
-    f, the ratio s of the chirp rate to that of the up-chirp, and the rate S of the up-chirp.
+    It is -f tau + s S tau^2 / 2, with the delay tau = 2 (R + dR - decrease) / c. f is ``carrier``,
+    s ``chirp_slope``, S ``chirp_rate`` of the up-chirp, R ``axis_range``, dR ``range_offset`` and
+    decrease ``range_decrease``.
     """
     delay = Fraction(axis_range) + Fraction(range_offset) - Fraction(range_decrease)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
@@ -251,6 +252,6 @@ def _start_phase(
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return a point's value of an array (n,), or of one number that all points share."""
+    """Return a point's value from an array (n,), or the one number that all points share."""
     column = np.asarray(column)
     return column[point] if column.ndim else column

@@ -17,4 +17,4 @@ class UnsupportedShotError(ValueError):
     def __init__(self, message: str, point_index: int | None = None) -> None:
         super().__init__(message)
         self.point_index = point_index
-        """Index of the shot among those computed together; None if it is unknown."""
+        """Index of the shot in the batch that was computed together; None if it is unknown."""

@@ -32,36 +32,37 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 
 SEGMENT_NAMES = ("up", "doppler", "down")
-"""Names of the segments, in the order of rows of arrays by segment."""
+"""Names of the segments, in the order of the rows of arrays by segment."""
 SEGMENT_ORDER_PATH = "instrument.chirp.segments"
-"""Path of the segments of a shot, one of `SEGMENT_ORDERS`."""
+"""Parameter path of the names and order of a shot's segments, one of `SEGMENT_ORDERS`."""
 SEGMENT_GAP_PATH = "instrument.chirp.gap"
-"""Path of the time between two segments [s]."""
+"""Parameter path of the time between the end of a segment and the start of the next one [s]."""
 SEGMENT_ORDERS = (
     "up doppler down", "up down", "down up", "down doppler up", "doppler up down",
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
 """Possible sets of segments of a shot, each in the order of time."""
 DOPPLER_SLOPE_PATH = "instrument.chirp.doppler_slope"
-"""Path of the chirp rate of the Doppler segment over that of the up-chirp."""
+"""Parameter path of the chirp rate of the Doppler segment, over that of the up-chirp."""
 DOWN_SLOPE_PATH = "instrument.chirp.down_slope"
-"""Path of the chirp rate of the down segment over that of the up-chirp."""
+"""Parameter path of the chirp rate of the down segment, over that of the up-chirp."""
 SHOT_DETECTION_PATH = "instrument.processing.shot_detection"
-"""Path of the rule by which a shot is detected, one of `SHOT_DETECTION_RULES`."""
+"""Parameter path of the rule by which a shot is detected, one of `SHOT_DETECTION_RULES`."""
 BOTH_CHIRPS, ANY_TWO = SHOT_DETECTION_RULES = ("both_chirps", "any_two")
-"""Names of the segments that must be detected for the detection of a shot."""
-TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
-"""Path of the assumption by which two beats without signs are read, one of `TWO_BEAT_ASSUMPTIONS`.
+"""Names of detection rules: a shot is detected if both chirps detect the echo, or any two segments.
 """
+TWO_BEAT_ASSUMPTION_PATH = "instrument.processing.two_beats"
+"""Parameter path of the assumption that gives range and velocity from two beats of unknown sign. It
+is one of `TWO_BEAT_ASSUMPTIONS`."""
 PEAKS_PATH = "instrument.processing.peaks"
-"""Path of the selection of peaks that are reported, one of `REPORTED_PEAKS`."""
+"""Parameter path of which peaks a segment reports, one of `REPORTED_PEAKS`."""
 ALL_PEAKS, STRONGEST_PEAK = REPORTED_PEAKS = ("all", "strongest")
-"""Names of the selections of peaks that are reported of each segment."""
+"""Names of the peaks that a segment reports: all above the threshold, or the strongest alone."""
 FAR_TARGET, FAST_TARGET = TWO_BEAT_ASSUMPTIONS = ("far", "fast")
-"""Names of assumptions: the range beat exceeds the Doppler shift, or the Doppler shift exceeds
-it."""
+"""Names of assumptions on two beats of unknown sign. Either the range beat exceeds the Doppler
+shift (``far``), or the Doppler shift exceeds the range beat (``fast``)."""
 DEFAULT_CHIRP_SLOPES = (1, 0, -1)
-"""Default ratios of the chirp rates of up, Doppler and down segment to that of the up-chirp."""
+"""Default chirp rates of up, Doppler and down segment, each over that of the up-chirp."""
 WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SEGMENT_ORDER_PATH: SEGMENT_ORDERS[0],
     SEGMENT_GAP_PATH: 0.0,
@@ -74,13 +75,14 @@ WAVEFORM_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
 """Default values of the waveform's parameters, by dotted path."""
 
 SEARCH_PREFIX = "instrument.processing.search."
-"""Prefix of the paths of the search band's parameters."""
+"""Common beginning of the dotted paths of the search band's parameters."""
 SEARCH_RANGE_PATHS = SEARCH_PREFIX + "min_range", SEARCH_PREFIX + "max_range"
-"""Paths of the smallest and the largest range in which echoes are searched [m]."""
+"""Parameter paths of the smallest and the largest range at which echoes are searched [m]."""
 SEARCH_VELOCITY_PATHS = SEARCH_PREFIX + "min_radial_velocity", SEARCH_PREFIX + "max_radial_velocity"
-"""Paths of the smallest and the largest radial velocity in which echoes are searched [m/s]."""
+"""Parameter paths of the smallest and the largest radial velocity of searched echoes [m/s]."""
 SEARCH_BAND_PATHS = SEARCH_RANGE_PATHS + SEARCH_VELOCITY_PATHS
-"""Paths of all parameters of the search band. Either all four are given or none."""
+"""Parameter paths of the search band's four limits in range and velocity. Either all four are given
+or none."""
 
 
 class WaveformSegment(NamedTuple):
@@ -90,22 +92,25 @@ class WaveformSegment(NamedTuple):
     """
 
     name: str
-    """Name, one of :data:`SEGMENT_NAMES`."""
+    """Name of the segment, one of :data:`SEGMENT_NAMES`."""
     chirp_slope: float
-    """Ratio of the segment's chirp rate to that of the up-chirp: 1, 0 and -1 by default."""
+    """Chirp rate of the segment over that of the up-chirp; up, Doppler, down are 1, 0, -1 by
+    default.
+    """
     chirp_rate: np.ndarray
-    """Signed chirp rate [Hz/s]."""
+    """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Frequency f_seg at the segment's start, by which a delay makes a phase [Hz]."""
+    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
     includes_leakage: bool
-    """True if leakage in the segment is evaluated."""
+    """True if leakage, false alarms by the echo's signal far from its line, is evaluated here."""
     range_decrease: np.ndarray | float
-    """Decrease of the target's range from the shot's start to the segment's [m]."""
+    """Decrease of the target's range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray | float
-    """Doppler ratio 2 v_r / c of the line on the beam's axis, at the segment's start."""
+    """Doppler ratio 2 v_r / c of the line on the beam's axis at the start of the segment."""
     start_time: np.ndarray | float
-    """Time from the shot's start to the segment's [s]; 0 if the target's motion between segments is
-    neglected."""
+    """Time from the start of the shot to that of the segment [s]. It is 0 if the target's motion
+    between segments is neglected.
+    """
 
     def delay(self, range: np.ndarray | float) -> np.ndarray:
         """Return the delay of the echo at the segment's start [s].
@@ -130,19 +135,19 @@ class WaveformSegment(NamedTuple):
 
 
 class RangeVelocity(NamedTuple):
-    """Range and radial velocity that follow from the peaks of n shots, (n,) each."""
+    """Range and radial velocity of n shots, (n,) each, as computed from peaks of their spectra."""
 
     range: np.ndarray
-    """Range [m]."""
+    """Range of the target [m]."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s], positive when closing."""
+    """Radial velocity of the target [m/s], positive when closing."""
 
 
 def carrier_frequencies(
     architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
     bandwidth: np.ndarray, chirp_slopes: Sequence[ArrayLike] = DEFAULT_CHIRP_SLOPES,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the frequencies f_seg by which a delay makes a phase, for all three segments.
+    """Return the frequency at the start of each segment, by which a delay makes a phase [Hz].
 
     Parameters
     ----------
@@ -181,9 +186,9 @@ def carrier_frequencies(
 
 
 def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the ratios of up, Doppler and down segment's chirp rates to that of the up-chirp.
+    """Return the chirp rates of up, Doppler and down segment, over that of the up-chirp.
 
-    The points share them.
+    All points share them.
     """
     doppler, down = (
         float(np.ravel(parameters.get(path, WAVEFORM_DEFAULTS[path]))[0])
@@ -193,7 +198,7 @@ def chirp_slopes(parameters: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def segment_carriers(parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the frequencies f_seg [Hz] of :func:`carrier_frequencies`, by dotted path."""
+    """Return the frequencies [Hz] of :func:`carrier_frequencies` for parameters by dotted path."""
     return carrier_frequencies(
         str(parameters["instrument.receiver.architecture"]),
         wavelength=parameters["instrument.laser.wavelength"],
@@ -220,7 +225,7 @@ def existing_segments(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     segment_order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return the times at which up, Doppler and down segment start, from the shot's start on [s].
+    """Return the times [s] from the shot's start to the start of up, Doppler and down segment.
 
     Parameters
     ----------
@@ -275,11 +280,12 @@ def beat_frequency(
 
 
 SAMPLE_TIME_TOLERANCE = 1e-6
-"""Fraction of a sample by which a sample may lie outside a time limit and still count as within."""
+"""Tolerance for time limits of samples [sample intervals]. A sample outside a limit by less than
+this counts as inside."""
 
 
 def record_length(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the length of the record in samples, (n,) int64, for parameters by dotted path.
+    """Return the number of samples in the record, (n,) int64, for parameters by dotted path.
 
     It is the FFT size, or the number of samples between the acquisition delay and the chirp's end,
     if that is smaller.
@@ -325,7 +331,7 @@ def count_samples_before_echo(
 
 
 def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
-    """Return the frequency, 0 to half the sample rate, at which a real record shows a frequency.
+    """Return the frequency at which a real record shows a signal, 0 to half the sample rate.
 
     `frequency`, of either sign, and `sample_rate` are in the same unit.
     """
@@ -333,39 +339,40 @@ def fold_frequency(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray
 
 
 FOLD_PENALTY_BINS = 4.0
-"""Mismatch [bins] by which a reading without folds may exceed one with a fold and still be
-chosen."""
+"""Advantage [bins] of interpretations of the peaks in which no peak is folded at Nyquist. One with
+a fold is chosen only if its mismatch of the third peak is smaller by more than this."""
 
 N_READINGS = 16
-"""Number of readings of unsigned peaks: choices of folded peaks, and of half sum or difference.
-
-:func:`beats_of_reading` defines their numbers.
-"""
+"""Number of interpretations (readings) of peaks of unknown sign. They differ in which peaks are
+folded at Nyquist, and in whether half the sum or half the difference is the Doppler frequency.
+:func:`beats_of_reading` defines their numbers."""
 
 FAR_READING = 1
-"""Number, for :func:`beats_of_reading`, of the reading with |f_d| < f_r, the range beat.
-
-No peak is folded, and half the difference of the up and down peak is the Doppler frequency f_d."""
+"""Number, for :func:`beats_of_reading`, of the interpretation for far targets. The range beat
+exceeds the Doppler frequency, and no peak is folded at Nyquist. Half the difference of the up and
+down peak is the Doppler frequency."""
 
 FAST_READING = 0
-"""Number, for :func:`beats_of_reading`, of the reading with |f_d| > f_r, the range beat.
-
-No peak is folded, and half the sum of the up and down peak is the Doppler frequency f_d."""
+"""Number, for :func:`beats_of_reading`, of the interpretation for fast targets. The Doppler
+frequency exceeds the range beat, and no peak is folded at Nyquist. Half the sum of the up and down
+peak is the Doppler frequency."""
 
 
 SIGNED_READING = 16
-"""Number of the reading of the signed peaks u and d of a complex record: 2 f_r = d - u and f_d = u
-+ f_r, each modulo the sample rate. Range beats f_r are positive, up to half the sample rate.
-Doppler shifts f_d have either sign, up to half of it."""
+"""Number, for :func:`beats_of_reading`, of the interpretation of a complex record's signed peaks.
+With the up peak u and the down peak d, the range beat is (d - u) / 2. The Doppler frequency is u
+plus the range beat. Twice the range beat, and the Doppler frequency, are modulo the sample rate.
+Range beats are positive, up to half the sample rate; Doppler shifts have either sign, up to half of
+it."""
 
 NEGATIVE_BEAT_FRACTION_MAX = 1 / 64
-"""Largest magnitude of a negative difference of down and up peak, over the sample rate, that is
-read as negative. Rounding of peaks to bins may make the difference, 2 f_r, negative. Differences
-below this are read modulo the sample rate."""
+"""Largest magnitude of a negative difference of down and up peak, over the sample rate, that counts
+as negative. Rounding of peaks to bins may make this difference, twice the range beat, slightly
+negative. Larger negative differences are taken modulo the sample rate."""
 
 
 def beats_of_reading(reading, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of arrays, or compiled
-    """Convert the peaks of up- and down-chirp to Doppler frequency and range beat, by one reading.
+    """Convert the peaks of both chirps to Doppler frequency and range beat, by one interpretation.
 
     Parameters
     ----------
@@ -585,7 +592,7 @@ def fit_range_velocity(
 def _solve_beats(
     beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the Doppler ratio beta and x = tau (1 + beta) to signed beats by weighted least squares.
+    """Fit the Doppler ratio and the delay to signed beats by weighted least squares.
 
     Parameters
     ----------
@@ -620,7 +627,7 @@ def _solve_beats(
 def range_velocity_response(
     beats: np.ndarray, *, weights: np.ndarray, carriers: np.ndarray, chirp_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much the fitted range and radial velocity change with the beats.
+    """Return the changes of the fitted range and radial velocity for given changes of the beats.
 
     Parameters
     ----------
@@ -645,9 +652,11 @@ def range_velocity_response(
 def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Fit (beta, x) to unsigned peaks, with the signs and folds that fit best, (2, n).
+    """Fit Doppler ratio and delay to peaks of unknown sign, (2, n).
 
-    The parameters are those of :func:`fit_range_velocity` for segments that are all detected.
+    Signs and folds at Nyquist are those that fit best. The second row is tau (1 + beta), with the
+    delay tau and the Doppler ratio beta. The parameters are those of :func:`fit_range_velocity` for
+    segments that are all detected.
     """
     n_peaks = len(peaks)
     least_cost, solutions = np.full(peaks.shape[1:], np.inf), np.full((2, *peaks.shape[1:]), np.nan)
@@ -681,9 +690,10 @@ def _solve_unsigned_beats(  # type: ignore[no-untyped-def]  # seven arrays and a
 def _solve_signed_beats(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, chirp_rates, sample_rate, bin_width, two_beat_assumption
 ):
-    """Fit (beta, x) to signed peaks, which are known modulo the sample rate.
+    """Fit Doppler ratio and delay to signed peaks, which are known modulo the sample rate.
 
-    The parameters are those of :func:`fit_range_velocity` for segments that are all detected.
+    The second result is tau (1 + beta), with the delay tau and the Doppler ratio beta. The
+    parameters are those of :func:`fit_range_velocity` for segments that are all detected.
     """
     point_index = np.arange(peaks.shape[1])
     lowest_segment, highest_segment = chirp_rates.argmin(axis=0), chirp_rates.argmax(axis=0)

@@ -22,16 +22,17 @@ The window is the sum over m of (-1)^m c_m cos(2 pi m n / L).
 """
 
 WINDOW_NAME_ALIASES = {"boxcar": "rectangular", "rect": "rectangular", "hanning": "hann"}
-"""Canonical names of windows by their other names."""
+"""Canonical window names by alternative name."""
 
 ENVELOPE_SAMPLES_PER_BIN = 16
-"""Number of samples per bin of fs/L in the FFT from which the envelope of a window without a closed
-form follows."""
+"""Number of samples per bin of fs/L in the FFT for the envelope of a window's transform. It is used
+for windows without a closed form."""
 
 _CLOSED_FORM_LENGTH_MIN = 64
-"""Smallest length [samples] for which the closed form of a cosine sum's transform is used."""
+"""Smallest number of samples for which the closed form of a cosine sum's transform is used."""
 _WEIGHT_SAMPLES_MAX = 256
-"""Largest number of samples from which :meth:`Window.weights_by_record_position` is computed."""
+"""Largest number of window samples from which :meth:`Window.weights_by_record_position` is
+computed. Longer windows are sampled more coarsely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +40,25 @@ class Window:
     """Window of a given name and length, with its sums and the envelope of its transform."""
 
     name: str
-    """Canonical name, as of :func:`canonical_window_name`."""
+    """Name of the window in the spelling of :func:`canonical_window_name`."""
     length: int
-    """Number of samples L."""
+    """Number of samples of the window."""
     first_value: float
-    """First sample w[0]."""
+    """Value of the window's first sample."""
     sum: float
-    """Sum of w, the peak of its transform W."""
+    """Sum of the window's samples, which is the peak of its transform."""
     energy: float
-    """Energy E_w = sum w^2."""
+    """Sum of the squares of the window's samples."""
     envelope_distances: np.ndarray
-    """(m,): distances y from a line at which the envelope is tabulated [bins of fs/L]."""
+    """(m,): distance from a line at which the envelope is tabulated [bins of fs/L]."""
     sidelobe_envelope: np.ndarray
-    """(m,): largest |W| / `sum` at and beyond each of `envelope_distances`."""
+    """(m,): largest magnitude of the window's transform at or beyond each distance, over its peak.
+    """
     n_missing: int = 0
-    """Number of first samples that :func:`zero_first_samples` has set to 0."""
+    """Number of samples at the start that :func:`zero_first_samples` has set to 0."""
 
     def samples(self) -> np.ndarray:
-        """Return the samples w (L,), of which `n_missing` first ones may be 0."""
+        """Return the samples of the window (L,), of which the first `n_missing` may be 0."""
         w = window_samples(self.name, self.length)
         if self.n_missing:
             w = w.copy()
@@ -64,7 +66,7 @@ class Window:
         return w
 
     def weights_by_record_position(self, adds_powers: bool) -> tuple[float, ...]:
-        """Return how |w|, or its autocorrelation, is distributed over the record.
+        """Return the distribution of the window's magnitude or autocorrelation over the record.
 
         Parameters
         ----------
@@ -91,10 +93,11 @@ class Window:
         return tuple(map(float, weights / weights.sum()))
 
     def node_phase_limits(self, adds_powers: bool) -> np.ndarray:
-        """Return the largest half-widths pi h of a group of lines that J nodes represent.
+        """Return how wide a group of lines may be for J equivalent lines to represent it.
 
-        The result is that of :func:`sweep.model.spectrum.lines.node_phase_limits`, for the
-        tolerances of sums of amplitudes, or of powers with `adds_powers`.
+        The widths are half-widths times pi [rad]. The result is that of
+        :func:`sweep.model.spectrum.lines.node_phase_limits`, for the tolerances of sums of
+        amplitudes, or of powers with `adds_powers`.
         """
         from sweep.model.spectrum.lines import (
             AMPLITUDE_TOLERANCES,
@@ -107,7 +110,10 @@ class Window:
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
-        """Equivalent noise bandwidth L E_w / sum^2 [bins of fs/L]."""
+        """Equivalent noise bandwidth [bins of fs/L].
+
+        It is L times the sum of squared samples, over the squared sum of samples.
+        """
         return self.length * self.energy / self.sum**2
 
 
@@ -152,7 +158,7 @@ def window_samples(name: str, length: int) -> np.ndarray:
 
 
 def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
-    """Compute the samples (length,) of a cosine-sum window, bit for bit as scipy.signal does."""
+    """Return the samples (length,) of a cosine-sum window, identical to those of scipy.signal."""
     c = [float(t) for t in COSINE_SUM_COEFFICIENTS[name]]
     if len(c) == 2:
         constant_term, _ = c
@@ -168,7 +174,7 @@ def _cosine_sum_samples(name: str, length: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def get_window(name: str, length: int) -> Window:
-    """Return the window of a name and a length [samples]; it is computed once and cached."""
+    """Return the :class:`Window` of a name and a number of samples; it is cached."""
     name = canonical_window_name(name)
     if name in COSINE_SUM_COEFFICIENTS and length >= _CLOSED_FORM_LENGTH_MIN:
         return _cosine_sum_window(name, length)
@@ -176,7 +182,8 @@ def get_window(name: str, length: int) -> Window:
 
 
 ZEROED_STEPS_PER_RECORD = 32
-"""Number of equal parts of a record, to multiples of which :func:`zero_first_samples` rounds."""
+"""Number of equal steps of a record, to which :func:`zero_first_samples` rounds the missing
+samples."""
 
 
 def zero_first_samples(window: Window, n_missing: int) -> Window:
@@ -203,14 +210,17 @@ def zero_first_samples(window: Window, n_missing: int) -> Window:
 
 @lru_cache(maxsize=2 * ZEROED_STEPS_PER_RECORD)
 def _zero_first_steps(window: Window, step: int) -> Window:
-    """Return a window whose first `step` parts, of :data:`ZEROED_STEPS_PER_RECORD`, are 0."""
+    """Return a window whose first steps are 0; a record has :data:`ZEROED_STEPS_PER_RECORD`.
+
+    ``step`` is the number of zeroed steps.
+    """
     shortened = replace(window, n_missing=step * window.length // ZEROED_STEPS_PER_RECORD)
     w = shortened.samples()
     return replace(shortened, sum=float(w.sum()), energy=float((w**2).sum()))
 
 
 def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
-    """Compute the transform W(y) by a direct sum over the samples; slow, for tests.
+    """Compute the window's Fourier transform by a direct sum over samples; slow, for tests.
 
     Parameters
     ----------
@@ -231,7 +241,7 @@ def direct_transform(window: Window, y: np.ndarray) -> np.ndarray:
 
 
 def _cosine_sum_window(name: str, length: int) -> Window:
-    """Compute the fields of a cosine-sum window from closed forms."""
+    """Return a cosine-sum :class:`Window`, computed from closed forms."""
     coefficients = tuple(float(t) for t in COSINE_SUM_COEFFICIENTS[name])
     envelope_distances, sidelobe_envelope = _cosine_sum_envelope(coefficients, length)
     first_value = math.fsum((-1) ** m * coefficient for m, coefficient in enumerate(coefficients))
@@ -253,7 +263,7 @@ def _cosine_sum_window(name: str, length: int) -> Window:
 def _cosine_sum_envelope(
     coefficients: tuple[float, ...], length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the envelope of a cosine-sum window's transform from its closed form.
+    """Return the envelope of a cosine-sum window's transform, computed from its closed form.
 
     Parameters
     ----------
@@ -291,10 +301,11 @@ def _cosine_sum_envelope(
 def _decimate_envelope(
     distances: np.ndarray, envelope: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep values of an envelope at distances some 2 % apart.
+    """Return an envelope reduced to distances that differ by some 2 %.
 
-    `envelope` (m,) is the largest |W| / sum at and beyond each of `distances` (m,). The factor 1.03
-    covers sidelobes whose peaks lie between samples.
+    `envelope` (m,) is the largest magnitude of a window's transform at and beyond each of
+    `distances` (m,), over its peak. The factor 1.03 covers sidelobes whose peaks lie between
+    samples.
     """
     kept_indices = np.unique(
         np.searchsorted(distances, np.geomspace(distances[0], distances[-1], 512)).clip(
@@ -305,7 +316,7 @@ def _decimate_envelope(
 
 
 def _window_from_samples(name: str, length: int) -> Window:
-    """Compute the fields of any window from its samples and their FFT."""
+    """Return the :class:`Window` of any name, computed from its samples and their FFT."""
     w = window_samples(name, length)
     fft_size = ENVELOPE_SAMPLES_PER_BIN * length
     distances = np.arange(fft_size // 2 + 1) / ENVELOPE_SAMPLES_PER_BIN

@@ -23,63 +23,74 @@ import numpy as np
 from sweep.model.window import Window, get_window, window_samples
 
 _ROUNDING_ERROR = 1e-6
-"""Relative margin for rounding of the smallest scalloping gain."""
+"""Relative margin for rounding errors of the smallest main-lobe magnitude within half a bin."""
 _SERIES_TERMS = 28
-"""Number of terms of the main lobe's series."""
+"""Number of terms of the power series of a window's main lobe."""
 _MAIN_LOBE_STEPS = 1024
-"""Number of steps of the main lobe's table over half a bin."""
+"""Number of steps of the main-lobe table, from 0 to half an FFT bin."""
 _ENVELOPE_CELLS, _ENVELOPE_KNEE_WINDOW_BINS = 8192, 16.0
-"""Number of cells of the table of sidelobes, even in d / (d + knee), and its knee [bins of fs/L].
-"""
+"""Number of cells of the sidelobe table, and the distance at its middle [bins of fs/L]. Cells are
+equally spaced in d / (d + middle distance) of the distance d."""
 _CELLS_PER_OCTAVE = 64
-"""Number of cells per octave of magnitude in the table of distances."""
+"""Number of cells per factor of 2 in magnitude, in the table of distances by magnitude."""
 _OCTAVE_MIN = -80
-"""Last octave of the table of distances, relative to the peak."""
+"""Smallest magnitude in the table of distances by magnitude [octaves relative to the peak]."""
 
 
 class WindowResponse(NamedTuple):
-    """Response of a window over an FFT's bins; powers and magnitudes are relative to the peak."""
+    """Magnitude of a window's transform at the FFT bins around a line, over its peak."""
 
     main_lobe: np.ndarray
-    """(m,): magnitude at distances of 0..1/2 bin in equal steps."""
+    """(m,): magnitude at distances from a line of 0..1/2 FFT bin, in equal steps."""
     slope_max: float
-    """Bound on |F'| [1/bin]."""
+    """Upper bound on the slope of the relative power over distance, as a magnitude [1/bin]."""
     curvature_max: float
-    """Bound on |F''| [1/bin^2]."""
+    """Upper bound on the second derivative of the relative power over distance [1/bin^2]."""
     padding_factor: float
-    """Bins of the FFT per bin of fs/L, 1/r; ``central_energy_min`` counts as many bins to either
-    side."""
+    """FFT size over number of samples, the number of FFT bins per bin of fs/L.
+    ``central_energy_min`` includes as many FFT bins on each side.
+    """
     central_energy_min: float
-    """Smallest sum of the powers F of the bins within ``padding_factor`` bins of a line, for any
-    position of the line between bins."""
+    """Smallest sum of relative powers of the FFT bins within ``padding_factor`` bins of a line. It
+    is the minimum over positions of the line between bins.
+    """
     sidelobe_envelope: np.ndarray
-    """(cells + 1,): largest magnitude at or beyond distances even in d / (d + knee)."""
+    """(cells + 1,): largest magnitude at or beyond tabulated distances d. They are equally spaced
+    in d / (d + knee), with a fixed distance, the knee.
+    """
     distance_by_octave: np.ndarray
-    """(cells,): distance [bins] beyond which all magnitudes are smaller, by octaves of magnitude.
+    """(cells,): distance [bins] beyond which all magnitudes are smaller than a tabulated one.
+    Tabulated magnitudes are equally spaced in octaves.
     """
     scalloping_gain_min: float
-    """Smallest magnitude of the bin nearest to a line."""
+    """Smallest magnitude of the FFT bin nearest to a line, which is up to half a bin away."""
 
     def scalloping_gain(self, distance: np.ndarray) -> np.ndarray:
-        """Return the magnitude of a bin at a distance from a line, 0..1/2 bin."""
+        """Return a bin's magnitude, over the peak, at ``distance`` [bins] from a line, 0..1/2."""
         clipped_distance = np.fmin(distance, 0.5)
         return self.main_lobe[(clipped_distance * (2 * _MAIN_LOBE_STEPS) + 0.5).astype(np.int64)]
 
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
-        """Return the largest magnitude of a bin at least ``distance`` [bins] from a line."""
+        """Return the largest magnitude, over the peak, at ``distance`` [bins] or farther.
+
+        ``distance`` is from a line.
+        """
         knee = _ENVELOPE_KNEE_WINDOW_BINS * self.padding_factor
         table_position = 1 - knee / (np.fmax(distance, 0.0) + knee)
         return self.sidelobe_envelope[(table_position * _ENVELOPE_CELLS).astype(np.int64)]
 
     def distance_below(self, magnitude: np.ndarray) -> np.ndarray:
-        """Return the distance [bins] beyond which all bins are smaller; inf if none is known."""
+        """Return the distance [bins] from a line beyond which all bins are below ``magnitude``.
+
+        Magnitudes are relative to the peak. The result is inf if no distance is known.
+        """
         octave = np.log2(np.fmin(np.fmax(magnitude, 2.0**_OCTAVE_MIN), 1.0))
         return self.distance_by_octave[np.ceil(-octave * _CELLS_PER_OCTAVE).astype(np.int64)]
 
 
 @lru_cache(maxsize=32)
 def window_response(window_name: str, length: int, fft_size: int) -> WindowResponse:
-    """Return the response of a window over an FFT's bins, prepared once and cached.
+    """Return the magnitude response of a window at FFT bins around a line (cached).
 
     Parameters
     ----------
@@ -132,7 +143,11 @@ def window_response(window_name: str, length: int, fft_size: int) -> WindowRespo
 
 
 def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the coefficients of S(y) / sum w in powers of y^2, from the window's even moments."""
+    """Return the power series of a window's cosine transform in the squared distance.
+
+    The transform is relative to the window's sum. The coefficients follow from the even moments of
+    the window ``w``.
+    """
     moments = np.empty(_SERIES_TERMS)
     weighted_power = w / w.sum()
     for k in range(_SERIES_TERMS):
@@ -144,7 +159,7 @@ def _main_lobe_series(w: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the magnitude of the main lobe from its series.
+    """Return the main-lobe magnitude of a window's transform from its power series.
 
     Parameters
     ----------
@@ -169,7 +184,10 @@ def main_lobe_magnitude(fft_window: Window, coefficients: np.ndarray, y: np.ndar
 def _central_energy_min(
     fft_window: Window, coefficients: np.ndarray, record_fraction: float, slope_max: float
 ) -> float:
-    """Return the smallest sum of F over bins within one window bin of a line, wherever it lies."""
+    """Return the smallest sum of relative powers over bins within one bin of fs/L of a line.
+
+    The minimum is over positions of the line between FFT bins.
+    """
     reach_bins = math.floor(1 / record_fraction) + 1
     bin_offset = np.arange(64) / 64
     distance = (np.arange(-reach_bins, reach_bins + 1)[:, None] - bin_offset) * record_fraction
@@ -186,23 +204,24 @@ def _central_energy_min(
 
 
 class MissingSamples(NamedTuple):
-    """Samples of the record that are taken before the echo arrives, by segment."""
+    """Effect of the samples that are taken before the echo arrives, by segment."""
 
     lost_fraction: np.ndarray
-    """Sum |w| over the missing samples, over sum w."""
+    """Sum of the window's magnitude over the missing samples, over the window's sum."""
     step_sidelobe_factor: np.ndarray
-    """Factor on the sidelobes of a rectangular window, relative to sum w, that bounds the sidelobes
-    added by the missing samples."""
+    """Bound on the sidelobes that missing samples add, over those of a rectangular window.
+    Sidelobes are relative to the sum of the window.
+    """
     n_missing: np.ndarray
-    """Number of missing samples."""
+    """Number of samples that are taken before the echo arrives."""
     centroid_bound: np.ndarray
-    """Bound on the mean position, -1..1, of the remaining samples."""
+    """Upper bound on the mean position of the remaining samples in the record, -1..1."""
     all_missing: np.ndarray
-    """True where all samples are missing."""
+    """True where all samples are taken before the echo arrives."""
 
 
 def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSamples:
-    """Compute bounds for records whose first samples have no echo.
+    """Compute bounds on the effect of samples at the record's start that lack the echo.
 
     Parameters
     ----------
@@ -231,7 +250,7 @@ def missing_sample_bounds(window: Window, n_missing: np.ndarray) -> MissingSampl
 
 @lru_cache(maxsize=8)
 def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate bounds of :func:`missing_sample_bounds` by missing samples, (L + 1,) each.
+    """Tabulate bounds of :func:`missing_sample_bounds` by number of missing samples, (L + 1,) each.
 
     They are the lost fraction, and the factors by the variation of missing and of remaining
     samples.
@@ -252,7 +271,7 @@ def _bounds_by_missing_count(window: Window) -> tuple[np.ndarray, np.ndarray, np
 def window_max_near(
     window: Window, first_sample: np.ndarray, reach_samples: np.ndarray
 ) -> np.ndarray:
-    """Return the largest |w| near a sample, over sum w.
+    """Return the largest magnitude of the window near a sample, over the window's sum.
 
     Parameters
     ----------
@@ -276,7 +295,10 @@ def window_max_near(
 
 @lru_cache(maxsize=64)
 def _window_max_within(window: Window, exponent: int) -> np.ndarray:
-    """Return the largest |w| within 2^exponent samples of each position, (L + 1,), over sum w."""
+    """Return the largest magnitude of a window near each position, over its sum, (L + 1,).
+
+    Near means within 2^``exponent`` samples.
+    """
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     magnitude = np.abs(window_samples(window.name, window.length))

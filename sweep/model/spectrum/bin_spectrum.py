@@ -1,13 +1,13 @@
 """Spectrum of a segment's lines in the bins that matter, without the record or its FFT.
 
-With the weights C_b of the lines, their positions nu_b and their shape G
-(:mod:`sweep.model.spectrum.line_shape`),
+Line b has the complex weight C_b and the position nu_b [bins]. All lines have the shape G
+(:mod:`sweep.model.spectrum.line_shape`). In bin k their spectrum F and the record's spectrum X are
 
     F(k) = sum_b C_b G(k - nu_b),    X[k] = F(k) + conj F(-k)
 
 for a real record, where the second term is the images. The spectrum of a complex record is F alone
-(PHYSICS section 5). The factor e^{-i pi r k}, r = L/N, which all terms share, is dropped. Lines
-whose powers add have |C_b|^2 |G|^2 instead.
+(PHYSICS section 5). All terms share the factor e^{-i pi r k}, which is dropped; r is the
+number L of samples over the FFT size N. Lines whose powers add have |C_b|^2 |G|^2 instead.
 
 In bins near the lines F is computed from the table of G. In bins far from all lines it is computed
 from a few sources that replace the lines. There the ends of the record determine the shape, and the
@@ -44,210 +44,242 @@ from sweep.model.spectrum.lines import (
 )
 
 ZERO = np.int64(0)
-"""0 as an argument of kernels. Numba would compile a kernel anew for a literal 0."""
+"""The integer 0 as an argument of compiled functions. Numba would compile them anew for a literal
+0."""
 
 FAR_BINS_PER_BATCH = 128
-"""Number of bins far from the lines that are computed together."""
+"""Number of frequency bins per pass of the calculation far from the lines."""
 
 SOURCE_LOG_ACCURACY = 28.0
-"""-ln of the relative error of the spectrum of sources, with a margin for the poles of a window."""
+"""-ln of the largest relative error of F when equivalent lines replace a segment's lines. F is the
+lines' spectrum. The value includes a margin for windows with poles."""
 
 END_POLYNOMIAL_EXTRA_LOG_ACCURACY = 11.0
-"""Difference between -ln of the error of the polynomials A and B and that of the sources."""
+"""Extra accuracy of the polynomials A and B, added to -ln of the equivalent lines' relative error.
+A and B give a line's spectrum far from it (:mod:`sweep.model.spectrum.line_shape`)."""
 
 LINE_BATCH_BINS = 8
-"""Width [bins] of an interval whose lines are spread over cells together. All of them use the bins
-that the table holds for each of them."""
+"""Width [bins] of a frequency interval whose lines are spread over table cells in one pass. A bin
+is computed from the table only if the table of every line in the interval contains it."""
 
 LINE_BATCH_EDGE_BINS = KERNEL_CELLS // 2 // min(CELLS_PER_BIN) + 1
-"""Distance [bins] from such an interval up to which its lines are spread over cells."""
+"""Greatest distance [bins] outside an interval of LINE_BATCH_BINS at which its lines occupy cells.
+"""
 
 LINE_BATCH_CELLS_MAX = LINE_BATCH_BINS * max(CELLS_PER_BIN) + KERNEL_CELLS + ZERO_WEIGHT_CELLS
-"""Maximum number of cells of such an interval."""
+"""Maximum number of table cells over which the lines of one interval of LINE_BATCH_BINS are spread.
+"""
 
 TABLE_SHORTFALL_BINS = LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS + 1
-"""Bins by which the table may reach less far from a line than its half-width."""
+"""Margin [bins] by which the usable half-width of a line's table is below its stored half-width.
+Lines are processed in intervals, so a line may not use the table's outermost bins."""
 
 _N_SCRATCH_ROWS = 42
-"""Number of arrays of floats in :class:`SpectrumWorkspace`."""
+"""Number of float arrays of equal length in :class:`SpectrumWorkspace`."""
 
 
 class LineBundle(NamedTuple):
-    """Number, extent and total weight of the lines from which a spectrum is computed."""
+    """Number, frequency range and total weight of the lines from which a spectrum is computed."""
 
     origin_bin: int
-    """Bin from which positions of the lines count."""
+    """FFT bin number of the frequency from which line positions are counted."""
     n_lines: int
-    """Number of lines."""
+    """Number of lines from which the spectrum is computed."""
     lowest_position: float
-    """Lowest position of a line [bins from the origin]."""
+    """Lowest line frequency [bins from ``origin_bin``]."""
     highest_position: float
-    """Highest position of a line [bins from the origin]."""
+    """Highest line frequency [bins from ``origin_bin``]."""
     weight_sum: float
-    """Sum of |C_b|, or an upper bound of it; sqrt(sum |C_b|^2) if powers add."""
+    """Sum of the magnitudes of the lines' complex weights [V], or an upper bound of it. If powers
+    add, square root of the sum of their squares.
+    """
 
 
 class SeenLines(NamedTuple):
-    """Range of bins in which lines appear in a spectrum; 0 .. N/2 if it folds them."""
+    """Lowest and highest bin at which lines appear in a spectrum.
+
+    A spectrum that folds frequencies shows them within 0 .. N/2, where N is the FFT size.
+    """
 
     lowest_position: float
-    """Lowest position [bins]."""
+    """Lowest frequency at which a line appears [bins from DC]."""
     highest_position: float
-    """Highest position [bins]."""
+    """Highest frequency at which a line appears [bins from DC]."""
 
 
 class BinRange(NamedTuple):
-    """First and last bin of a range."""
+    """Range of FFT bins, first and last bin included."""
 
     first_bin: int
-    """First bin."""
+    """FFT bin number of the first bin."""
     last_bin: int
-    """Last bin."""
+    """FFT bin number of the last bin, included."""
 
 
 class DetectedSpan(NamedTuple):
-    """A span of bins around the lines of a segment, and the detection in it."""
+    """Adjacent FFT bins around the lines of a segment (a span), and the detection in them."""
 
     first_bin: int
-    """First bin of the span."""
+    """FFT bin number of the first bin of the span."""
     n_bins: int
-    """Number of bins."""
+    """Number of bins of the span."""
     peak_index: int
-    """Index in the span of the largest bin."""
+    """Index of the bin with the largest magnitude, counted from the first bin of the span."""
     n_exempt: int
-    """Number of bins that cannot raise a false alarm."""
+    """Number of bins of the span that belong to the echo and so cannot raise a false alarm."""
     leakage: float
-    """Probability that leaked signal raises at least one false alarm; 0 if it is not computed."""
+    """Probability that the echo's signal far from its lines raises at least one false alarm. The
+    value is 0 if it is not computed.
+    """
 
 
 class AveragingShifts(NamedTuple):
-    """Shifts of all lines over which |X|^2 is averaged; empty if it is not."""
+    """Frequency shifts of all lines, with weights, over which |X|^2 is averaged.
+
+    X is the spectrum. The arrays are empty if there is no average.
+    """
 
     offset: np.ndarray
-    """(shifts,): shift [bins of fs/N]."""
+    """(shifts,): frequency shift [bins of width fs/N, sample rate over FFT size]."""
     weight: np.ndarray
-    """(shifts,): weight; the sum is 1."""
+    """(shifts,): weight of each shift in the average; the sum is 1."""
 
 
 class EndStrengths(NamedTuple):
-    """Lines, or sources that replace them, with their strengths at the two ends of the record."""
+    """Lines, or equivalent lines, with their complex amplitudes at both ends of the record."""
 
     position: np.ndarray
-    """Position [bins from the origin]."""
+    """Frequency of each line [bins from the origin bin]."""
     start_re: np.ndarray
-    """Real part of the strength at the record's start, which multiplies A."""
+    """Real part of the amplitude at the record's start, which multiplies the polynomial A."""
     start_im: np.ndarray
-    """Imaginary part of the strength at the start."""
+    """Imaginary part of the amplitude at the record's start."""
     end_re: np.ndarray
-    """Real part of the strength at the record's end, which multiplies B."""
+    """Real part of the amplitude at the record's end, which multiplies the polynomial B."""
     end_im: np.ndarray
-    """Imaginary part of the strength at the end."""
+    """Imaginary part of the amplitude at the record's end."""
 
 
 class FarBins(NamedTuple):
-    """Quantities of a batch of bins k far from the lines, one element per bin."""
+    """Trigonometric values and scratch arrays for a batch of bins k far from the lines.
+
+    Arrays have one element per bin. N is the FFT size, L the number of samples.
+    """
 
     tangent: np.ndarray
-    """tan(pi k / N)."""
+    """tan(pi k / N) of each bin k, with the FFT size N."""
     turn_re: np.ndarray
-    """cos(pi r k), r = L/N."""
+    """cos(pi k L / N) of each bin k, with L samples and the FFT size N."""
     turn_im: np.ndarray
-    """sin(pi r k)."""
+    """sin(pi k L / N) of each bin k, with L samples and the FFT size N."""
     cotangent: np.ndarray
-    """Scratch: cot(pi (k - nu) / N) of the distance from a line at nu."""
+    """Scratch: cot(pi (k - nu) / N) for a line at nu bins, with the FFT size N."""
     start_re: np.ndarray
-    """Scratch: real part of the polynomial A at this cotangent."""
+    """Scratch: real part of the polynomial A of the record's start, evaluated at ``cotangent``."""
     start_im: np.ndarray
-    """Scratch: imaginary part of A."""
+    """Scratch: imaginary part of the polynomial A of the record's start, evaluated at
+    ``cotangent``.
+    """
     end_re: np.ndarray
-    """Scratch: real part of the polynomial B at this cotangent."""
+    """Scratch: real part of the polynomial B of the record's end, evaluated at ``cotangent``."""
     end_im: np.ndarray
-    """Scratch: imaginary part of B."""
+    """Scratch: imaginary part of the polynomial B of the record's end, evaluated at ``cotangent``.
+    """
 
 
 class FieldWorkspace(NamedTuple):
-    """Lines, their spectrum F, and the scratch arrays by which it is computed."""
+    """Lines, their spectrum without images, and the scratch arrays for computing it."""
 
     lines: LineArrays
-    """Lines of the segment."""
+    """Positions and weights of the segment's lines."""
     line_scratch: LineScratch
-    """Scratch of sums over lines."""
+    """Scratch arrays for sums over lines."""
     cell_re: np.ndarray
-    """Real part of the weights in the cells over which lines are spread."""
+    """Real part of the weights in the table cells over which lines are spread."""
     cell_im: np.ndarray
-    """Imaginary part of the weights in the cells."""
+    """Imaginary part of the weights in the table cells over which lines are spread."""
     line_ends: EndStrengths
-    """Strengths of the lines at the record's ends."""
+    """Amplitudes of the segment's lines at the record's start and end."""
     sources: EndStrengths
-    """Equivalent lines, which replace the real ones in the spectrum of bins far away."""
+    """Equivalent lines (sources), which replace the segment's lines in bins far away."""
     far_bins: FarBins
-    """Quantities of a batch of bins far away."""
+    """Trigonometric values and scratch arrays for a batch of bins far from the lines."""
     re: np.ndarray
-    """Real part of F in consecutive bins; F itself if powers add."""
+    """Real part of the lines' spectrum in consecutive bins; the power spectrum if powers add."""
     im: np.ndarray
-    """Imaginary part of F; unused if powers add."""
+    """Imaginary part of the lines' spectrum in consecutive bins; unused if powers add."""
 
 
 class SpanArrays(NamedTuple):
-    """Magnitudes and crossing probabilities in the bins of a span, from its first bin on."""
+    """Magnitudes and crossing probabilities in consecutive bins around the lines (a span)."""
 
     magnitude: np.ndarray
-    """|X| without noise [V, summed over the record]."""
+    """Magnitude of the spectrum without noise [V, summed over the record]."""
     is_exempt: np.ndarray
-    """True in bins that cannot raise a false alarm, bool."""
+    """True in bins that belong to the echo and so cannot raise a false alarm, bool."""
     half_square: np.ndarray
-    """Scratch: |X|^2 / (2 sigma^2)."""
+    """Scratch: squared magnitude over twice the noise variance per quadrature."""
     crossing_probability: np.ndarray
-    """Probability by which the signal raises that of noise alone to cross the threshold."""
+    """Increase of a bin's probability of crossing the threshold, due to signal, over noise alone.
+    """
 
 
 class IntegralPoints(NamedTuple):
-    """Gauss points of the integral over bins far from the lines."""
+    """Quadrature points of an integral over bins far from the lines, which gives their leakage.
+
+    Leakage is the probability of false alarms by the echo's signal.
+    """
 
     cotangent: np.ndarray
-    """cot(pi q / N) of the distance q from the centre of the lines [bins]; later tan(pi q / N)."""
+    """cot(pi q / N) at q bins from the centre of the lines, with the FFT size N. A later step
+    replaces it by tan(pi q / N).
+    """
     weight: np.ndarray
-    """Weight of the point in a sum over bins."""
+    """Quadrature weight of the point in a sum over bins."""
     half_square: np.ndarray
-    """|X|^2, later |X|^2 / (2 sigma^2)."""
+    """Squared magnitude of the spectrum. A later step divides it by twice the noise variance per
+    quadrature.
+    """
     re: np.ndarray
-    """Scratch: real part of X."""
+    """Scratch: real part of the spectrum at the points."""
     im: np.ndarray
-    """Scratch: imaginary part of X."""
+    """Scratch: imaginary part of the spectrum at the points."""
 
 
 class SpectrumWorkspace(NamedTuple):
-    """Arrays in which the spectrum of one segment is computed."""
+    """Arrays for computing the spectrum of one segment of one point."""
 
     field: FieldWorkspace
-    """Lines and their spectrum F."""
+    """Lines and their spectrum without images."""
     inverse_gain_re: np.ndarray
-    """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`."""
+    """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`: real part of 1 over the gain."""
     inverse_gain_im: np.ndarray
-    """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`."""
+    """Scratch of :func:`sweep.model.spectrum.lines.compute_lines`: imaginary part of 1 over the
+    gain.
+    """
     nodes: LineArrays
-    """Equivalent lines that replace the lines of the segment."""
+    """Equivalent lines at Chebyshev nodes, which replace the segment's lines."""
     imaginary_part: np.ndarray
-    """Scratch: imaginary part of X in the bins of the span."""
+    """Scratch: imaginary part of the spectrum in the computed bins around the lines."""
     mean_square: np.ndarray
-    """Scratch: |X|^2 averaged over shifts, in the bins of the span."""
+    """Scratch: squared magnitude averaged over shifts, in the computed bins around the lines."""
     span: SpanArrays
-    """Bins of the span."""
+    """Magnitudes and crossing probabilities in the computed bins around the lines."""
     integral: IntegralPoints
-    """Points of the integral over the bins beyond the span."""
+    """Quadrature points of the integral over bins outside ``span``, which gives their leakage."""
 
 
 _SCRATCH_BYTES_KEPT_MAX = 1 << 26
-"""Largest scratch [bytes] that a thread keeps for its next batch."""
+"""Largest scratch array [bytes] that a thread keeps for its next batch of points."""
 
 _thread_scratch = threading.local()
 
 
 def _scratch_rows(width: int) -> np.ndarray:
-    """Return scratch (rows, width), the same array for each batch of a thread.
+    """Return a scratch array (_N_SCRATCH_ROWS, width), reused in all batches of a thread.
 
-    Of a new array the operating system clears every page that a batch touches. With wide spectra
-    this takes an eighth of the time of a flight, as few numbers in each row are used.
+    The operating system has to clear every page of a new array that a batch writes. With wide
+    spectra this takes an eighth of a flight's run time, because each row uses few elements.
     """
     rows: np.ndarray | None = getattr(_thread_scratch, "rows", None)
     if rows is None or rows.shape[1] != width:
@@ -259,8 +291,8 @@ def _scratch_rows(width: int) -> np.ndarray:
 def allocate_workspace(width: int) -> SpectrumWorkspace:
     """Allocate a workspace for up to ``width`` - 16 lines, bins or cells.
 
-    A thread that asks for the same width again has the same arrays again, as a batch of points has
-    no use for those of the batch before.
+    A second call in the same thread with the same width returns the same arrays. A batch of points
+    does not need the values of the batch before.
     """
     width = max(width, BATCH_SCRATCH_SIZE, LINE_BATCH_CELLS_MAX)
     rows = iter(_scratch_rows(width))
@@ -294,9 +326,10 @@ def allocate_workspace(width: int) -> SpectrumWorkspace:
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
-    """Add the lines to F in those of ``n_bins`` bins from ``first_bin`` on that the table holds.
+    """Add the lines' spectrum to ``field``, only in bins that the line-shape table contains.
 
-    Each line is spread over cells around its position. The table holds the spectrum of a cell.
+    The bins are those of ``n_bins`` from ``first_bin`` on. Each line is spread over cells around
+    its position. The table holds the spectrum of a line in a cell.
     """
     fft_size, cells_per_bin = layout.fft_size, layout.cells_per_bin
     lines, last_line_bin = field.lines, math.floor(bundle.highest_position)
@@ -321,7 +354,10 @@ def add_lines_by_table(first_bin, n_bins, bundle, shape, layout, field):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _spread_line(cell_position, re, im, cell_re, cell_im):
-    """Spread a line at a position among cells over KERNEL_CELLS of them."""
+    """Add a line of complex weight ``re`` + i ``im`` to KERNEL_CELLS cells around its position.
+
+    ``cell_position`` is the line's position in cells from the first cell.
+    """
     cell = np.uint64(math.floor(cell_position))
     cell_coordinate = 2.0 * (cell_position - math.floor(cell_position)) - 1.0
     for j in range(np.uint64(KERNEL_CELLS + ZERO_WEIGHT_CELLS)):
@@ -334,9 +370,9 @@ def _spread_line(cell_position, re, im, cell_re, cell_im):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def _first_bin_in_table(batch_bin, lap, layout):
-    """Return the first bin that the table holds for all lines of the interval at ``batch_bin``.
+    """Return the first bin that the tables of all lines in the interval at ``batch_bin`` contain.
 
-    ``lap`` is the number of FFT lengths by which the spectrum is repeated.
+    ``lap`` is the number of FFT lengths by which the periodic spectrum is shifted.
     """
     return (
         batch_bin + lap * layout.fft_size + LINE_BATCH_BINS + LINE_BATCH_EDGE_BINS
@@ -345,15 +381,19 @@ def _first_bin_in_table(batch_bin, lap, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def _end_bin_in_table(batch_bin, lap, layout):
-    """Return the bin after the last one that the table holds for all lines of the interval."""
+    """Return the bin after the last one that the tables of all lines in an interval contain.
+
+    ``batch_bin`` is the first bin of the interval. ``lap`` is the number of FFT lengths by which
+    the periodic spectrum is shifted.
+    """
     return batch_bin + lap * layout.fft_size - LINE_BATCH_EDGE_BINS + layout.table_bins
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def _add_cells(first_bin, n_bins, batch_bin, n_cells, lap, shape, layout, field):
-    """Add the cells of one interval of lines to F.
+    """Add the spectrum of the cells of one interval of lines to ``field``.
 
-    The first cell lies KERNEL_CELLS / 2 - 1 cells below the interval's first bin.
+    The first cell lies KERNEL_CELLS / 2 - 1 cells below ``batch_bin``, the interval's first bin.
     """
     cells_per_bin, adds_powers = layout.cells_per_bin, layout.adds_powers
     n_columns = shape.table_re.size // cells_per_bin
@@ -386,7 +426,9 @@ def _add_cells(first_bin, n_bins, batch_bin, n_cells, lap, shape, layout, field)
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def compute_sources(bundle, distance_min, log_accuracy, layout, field):
-    """Compute the lines' strengths at the record's ends, and sources that replace the lines.
+    """Compute the lines' amplitudes at the record's ends, and equivalent lines for far bins.
+
+    Far from the lines, a few equivalent lines (sources) give the same spectrum.
 
     Parameters
     ----------
@@ -448,10 +490,10 @@ def compute_sources(bundle, distance_min, log_accuracy, layout, field):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def far_line_weight(weight_sum, n_sources, layout, sources):
-    """Return the total weight of the lines as seen from bins beyond the table.
+    """Return the total weight [V] of the lines that determines the spectrum in bins far from them.
 
-    ``weight_sum`` is :attr:`LineBundle.weight_sum`, which the result does not exceed. ``sources``
-    are the :class:`EndStrengths` of ``n_sources`` sources.
+    ``weight_sum`` is :attr:`LineBundle.weight_sum`, an upper limit of the result. ``sources`` are
+    the :class:`EndStrengths` of ``n_sources`` equivalent lines.
     """
     start_sum, end_sum = 0.0, 0.0
     for source in range(n_sources):
@@ -463,15 +505,19 @@ def far_line_weight(weight_sum, n_sources, layout, sources):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def tangent_at(bin_, fft_size, tangents):
-    """Return tan(pi k / N) of any bin k; ``tangents`` holds those of bins 0 .. N/2."""
+    """Return tan(pi k / N) of any bin k, for the FFT size N.
+
+    ``tangents`` holds the values of bins 0 .. N/2.
+    """
     bin_ %= fft_size
     return tangents[bin_] if 2 * bin_ <= fft_size else -tangents[fft_size - bin_]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
-    """Compute tan(pi k / N) and exp(i pi r k) of up to FAR_BINS_PER_BATCH bins into ``far_bins``.
+    """Compute tan(pi k / N) and exp(i pi k L / N) of a batch of bins k into ``far_bins``.
 
+    N is the FFT size, L the number of samples. ``n_bins`` is at most FAR_BINS_PER_BATCH.
     ``tangents`` holds the tangents of bins 0 .. N/2.
     """
     fft_size = layout.fft_size
@@ -492,7 +538,7 @@ def prepare_far_bins(first_bin, n_bins, layout, tangents, far_bins):
 def add_line_by_record_ends(
     begin_offset, end_offset, field_offset, strengths, line, log_accuracy, ends, layout, field
 ):
-    """Add one line or source to F in bins far from it.
+    """Add the spectrum of one line, or equivalent line, to ``field`` in bins far from it.
 
     Parameters
     ----------
@@ -515,7 +561,8 @@ def add_line_by_record_ends(
 
     Notes
     -----
-    With the strengths a and b at the two ends, and c = cot(pi (k - nu) / N),
+    The line at nu bins has the amplitudes a and b at the two ends of the record. r is the number
+    of samples over the FFT size N. In bin k, with c = cot(pi (k - nu) / N),
 
         F(k) += e^{i pi r k} a A(c) - e^{-i pi r k} b B(c).
 
@@ -580,7 +627,7 @@ def add_line_by_record_ends(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, tangents, field):
-    """Compute F in ``n_bins`` bins into ``field.re`` and ``field.im``.
+    """Compute the lines' spectrum F in ``n_bins`` bins into ``field.re`` and ``field.im``.
 
     Parameters
     ----------
@@ -591,13 +638,13 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
     bundle
         :class:`LineBundle` of the lines in ``field.lines``.
     negligible_ratio
-        Error of F that is allowed, over the sum of |C_b|.
+        Allowed error of F over the sum of the lines' amplitudes.
     shape
         :class:`sweep.model.spectrum.line_shape.LineShape`.
     layout
         :class:`SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     field
         :class:`FieldWorkspace`.
     """
@@ -688,9 +735,10 @@ def compute_field(first_bin, n_bins, bundle, negligible_ratio, shape, layout, ta
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def bins_to_nearest_line(first_bin, n_bins, lowest_position, highest_position, fft_size):
-    """Return the least distance [bins] of a range of bins from the lines; 0 between the lines.
+    """Return the smallest distance [bins] between a range of bins and the lines.
 
-    Distances are measured around the circle of all N bins.
+    The result is 0 if the range reaches between the lines. Distances are measured around the circle
+    of all ``fft_size`` bins.
     """
     centre_distance = first_bin + 0.5 * (n_bins - 1) - 0.5 * (lowest_position + highest_position)
     centre_distance = abs(centre_distance - fft_size * np.rint(centre_distance / fft_size))
@@ -701,9 +749,10 @@ def bins_to_nearest_line(first_bin, n_bins, lowest_position, highest_position, f
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def envelope_index(distance, envelope):
-    """Return the index of the largest tabulated distance of a line's envelope up to ``distance``.
+    """Return the index of the largest tabulated distance that does not exceed ``distance``.
 
-    ``envelope`` is a :class:`sweep.model.spectrum.line_shape.LineEnvelope`.
+    ``distance`` is from a line [bins]. ``envelope`` is the
+    :class:`sweep.model.spectrum.line_shape.LineEnvelope` with the tabulated distances.
     """
     low, high = 0, envelope.distance.size
     while low < high:
@@ -719,10 +768,11 @@ def envelope_index(distance, envelope):
 def compute_magnitudes(
     first_bin, n_bins, bundle, negligible_ratio, shifts, shape, layout, tangents, workspace
 ):
-    """Compute |X| in ``n_bins`` bins from ``first_bin`` on into ``workspace.span.magnitude``.
+    """Compute the magnitude of the spectrum in ``n_bins`` bins, into ``workspace.span.magnitude``.
 
-    Parameters are those of :func:`compute_field`, with :class:`AveragingShifts` over which |X|^2 is
-    averaged, and a :class:`SpectrumWorkspace`. Bins count from DC.
+    The first bin is ``first_bin``, counted from DC. Other parameters are those of
+    :func:`compute_field`, with :class:`AveragingShifts` over which the squared magnitude is
+    averaged, and a :class:`SpectrumWorkspace`.
     """
     field, span = workspace.field, workspace.span
     is_mirror_image = is_mirrored(
@@ -796,10 +846,11 @@ def compute_magnitudes(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def distance_below_level(level, weight_sum, envelope):
-    """Return the distance [bins] from which on lines of a summed weight stay below a level.
+    """Return the distance [bins] from the lines beyond which their spectrum stays below ``level``.
 
-    ``envelope`` is a :class:`sweep.model.spectrum.line_shape.LineEnvelope`. The result is infinite
-    if the lines exceed the level at any distance.
+    ``weight_sum`` is the lines' total weight [V], ``level`` a magnitude [V]. ``envelope`` is a
+    :class:`sweep.model.spectrum.line_shape.LineEnvelope`. The result is infinite if the lines
+    exceed the level at any distance.
     """
     if not weight_sum > 0.0:
         return 1.0
@@ -817,7 +868,10 @@ def distance_below_level(level, weight_sum, envelope):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
-    """Return true if a real record shows lines of negative frequency at the opposite frequency."""
+    """Return true if a real record shows lines of negative frequency at the opposite frequency.
+
+    The lines' frequencies are given in bins from ``origin_bin``. The middle of their range decides.
+    """
     return (
         origin_bin + 0.5 * (lowest_position + highest_position) < 0.0
         and spectrum_type != COMPLEX_RECORD
@@ -826,7 +880,10 @@ def is_mirrored(origin_bin, lowest_position, highest_position, spectrum_type):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def seen_lines(origin_bin, lowest_position, highest_position, layout):
-    """Return the :class:`SeenLines` of lines at positions counted from ``origin_bin``."""
+    """Return the :class:`SeenLines`, the bins from DC at which lines appear in the spectrum.
+
+    The given positions are counted from ``origin_bin`` [bins].
+    """
     if is_mirrored(origin_bin, lowest_position, highest_position, layout.spectrum_type):
         return SeenLines(-origin_bin - highest_position, -origin_bin - lowest_position)
     return SeenLines(origin_bin + lowest_position, origin_bin + highest_position)
@@ -834,9 +891,10 @@ def seen_lines(origin_bin, lowest_position, highest_position, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def bins_around_lines(margin_bins, seen, layout):
-    """Return the :class:`BinRange` of the lines with a margin on either side [bins].
+    """Return the :class:`BinRange` from ``margin_bins`` below the lines to as many bins above.
 
-    ``seen`` is the :class:`SeenLines`. A margin beyond DC or Nyquist is folded back.
+    ``seen`` is the :class:`SeenLines`. If the margin extends beyond DC or Nyquist, the part beyond
+    is folded back.
     """
     fft_size, nyquist_bin = layout.fft_size, layout.fft_size // 2
     margin_bins = min(margin_bins, 2.0 * fft_size)
@@ -855,7 +913,7 @@ def bins_around_lines(margin_bins, seen, layout):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def distance_below_level_with_images(level, weight_sum, seen, envelope, layout):
-    """Return the distance [bins] from which on lines and their images stay below a level.
+    """Return the distance [bins] beyond which the spectrum of lines and images is below ``level``.
 
     Parameters are those of :func:`distance_below_level`, with the :class:`SeenLines`.
     """
@@ -883,7 +941,7 @@ def detect_in_span(
     tangents,
     workspace,
 ):
-    """Compute a span of bins around a segment's lines, and detect the echo in it.
+    """Compute the spectrum in the bins around a segment's lines, and detect the echo there.
 
     Parameters
     ----------
@@ -906,7 +964,7 @@ def detect_in_span(
     layout
         :class:`SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     workspace
         :class:`SpectrumWorkspace`, whose ``span.magnitude`` and ``span.is_exempt`` are results.
 

@@ -1,10 +1,12 @@
 """Detection and leakage of a segment, where all bins count but few are computed.
 
-The bins of a span around the lines are computed one by one: all that may cross the threshold, and
-as many more as it takes for the leaked signal to become smooth. Beyond the span, down to DC and up
-to Nyquist, the probabilities that leaked signal adds are summed as an integral, with an error below
-1e-6 of the leakage. The integral is left out if the envelope of the line shape bounds it below the
-tolerance.
+Leakage is the probability of false alarms by the echo's signal far from its lines.
+
+A span, the adjacent bins around the lines, is computed bin by bin. It contains all bins that may
+cross the threshold, and as many more as it takes for the leaked signal to become smooth. Beyond the
+span, down to DC and up to Nyquist, the probabilities that leaked signal adds are summed as an
+integral, with an error below 1e-6 of the leakage. The integral is left out if the envelope of the
+line shape bounds it below the tolerance.
 
 Without padding the factor e^{i pi k} is a sign, so |X| far from the lines is a smooth function of
 k. Its sum over bins is then an integral plus corrections at its near end (Euler-Maclaurin, in
@@ -12,8 +14,9 @@ central differences). As |X|^2 is even about DC and Nyquist, the only correction
 half the value there. In v = cot(pi q / N), with the distance q from the lines, the integrand is
 nearly a polynomial: about thirty Gauss points represent sixty thousand bins.
 
-In developed speckle the leaked signal fades with its echo. If the speckle's power is u, of mean 1,
-bins of power u |X|^2 leak with the probability 1 - exp(-R(u)), and the mean is
+In developed speckle the leaked signal fades with its echo. The speckle's power is u, of mean 1. Let
+R(u) be the summed rate of false alarms by bins of power u |X|^2. At least one of them raises a
+false alarm with the probability 1 - exp(-R(u)). The mean is
 
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 
@@ -70,40 +73,49 @@ from sweep.model.spectrum.bin_spectrum import (
 from sweep.model.spectrum.lines import REAL_WITH_IMAGES
 
 INTEGRAL_END_CORRECTION_BINS = 3
-"""Number of bins on either side of the integral's near end that its corrections use."""
+"""Number of bins that correct an integral over bins at its end near the lines. They are on each
+side of that end."""
 
 END_CORRECTION_ERROR_MAX = 1e-7
-"""Largest last term of the end corrections, relative to the whole leakage."""
+"""Largest accepted value of the last end correction of the integral over bins, relative to the
+whole leakage. Leakage is the probability of false alarms by the echo's signal far from its lines.
+"""
 
 GAUSS_POINTS_MAX = 200
-"""Maximum number of Gauss points on one side of the lines."""
+"""Maximum number of Gauss points of the integral over bins on one side of the lines."""
 
 AT_BIN, HALF_BIN_BEYOND = np.bool_(False), np.bool_(True)
-"""Positions of cotangents: at a bin, or half a bin beyond. NumPy booleans, because numba
-would compile the function anew for Python's."""
+"""Arguments of :func:`_bin_cotangent`: distance of a whole number of bins, or half a bin more. They
+are NumPy booleans, because numba would compile the function anew for Python's."""
 
 OCTAVE_STEP_LEAKAGE_MAX = 0.5
-"""Leakage of the brightest speckle up to which one power per octave is sufficient."""
+"""Leakage of the brightest speckle up to which one speckle power per octave is enough. Leakage is
+the probability of false alarms by the echo's signal far from its lines."""
 RATE_MIN = 1e-30
-"""Rate R below which leakage is taken to be 0."""
+"""Lower limit of the bins' summed rate of false alarms by leaked signal. Smaller sums count as this
+value. The probability of at least one false alarm is 1 - exp(-sum)."""
 CERTAIN_LEAKAGE_RATE = 34.5
-"""Rate R from which on leakage is certain."""
+"""Upper limit of the bins' summed rate of false alarms by leaked signal. Larger sums count as this
+value. The probability of at least one false alarm, 1 - exp(-sum), is then 1."""
 
 _SPECKLE_INTEGRATION_STEPS = 160
 _RELATIVE_ROOT_POWERS = np.arange(1, _SPECKLE_INTEGRATION_STEPS + 1) / _SPECKLE_INTEGRATION_STEPS
 _POWER_NODES = np.concatenate([[0.0], SPECKLE_POWER_MAX * _RELATIVE_ROOT_POWERS**2])
-"""Speckle powers at which the mean over speckle is evaluated, closer together if small."""
+"""Speckle powers, over their mean, at which a mean over speckle is evaluated. Small powers are
+closer together."""
 _OCTAVES_BELOW_MAX = -2 * np.log2(_RELATIVE_ROOT_POWERS)
-"""Distances of these powers, except the first, from SPECKLE_POWER_MAX [octaves]."""
+"""Distance of each speckle power, except 0, below SPECKLE_POWER_MAX [octaves]."""
 _POWER_WEIGHTS = (
     np.exp(-_POWER_NODES[1:])
     * 0.5
     * np.append(_POWER_NODES[2:] - _POWER_NODES[:-2], np.diff(_POWER_NODES[-2:]))
 )
-"""Weights of these powers: density e^-u times the trapezoidal rule."""
+"""Weight of each speckle power, except 0, in a mean over speckle. It is the density e^-u of the
+power u, times its trapezoidal interval."""
 
 _END_CORRECTION_FACTORS = 1.0 / 24.0, -17.0 / 5760.0, 367.0 / 967680.0
-"""Factors of the first, third and fifth difference in the correction of an integral's near end."""
+"""Factors of the integrand's first, third and fifth difference in an Euler-Maclaurin correction. It
+applies at the end, near the lines, of an integral over bins."""
 
 _GAUSS_ORDER_MAX = 12
 _GAUSS_NODES = np.zeros((_GAUSS_ORDER_MAX + 1, _GAUSS_ORDER_MAX))
@@ -113,47 +125,53 @@ for _n in range(1, _GAUSS_ORDER_MAX + 1):
 
 
 class LeakageLimits(NamedTuple):
-    """Noise, threshold and tolerance by which leakage is computed."""
+    """Noise, threshold and tolerance for computing leakage."""
 
     noise_sigma: float
-    """Noise per quadrature in a bin [V, summed over the record]."""
+    """Noise standard deviation per quadrature in a bin [V, summed over the record]."""
     threshold: float
-    """Threshold on |X| [V, summed over the record]."""
+    """Detection threshold on a bin's magnitude [V, summed over the record]."""
     tolerance: float
-    """Probability of leakage that may be neglected."""
+    """Leakage that may be neglected [probability of at least one false alarm]."""
     sidelobe_correlation: float
-    """Correlation of the noise of neighbouring bins in phase with the sidelobes of a line."""
+    """Correlation coefficient of the noise of adjacent bins, in phase with a line's sidelobes."""
 
 
 class SettledLeakage(NamedTuple):
-    """Leakage of a span and of the bins beyond it, if the span is wide enough to compute it."""
+    """Leakage of the computed bins around the lines and of all bins beyond them.
+
+    It is valid only if enough bins around the lines are computed.
+    """
 
     leakage: float
-    """Probability that leaked signal raises at least one false alarm."""
+    """Probability that the echo's signal far from its lines raises at least one false alarm."""
     is_settled: bool
-    """True if the span is wide enough; else ``leakage`` means nothing."""
+    """True if enough bins around the lines are computed; otherwise ``leakage`` is invalid."""
 
 
 class EnvelopeBeyond(NamedTuple):
-    """Envelope of the line shape from some distance on."""
+    """Bounds on a line's spectrum at all distances above a given one. The line has amplitude 1."""
 
     magnitude: float
-    """Largest |G|."""
+    """Largest magnitude of the line's spectrum."""
     square_sum: float
-    """Upper bound of the sum of |G|^2 over the bins on one side of the line."""
+    """Upper bound of the sum of the squared magnitudes over the bins on one side of the line."""
 
 
 class NearEndCorrection(NamedTuple):
-    """Euler-Maclaurin correction at the near end of the integral on one side of the lines."""
+    """Correction of a sum over bins that is computed as an integral (Euler-Maclaurin).
+
+    It applies at the integral's end near the lines, on one side of them.
+    """
 
     correction: float
-    """Correction of the sum of crossing rates."""
+    """Correction added to the sum of the bins' false-alarm rates."""
     last_term: float
-    """Size of its last term."""
+    """Size of the last term of ``correction``, an estimate of its error."""
     steepness: float
-    """-d ln f / dq of the crossing rate f at the near end [1/bin]."""
+    """-d ln f / dq of a bin's false-alarm rate f over the distance q [1/bin], at the near end."""
     exists: bool
-    """False if an exempt bin is too near to compute the correction."""
+    """False if bins of the echo are too close to the near end to compute the correction."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
@@ -170,10 +188,11 @@ def detect_with_leakage(
     crossing_series,
     speckle_rates,
 ):
-    """Compute a span of bins around a segment's lines, the detection, and the leakage of all bins.
+    """Compute the bins around a segment's lines, the detection, and the leakage of all bins.
 
-    Parameters and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`,
-    with these differences.
+    Leakage is the probability of false alarms by the echo's signal far from its lines. Parameters
+    and result are those of :func:`sweep.model.spectrum.bin_spectrum.detect_in_span`, with these
+    differences.
 
     Parameters
     ----------
@@ -311,9 +330,10 @@ def detect_with_leakage(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, speckle_rates):
-    """Return the leakage of the bins of a span, or its mean over developed speckle.
+    """Return the leakage of the computed bins around the lines, or its mean over speckle.
 
-    The echo is in developed speckle if ``speckle_power_max`` is above 1.
+    Leakage is the probability of false alarms by the echo's signal. The mean is taken over
+    developed speckle if ``speckle_power_max`` is above 1.
     """
     if speckle_power_max > 1.0:
         return _mean_leakage_of_bins(n_bins, limits, span, speckle_rates)
@@ -322,9 +342,10 @@ def _leakage_of_span(n_bins, limits, speckle_power_max, span, crossing_series, s
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_series):
-    """Return the leakage of a span, over its bins that exceed ``negligible_signal_ratio`` [sigma].
+    """Return the probability of a false peak by leaked signal in the bins of a span.
 
-    Smaller magnitudes are set to 0, except those of the echo.
+    A span is the computed bins around a segment's lines. Magnitudes below
+    ``negligible_signal_ratio`` times the noise sigma are set to 0, except those of the echo.
 
     Parameters
     ----------
@@ -348,8 +369,9 @@ def leakage_of_bins(n_bins, limits, negligible_signal_ratio, span, crossing_seri
 def leakage_of_bins_in_speckle(n_bins, limits, negligible_signal_ratio, span, speckle_rates):
     """Return the mean of :func:`leakage_of_bins` over developed speckle.
 
-    ``speckle_rates``: :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of
-    the threshold over sigma.
+    ``speckle_rates`` are the
+    :class:`sweep.model.detection.speckle_crossing_rates.SpeckleCrossingRates` of the threshold over
+    the noise sigma.
     """
     _clear_negligible_bins(n_bins, limits.noise_sigma, negligible_signal_ratio, span)
     return _mean_leakage_of_bins(n_bins, limits, span, speckle_rates)
@@ -357,7 +379,10 @@ def leakage_of_bins_in_speckle(n_bins, limits, negligible_signal_ratio, span, sp
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
-    """Set magnitudes below ``negligible_signal_ratio`` [sigma] to 0, except those of the echo."""
+    """Set small magnitudes to 0, except those of the echo.
+
+    The limit is ``negligible_signal_ratio`` times ``noise_sigma``.
+    """
     for i in range(n_bins):
         if not span.is_exempt[i] and span.magnitude[i] < negligible_signal_ratio * noise_sigma:
             span.magnitude[i] = 0.0
@@ -365,9 +390,10 @@ def _clear_negligible_bins(n_bins, noise_sigma, negligible_signal_ratio, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _further_group_probability(n_bins, limits, span, crossing_series):
-    """Return the probability that leaked signal raises a group of bins apart from the echo.
+    """Return the probability that leaked signal raises a false peak apart from the echo.
 
-    The crossing probabilities of the bins go to ``span.crossing_probability``.
+    A false peak is a group of adjacent bins above the threshold. The crossing probabilities of the
+    bins go to ``span.crossing_probability``.
     """
     _fill_crossing_probabilities(n_bins, limits, span, crossing_series)
     exclude_bins_joining_echo(
@@ -385,7 +411,10 @@ def _further_group_probability(n_bins, limits, span, crossing_series):
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
-    """Return the mean leakage of the bins of a span over developed speckle."""
+    """Return the probability of a false peak by leaked signal, averaged over speckle.
+
+    The bins are the computed ones around a segment's lines (a span).
+    """
     return _mean_leakage_over_speckle(
         ZERO, n_bins, limits, span, speckle_rates, np.zeros(N_SPECKLE_POWERS)
     )
@@ -395,7 +424,9 @@ def _mean_leakage_of_bins(n_bins, limits, span, speckle_rates):
 def _mean_leakage_over_speckle(
     first_index, end_index, limits, span, speckle_rates, relative_rates_beyond
 ):
-    """Return the mean leakage, over developed speckle, of bins of a span and of bins beyond it.
+    """Return the mean probability, over speckle, of a false peak by leaked signal.
+
+    The bins are some of a span, the computed bins around the lines, and all bins beyond it.
 
     Parameters
     ----------
@@ -476,8 +507,9 @@ def _mean_leakage_over_speckle(
 def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates):
     """Mark the bins that may join an echo by a crossing probability of 1, all others by 0.
 
-    Returns an upper bound of the number of bins that have to be listed one by one: the marked bins,
-    the echo's bins next to them, and one for each gap between them.
+    A bin joins an echo if it crosses the threshold next to it. The result is an upper bound of the
+    number of bins to be listed one by one: marked bins, the echo's bins next to them, and one for
+    each gap between them.
     """
     n_listed_max, stretch_end = 0, first_index
     for i in range(first_index, end_index):
@@ -500,9 +532,10 @@ def _mark_joining_bins(first_index, end_index, noise_sigma, span, speckle_rates)
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, speckle_rates):
-    """Mark consecutive bins as long as all of them may cross; return their number.
+    """Mark consecutive bins as long as all of them may cross the threshold; return their number.
 
-    Of ``n_bins`` bins from ``first_index`` on, upwards if ``step`` is 1, downwards if it is -1.
+    The bins are ``n_bins`` from ``first_index`` on, upwards if ``step`` is 1, downwards if it is
+    -1.
     """
     n_marked, p_all_cross = 0, 1.0
     while n_marked < n_bins and p_all_cross > JOINED_PROBABILITY_MIN:
@@ -521,8 +554,9 @@ def _mark_bins_that_may_all_cross(first_index, step, n_bins, noise_sigma, span, 
 def _n_powers_per_octave(rate_at_brightest):
     """Return the number of speckle powers per octave at which leakage is computed.
 
-    ``rate_at_brightest`` is the rate R of the brightest speckle. If bins join the echo in bright
-    speckle, leakage does not rise with the power, and the powers are closer.
+    ``rate_at_brightest`` is the summed rate of false alarms in the brightest speckle. If bins join
+    the echo in bright speckle, leakage does not increase with the power. The powers are then closer
+    together.
     """
     return POWERS_PER_OCTAVE_MAX if -math.expm1(-rate_at_brightest) > OCTAVE_STEP_LEAKAGE_MAX else 1
 
@@ -536,6 +570,9 @@ def _harmonic_mean_slope(first, second):
 @njit(cache=True, error_model="numpy", borrows=True)
 def mean_leakage_in_speckle(log_rates, powers_per_octave):
     """Return the mean leakage over developed speckle, int_0^inf e^-u (1 - exp(-R(u))) du.
+
+    Here u is the speckle's power relative to its mean, and R(u) the sum of the bins' false-alarm
+    rates.
 
     Parameters
     ----------
@@ -588,12 +625,14 @@ def mean_leakage_in_speckle(log_rates, powers_per_octave):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, envelope):
-    """Bound the leakage of all bins that are ``distance_min`` or more bins away from the lines.
+    """Bound the probability of false alarms by leaked signal in all bins far from the lines.
+
+    The bins are ``distance_min`` or more bins away from the lines.
 
     Parameters
     ----------
     weight_sum
-        Sum of |C_b| of the lines.
+        Sum of the lines' amplitudes [V].
     distance_min
         Least distance from the lines [bins].
     image_distance
@@ -640,7 +679,7 @@ def _leakage_bound_beyond(weight_sum, distance_min, image_distance, limits, enve
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _envelope_beyond(distance_min, envelope):
-    """Return the :class:`EnvelopeBeyond` of a line from ``distance_min`` bins on."""
+    """Return the :class:`EnvelopeBeyond` of a line from a distance of ``distance_min`` bins on."""
     index = envelope_index(distance_min - 1.5, envelope)
     magnitude = envelope.magnitude[index]
     return EnvelopeBeyond(magnitude, magnitude * magnitude + envelope.square_integral[index])
@@ -648,12 +687,14 @@ def _envelope_beyond(distance_min, envelope):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _leakage_bound_of_span(n_bins, limits, span):
-    """Bound the leakage of the bins of a span from their magnitudes; inf if a bin is too strong.
+    """Bound the leakage of computed bins from their magnitudes; inf if a bin is too strong.
 
-    With x and y as in :func:`_leakage_bound_beyond`, Q_1 is convex in x up to y - 2, because I_2(z)
-    / I_1(z) >= z / (2 + sqrt(z^2 + 4)). Relative to the strongest bin each bin then adds at most
-    the ratio of their powers. The strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2
-    allows for the probability that noise alone stays below the threshold, at least 1 - e^-2.
+    Leakage is the probability of false alarms by the echo's signal. With x = a^2/2 and y = b^2/2,
+    of the signal a and the threshold b over the noise sigma, Q_1 is convex in x up to y - 2. Q_1 is
+    the Marcum function. The reason is I_2(z) / I_1(z) >= z / (2 + sqrt(z^2 + 4)) with z = a b.
+    Relative to the strongest bin each bin then adds at most the ratio of their powers. The
+    strongest bin adds at most e^{-(b - a)^2 / 2}. The factor 1.2 allows for the probability that
+    noise alone stays below the threshold, at least 1 - e^-2.
     """
     largest, square_sum = 0.0, 0.0
     for i in range(n_bins):
@@ -670,9 +711,10 @@ def _leakage_bound_of_span(n_bins, limits, span):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
-    """Compute the crossing probability that signal adds in each bin of a span, except the echo's.
+    """Compute the probability by which signal raises each bin's threshold crossing above noise's.
 
-    Bins above the threshold, which bright speckle may contain, are beyond the series.
+    Bins of the echo are left out. Bins above the threshold, which bright speckle may contain, are
+    outside the range of the series.
     """
     noise_sigma, threshold = limits.noise_sigma, limits.threshold
     threshold_ratio, scale = threshold / noise_sigma, 0.5 / (noise_sigma * noise_sigma)
@@ -698,12 +740,13 @@ def _fill_crossing_probabilities(n_bins, limits, span, crossing_series):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _extra_bins_min(weight_sum, line_extent, limits, crossing_distance, envelope, layout):
-    """Return the number of bins beyond the clearance that the span needs before the integral.
+    """Return the number of bins to compute one by one beyond the clearance from the lines.
 
-    A heuristic: far enough for the threshold, for a smooth rate, and for 3/4 of ``line_extent``,
-    the extent of the lines [bins]; rounded up to a multiple of 8. :func:`detect_with_leakage`
-    doubles it until :func:`_leakage_of_span_and_beyond` is accurate. ``crossing_distance`` is the
-    distance from the lines [bins] up to which signal alone may cross.
+    The leakage integral covers the bins beyond them. The number is a heuristic. It depends on the
+    threshold, on the smoothness of the false-alarm rate, and on 3/4 of ``line_extent``, the extent
+    of the lines [bins]. It is a multiple of 8. :func:`detect_with_leakage` doubles it until
+    :func:`_leakage_of_span_and_beyond` is accurate. ``crossing_distance`` is the distance from the
+    lines [bins] up to which signal alone may cross the threshold.
     """
     clearance = layout.clearance_bins
     edge_signal = envelope.magnitude[clearance] * weight_sum / limits.noise_sigma
@@ -733,7 +776,7 @@ def _leakage_of_span_and_beyond(
     crossing_series,
     speckle_rates,
 ):
-    """Compute the :class:`SettledLeakage` of a span and of all bins beyond it.
+    """Compute the :class:`SettledLeakage` of the bins around the lines and of all other bins.
 
     Parameters are those of :func:`detect_with_leakage`, with the :class:`DetectedSpan` and the
     :class:`sweep.model.spectrum.bin_spectrum.SeenLines`. If the echo is in developed speckle, the
@@ -853,9 +896,10 @@ def _leakage_of_span_and_beyond(
 def _mean_leakage_of_span_and_beyond(
     n_bins, n_points, limits, goes_on_below, goes_on_above, span, integral, speckle_rates
 ):
-    """Return the mean leakage, over developed speckle, of a span and of the integral beyond it.
+    """Return the mean leakage over developed speckle of computed bins and of the integral's bins.
 
-    The integral has ``n_points`` points. It extends below or above the span, or both.
+    The integral covers the bins beyond the computed ones, below them, above them, or both. It has
+    ``n_points`` quadrature points.
     """
     relative_rates_beyond = np.zeros(N_SPECKLE_POWERS)
     scale = 1.0 / (limits.noise_sigma * limits.noise_sigma)
@@ -891,9 +935,10 @@ def _mean_leakage_of_span_and_beyond(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _end_correction_factor(offset):
-    """Return the factor of a bin's crossing rate in the correction at the near end.
+    """Return the factor of a bin's false-alarm rate in the correction at the integral's near end.
 
-    ``offset`` is the distance from the last bin before the integral, -2 .. 3, towards the integral.
+    ``offset`` is the bin's distance from the last bin before the integral, -2 .. 3, positive
+    towards the integral.
     """
     factor_1, factor_3, factor_5 = _END_CORRECTION_FACTORS
     factors = factor_1 - 3.0 * factor_3 + 10.0 * factor_5, factor_3 - 5.0 * factor_5, factor_5
@@ -904,11 +949,12 @@ def _end_correction_factor(offset):
 def _fill_far_powers(
     n_points, centre_bin, bundle, log_accuracy, shape, layout, tangents, workspace
 ):
-    """Compute |X|^2 at the points of the integral into ``workspace.integral.half_square``.
+    """Compute the squared magnitude of the spectrum at the leakage integral's points.
 
-    The relative error is exp(-``log_accuracy``). ``workspace.integral.cotangent`` holds the points
-    by tan(pi q / N) of their distance q from ``centre_bin``. Lines that are too few for equivalent
-    sources are summed exactly.
+    The result goes to ``workspace.integral.half_square``.
+    The relative error is exp(-``log_accuracy``). ``workspace.integral.cotangent`` contains tan(pi q
+    / N) of each point, with its distance q from ``centre_bin`` [bins] and the FFT size N. If there
+    are fewer lines than equivalent lines needed, the lines are summed exactly.
     """
     field, integral = workspace.field, workspace.integral
     far_bins = field.far_bins
@@ -958,7 +1004,10 @@ def _fill_far_powers(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _near_end_correction(side, n_bins, span):
-    """Compute the :class:`NearEndCorrection` of the integral below (-1) or above (1) a span."""
+    """Compute the :class:`NearEndCorrection` of the leakage integral on one side of the lines.
+
+    ``side`` is -1 for the integral below the computed bins, 1 for that above.
+    """
     probabilities, is_exempt = span.crossing_probability, span.is_exempt
     step = 1 if side > 0 else -1
     i = (
@@ -994,7 +1043,9 @@ def _near_end_correction(side, n_bins, span):
 def _append_gauss_points(
     side, last_distance, centre_bin, steepness, layout, tangents, cotangents, weights, n_points
 ):
-    """Append the Gauss points of the integral on one side of the lines; return their number.
+    """Append the quadrature points of the leakage integral on one side of the lines.
+
+    The integral is over bins far from the lines. The result is the number of all points.
 
     Parameters
     ----------
@@ -1010,7 +1061,7 @@ def _append_gauss_points(
     layout
         :class:`sweep.model.spectrum.lines.SpectrumLayout`.
     tangents
-        tan(pi k / N) of bins 0 .. N/2.
+        tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N.
     cotangents, weights
         Results: cot(pi q / N) at the distance q from ``centre_bin``, and weights of an integral
         over the cotangent.
@@ -1063,9 +1114,10 @@ def _append_gauss_points(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _bin_cotangent(distance, half_bin_beyond, fft_size, tangents):
-    """Return cot(pi q / N) at q = ``distance`` bins, or half a bin farther, 0 < q <= N/2.
+    """Return cot(pi q / N) for q bins, with the FFT size N and 0 < q <= N/2.
 
-    ``tangents`` holds tan(pi k / N) of bins 0 .. N/2.
+    q is ``distance``, or half a bin more if ``half_bin_beyond``. ``tangents`` holds tan(pi k / N)
+    of bins k = 0 .. N/2.
     """
     tangent_at_bin = tangents[distance]
     if not half_bin_beyond:
@@ -1077,10 +1129,11 @@ def _bin_cotangent(distance, half_bin_beyond, fft_size, tangents):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _gauss_order(near_steepness, relative_cotangent):
-    """Return the number of Gauss points of a panel of the integral.
+    """Return the number of Gauss points for one section of the leakage integral.
 
-    ``near_steepness`` is -d ln f / d ln q of the integrand at the near end; ``relative_cotangent``
-    is the cotangent at which the panel begins, over that at the near end.
+    ``near_steepness`` is -d ln f / d ln q of the integrand f over the distance q, at the near end.
+    ``relative_cotangent`` is the cotangent at the section's start, relative to that at the near
+    end.
     """
     order = 4 + int(0.6 * near_steepness * relative_cotangent)
     if relative_cotangent > 0.9:

@@ -1,7 +1,8 @@
 """Line shape: the spectrum of one line of amplitude 1 in the bins around it.
 
 All lines of a segment share the window and the phase error psi(t) of the record, so they share one
-shape. With x = -1 .. 1 over the record of L samples, r = L/N, and a distance of y bins of fs/N,
+shape. Let x = -1 .. 1 be the position in the record of L samples, w the window, N the FFT size and
+fs the sample rate. With r = L/N and a distance of y bins of fs/N,
 
     G(y) = sum_n w(x_n) exp(2 pi i psi(x_n)) exp(-i pi r y x_n)
 
@@ -47,13 +48,16 @@ from sweep.model.spectrum.lines import SpectrumLayout
 from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, window_samples
 
 CELLS_PER_BIN = (2, 4)
-"""Number of table cells in a bin of fs/N if amplitudes add, and if powers add."""
+"""Number of table cells in a bin of width fs/N: if amplitudes add, and if powers add. fs is the
+sample rate, N the FFT size."""
 
 KERNEL_CELLS = 14
-"""Number of cells over which a line is spread: cells -6 .. 7 for a line between cells 0 and 1."""
+"""Number of table cells over which a line is spread: cells -6 .. 7 for a line between cells 0 and
+1."""
 
 KERNEL_BETA = 32.32432
-"""Parameter b of the kernel I_0(b sqrt(1 - (2 z / KERNEL_CELLS)^2)) / I_0(b) at z cells."""
+"""Parameter b of the Kaiser-Bessel kernel that spreads a line over table cells. At a distance of z
+cells it is I_0(b sqrt(1 - (2 z / KERNEL_CELLS)^2)) / I_0(b)."""
 
 DECONVOLUTION_TAPS = np.array([
     27.059814524108916, -24.069297462538476, 18.21886188994693, -12.301303141361002,
@@ -62,129 +66,148 @@ DECONVOLUTION_TAPS = np.array([
     0.007388544649665242, -0.0018900276225103194, 0.0004085782830266439, -7.179287548481712e-05,
     9.634021822884657e-06, -8.798393952475983e-07, 4.1136322681806606e-08,
 ])  # fmt: skip
-"""Even filter over cells whose transform is 1 over that of the kernel, to 1e-13 below pi / 2."""
+"""Coefficients of a symmetric filter over table cells that divides a table by the kernel's
+transform. Its relative error is 1e-13 below a phase of pi / 2 per cell."""
 
 MODE_TIERS = ((24, 20, 64), (48, 56, 96), (128, 200, 256))
-"""Accuracy tiers: maximum number of modes; distance [bins of fs/L] beyond which the record's ends
-determine a shape; bins that its table holds on either side, if few points share it."""
+"""Three integers for each accuracy tier of line shapes. First: maximum number of Chebyshev modes of
+exp(2 pi i psi), psi being the phase error. Second: distance [bins of fs/L, L samples] beyond which
+the record's ends determine the shape. Third: bins of fs/L that the table holds on each side of the
+line, if few points share it."""
 
 SHARED_TABLE_BINS = 256
-"""Number of bins of fs/L that a table holds on either side if many points share it. It then serves
-wide footprints."""
+"""Half-width [bins of fs/L, L samples] of a line-shape table that many points share. It is wide
+enough for wide footprints."""
 
 END_DERIVATIVES_MAX = 12
-"""Highest order of the derivatives at the record's ends."""
+"""Highest order of derivatives at the record's ends in a line's spectrum far from the line."""
 
 N_END_COEFFICIENTS = END_DERIVATIVES_MAX + 2
-"""Number of coefficients of the polynomials A and B."""
+"""Number of coefficients of each polynomial, of the record's start or end, that gives a line's
+spectrum far from the line."""
 
 MODE_SIZE_MIN = 1e-13
-"""Size of a mode, relative to the record, below which it is left out."""
+"""Smallest Chebyshev coefficient of a phase error's phasor that counts as a mode. The last modes
+with smaller coefficients are left out. The phasor has magnitude 1."""
 
 _RECORD_LENGTH_MIN, _PADDING_MAX = 4096, 8
-"""Least number of samples, and largest padding N/L, for which sums over a record are computed as
-integrals."""
+"""Least number of samples, and largest padding (FFT size over samples), for which a sum over the
+samples is computed as an integral."""
 
 _N_FAR_DISTANCES = 48
-"""Number of distances, from the end of a line shape's table to N/2, at which the envelope of the
-line shape is stored."""
+"""Number of distances beyond a line-shape table, up to half the FFT size, at which the envelope of
+the line's spectrum is stored."""
 
 _ENVELOPE_MARGIN = 1.05
-"""Factor on the envelope that covers what happens between cells."""
+"""Safety factor on the envelope of a line's spectrum. It covers maxima between table cells."""
 
 _TAP_REACH_CELLS = DECONVOLUTION_TAPS.size - 1
-"""Number of cells beyond either side of a table that its filter needs."""
+"""Number of extra cells on each side of a table that DECONVOLUTION_TAPS needs."""
 
 KERNEL_DEGREE = 13
-"""Degree of the polynomials that represent the kernel in a cell."""
+"""Degree of the polynomials that approximate the spreading kernel within a cell."""
 
 ZERO_WEIGHT_CELLS = 2
-"""Number of cells of weight 0 beyond those over which a line is spread, for whole vectors."""
+"""Number of cells of weight 0 after the KERNEL_CELLS cells of a line. They fill the processor's
+vectors."""
 
 LENGTH_CLASS_RATIO = math.sqrt(2.0)
-"""Ratio of the largest to the smallest number of samples of late echoes that share a table."""
+"""Largest ratio between the numbers of samples of two late echoes that share a line-shape table. A
+late echo fills only the last samples of its record."""
 
 _LATE_SAMPLES_PER_BIN_MIN = 16
-"""Least number of samples of a late echo per bin of fs/L' in its table. Sums over the samples are
-then integrals with six Euler-Maclaurin corrections."""
+"""Least number of samples of a late echo per bin of its table. A bin is fs/L' wide, L' being the
+echo's number of samples. Sums over samples are then integrals with six Euler-Maclaurin corrections.
+"""
 
 _LATE_TABLE_MARGIN_BINS = 16
-"""Bins of fs/L' that the table of a late echo holds beyond the distance from which on the record's
-ends determine the shape. Lines that are spread together need them."""
+"""Extra bins in the table of a late echo, for lines that are spread together. A bin is fs/L' wide,
+L' being the echo's number of samples. The bins follow the distance beyond which the record's ends
+determine the shape."""
 
 _LATE_PADDING_MAX = 16
-"""Largest padding N/L' of a late echo whose shape is a sum of modes."""
+"""Largest ratio of FFT size to a late echo's samples at which its line shape is a sum of modes."""
 
 _LATE_VALUES_PER_BIN = 2
-"""Number of tabulated values in a bin of fs/L'."""
+"""Number of tabulated values of a late echo's line shape in a bin. A bin is fs/L' wide, L' being
+the echo's number of samples."""
 
 EULER_MACLAURIN_COEFFICIENTS = {
     1: 1 / 12, 3: -1 / 720, 5: 1 / 30240, 7: -1 / 1209600, 9: 1 / 47900160,
     11: -691 / 1307674368000,
 }  # fmt: skip
-"""Coefficients B_(m+1) / (m+1)! of the derivatives of order m at the ends, by m."""
+"""Coefficients B_(m+1) / (m+1)! of the Euler-Maclaurin formula, by the order m of the derivative at
+the ends. B are the Bernoulli numbers."""
 
 _EULER_MACLAURIN_ORDER_MAX = max(EULER_MACLAURIN_COEFFICIENTS)
 
 
 class EndPolynomials(NamedTuple):
-    """Coefficients of the polynomials A and B in cot(pi y / N), lowest power first."""
+    """Coefficients of two polynomials that give a line's spectrum far from the line.
+
+    A is of the record's start, B of its end. Their variable is cot(pi y / N) at y bins from the
+    line, N being the FFT size. The lowest power is first.
+    """
 
     start_re: np.ndarray
-    """(..., N_END_COEFFICIENTS): real part of A, of the record's start."""
+    """(..., N_END_COEFFICIENTS): real part of the coefficients of A, of the record's start."""
     start_im: np.ndarray
-    """Imaginary part of A."""
+    """(..., N_END_COEFFICIENTS): imaginary part of the coefficients of A, of the record's start."""
     end_re: np.ndarray
-    """Real part of B, of the record's end."""
+    """(..., N_END_COEFFICIENTS): real part of the coefficients of B, of the record's end."""
     end_im: np.ndarray
-    """Imaginary part of B."""
+    """(..., N_END_COEFFICIENTS): imaginary part of the coefficients of B, of the record's end."""
 
 
 class LineEnvelope(NamedTuple):
-    """Largest |G| from each of m distances on."""
+    """Upper envelope of the spectrum of a line of amplitude 1, at m distances from the line."""
 
     distance: np.ndarray
-    """(m,): distance d from the line [bins of fs/N]; the same for all segments."""
+    """(m,): distance from the line [bins of width fs/N]; the same for all segments."""
     magnitude: np.ndarray
-    """(..., m): largest |G| at any distance of d or more."""
+    """(..., m): largest magnitude of the line's spectrum at this distance or farther."""
     square_integral: np.ndarray
-    """(..., m): upper bound of the integral of |G|^2 over distances of d or more [bins]."""
+    """(..., m): upper bound of the integral of the squared magnitude from this distance on [bins].
+    """
 
 
 class LineShape(NamedTuple):
-    """Line shape of one segment, or of all segments with a leading dimension."""
+    """Spectrum of a line of amplitude 1, for one segment, or for all with a leading dimension."""
 
     table_re: np.ndarray
-    """(..., cells * columns): real part of G, divided by the kernel's transform, by cell of a bin
-    and bin; |G|^2 if powers add."""
+    """(..., cells * columns): real part of the line's spectrum by cell within a bin, then by bin.
+    It is divided by the transform of the spreading kernel. If powers add, it is the squared
+    magnitude.
+    """
     table_im: np.ndarray
-    """(..., cells * columns): imaginary part; 0 if powers add."""
+    """(..., cells * columns): imaginary part of the line's spectrum; 0 if powers add."""
     envelope: LineEnvelope
-    """Envelope of |G|."""
+    """Upper envelope of the magnitude of the line's spectrum."""
     ends: EndPolynomials
-    """Polynomials A and B; unused if the table holds all bins."""
+    """Polynomials for the spectrum far from the line; unused if the table holds all bins."""
 
 
 class ShapeModes(NamedTuple):
-    """Chebyshev modes of the phase errors of all segments and shapes."""
+    """Chebyshev coefficients of exp(2 pi i psi), for the phase error psi [cycles] of each shape."""
 
     line_shift: np.ndarray
-    """(segments, shapes): shift of the line [bins of fs/L]."""
+    """(segments, shapes): frequency shift of the line by the mean phase slope [bins of fs/L]."""
     re: np.ndarray
-    """(segments, shapes, modes): real part of the coefficients a_j."""
+    """(segments, shapes, modes): real part of the Chebyshev coefficients."""
     im: np.ndarray
-    """(segments, shapes, modes): imaginary part of the coefficients a_j."""
+    """(segments, shapes, modes): imaginary part of the Chebyshev coefficients."""
     n_modes: np.ndarray
-    """(segments, shapes) int64: number of modes that are not negligible; 0 if there are too many.
+    """(segments, shapes) int64: number of coefficients that are not negligible. It is 0 if more are
+    needed than the arrays hold.
     """
 
     def select(self, is_selected: np.ndarray) -> "ShapeModes":
-        """Select some of the shapes."""
+        """Return the modes of the shapes for which ``is_selected`` is true."""
         return ShapeModes(*(np.ascontiguousarray(values[:, is_selected]) for values in self))
 
 
 def zero_modes(segments: int, n_shapes: int, n_modes_max: int) -> ShapeModes:
-    """Allocate :class:`ShapeModes` of zeros."""
+    """Allocate :class:`ShapeModes` with all values 0."""
     shape = segments, n_shapes
     return ShapeModes(
         np.zeros(shape),
@@ -195,37 +218,53 @@ def zero_modes(segments: int, n_shapes: int, n_modes_max: int) -> ShapeModes:
 
 
 class LineShapeTables(NamedTuple):
-    """Tables of one window and FFT from which line shapes are built."""
+    """Tables of one window and FFT size from which the line shapes of segments are computed."""
 
     layout: SpectrumLayout
-    """Sizes of the spectrum and of the table of a shape."""
+    """Sizes of the spectrum and of a line-shape table."""
     mode_transforms: np.ndarray
-    """(modes, places): transform of each mode without the record's first sample: the real part of
-    even modes, the imaginary part of odd ones. Places are the cells at :func:`_cell_distances`. If
-    amplitudes add, the values of a shape's table follow in further places. For late echoes places
-    are u = -U .. U in steps of half a bin of fs/L', and the kernel's transform is divided out."""
+    """(modes, places): Fourier transform of each Chebyshev mode without the record's first sample.
+    It is real for even modes; for odd modes it is the imaginary part.
+
+    Places are the table's cells at :func:`_cell_distances`. If amplitudes add, the values of a
+    shape's table follow in further places. For late echoes places are distances u = -U .. U from
+    the line in steps of half a bin of fs/L', with L' samples of the echo. The spreading kernel's
+    transform is then divided out.
+    """
     first_sample_cosine: np.ndarray
-    """(places,): the window's first sample times cos(pi r y); empty for late echoes."""
+    """(places,): the window's first sample times cos(pi L y / N) at y bins from the line. L is the
+    number of samples, N the FFT size. The array is empty for late echoes.
+    """
     first_sample_sine: np.ndarray
-    """(places,): the window's first sample times sin(pi r y)."""
+    """(places,): the window's first sample times sin(pi L y / N) at y bins from the line. L is the
+    number of samples, N the FFT size. The array is empty for late echoes.
+    """
     mode_ends: EndPolynomials
-    """Polynomials A and B of each mode, (modes, N_END_COEFFICIENTS)."""
+    """Polynomials of each Chebyshev mode for its spectrum far from the line, (modes,
+    N_END_COEFFICIENTS).
+    """
     envelope_distance: np.ndarray
-    """(m,): distances d of the envelope [bins of fs/N]."""
+    """(m,): distances from the line at which envelopes are tabulated [bins of fs/N]."""
     envelope_cotangent: np.ndarray
-    """(m,): cot(pi d / N)."""
+    """(m,): cot(pi d / N) of each ``envelope_distance`` d, with the FFT size N."""
     full_table_re: np.ndarray
-    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins; else
-    empty."""
+    """(segments, cells * columns): :attr:`LineShape.table_re` of tables that hold all bins;
+    otherwise empty.
+    """
     full_table_im: np.ndarray
-    """(segments, cells * columns): :attr:`LineShape.table_im` of such tables."""
+    """(segments, cells * columns): :attr:`LineShape.table_im` of tables that hold all bins; else
+    empty.
+    """
     full_envelope: LineEnvelope
-    """Envelopes of such tables, (segments, m); else empty."""
+    """(segments, m): envelopes of line shapes whose tables hold all bins; else empty."""
     echo_lengths: np.ndarray
-    """(segments, shapes) int64: number of samples of late echoes whose shapes are sums of modes;
-    else empty."""
+    """(segments, shapes) int64: number of samples of the echo, for late echoes with mode sums. The
+    array is empty for other tables. A late echo fills only the last samples of its record.
+    """
     taylor_coefficients: np.ndarray
-    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of such modes at x = 1; else empty."""
+    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of late echoes' modes at the record's
+    end. The array is empty for other tables.
+    """
 
 
 _NO_ENDS = EndPolynomials(*(np.empty((0, 1)) for _ in EndPolynomials._fields))
@@ -234,7 +273,7 @@ _NO_LENGTHS = np.empty((0, 0), np.int64)
 
 
 def _no_full_envelope(distance: np.ndarray) -> LineEnvelope:
-    """Return the full envelopes of tables that do not hold all bins."""
+    """Return an empty :class:`LineEnvelope` for tables that do not hold all bins."""
     return LineEnvelope(distance, _NO_TABLE, _NO_TABLE)
 
 
@@ -245,7 +284,7 @@ _gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
 def line_shape_tables(
     window: Window, fft_size: int, adds_powers: bool, tier: int, *, shared: bool = True
 ) -> LineShapeTables:
-    """Prepare the tables for shapes that are sums of modes.
+    """Prepare the tables for line shapes that are sums of Chebyshev modes.
 
     Parameters
     ----------
@@ -321,7 +360,8 @@ def line_shape_tables(
 def late_length_class(window: Window, length_min: np.ndarray) -> np.ndarray:
     """Return the length classes of late echoes of ``length_min`` samples, (n,) int64.
 
-    Class c has at most L / :data:`LENGTH_CLASS_RATIO` ** (c - 1) samples, and shares a table.
+    Late echoes of one class share a table. With a record of L samples, those of class c have at
+    most L / :data:`LENGTH_CLASS_RATIO` ** (c - 1) samples.
     """
     ratio = window.length / np.maximum(length_min, 1)
     return np.ceil(np.log(ratio) / math.log(LENGTH_CLASS_RATIO) - 1e-9).astype(np.int64)
@@ -330,10 +370,10 @@ def late_length_class(window: Window, length_min: np.ndarray) -> np.ndarray:
 def late_echo_has_modes(
     window: Window, fft_size: int, tier: int, length_min: np.ndarray, length_max: np.ndarray
 ) -> np.ndarray:
-    """Return true for late echoes whose shapes may be sums of modes, (n,) bool.
+    """Return true for late echoes whose line shapes may be sums of Chebyshev modes, (n,) bool.
 
-    ``length_min`` and ``length_max`` are the least and the largest number of samples of a segment,
-    (n,); ``tier`` is an index in :data:`MODE_TIERS`.
+    ``length_min`` and ``length_max`` (n,) are the least and the largest number of samples of the
+    echo in any segment. ``tier`` is an index in :data:`MODE_TIERS`.
     """
     if window.name not in COSINE_SUM_COEFFICIENTS:
         return np.zeros(length_min.shape, np.bool_)
@@ -350,9 +390,10 @@ def late_echo_has_modes(
 def late_window_samples(
     window: Window, late_position: np.ndarray, n_samples: np.ndarray
 ) -> np.ndarray:
-    """Return the window at positions x = -1 .. 1 of the last ``n_samples`` samples of the record.
+    """Return the window's values over the last ``n_samples`` samples of the record.
 
-    The shape of the result is that of ``n_samples``, followed by that of ``late_position``.
+    ``late_position`` runs from -1 to 1 over these samples. The shape of the result is that of
+    ``n_samples``, followed by that of ``late_position``.
     """
     fraction = np.asarray(n_samples)[..., None] / window.length
     record_position = 1.0 - fraction * (1.0 - late_position)
@@ -371,8 +412,7 @@ def late_line_shape_tables(
 ) -> LineShapeTables:
     """Prepare the tables for late echoes of one length class whose shapes are sums of modes.
 
-    Parameters are those of :func:`line_shape_tables`, with the class
-    (:func:`late_length_class`).
+    Parameters are those of :func:`line_shape_tables`, with the class (:func:`late_length_class`).
     """
     clearance_bins = MODE_TIERS[tier][1]
     table_half_width = clearance_bins + _LATE_TABLE_MARGIN_BINS
@@ -405,18 +445,20 @@ def late_line_shape_tables(
 
 
 class LateModeTransforms(NamedTuple):
-    """Transforms of the modes of late echoes."""
+    """Fourier transforms and Taylor coefficients of the Chebyshev modes of late echoes."""
 
     mode_transforms: np.ndarray
-    """(modes, places): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1, divided by the
-    kernel's transform."""
+    """(modes, places): half the integral of T_j(x) exp(-i pi u x) over x = -1 .. 1. T_j is the
+    Chebyshev polynomial of mode j, u the distance from the line [bins of fs/L']. L' is the echo's
+    number of samples. The spreading kernel's transform is divided out.
+    """
     taylor_coefficients: np.ndarray
-    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of the modes at x = 1."""
+    """(modes, END_DERIVATIVES_MAX + 1): Taylor coefficients of the modes at the record's end."""
 
 
 @lru_cache(maxsize=len(MODE_TIERS))
 def _late_mode_transforms(tier: int) -> LateModeTransforms:
-    """Compute the transforms of the modes of a tier of :data:`MODE_TIERS`."""
+    """Compute the :class:`LateModeTransforms` for an index ``tier`` in :data:`MODE_TIERS`."""
     n_modes, clearance_bins, _ = MODE_TIERS[tier]
     half_count = math.ceil(
         (1.02 * LENGTH_CLASS_RATIO * (clearance_bins + _LATE_TABLE_MARGIN_BINS) + 14)
@@ -438,7 +480,10 @@ def _late_mode_transforms(tier: int) -> LateModeTransforms:
 
 
 def window_has_modes(window: Window, fft_size: int) -> bool:
-    """Return true if shapes of a window are sums of modes; else their tables hold all bins."""
+    """Return true if line shapes of this window may be sums of Chebyshev modes.
+
+    Otherwise the line-shape tables hold all bins.
+    """
     is_long_enough = (
         window.length >= _RECORD_LENGTH_MIN and window.length * _PADDING_MAX >= fft_size
     )
@@ -452,7 +497,7 @@ def full_line_shape_tables(
     phase: np.ndarray,
     first_sample: np.ndarray | None = None,
 ) -> LineShapeTables:
-    """Compute line shapes whose tables hold all bins, one per segment.
+    """Compute line shapes whose tables hold all bins of the spectrum, one per segment.
 
     Parameters
     ----------
@@ -530,7 +575,10 @@ def _fill_full_envelope(
     envelope_magnitude: np.ndarray,
     square_integral: np.ndarray,
 ) -> None:
-    """Fill the arrays (m,) of a :class:`LineEnvelope` from |G|^2 at all cells of the circle."""
+    """Fill the arrays (m,) of a :class:`LineEnvelope` from a line's squared spectrum.
+
+    ``squared_magnitude`` is given at all cells of the periodic spectrum.
+    """
     paired = squared_magnitude + np.maximum(
         np.roll(squared_magnitude, cells_per_bin // 2),
         np.roll(squared_magnitude, -(cells_per_bin // 2)),
@@ -548,14 +596,18 @@ def _fill_full_envelope(
 
 
 def spreading_kernel(cell_distance: np.ndarray) -> np.ndarray:
-    """Evaluate the kernel that spreads lines over cells, at z cells, |z| <= KERNEL_CELLS / 2."""
+    """Evaluate the kernel that spreads lines over table cells.
+
+    ``cell_distance`` is the distance from the line [cells], at most KERNEL_CELLS / 2.
+    """
     root = np.sqrt(np.maximum(1 - (2 * cell_distance / KERNEL_CELLS) ** 2, 0.0))
     return np.asarray(i0(KERNEL_BETA * root) / i0(KERNEL_BETA))
 
 
 _kernel_coordinate = np.cos(np.pi * (np.arange(KERNEL_DEGREE + 1) + 0.5) / (KERNEL_DEGREE + 1))
 KERNEL_BASIS = np.zeros((KERNEL_DEGREE + 1, KERNEL_CELLS + ZERO_WEIGHT_CELLS))
-"""Polynomial coefficients of the kernel in s = -1 .. 1 across a cell, (powers, cells)."""
+"""Polynomial coefficients of the spreading kernel, (powers, cells). Their variable runs from -1 to
+1 across a cell."""
 
 for _j in range(KERNEL_CELLS):
     KERNEL_BASIS[:, _j] = cheb2poly(
@@ -568,13 +620,13 @@ for _j in range(KERNEL_CELLS):
 
 
 def spreading_kernel_transform(theta: np.ndarray) -> np.ndarray:
-    """Evaluate the Fourier transform of the kernel at theta [rad/cell], |theta| <= pi."""
+    """Evaluate the Fourier transform of the spreading kernel at ``theta`` [rad/cell], up to pi."""
     root = np.sqrt(KERNEL_BETA**2 - (KERNEL_CELLS * theta / 2) ** 2)
     return np.asarray(KERNEL_CELLS * np.sinh(root) / root / i0(KERNEL_BETA))
 
 
 def table_size(layout: SpectrumLayout) -> int:
-    """Return the number of cells times columns in the table of a line shape."""
+    """Return the number of values in the table of a line shape, cells per bin times columns."""
     columns = layout.fft_size if layout.holds_all_bins else 2 * layout.table_bins + 1
     return layout.cells_per_bin * columns
 
@@ -594,7 +646,7 @@ def allocate_line_shapes(tables: LineShapeTables, segments: int) -> LineShape:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def select_segment(shapes, segment):
-    """Select the :class:`LineShape` of one segment; its arrays are views."""
+    """Return the :class:`LineShape` of one segment; its arrays are views of ``shapes``."""
     envelope, ends = shapes.envelope, shapes.ends
     return LineShape(
         shapes.table_re[segment],
@@ -613,7 +665,7 @@ def select_segment(shapes, segment):
 
 @njit(cache=True, error_model="numpy")
 def copy_line_shape(shapes, from_segment, to_segment):
-    """Copy the line shape of one segment to another segment."""
+    """Copy the line shape of one segment to another segment in ``shapes``."""
     source, target = select_segment(shapes, from_segment), select_segment(shapes, to_segment)
     target.table_re[:], target.table_im[:] = source.table_re, source.table_im
     target.envelope.magnitude[:] = source.envelope.magnitude
@@ -623,15 +675,18 @@ def copy_line_shape(shapes, from_segment, to_segment):
 
 
 def chebyshev_nodes(n_nodes: int) -> np.ndarray:
-    """Return the positions in the record, -1 .. 1, at which phase errors are sampled, (nodes,)."""
+    """Return the Chebyshev nodes at which phase errors are sampled, (nodes,).
+
+    A node is a time within the record, from -1 at the start to 1 at the end.
+    """
     return np.cos(np.pi * (np.arange(n_nodes) + 0.5) / n_nodes)
 
 
 @lru_cache(maxsize=8)
 def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
-    """Return the matrix from values at Chebyshev nodes to Chebyshev coefficients.
+    """Return the matrix (nodes, coefficients) from values to Chebyshev coefficients.
 
-    (nodes, coefficients), for values at :func:`chebyshev_nodes`.
+    The values are at :func:`chebyshev_nodes`.
     """
     matrix = 2 / n_nodes * np.cos(np.outer(np.arccos(chebyshev_nodes(n_nodes)), np.arange(n_nodes)))
     matrix[:, 0] /= 2
@@ -639,9 +694,9 @@ def chebyshev_coefficient_matrix(n_nodes: int) -> np.ndarray:
 
 
 def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
-    """Return the distances y from the line of a table's cells and of those that its filter needs.
+    """Return the distances from the line [bins of fs/N] of a table's cells, in steps of one cell.
 
-    In bins of fs/N, in steps of one cell.
+    Cells that the filter DECONVOLUTION_TAPS needs on each side are included.
     """
     cells_per_bin = CELLS_PER_BIN[adds_powers]
     return (
@@ -654,9 +709,9 @@ def _cell_distances(table_bins: int, adds_powers: bool) -> np.ndarray:
 
 
 def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
-    """Divide values by the kernel's transform, and sort them by cell of a bin and by bin.
+    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
 
-    ``values`` (..., places) are at :func:`_cell_distances`.
+    ``values`` (..., places) are at the distances of :func:`_cell_distances`.
     """
     n_inner = values.shape[-1] - 2 * _TAP_REACH_CELLS
     filtered = DECONVOLUTION_TAPS[0] * values[..., _TAP_REACH_CELLS : _TAP_REACH_CELLS + n_inner]
@@ -668,9 +723,10 @@ def _deconvolve_into_rows(values: np.ndarray, cells_per_bin: int) -> np.ndarray:
 
 
 def _envelope_distances(table_bins: int, fft_size: int) -> np.ndarray:
-    """Return the distances at which envelopes are tabulated [bins of fs/N].
+    """Return the distances from the line at which envelopes are tabulated [bins of fs/N].
 
-    One distance per bin of the table, then a geometric progression up to N/2.
+    There is one distance per bin of the table. A geometric progression up to N/2 follows, N being
+    the FFT size.
     """
     far_distances = np.geomspace(
         table_bins + 1, max(fft_size / 2, table_bins + 2), _N_FAR_DISTANCES
@@ -679,18 +735,18 @@ def _envelope_distances(table_bins: int, fft_size: int) -> np.ndarray:
 
 
 def _cotangents(distance: np.ndarray, fft_size: int) -> np.ndarray:
-    """Return cot(pi d / N) of distances d [bins of fs/N]."""
+    """Return cot(pi d / N) of distances d [bins of fs/N], with the FFT size N."""
     with np.errstate(divide="ignore"):
         return np.asarray(1 / np.tan(np.pi * distance / fft_size))
 
 
 @njit(cache=True, error_model="numpy")
 def _mode_integrals(weighted_modes, node, distance):
-    """Integrate modes times exp(-i pi y x) by a quadrature over x, (modes, places).
+    """Integrate Chebyshev modes times exp(-i pi y x) over x by a quadrature, (modes, places).
 
-    ``weighted_modes`` (modes, nodes) are values times quadrature weights at the positions ``node``;
-    ``distance`` (places,) is y [bins of fs/L]. Even modes have real integrals, odd modes imaginary
-    ones.
+    ``weighted_modes`` (modes, nodes) are the modes' values times quadrature weights at the
+    positions x, given by ``node``. ``distance`` (places,) is y [bins of fs/L]. Even modes have real
+    integrals, odd modes imaginary ones.
     """
     integrals = np.zeros((weighted_modes.shape[0], distance.size))
     cosine, sine = np.empty(distance.size), np.empty(distance.size)
@@ -706,11 +762,11 @@ def _mode_integrals(weighted_modes, node, distance):
 
 
 def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np.ndarray:
-    """Compute the Taylor coefficients of w T_j at the record's end x = 1.
+    """Compute the Taylor coefficients of each Chebyshev mode times the window, at the record's end.
 
-    The window w is the sum of cosines with the coefficients ``coefficient_texts``. At x = 1 the
-    cosines may almost cancel, so their sums are exact fractions. The result is
-    (modes, END_DERIVATIVES_MAX + 1).
+    The window is the sum of cosines with the coefficients ``coefficient_texts``. The cosines may
+    almost cancel at the record's end, so their sums are exact fractions. The result is (modes,
+    END_DERIVATIVES_MAX + 1).
     """
     order = np.arange(END_DERIVATIVES_MAX + 1)
     even = np.where(order % 2 == 0, (-1.0) ** (order // 2), 0.0)
@@ -740,10 +796,11 @@ def _taylor_coefficients(coefficient_texts: tuple[str, ...], n_modes: int) -> np
 def _euler_maclaurin_corrections(
     taylor_coefficients: np.ndarray, distance: np.ndarray, length: int
 ) -> np.ndarray:
-    """Compute the difference between sums over samples and integrals, (modes, places).
+    """Compute sums over samples minus integrals over the record, for each mode, (modes, places).
 
-    By the Euler-Maclaurin formula, from the Taylor coefficients of modes at x = 1, at distances y
-    [bins of fs/L], for a record of ``length`` samples.
+    The differences follow from the Euler-Maclaurin formula and the Taylor coefficients of modes at
+    the record's end. ``distance`` is from the line [bins of fs/L]. ``length`` is the number L of
+    samples.
     """
     bernoulli = {1: 1 / 12, 3: -1 / 720, 5: 1 / 30240}
     phase_factor = np.exp(-1j * np.pi * distance)
@@ -769,7 +826,7 @@ def _euler_maclaurin_corrections(
 def _power_sum_polynomials() -> np.ndarray:
     """Return the coefficients of sum_n n^j e^{-i theta n} as a polynomial in cot(theta / 2).
 
-    (END_DERIVATIVES_MAX + 1, N_END_COEFFICIENTS), by j and by power of the cotangent.
+    The result is (END_DERIVATIVES_MAX + 1, N_END_COEFFICIENTS), by j and by power of the cotangent.
     """
     n_coefficients = N_END_COEFFICIENTS
     sums = np.zeros((END_DERIVATIVES_MAX + 1, n_coefficients), complex)
@@ -788,10 +845,9 @@ _POWER_SUMS_RE, _POWER_SUMS_IM = (
 )
 
 _CORRECTION_FACTORS = np.zeros((_EULER_MACLAURIN_ORDER_MAX + 1, _EULER_MACLAURIN_ORDER_MAX + 1))
-"""Factors in the Euler-Maclaurin correction of one end, (d, i).
-
-The correction is a polynomial in -i theta. Its coefficient of power d is a sum over Taylor
-coefficients i."""
+"""Factors in the Euler-Maclaurin correction of one end of the record, (d, i). The correction is a
+polynomial in -i theta, with the phase theta per sample. Its coefficient of power d is a sum over
+Taylor coefficients i."""
 
 for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
     for _i in range(_m + 1):
@@ -799,9 +855,10 @@ for _m, _coefficient in EULER_MACLAURIN_COEFFICIENTS.items():
 
 
 def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynomials:
-    """Compute the polynomials A and B of modes, (modes, N_END_COEFFICIENTS).
+    """Compute the :class:`EndPolynomials` of Chebyshev modes, (modes, N_END_COEFFICIENTS).
 
-    ``taylor_coefficients`` are those of the modes at x = 1; ``length`` is the number of samples.
+    ``taylor_coefficients`` are those of the modes at the record's end; ``length`` is the number of
+    samples.
     """
     power_sums = _POWER_SUMS
     step_powers = (2 / length) ** np.arange(END_DERIVATIVES_MAX + 1)
@@ -827,7 +884,7 @@ def _end_polynomials(taylor_coefficients: np.ndarray, length: int) -> EndPolynom
 
 @njit(cache=True, error_model="numpy")
 def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
-    """Decompose phase errors into a shift of the line and Chebyshev modes.
+    """Decompose phase errors into a frequency shift of the line and Chebyshev modes.
 
     Parameters
     ----------
@@ -873,7 +930,9 @@ def decompose_phase_errors(phase, window_values, coefficient_matrix, modes):
 
 @njit(cache=True, error_model="numpy")
 def build_line_shape(segment, shape_index, previous_index, modes, tables, shape):
-    """Compute the line shape of one segment as a sum of modes, or copy a table of all bins.
+    """Compute one segment's line shape, the spectrum of a line of amplitude 1.
+
+    It is a sum of Chebyshev modes, or a copy of a table of all bins.
 
     Parameters
     ----------
@@ -892,7 +951,9 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
 
     Notes
     -----
-    With f = w exp(2 pi i psi), the modes a_j and their tabulated transforms M_j,
+    G is the line's spectrum at y bins from the line, w the window, psi the phase error [cycles] and
+    r the number of samples over the FFT size. With f = w exp(2 pi i psi), the mode coefficients a_j
+    and their tabulated transforms M_j,
 
         G(y) = sum_j a_j M_j(y) + (f(-1) e^{i pi r y} - f(1) e^{-i pi r y}) / 2.
 
@@ -961,7 +1022,7 @@ def build_line_shape(segment, shape_index, previous_index, modes, tables, shape)
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _clear_end_polynomials(ends):
-    """Set all coefficients of :class:`EndPolynomials` to 0."""
+    """Set all coefficients of an :class:`EndPolynomials` to 0."""
     for d in range(N_END_COEFFICIENTS):
         ends.start_re[d], ends.start_im[d], ends.end_re[d], ends.end_im[d] = 0.0, 0.0, 0.0, 0.0
 
@@ -970,7 +1031,8 @@ def _clear_end_polynomials(ends):
 def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segment_exists):
     """Return the first segment before ``segment`` with the same line shape; -1 if there is none.
 
-    Shapes are equal if their modes (:class:`ShapeModes`) and echo lengths (segments, shapes) are.
+    Two shapes are the same if their modes (:class:`ShapeModes`) and their numbers of samples in
+    ``echo_lengths`` (segments, shapes) are equal.
     """
     n_modes = modes.n_modes[segment, shape_index]
     for s in range(segment):
@@ -990,13 +1052,16 @@ def first_segment_of_same_shape(segment, shape_index, modes, echo_lengths, segme
 
 @njit(cache=True, error_model="numpy")
 def build_late_line_shape(segment, shape_index, modes, tables, shape):
-    """Compute the line shape of a late echo, of ``tables.echo_lengths`` samples L'.
+    """Compute the line shape of an echo that arrives after its record has begun.
 
-    Parameters are those of :func:`build_line_shape`.
+    The line shape is the spectrum of a line of amplitude 1. The echo has ``tables.echo_lengths``
+    samples L'. Parameters are those of :func:`build_line_shape`.
 
     Notes
     -----
-    With f = w exp(2 pi i psi) over the echo's samples, r' = L'/N and theta = 2 pi y / N,
+    G is the line's spectrum at y bins from the line, w the window, psi the phase error [cycles], N
+    the FFT size and B the Bernoulli numbers. With f = w exp(2 pi i psi) over the echo's samples,
+    r' = L'/N and theta = 2 pi y / N,
 
         G(y) = L'/2 int f(x) e^{-i pi r' y x} dx + (f(-1) e^{i pi r' y} - f(1) e^{-i pi r' y}) / 2
                + sum_m B_{m+1} / (m+1)! [ d^m / dn^m (f e^{-i theta n}) ] at the ends,
@@ -1104,9 +1169,9 @@ def build_late_line_shape(segment, shape_index, modes, tables, shape):
 
 @njit(cache=True, error_model="numpy")
 def _fill_table(values, layout, table):
-    """Divide values at cells by the kernel's transform, and sort them by cell of a bin and by bin.
+    """Divide a table by the spreading kernel's transform, then sort it by cell of a bin and by bin.
 
-    ``values`` are at :func:`_cell_distances`, ``table`` is the result.
+    ``values`` are at the distances of :func:`_cell_distances`. The result goes to ``table``.
     """
     cells_per_bin, columns = layout.cells_per_bin, 2 * layout.table_bins + 1
     n_values = np.uint64(cells_per_bin * columns)
@@ -1124,10 +1189,11 @@ def _fill_table(values, layout, table):
 
 @njit(cache=True, error_model="numpy")
 def _fill_envelope(squared_magnitude, layout, envelope_cotangent, shape):
-    """Fill the envelope of a shape from |G|^2 at cells, and beyond them from its end polynomials.
+    """Fill the envelope of a shape from squared magnitudes at cells and from its end polynomials.
 
-    |G|^2 varies with y as a sine with a period of one bin. It is therefore nowhere larger than the
-    sum of two values that are half a bin apart.
+    The polynomials are used at distances outside the table. The squared magnitude varies over
+    distance as a sine with a period of one bin. It is therefore nowhere larger than the sum of two
+    values that are half a bin apart.
     """
     table_bins, cells_per_bin = layout.table_bins, layout.cells_per_bin
     distance, ends = shape.envelope.distance, shape.ends

@@ -1,14 +1,14 @@
 """Lines of one segment: frequency, strength and phase of each beamlet's beat.
 
-The beat of a beamlet is a tone at nu bins of fs/N. Its line appears at nu minus a whole number of
-FFT lengths, within -N/2 .. N/2. A real record shows the line and its image at the opposite
-frequency.
+The beat of a beamlet is a tone at nu bins of fs/N, the sample rate over the FFT size. Its line
+appears at nu minus a whole number of FFT lengths, within -N/2 .. N/2. A real record shows the line
+and its image at the opposite frequency.
 
 Many close lines are replaced by a few. The spectrum is band-limited as a function of a line's
-position. Lines within +-h bins are therefore equivalent to J lines at Chebyshev nodes, with J about
-8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has an error of about
-2 J_J(pi h t). This is negligible except at the record's ends, where most windows are small. The
-window weighs the error.
+position. Lines within +-h bins are therefore equivalent to some number J of lines at Chebyshev
+nodes, with J about 8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has
+an error of about 2 J_J(pi h t). This is negligible except at the record's ends, where most windows
+are small. The window weighs the error.
 """
 
 import math
@@ -31,36 +31,39 @@ AMPLITUDE_TOLERANCES = (
     1e-13, 3e-13, 1e-12, 3e-12, 1e-11, 3e-11, 1e-10, 3e-10, 1e-9, 3e-9, 1e-8, 3e-8, 1e-7, 3e-7,
     1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2,
 )  # fmt: skip
-"""Tabulated errors of a sum of amplitudes over equivalent lines, relative to the sum of |C_b|."""
+"""Tabulated errors of a summed amplitude when few equivalent lines replace all lines. They are
+relative to the sum of the lines' amplitudes."""
 
 POWER_TOLERANCES = (
     1e-18, 1e-15, 1e-13, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3
 )  # fmt: skip
-"""Tabulated errors of a sum of powers over equivalent lines, relative to the sum of |C_b|^2.
-
-A null of |X| shows the square root of the error."""
+"""Tabulated errors of a summed power when few equivalent lines replace all lines. They are relative
+to the sum of the lines' powers. Where the spectrum's magnitude is zero, it shows the square root of
+the error."""
 
 NODES_MAX = 128
-"""Maximum number of equivalent lines. Lines that would need more are not replaced."""
+"""Maximum number of equivalent lines that replace all lines. Lines that would need more are kept.
+"""
 
 NODES_PER_BATCH = 128
-"""Size of each section of :attr:`LineScratch.batch`. It is a constant, so that the compiler knows
+"""Size of each section of :attr:`LineScratch.batch`. It is constant, so that the compiler knows
 that sections do not overlap."""
 
 LINES_PER_BATCH = 32
-"""Number of lines that are summed together; many echoes have few lines."""
+"""Number of lines that are processed in one pass of a sum. It is small, because many echoes have
+few lines."""
 
 _X, _EVEN, _ODD, _RE, _IM, _LANES = (NODES_PER_BATCH * section for section in range(6))
-"""First elements of the sections of :attr:`LineScratch.batch`: positions x of lines or nodes,
--1 .. 1; Chebyshev polynomials of even and of odd order at x; real and imaginary parts of weights;
-partial sums."""
+"""Index of the first element of each section of :attr:`LineScratch.batch`. The sections hold
+positions x of lines or nodes, -1 .. 1, and Chebyshev polynomials of even and of odd order at x.
+Real and imaginary parts of weights follow, then partial sums."""
 
 BATCH_SCRATCH_SIZE = 6 * NODES_PER_BATCH
 """Number of elements of :attr:`LineScratch.batch`."""
 
 N_SUM_LANES = 8
-"""Number of partial sums that are added side by side. Their order does not depend on the machine.
-"""
+"""Number of partial sums that are added in parallel. It is fixed, so that the order of additions
+does not depend on the machine."""
 
 CHEBYSHEV_NODES = np.zeros((NODES_MAX + 1, NODES_MAX))
 for _n in range(1, NODES_MAX + 1):
@@ -68,82 +71,95 @@ for _n in range(1, NODES_MAX + 1):
 
 
 REAL_WITHOUT_IMAGES, REAL_WITH_IMAGES, COMPLEX_RECORD = range(3)
-"""Types of spectra: bins 0 .. N/2 of a real record, without or with the images of lines; all N bins
-of a complex record, whose numbers may continue below 0 and above N."""
+"""Types of spectra. The first two are bins 0 .. N/2 of a real record, without or with the lines'
+images at negative frequency. The third is all N bins of a complex record. Its bin numbers may
+continue below 0 and above N, the FFT size."""
 
 
 class SpectrumLayout(NamedTuple):
-    """Sizes of a spectrum and of the line-shape table from which it is computed."""
+    """Sizes of a spectrum and of the line-shape table for computing it."""
 
     fft_size: int
-    """FFT size N."""
+    """FFT size N, the number of samples after zero padding."""
     record_length: int
-    """Number of samples L of the record; of an echo that arrives late, number of its samples L'."""
+    """Number of samples of the record. For an echo that arrives late, it is the number of samples
+    with the echo.
+    """
     table_bins: int
-    """Number of bins T that the table holds on either side of a line."""
+    """Number of FFT bins that the line-shape table holds on each side of a line."""
     cells_per_bin: int
-    """Number of table cells in a bin of fs/N."""
+    """Number of line-shape table cells in an FFT bin."""
     adds_powers: bool
-    """True if the powers of lines add, False if their amplitudes do."""
+    """True if the beamlets' powers add in the spectrum, False if their amplitudes do."""
     holds_all_bins: bool
-    """True if the table holds all bins of the spectrum."""
+    """True if the line-shape table holds all bins of the spectrum."""
     clearance_bins: int
-    """Distance from a line [bins of fs/N] beyond which the record's ends determine its shape."""
+    """Distance from a line [FFT bins] beyond which the record's two ends determine the line's
+    spectrum.
+    """
     spectrum_type: int = REAL_WITH_IMAGES
-    """REAL_WITHOUT_IMAGES, REAL_WITH_IMAGES or COMPLEX_RECORD."""
+    """Type of spectrum: REAL_WITHOUT_IMAGES, REAL_WITH_IMAGES or COMPLEX_RECORD."""
 
 
 class LineArrays(NamedTuple):
-    """Positions and weights of lines, one element per line; arrays may be longer."""
+    """Positions and complex weights of lines, one element per line; arrays may be longer."""
 
     position: np.ndarray
-    """Position nu of each line [bins of fs/N], counted from the origin bin."""
+    """Frequency of each line [FFT bins from the origin bin]."""
     re: np.ndarray
-    """Real part of the weight C_b; |C_b|^2 if powers add."""
+    """Real part of the line's complex amplitude [V]; its squared magnitude if powers add."""
     im: np.ndarray
-    """Imaginary part of the weight C_b; 0 if powers add."""
+    """Imaginary part of the line's complex amplitude [V]; 0 if powers add."""
 
 
 class LineScratch(NamedTuple):
-    """Scratch arrays of sums over lines."""
+    """Scratch arrays for sums over lines."""
 
     batch: np.ndarray
-    """(BATCH_SCRATCH_SIZE,): sections for a batch of lines, or for nodes."""
+    """(BATCH_SCRATCH_SIZE,): sections for the lines of one pass, or for the Chebyshev nodes."""
     moment_re: np.ndarray
-    """(NODES_MAX + 1,) or more: real parts of the Chebyshev moments of the weights."""
+    """(NODES_MAX + 1,) or more: real part of sum_b C_b T_j(x_b), by order j of the Chebyshev
+    polynomial T_j. Line b has the weight C_b and the position x_b.
+    """
     moment_im: np.ndarray
-    """(NODES_MAX + 1,) or more: imaginary parts of the Chebyshev moments of the weights."""
+    """(NODES_MAX + 1,) or more: imaginary part of sum_b C_b T_j(x_b), by order j of the Chebyshev
+    polynomial T_j. Line b has the weight C_b and the position x_b.
+    """
 
 
 class LineSummary(NamedTuple):
-    """Sums of the weights of lines, and the range of their positions."""
+    """Sums of the lines' weights, and their lowest and highest frequency."""
 
     magnitude_sum: float
-    """Sum of |C_b|, or an upper bound of it; sum of |C_b|^2 if powers add."""
+    """Sum of the lines' amplitudes [V], or an upper bound of it; sum of their powers if powers add.
+    """
     power_sum: float
-    """Sum of |C_b|^2; sum of |C_b|^4 if powers add."""
+    """Sum of the lines' powers [V^2]; sum of their squared powers if powers add."""
     lowest_position: float
-    """Lowest position [bins]."""
+    """Lowest line frequency [FFT bins from the origin bin]."""
     highest_position: float
-    """Highest position [bins]."""
+    """Highest line frequency [FFT bins from the origin bin]."""
 
 
 class BeamletArrays(NamedTuple):
-    """Beamlets of all footprints, relative to the beam's axis."""
+    """Range, Doppler ratio and amplitude of all beamlets, relative to the beam's axis."""
 
     relative_range_offset: np.ndarray
-    """(footprints, beamlets): relative difference of range, (R_b - R_0) / R_0."""
+    """(footprints, beamlets): range of the beamlet minus that on the axis, over the latter."""
     doppler_ratio_offset: np.ndarray
-    """(footprints, beamlets): difference of Doppler ratio, beta_b - beta_0."""
+    """(footprints, beamlets): Doppler ratio 2 v_r / c of the beamlet minus that on the axis."""
     relative_amplitude: np.ndarray
-    """(footprints, beamlets): amplitude, relative to that of a single line on the axis."""
+    """(footprints, beamlets): amplitude of the beamlet's beat, over that of a single line on the
+    axis.
+    """
     phase_cycles: np.ndarray
-    """(segments, footprints, beamlets): random phases [cycles]; (0, footprints, beamlets) if there
-    are none."""
+    """(segments, footprints, beamlets): random phase of each beamlet's beat [cycles]. The shape is
+    (0, footprints, beamlets) if there are no random phases.
+    """
 
 
 def beamlet_arrays(beamlet_table: np.ndarray) -> BeamletArrays:
-    """Name the rows of :attr:`sweep.model.preparation.Shots.beamlet_table`."""
+    """Return the rows of :attr:`sweep.model.preparation.Shots.beamlet_table` as named fields."""
     range_offset, doppler_offset, amplitude = beamlet_table[:3]
     return BeamletArrays(range_offset, doppler_offset, amplitude, beamlet_table[3:])
 
@@ -155,48 +171,54 @@ class PointParameters(NamedTuple):
     """
 
     range: np.ndarray
-    """Range R_0 along the beam's axis at the start of the shot [m]."""
+    """Range along the beam's axis at the start of the shot [m]."""
     doppler_ratio: np.ndarray
-    """Doppler ratio 2 v / c at the start of the shot."""
+    """Doppler ratio 2 v_r / c at the start of the shot, with the radial velocity v_r."""
     chirp_rate: np.ndarray
-    """Chirp rate [Hz/s], positive."""
+    """Chirp rate of the up-chirp [Hz/s], positive."""
     beat_amplitude_scale: np.ndarray
-    """Amplitude of the beat of a line of relative amplitude 1 [V]."""
+    """Amplitude [V] of the beat at the ADC for a line of relative amplitude 1."""
     detector_bandwidth: np.ndarray
-    """Bandwidth of the detector's pole [Hz]."""
+    """3 dB bandwidth of the detector's single-pole low-pass [Hz]."""
     amplifier_bandwidth: np.ndarray
-    """Bandwidth of the amplifier's pole [Hz]."""
+    """3 dB bandwidth of the amplifier's single-pole low-pass [Hz]."""
     sample_rate: np.ndarray
-    """Sample rate fs [Hz]."""
+    """Sample rate of the record [Hz]."""
     record_start: np.ndarray
     """Time from the start of a segment to the first sample of its record [s]."""
     up_carrier: np.ndarray
-    """Carrier of the up segment [Hz]."""
+    """Frequency at the start of the up segment [Hz], by which a delay makes a phase."""
     down_carrier: np.ndarray
-    """Carrier of the down segment [Hz]."""
+    """Frequency at the start of the down segment [Hz], by which a delay makes a phase."""
     noise_sigma: np.ndarray
-    """Noise per quadrature in a bin [V, summed over the record]."""
+    """Noise standard deviation per quadrature in a bin [V, summed over the record]."""
     threshold: np.ndarray
-    """Threshold on |X| [V, summed over the record]."""
+    """Detection threshold on a bin's magnitude [V, summed over the record]."""
     negligible_signal_ratio: np.ndarray
-    """Signal |X| over ``noise_sigma`` below which a bin counts as noise alone."""
+    """Signal magnitude over ``noise_sigma`` below which a bin counts as noise alone."""
     line_noise: np.ndarray
-    """Noise per quadrature in bins that lines fill, with the part of the phase-noise pedestal that
-    changes |X| [V, summed over the record]."""
+    """Noise standard deviation per quadrature in bins that contain lines [V, summed over the
+    record]. It includes the part of the laser's phase-noise pedestal that changes the magnitude.
+    """
     leakage_tolerance: np.ndarray
-    """Probability of leakage that may be neglected."""
+    """Leakage that may be neglected [probability of at least one false alarm]."""
     line_error_tolerance: np.ndarray
-    """Error of |X| over ``noise_sigma`` that approximations of the lines may make in a bin."""
+    """Error of a bin's magnitude over ``noise_sigma`` that approximations of the lines may cause.
+    """
     image_gain: np.ndarray
-    """Amplitude of the I/Q image of a line over that of the line; 0 if there is none."""
+    """Amplitude of a line's image by I/Q imbalance, over that of the line; 0 if there is none."""
     side_noise: np.ndarray
-    """Noise per quadrature in bins beside the lines, with the whole pedestal [V]."""
+    """Noise standard deviation per quadrature in bins next to the lines [V, summed over the
+    record]. It includes the whole phase-noise pedestal of the laser.
+    """
     pedestal_reach_bins: np.ndarray
-    """Distance from the lines up to which the pedestal widens the echo [bins of fs/N]."""
+    """Distance from the lines [FFT bins] up to which the laser's phase-noise pedestal counts as
+    echo.
+    """
     pedestal_line_width_bins: np.ndarray
-    """Line width of the laser [bins of fs/N]."""
+    """Line width of the laser [FFT bins]."""
     pedestal_delay: np.ndarray
-    """Delay of the echo, at most the duration of the record [N/fs]."""
+    """Delay of the echo, at most the duration of the record [N/fs, FFT size over sample rate]."""
 
 
 class SegmentParameters(NamedTuple):
@@ -206,61 +228,67 @@ class SegmentParameters(NamedTuple):
     """
 
     chirp_rate: np.ndarray
-    """Signed chirp rate [Hz/s]."""
+    """Signed chirp rate of the segment [Hz/s]."""
     carrier: np.ndarray
-    """Carrier [Hz]."""
+    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
     whitening_gain: np.ndarray
-    """Gain of the signal in the whitened spectrum."""
+    """Factor on the signal's amplitude in the spectrum whose noise is whitened."""
     range_decrease: np.ndarray
     """Decrease of the range from the start of the shot to that of the segment [m]."""
     doppler_ratio: np.ndarray
-    """Doppler ratio beta at the start of the segment."""
+    """Doppler ratio 2 v_r / c at the start of the segment, with the radial velocity v_r."""
     start_time: np.ndarray
-    """Start of the segment, from that of the shot [s]."""
+    """Time from the start of the shot to that of the segment [s]."""
 
 
 def point_parameters(point_table: np.ndarray) -> PointParameters:
-    """Name the shared rows of :meth:`sweep.model.preparation.Shots.point_parameter_table`."""
+    """Return the rows of a point table that all segments share as named fields.
+
+    The table is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    """
     return PointParameters(*point_table[: len(PointParameters._fields)])
 
 
 def segment_parameters(point_table: np.ndarray) -> SegmentParameters:
-    """Name the rows by segment of :meth:`sweep.model.preparation.Shots.point_parameter_table`."""
+    """Return the rows of a point table that differ by segment as named fields.
+
+    The table is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    """
     n_fields, n_points = len(SegmentParameters._fields), point_table.shape[1]
     rows_by_segment = point_table[len(PointParameters._fields) :].reshape(-1, n_fields, n_points)
     return SegmentParameters(*np.ascontiguousarray(rows_by_segment.swapaxes(0, 1)))
 
 
 class BeatParameters(NamedTuple):
-    """Parameters on which the beats of one segment at one point depend."""
+    """Parameters of one point and segment from which the beamlets' beats are computed."""
 
     range: float
-    """Range R_0 along the beam's axis at the start of the shot [m]."""
+    """Range along the beam's axis at the start of the shot [m]."""
     range_decrease: float
     """Decrease of the range from the start of the shot to that of the segment [m]."""
     doppler_ratio: float
-    """Doppler ratio beta at the start of the segment."""
+    """Doppler ratio 2 v_r / c at the start of the segment, with the radial velocity v_r."""
     start_time: float
-    """Start of the segment, from that of the shot [s]."""
+    """Time from the start of the shot to that of the segment [s]."""
     chirp_rate: float
-    """Signed chirp rate [Hz/s]."""
+    """Signed chirp rate of the segment [Hz/s]."""
     carrier: float
-    """Carrier [Hz]."""
+    """Frequency at the segment's start [Hz], by which a delay makes a phase."""
     amplitude: float
-    """Amplitude of the beat of a line of relative amplitude 1, in the whitened spectrum [V]."""
+    """Amplitude [V] of the beat of a line of relative amplitude 1, in the whitened spectrum."""
     detector_bandwidth: float
-    """Bandwidth of the detector's pole [Hz]."""
+    """3 dB bandwidth of the detector's single-pole low-pass [Hz]."""
     amplifier_bandwidth: float
-    """Bandwidth of the amplifier's pole [Hz]."""
+    """3 dB bandwidth of the amplifier's single-pole low-pass [Hz]."""
     sample_rate: float
-    """Sample rate fs [Hz]."""
+    """Sample rate of the record [Hz]."""
     record_start: float
-    """Time from the start of the segment to the first sample with the echo [s]."""
+    """Time from the start of the segment to the first sample that contains the echo [s]."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def beat_parameters_at(point_parameters, segment_parameters, segment, point):
-    """Select the :class:`BeatParameters` of one segment of one point."""
+    """Return the :class:`BeatParameters` of one segment of one point."""
     return BeatParameters(
         point_parameters.range[point],
         segment_parameters.range_decrease[segment, point],
@@ -279,7 +307,9 @@ def beat_parameters_at(point_parameters, segment_parameters, segment, point):
 
 @lru_cache(maxsize=32)
 def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...]) -> np.ndarray:
-    """Tabulate the largest pi h [rad] at which J equivalent lines meet each tolerance.
+    """Tabulate how wide a group of lines may be so that J equivalent lines meet each tolerance.
+
+    The width is the half-width h [bins of fs/L] times pi, a phase [rad] at the record's end.
 
     Parameters
     ----------
@@ -307,8 +337,9 @@ def node_phase_limits(weights: tuple[float, ...], tolerances: tuple[float, ...])
 def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Bound the remainder of a Chebyshev series after J terms, (tolerances, J), for ln z < ln 2 J.
 
-    The remainder is the weighted mean over t of 2 sum_{m >= J} |J_m(z t)|. Its bound follows from
-    J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
+    The series represents exp(i z x t) at the position x of a line, -1 .. 1, and the time t in the
+    record. J_m is the Bessel function. The remainder is the weighted mean over t of 2 sum_{m >= J}
+    |J_m(z t)|. Its bound follows from J_m(x) <= (x/2)^m / m! exp(-x^2 / (4 m + 4)).
     """
     phase_span, weighted_sum = np.exp(log_z), np.zeros(log_z.shape)
     for record_position, weight in zip(np.linspace(0, 1, weights.size), weights, strict=True):
@@ -325,7 +356,7 @@ def _truncation_bound(log_z: np.ndarray, n_terms: np.ndarray, weights: np.ndarra
 def compute_lines(
     beat, segment, beamlets, footprint_row, layout, lines, inverse_gain_re, inverse_gain_im
 ):
-    """Compute the positions nu_b and the complex weights C_b of a segment's lines.
+    """Compute the positions and the complex weights of a segment's lines.
 
     Parameters
     ----------
@@ -438,7 +469,7 @@ def compute_lines(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
-    """Append the images of lines at the opposite frequencies; return the number of all lines.
+    """Append images of lines at the opposite frequencies; return the number of lines and images.
 
     ``image_gain`` is the amplitude of an image over that of its line.
     """
@@ -453,7 +484,7 @@ def add_image_lines(lines, n_lines, origin_bin, image_gain, adds_powers):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fold_lines(lines, n_lines, layout):
-    """Shift lines by whole FFT lengths to positions within N/2 bins of the origin."""
+    """Shift lines by whole FFT lengths, to positions within half an FFT length of the origin."""
     for line in range(n_lines):
         n_folds = math.floor(lines.position[line] / layout.fft_size + 0.5)
         lines.position[line] -= n_folds * layout.fft_size
@@ -505,7 +536,7 @@ def summarise_lines(lines, n_lines, adds_powers, batch):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_allowed, threshold):
-    """Return the error that equivalent lines may make, relative to the largest possible peak.
+    """Return the tolerated error of replacing lines, relative to the largest possible peak.
 
     Parameters
     ----------
@@ -546,11 +577,12 @@ def allowed_relative_error(summary, n_lines, adds_powers, window_sum, bin_error_
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def count_nodes(phase_span, tolerance, phase_limits):
-    """Return the number of nodes that represent lines within a phase span to a tolerance.
+    """Return the number of equivalent lines that represent a group of lines to a tolerance.
 
-    ``phase_span`` is pi h [rad] of lines within +-h bins. ``phase_limits`` is the table of
-    :func:`node_phase_limits`; if all its tolerances are larger than ``tolerance``, its smallest one
-    is used. If no number of nodes is sufficient, the result is NODES_MAX + 1.
+    ``phase_span`` is pi h [rad] of lines within +-h bins of fs/L; 2 pi h if powers add.
+    ``phase_limits`` is the table of :func:`node_phase_limits`. If all its tolerances are larger
+    than ``tolerance``, its smallest one is used. If no number is sufficient, the result is
+    NODES_MAX + 1.
     """
     limit_row = phase_limits.shape[0] - 1
     while limit_row > 0 and phase_limits[limit_row, 0] > tolerance:

@@ -40,36 +40,38 @@ from sweep.model.spectrum.lines import (
 )
 
 CELLS_PER_BIN = 16
-"""Number of cells of the frequency grid per bin of the FFT."""
+"""Number of cells of the frequency grid per FFT bin."""
 
 GRID_CELLS_MIN = 1 << 12
-"""Default number of cells of the grid; points whose lines spread farther get more."""
+"""Default number of cells of the frequency grid. Points whose lines cover more bins get more cells.
+"""
 
 CLEARANCE_BINS = 16
-"""Number of bins on each side of the lines that the circular convolution must not reach."""
+"""Number of bins on each side of the lines that the circular convolution must not wrap into."""
 
 _SPECTRA_PER_TRANSFORM = 32
-"""Number of spectra per call of the FFT: as many as the processor's cache holds."""
+"""Number of spectra per call of the FFT, so that they fit into the processor's cache."""
 
 
 class GridOptions(NamedTuple):
-    """Options of the transform, as of :func:`find_peaks_on_grid`."""
+    """Options of :func:`find_peaks_on_grid`."""
 
     degree: int
-    """Degree of the polynomial that spreads each line over cells."""
+    """Degree of the polynomial that spreads each line over cells; 0 for the nearest cell."""
     real: bool
-    """True to transform powers as real numbers, if the powers of the lines add."""
+    """True to transform powers as real numbers. It has effect only if the powers of the lines add.
+    """
     folded: bool
-    """True to transform back to the bins alone, not to all cells."""
+    """True to transform back to the FFT bins alone, not to all cells."""
 
 
 class GridSpectra(NamedTuple):
-    """Spectra of m points around their lines, without noise."""
+    """Spectra of m points in the bins around their lines, without noise."""
 
     first_bin: np.ndarray
-    """(m,): first bin of each spectrum."""
+    """(m,): FFT bin number of the first bin of each spectrum."""
     magnitude: np.ndarray
-    """(m, cells / CELLS_PER_BIN): |X| [V, summed over the record]."""
+    """(m, cells / CELLS_PER_BIN): magnitude of each bin [V, summed over the record]."""
 
 
 def find_peaks_on_grid(
@@ -134,8 +136,8 @@ def find_peaks_on_grid(
 def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
     """Return the number of grid cells of each point, (n,) int64, a power of two.
 
-    The lines are in the middle of the grid, with `CLEARANCE_BINS` and as much room as they take
-    on both sides.
+    The lines are in the middle of the grid. On each side there are `CLEARANCE_BINS` and as many
+    bins as the lines cover.
     """
     beat_per_ratio = 2 * np.abs(shots.waveform.chirp_rate) * shots.range / SPEED_OF_LIGHT
     carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.waveform.carriers])
@@ -247,7 +249,7 @@ def _window_transform(
 ) -> np.ndarray:
     """Return the FFT, over the grid's cells, of the window's spectrum with phase 0 at mid-record.
 
-    The window's spectrum is an FFT of its samples. It is squared if `adds_powers`.
+    The window's spectrum is an FFT of its samples. If `adds_powers`, its squared magnitude is used.
     """
     cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
     transform = fft.fft(windows.window_samples(window_name, length), CELLS_PER_BIN * fft_size)[
@@ -273,7 +275,7 @@ def _deposit_lines(
     centre_bin,
     grid,
 ):
-    """Add the lines of m points to their grids: amplitudes or powers.
+    """Add the amplitudes or powers of the lines of m points to the cells of their grids.
 
     Parameters
     ----------
@@ -344,7 +346,7 @@ def _deposit_lines(
 
 @njit(cache=True, error_model="numpy")
 def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
-    """Add a line to the nearest cell, or spread it over several by Lagrange interpolation."""
+    """Add a line to the nearest cell, or spread it over several cells by Lagrange interpolation."""
     first_cell = (
         int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
     )

@@ -1,7 +1,8 @@
 """Line of other light than the echo's that is in every record, such as leaked transmitted light.
 
-With the amplitude A of its beat, its delay tau, the window's transform W and the receiver's
-transfer function H, the line is
+The line's beat has the amplitude A, the delay tau and the phase phi. With the window's transform W,
+the receiver's transfer function H, the chirp rate S, the FFT size N and the sample rate fs, its
+spectrum L_k in bin k is
 
     L_k = A H / 2 (e^{j phi} W(k - nu) + e^{-j phi} W(k + nu)),   nu = S tau N / fs
 
@@ -31,27 +32,32 @@ from sweep.model.waveform import count_samples_before_echo
 from sweep.model.window import Window, window_samples
 
 MASK_THRESHOLD_FRACTION = 0.5
-"""Fraction of the threshold from which a bin's line masks it; a smaller line raises few alarms."""
+"""Fraction of the threshold that a permanent line reaches in a bin for the bin to be masked. A
+masked bin raises no alarm; a smaller line raises few alarms."""
 N_PHASES = 16
-"""Number of phases of the line over which alarms are averaged."""
+"""Number of phases of the permanent line over which its false alarms are averaged."""
 
 
 class LineTransforms(NamedTuple):
-    """Line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
+    """Spectrum of a permanent line of amplitude 2.
+
+    Bins are 0 .. N/2 of a real record, 0 .. N - 1 of a complex one, N being the FFT size.
+    """
 
     transforms: np.ndarray
-    """(2, bins) complex: transform of the line at its frequency, and at the negative frequency."""
+    """(2, bins) complex: transform of the line at its own frequency, and at the negative frequency.
+    """
     magnitude_max: np.ndarray
-    """(bins,): largest magnitude at any phase."""
+    """(bins,): magnitude of the line's spectrum at the phase where it is largest."""
     magnitude_rms: np.ndarray
-    """(bins,): root mean square of the magnitude over all phases of the line."""
+    """(bins,): root mean square of the magnitude of the line's spectrum over all its phases."""
 
 
 @lru_cache(maxsize=16)
 def _line_transforms(
     window: Window, fft_size: int, line_bin: float, is_complex: bool, n_missing: int = 0
 ) -> LineTransforms:
-    """Return the line at a frequency [bins] without the record's first `n_missing` samples."""
+    """Return the spectrum of a line at ``line_bin`` [bins] without `n_missing` first samples."""
     cycles = line_bin * np.arange(window.length) / fft_size
     record = window_samples(window.name, window.length) * np.exp(
         2j * np.pi * (cycles - np.rint(cycles))
@@ -144,7 +150,7 @@ def line_alarm_probability(
     amplitude_ratio: float,
     threshold_ratio: float,
 ) -> float:
-    """Return the probability that a line raises an alarm in its bins where noise alone does not.
+    """Return the probability that a permanent line raises a false alarm where noise does not.
 
     Parameters
     ----------
@@ -177,7 +183,9 @@ def line_alarm_probability(
 def line_bin_masks(
     shots: Shots, i: int, line: LineTransforms, *, half_amplitude: float, echo_bins: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bins of a segment that a line masks, and those in which it raises alarms.
+    """Return the bins that a permanent line masks, and those in which it may raise alarms.
+
+    A masked bin raises no alarm. An echo whose largest bin is masked is not detected.
 
     Parameters
     ----------
@@ -225,7 +233,7 @@ def raised_magnitude(
     threshold: float,
     in_speckle: bool,
 ) -> np.ndarray:
-    """Return |X| of an echo that alone crosses the threshold as often as echo and line together.
+    """Return the magnitude of an echo that alone crosses the threshold as often as with the line.
 
     Parameters
     ----------
@@ -259,7 +267,9 @@ def raised_magnitude(
 
 
 def apply_permanent_line(shots: Shots, bin_spans: Any) -> Any:
-    """Apply the permanent line to spectra: it masks some bins and raises others.
+    """Apply a permanent line to spectra: mask some bins and raise the magnitude of others.
+
+    The line is light other than the echo that is in every record.
 
     Parameters
     ----------

@@ -74,7 +74,8 @@ def _nearest_bins(
 ) -> np.ndarray:
     """Return the first bin and the number of bins nearest to beats in an interval, (2, ...).
 
-    The interval is ``beat_min`` to ``beat_max`` [bins]; ``is_signed`` is true for complex records.
+    The interval is ``beat_min`` to ``beat_max`` [bins]. ``is_signed`` is true for complex records,
+    whose bins have signed frequencies.
     """
     if is_signed:
         first_bin, last_bin = np.floor(beat_min + 0.5), np.floor(beat_max + 0.5)
@@ -100,10 +101,10 @@ def _nearest_bins(
 def n_alarm_bins(
     band_bins: np.ndarray, fft_size: int, first_alarm_bin: int, *, is_signed: bool
 ) -> np.ndarray:
-    """Return the number of bins of a band that may raise a false alarm, (3, ...).
+    """Return the number of bins of a search band that may raise a false alarm, (3, ...).
 
-    ``band_bins`` (3, 2, ...) is that of :func:`search_band_bins`. In real records (not
-    ``is_signed``) bins nearer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
+    ``band_bins`` (3, 2, ...) is the result of :func:`search_band_bins`. In real records (not
+    ``is_signed``) bins closer than ``first_alarm_bin`` to DC or Nyquist raise no alarm.
     """
     if is_signed:
         return band_bins[:, 1].astype(float)
@@ -115,7 +116,7 @@ def n_alarm_bins(
 
 
 def is_searched(shots: Any, segment: int, point: int, bins: ArrayLike) -> np.ndarray:
-    """Return true for those of ``bins`` that are searched in one segment of one point."""
+    """Return whether each of ``bins`` is in the search band of one segment of one point."""
     if shots.detection_settings.search_band is None:
         return np.ones(np.shape(bins), bool)
     first_bin, n_bins = shots.detection_settings.search_band[segment, :, point]

@@ -25,22 +25,24 @@ from sweep.model.detection.marcum import marcum_q1_excess
 
 
 class SearchBand(NamedTuple):
-    """Bins that are searched for echoes, in one segment or in (segments, m)."""
+    """Bins that are searched for echoes: scalars for one segment, or arrays (segments, m)."""
 
     first_bin: Any
-    """Number of the first bin, 0..N/2; of a complex record -N/2 .. N/2 - 1."""
+    """FFT bin number of the first searched bin: 0 .. N/2, or -N/2 .. N/2 - 1 of a complex record.
+    """
     n_bins: Any
-    """Number of bins."""
+    """Number of searched bins."""
     period_bins: int
     """FFT size N of a complex record, whose spectrum is periodic; 0 of a real record."""
 
 
 def restrict_to_band(shots: Any, spans: Any) -> Any:
-    """Restrict spans of bins to the search band.
+    """Restrict spans, adjacent bins around the lines, to the bins of the search band.
 
     Bins outside the band neither detect nor raise a false alarm. If the strongest bin of an echo is
-    outside, the echo is not detected, and only groups of bins about lines of its footprint remain
-    exempt from false alarms. The peak magnitude stays that of the strongest bin of all.
+    outside, the echo is not detected. Only adjacent bins above the threshold at lines of its
+    footprint then remain unable to raise false alarms. The peak magnitude stays that of the
+    strongest bin of all.
 
     Parameters
     ----------
@@ -112,7 +114,7 @@ def restrict_to_band(shots: Any, spans: Any) -> Any:
 
 
 def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return the positions of each beamlet's line in the three spectra, (m, 3, beamlets) [bins].
+    """Return the FFT bin positions of each beamlet's line by segment, (m, 3, beamlets).
 
     Parameters
     ----------
@@ -151,7 +153,7 @@ def beamlet_line_positions(shots: Any, points: np.ndarray | slice = slice(None))
 
 
 def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarray) -> np.ndarray:
-    """Return the mean positions of the beamlets' lines, weighted by power, (m, 3) [bins].
+    """Return the power-weighted mean FFT bin position of the beamlets' lines, (m, 3).
 
     Parameters
     ----------
@@ -175,7 +177,7 @@ def mean_line_positions(shots: Any, points: np.ndarray, strongest_bins: np.ndarr
 
 
 def axis_line_positions(shots: Any) -> np.ndarray:
-    """Return the positions of the lines on the beam's axis, (segments, n) [bins]."""
+    """Return the positions [FFT bins] of the lines on the beam's axis, (segments, n)."""
     cycles_per_sample = [
         (beat + drift) / shots.sample_rate
         for beat, drift in zip(shots.beat_frequencies, shots.mid_record_drifts, strict=True)
@@ -186,22 +188,22 @@ def axis_line_positions(shots: Any) -> np.ndarray:
 
 
 def _fold_to_bins(shots: Any, cycles_per_sample: np.ndarray) -> np.ndarray:
-    """Return the positions [bins] of lines from their frequencies over the sample rate.
+    """Return the positions [FFT bins] of lines from their frequencies [cycles per sample].
 
-    Frequencies alias; those of real records also fold at 0.
+    Frequencies alias to within half the sample rate. Those of real records also fold at 0.
     """
     positions = (cycles_per_sample - np.floor(cycles_per_sample + 0.5)) * shots.fft_size
     return np.asarray(positions if shots.complex_record else abs(positions))
 
 
 def as_columns(shots: Any, values: np.ndarray | float, n_trailing: int = 1) -> np.ndarray:
-    """Broadcast values to all points and append trailing dimensions of size 1, (n, 1, ...)."""
+    """Broadcast ``values`` to all n points and append ``n_trailing`` dimensions of size 1."""
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * n_trailing)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _is_in_band(bin_, band):
-    """Test if a bin is in a :class:`SearchBand`."""
+    """Return true if the FFT bin number ``bin_`` lies in a :class:`SearchBand`."""
     distance = bin_ - band.first_bin
     if band.period_bins > 0:
         distance %= band.period_bins
@@ -221,7 +223,7 @@ def _restrict_spans(
     n_exempt,
     leakage,
 ):
-    """Restrict spans of bins to the search band, in place.
+    """Restrict spans, adjacent bins around the lines, to the search band, in place.
 
     Parameters
     ----------
@@ -316,7 +318,7 @@ def _restrict_spans(
 def _mark_searched_echoes(
     magnitudes, is_exempt, first_bin, threshold, lobe_half_width, band, line_positions
 ):
-    """Mark the bins of echoes whose strongest bin is in the search band, and their neighbours.
+    """Mark the bins of echoes whose strongest bin is in the search band, and adjacent bins.
 
     Parameters
     ----------
@@ -367,7 +369,9 @@ def span_leakage(
     group_threshold,
     sidelobe_correlation,
 ):
-    """Return the probability that leaked signal makes a further group of bins cross a threshold.
+    """Return the probability that leaked signal raises a false peak apart from the echo.
+
+    A false peak is a group of adjacent bins above the threshold.
 
     Parameters
     ----------

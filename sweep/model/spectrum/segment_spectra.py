@@ -86,28 +86,32 @@ from sweep.model.spectrum.search_restriction import restrict_to_band
 from sweep.model.window import Window
 
 POINTS_PER_BATCH = 256
-"""Number of points that are prepared together; 16 times as many if few line shapes serve them."""
+"""Number of points that are processed in one batch. If few line shapes serve them, it is 16 times
+as many."""
 
 SPAN_BINS_PER_BATCH = 1 << 21
-"""Least number of bins of spans for which memory is allocated at a time."""
+"""Least number of bins, over all spans, for which memory is allocated in one step. A span is a
+range of bins around a segment's lines."""
 
 THRESHOLD_RATIO_STEP = 1e-7
-"""Step [sigma] to which thresholds are rounded for rates of leakage in developed speckle."""
+"""Step to which the threshold over the noise sigma is rounded. Rates of false alarms by leaked
+signal in developed speckle are tabulated per rounded threshold."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Names of the values that :func:`evaluate_segments` returns for each segment's spectrum."""
 
 NO_LEAKAGE, LEAKAGE_BY_INTEGRAL, LEAKAGE_BIN_BY_BIN = range(3)
-"""Methods for leakage: none; all bins of the spectrum, with an integral over those far from the
-lines; the bins of the span that exceed a level."""
+"""Methods for the probability of false alarms by leaked signal. The first computes none. The second
+counts all bins of the spectrum, with an integral over bins far from the lines. The third counts
+only the computed bins that exceed a level."""
 
 
 SPAN_DOES_NOT_FIT = np.int64(-1)
-"""Result of :func:`_evaluate_segment` if a span does not fit."""
+"""Result of :func:`_evaluate_segment` if a segment's bins exceed the allocated memory."""
 
 
 class BinSpans(NamedTuple):
-    """Spans of bins around the lines of the segments of m points, and the echoes in them.
+    """Bins around the lines of the segments of m points (spans), and the echoes in them.
 
     Arrays are (segments, m) unless another shape is stated. Segments that do not exist have no
     bins.
@@ -116,94 +120,111 @@ class BinSpans(NamedTuple):
     point_numbers: np.ndarray
     """(m,): indices of the points in the shots."""
     first_bin: np.ndarray
-    """First bin of the span. In spectra of complex records it is N or 2 N larger than its frequency
-    says, so that no bin of a span is below 0."""
+    """FFT bin number of the first bin of the span. For a complex record N or 2 N is added, N being
+    the FFT size, so that no bin number is below 0.
+    """
     n_bins: np.ndarray
-    """Number of bins in the span."""
+    """Number of bins of the span, the computed bins around the lines."""
     peak_index: np.ndarray
-    """Index in the span of the largest bin."""
+    """Index of the bin with the largest magnitude, counted from the span's first bin."""
     n_exempt: np.ndarray
-    """Number of bins that cannot raise a false alarm."""
+    """Number of bins that belong to the echo and so cannot raise a false alarm."""
     pd: np.ndarray
-    """Probability that the echo is detected."""
+    """Probability that the echo is detected in the segment."""
     miss: np.ndarray
-    """Probability that the echo is missed, 1 - pd with all its digits."""
+    """Probability that the echo is missed, 1 - pd, accurate even where it is small."""
     peak_magnitude: np.ndarray
-    """|X| of the largest bin [V, summed over the record]."""
+    """Magnitude of the largest bin without noise [V, summed over the record]."""
     leakage: np.ndarray
-    """Probability that leaked signal raises at least one extra group of bins, over noise alone."""
+    """Probability that leaked signal raises at least one extra false peak, over noise alone. A
+    false peak is a group of adjacent bins above the threshold.
+    """
     span_start: np.ndarray
-    """Index of the first bin of the span in ``magnitudes`` and ``is_exempt``."""
+    """Index in ``magnitudes`` and ``is_exempt`` of the first bin of each segment and point."""
     magnitudes: np.ndarray
-    """(bins,): |X| of all spans, one after the other [V, summed over the record]."""
+    """(bins,): magnitudes without noise of all spans, one span after the other [V, summed over the
+    record].
+    """
     is_exempt: np.ndarray
-    """(bins,) bool: true in bins of all spans that cannot raise a false alarm."""
+    """(bins,) bool: true in bins that belong to an echo and so cannot raise a false alarm."""
     peak_is_searched: np.ndarray
-    """Bool: true if the largest bin of the echo is searched; else it is in no span."""
+    """Bool: true if the largest bin of the echo is in the search band. Otherwise no span contains
+    it.
+    """
 
     def span_magnitudes(self, segment: int, column: int) -> np.ndarray:
-        """Return |X| of the span of one segment of point ``point_numbers[column]``, (bins,)."""
+        """Return the magnitudes without noise around one segment's lines, (bins,) [V].
+
+        The point is ``point_numbers[column]``.
+        """
         span_begin = self.span_start[segment, column]
         return self.magnitudes[span_begin : span_begin + self.n_bins[segment, column]]
 
 
 class SegmentSpectrum(NamedTuple):
-    """Bins of one segment's spectrum, and |X| there without noise."""
+    """Bin numbers and magnitudes of one segment's spectrum, without noise."""
 
     bins: np.ndarray
     """(bins,): consecutive bin numbers. Those of a complex record continue past Nyquist;
     :meth:`sweep.model.preparation.Shots.to_signed_bins` returns their frequencies."""
     magnitude: np.ndarray
-    """(bins,): |X| [V, summed over the record]."""
+    """(bins,): magnitude of the spectrum without noise [V, summed over the record]."""
 
 
 class ShapeGroup(NamedTuple):
-    """Points whose line shapes are computed from the same tables."""
+    """Points whose line shapes are computed from the same tables.
+
+    A line shape is the spectrum of a line of amplitude 1.
+    """
 
     point_numbers: np.ndarray
     """(m,): indices of the points in the shots."""
     shape_index: np.ndarray
-    """(m,): index of each point's shape in ``modes``."""
+    """(m,): index in ``modes`` of each point's line shape."""
     tables: LineShapeTables
-    """Tables from which the shapes are computed."""
+    """Tables from which the line shapes are computed."""
     modes: ShapeModes
-    """Modes of the shapes' phase errors."""
+    """Chebyshev coefficients of the phase errors of the line shapes."""
     is_late: bool = False
-    """True if some echoes have only part of the record's samples."""
+    """True if some echoes arrive after the record has begun and lack its first samples."""
 
 
 class DistinctShapes(NamedTuple):
-    """Points that represent all line shapes of a batch of points."""
+    """One point for each line shape that occurs in a batch of points."""
 
     point_numbers: np.ndarray
-    """(shapes,): indices in the shots of one point of each shape."""
+    """(shapes,): index in the shots of one point with each line shape."""
     shape_index: np.ndarray
-    """(m,): index of each point's shape."""
+    """(m,): index of each point's line shape in ``point_numbers``."""
 
 
 class EvaluationSettings(NamedTuple):
     """Settings of :func:`_evaluate_points` that all points share."""
 
     segment_exists: np.ndarray
-    """(segments,) bool: existence of up, Doppler and down segment."""
+    """(segments,) bool: true if the up, Doppler or down segment exists."""
     leakage_methods: np.ndarray
-    """(segments,): NO_LEAKAGE, LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN."""
+    """(segments,): method for the probability of false alarms by leaked signal. It is NO_LEAKAGE,
+    LEAKAGE_BY_INTEGRAL or LEAKAGE_BIN_BY_BIN.
+    """
     window_sum: float
-    """Sum of the window's samples."""
+    """Sum of the window's samples, the peak of its transform."""
     rule: DetectionRule
     """Rule by which the bins of an echo detect it."""
     speckle_table: SpeckleTable
-    """Speckle of all points."""
+    """Speckle of the echoes of all points."""
     with_pd: bool
-    """True if probabilities of detection are computed; else they are nan."""
+    """True if probabilities of detection are computed; otherwise they are nan."""
     phase_limits: np.ndarray
-    """:func:`sweep.model.spectrum.lines.node_phase_limits` of the record's window."""
+    """Table of :func:`sweep.model.spectrum.lines.node_phase_limits` for the record's window. It
+    gives the number of equivalent lines that replace all lines.
+    """
     tangents: np.ndarray
-    """(N // 2 + 1,): :func:`bin_tangents`."""
+    """(N // 2 + 1,): tan(pi k / N) of bins k = 0 .. N/2, with the FFT size N."""
 
 
 def evaluate_segments(shots: Shots, *, bin_by_bin: bool = False) -> np.ndarray:
-    """Compute the detection and leakage in each segment's spectrum.
+    """Compute detection and false alarms by leaked signal in each segment's spectrum.
 
     Parameters
     ----------
@@ -247,7 +268,9 @@ def iter_spans(
     ignores_band: bool = False,
     with_pd: bool = True,
 ) -> Iterator[BinSpans]:
-    """Yield the spans of all points, some points at a time, in any order.
+    """Yield the spectra around the lines of all points, some points at a time, in any order.
+
+    The adjacent bins around the lines of a segment are a span.
 
     Parameters
     ----------
@@ -320,7 +343,10 @@ def iter_spans(
 
 
 def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Empty the spans of segments whose echo arrives after the record: nothing is searched."""
+    """Remove all bins of segments whose echo arrives after the record.
+
+    No bin of these segments is searched for the echo.
+    """
     if shots.echo_record.n_samples_before is None:
         return spans
     lacks_echo = (
@@ -338,7 +364,10 @@ def _clear_spans_without_echo(shots: Shots, spans: BinSpans) -> BinSpans:
 
 
 def _leakage_in_looks(shots: Shots, spans: BinSpans) -> BinSpans:
-    """Replace one record's probability of leakage in spans by that of several looks."""
+    """Convert the spans' leakage from that of one record to that of several looks.
+
+    A look is one of several records of the same shot. Leakage is a probability of false alarm.
+    """
     negligible_signal_ratio, noise_sigma, threshold = (
         np.broadcast_to(value, shots.size)[spans.point_numbers]
         for value in (shots.negligible_signal_ratio, shots.bin_noise_sigma, shots.threshold)
@@ -399,8 +428,8 @@ def segment_spectrum(
 ) -> SegmentSpectrum:
     """Return the spectrum of one point's segment around its lines, without noise.
 
-    Bins whose |X| is below ``level_min`` [V, summed over the record] may be left out; 0 returns all
-    bins.
+    Bins with a magnitude below ``level_min`` [V, summed over the record] may be left out; 0 returns
+    all bins.
     """
     shots = replace(shots, permanent_line=None)
     (spans,) = iter_spans(
@@ -417,9 +446,9 @@ def segment_spectrum(
 
 
 def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
-    """Return |X| of all bins of a segment without noise [V], (bins,), by rising frequency.
+    """Return the magnitude of all bins of a segment without noise [V], by rising frequency.
 
-    Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
+    The shape is (bins,). Bins are those of :attr:`sweep.model.preparation.Shots.all_signed_bins`.
     """
     bins, magnitude = segment_spectrum(shots, point, segment)
     all_magnitudes = np.zeros(shots.n_bins)
@@ -428,7 +457,7 @@ def full_segment_spectrum(shots: Shots, point: int, segment: int) -> np.ndarray:
 
 
 def spectrum_type(shots: Shots) -> int:
-    """Return the type of the shots' spectra, as in :class:`SpectrumLayout`."""
+    """Return the type of the shots' spectra for :class:`SpectrumLayout`, e.g. COMPLEX_RECORD."""
     return (
         COMPLEX_RECORD
         if shots.complex_record
@@ -439,7 +468,7 @@ def spectrum_type(shots: Shots) -> int:
 
 
 def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
-    """Return the method by which the leakage of a group is computed, such as NO_LEAKAGE.
+    """Return the method by which the leakage of a group of points is computed, such as NO_LEAKAGE.
 
     ``bin_by_bin`` excludes LEAKAGE_BY_INTEGRAL.
     """
@@ -460,7 +489,7 @@ def _leakage_method(shots: Shots, group: ShapeGroup, bin_by_bin: bool) -> int:
 
 
 def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
-    """Yield groups of points whose line shapes can be computed together, in any order."""
+    """Yield groups of points whose line shapes are computed from the same tables, in any order."""
     if shots.echo_record.n_samples_before is not None:
         segment_exists = shots.has_segment
         is_late = (shots.echo_record.n_samples_before[segment_exists][:, points] > 0).any(axis=0)
@@ -533,21 +562,18 @@ def _iter_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]
 
 
 _NO_WINDOW = np.empty((0, 0, 0))
-"""Window values of modes that do not include the window."""
+"""Empty array of window values, for Chebyshev modes that do not include the window."""
 
 
 def _unused_modes(segments: int) -> ShapeModes:
-    """Return the modes of a shape that is not a sum of modes: one of amplitude 0."""
+    """Return one Chebyshev mode of amplitude 0, for line shapes that are not sums of modes."""
     modes = line_shape.zero_modes(segments, 1, 1)
     modes.n_modes[:] = 1
     return modes
 
 
 def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeGroup]:
-    """Yield groups of points with late echoes, in any order.
-
-    A late echo has only the last samples of the record of at least one segment.
-    """
+    """Yield groups of points with late echoes and common tables of line shapes, in any order."""
     window, fft_size, adds_powers = shots.window, shots.fft_size, shots.footprint.adds_powers
     segment_exists, segments = shots.has_segment, len(shots.waveform_segments)
     assert shots.echo_record.n_samples_before is not None
@@ -628,7 +654,7 @@ def _iter_late_shape_groups(shots: Shots, points: np.ndarray) -> Iterator[ShapeG
 def _tables_without_phase_error(
     window: Window, fft_size: int, adds_powers: bool, segments: int
 ) -> LineShapeTables:
-    """Return the tables of shapes without a phase error, which hold all bins."""
+    """Return the line-shape tables, which hold all bins, of records without a phase error."""
     return line_shape.full_line_shape_tables(
         window, fft_size, adds_powers, np.zeros((segments, window.length))
     )
@@ -638,7 +664,7 @@ def _tables_without_phase_error(
 def _tables_without_echo(
     window: Window, fft_size: int, adds_powers: bool, segments: int
 ) -> LineShapeTables:
-    """Return the tables of shapes of echoes that arrive after the record: all values are 0."""
+    """Return line-shape tables of zeros, for echoes that arrive after the record."""
     phase, first_sample = np.zeros((segments, window.length)), np.full(segments, window.length)
     return line_shape.full_line_shape_tables(window, fft_size, adds_powers, phase, first_sample)
 
@@ -649,13 +675,19 @@ def _sort_by_shape(
     tables: LineShapeTables,
     modes: ShapeModes,
 ) -> ShapeGroup:
-    """Sort the points of a group by their shapes, so that each shape is computed once."""
+    """Return a :class:`ShapeGroup` whose points are sorted by line shape.
+
+    Each line shape is then computed only once.
+    """
     order = np.argsort(shape_index, kind="stable")
     return ShapeGroup(points[order], shape_index[order], tables, modes)
 
 
 def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
-    """Find the distinct line shapes of a batch of points."""
+    """Return one point for each line shape that occurs in a batch of points.
+
+    A line shape is the spectrum of a line of amplitude 1.
+    """
     first_samples = (
         ()
         if shots.echo_record.n_samples_before is None
@@ -686,10 +718,9 @@ def _find_distinct_shapes(shots: Shots, batch: np.ndarray) -> DistinctShapes:
 
 
 def _phase_errors(shots: Shots, points: np.ndarray, record_positions: np.ndarray) -> np.ndarray:
-    """Return the phase errors [cycles] of points at positions x of the record.
+    """Return the phase errors [cycles] of points, (segments, points, positions).
 
-    (segments, points, positions). Positions -1 .. 1 cover the samples of the record that the echo
-    has.
+    ``record_positions`` from -1 to 1 cover the samples of the record that contain the echo.
     """
     phase = np.zeros((len(shots.waveform_segments), points.size, record_positions.size))
     for segment in np.flatnonzero(shots.has_segment):
@@ -711,13 +742,12 @@ def _evaluate_batch(
     keeps_magnitudes: bool,
     with_pd: bool,
 ) -> BinSpans:
-    """Compute the spans of bins around the lines, for the next batch of points of a group.
+    """Compute the spectra around the lines for the next batch of points of a group.
 
     The batch begins with the group's point number ``batch_begin``. It has as many points as fit
     into SPAN_BINS_PER_BATCH bins, at least one. The points of a group share the tables of line
-    shapes.
-    ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`;
-    ``lowest_levels`` (n,) is |X| [V] below which bins may be left out.
+    shapes. ``point_table`` is :meth:`sweep.model.preparation.Shots.point_parameter_table`.
+    ``lowest_levels`` (n,) are the magnitudes [V] below which bins may be left out.
     """
     points, tables = np.ascontiguousarray(group.point_numbers[batch_begin:]), group.tables
     segments, n_points = len(shots.waveform_segments), points.size
@@ -781,9 +811,10 @@ def _evaluate_batch(
 
 
 def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
-    """Return the table of :func:`sweep.model.spectrum.lines.node_phase_limits` of a group.
+    """Return the table that gives the number of equivalent lines for a group of points.
 
-    For late echoes it is that of a window which is all at the record's end.
+    It is that of :func:`sweep.model.spectrum.lines.node_phase_limits`. For late echoes it assumes a
+    window whose whole weight is at the record's end.
     """
     if not group.is_late:
         return shots.window.node_phase_limits(shots.footprint.adds_powers)
@@ -793,15 +824,15 @@ def _group_node_limits(shots: Shots, group: ShapeGroup) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def bin_tangents(fft_size: int) -> np.ndarray:
-    """Return tan(pi k / N) of bins k = 0 .. N/2, (N // 2 + 1,)."""
+    """Return tan(pi k / N) of bins k = 0 .. N/2, (N // 2 + 1,), for the FFT size N."""
     return np.tan(np.pi * np.arange(fft_size // 2 + 1) / fft_size)
 
 
 def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
-    """Return the shifts over which |X|^2 is averaged, (points, segments, shifts).
+    """Return the frequency shifts over which power spectra are averaged.
 
-    They come from the laser's line width, and from the drift of lines over looks. Shifts of weight
-    0 are the last ones.
+    The shape is (points, segments, shifts). Shifts result from the laser's line width, and from the
+    drift of lines over looks. Shifts of weight 0 are the last ones.
     """
     segments = len(shots.waveform_segments)
     if shots.laser_line.gaussian_width is None:
@@ -840,9 +871,9 @@ def _averaging_shifts(shots: Shots, points: np.ndarray) -> AveragingShifts:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _copy_lines(lines, n_lines, shifts):
-    """Copy lines to several shifted positions, and return the number of all copies.
+    """Copy lines to several shifted frequencies; return the number of all copies.
 
-    The powers of the lines add. Their copies average the power spectrum over the shifts.
+    The powers of the lines add. The copies average the power spectrum over the shifts.
 
     Parameters
     ----------
@@ -969,10 +1000,11 @@ def _prepare_lines(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _store_span(start, n_bins, span, magnitudes, is_exempt):
-    """Append a span to those of earlier points at index ``start``; return the next index.
+    """Append a span to the spans of earlier points at index ``start``; return the next index.
 
-    ``span`` are the :class:`sweep.model.spectrum.bin_spectrum.SpanArrays`; ``magnitudes`` and
-    ``is_exempt`` hold all spans.
+    A span is the computed bins around a segment's lines. ``span`` is its
+    :class:`sweep.model.spectrum.bin_spectrum.SpanArrays`. ``magnitudes`` and ``is_exempt`` hold all
+    spans.
     """
     for k in range(n_bins):
         magnitudes[start + k], is_exempt[start + k] = span.magnitude[k], span.is_exempt[k]
@@ -981,7 +1013,7 @@ def _store_span(start, n_bins, span, magnitudes, is_exempt):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _late_beat(beat, n_missing_samples):
-    """Return the beat parameters of an echo that lacks the first samples of the record."""
+    """Return the beat parameters of an echo that lacks the record's first ``n_missing_samples``."""
     return BeatParameters(
         beat.range,
         beat.range_decrease,
@@ -999,7 +1031,7 @@ def _late_beat(beat, n_missing_samples):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _late_layout(layout, n_samples):
-    """Return the layout of a spectrum whose record has ``n_samples`` samples."""
+    """Return the layout of a spectrum for an echo with ``n_samples`` of the record's samples."""
     return SpectrumLayout(
         layout.fft_size,
         n_samples,
@@ -1016,8 +1048,8 @@ def _late_layout(layout, n_samples):
 def _build_shapes(shape_index, built_index, modes, tables, segment_exists, shapes):
     """Compute the line shapes of all segments of a point into ``shapes``.
 
-    ``shape_index`` is the shape in ``modes``; ``built_index`` is the one that is in ``shapes``
-    already, or -1.
+    ``shape_index`` is the index of the line shape in ``modes``. ``built_index`` is that of the line
+    shape that is in ``shapes`` already, or -1.
     """
     is_late = tables.echo_lengths.size > 0
     for s in range(segment_exists.size):
@@ -1058,11 +1090,11 @@ def _evaluate_segment(
     speckle_rates,
     spans,
 ):
-    """Compute the span of segment ``s`` of point ``spans.point_numbers[i]``.
+    """Compute the spectrum and detection around the lines of segment ``s`` of one point.
 
-    Parameters are those of :func:`_evaluate_points`, with the line shape, the speckle and the
-    crossing rates of the segment. ``next_start`` is the index in ``spans.magnitudes`` of the span's
-    first bin.
+    The point is ``spans.point_numbers[i]``. Parameters are those of :func:`_evaluate_points`, with
+    the line shape, the speckle and the crossing rates of the segment. ``next_start`` is the index
+    in ``spans.magnitudes`` of the first bin.
 
     Returns
     -------
@@ -1217,7 +1249,9 @@ def _evaluate_points(
     crossing_series,
     spans,
 ):
-    """Compute the spans of m points, as many as fit; return the number of these points.
+    """Compute the bins around the lines of m points (spans), as many as fit into memory.
+
+    The result is the number of points that fit.
 
     Parameters
     ----------

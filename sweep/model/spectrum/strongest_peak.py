@@ -44,14 +44,15 @@ from sweep.model.spectrum.search_restriction import span_leakage
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 GAUSS_ORDER = 4
-"""Number of Gauss points in each interval of y."""
+"""Number of Gauss quadrature points in each interval of INTERVAL_EDGES."""
 INTERVAL_EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7.5, 9.5, 12, 15, 19, 24, 30, 37.0])
-"""Edges of the intervals of y. They count from the threshold, or from ln n - 4 if that is larger:
-below it n bins of noise certainly cross."""
+"""Edges of the quadrature intervals of z^2 / (2 sigma^2), with the magnitude z and the noise sigma.
+They count from the threshold, or from ln n - 4 if that is larger. Below it n bins of noise
+certainly contain a larger magnitude."""
 UP, DOPPLER, DOWN = range(3)
-"""Indices of the segments."""
+"""Indices of the segments in arrays by segment."""
 THRESHOLD_LEVEL = 0
-"""Index of the threshold among the levels z."""
+"""Index of the detection threshold among the magnitude levels of a segment."""
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(GAUSS_ORDER)
 _DERIVATIVE_MATRIX = np.array(
@@ -60,37 +61,43 @@ _DERIVATIVE_MATRIX = np.array(
         for row in np.eye(GAUSS_ORDER)
     ]
 ).T
-"""Matrix from values at the Gauss points to the derivatives of their polynomial there."""
+"""Matrix from values at the Gauss points to the derivatives of their interpolating polynomial at
+the same points."""
 
 
 class SpanProbabilities(NamedTuple):
-    """Probabilities of larger peaks than the echo's at m points."""
+    """Probabilities that another peak is larger than the echo's, at m points."""
 
     pd_loss: np.ndarray
-    """(segments, m): probability L that the echo is detected, but that a larger peak takes its
-    place."""
+    """(segments, m): probability that the echo crosses the threshold but another peak is larger."""
     p_alarm: np.ndarray
-    """(segments, m): probability P(Z >= b) that a bin without the echo crosses the threshold."""
+    """(segments, m): probability that any bin outside the echo crosses the threshold."""
     shared_gain: np.ndarray
-    """(m,): increase, by shared speckle, of the probability that both chirps report the echo's peak
-    although other bins cross."""
+    """(m,): increase by shared speckle of the probability that both chirps report the echo's peak.
+    It includes only cases in which bins outside the echo cross the threshold too.
+    """
 
 
 class LevelProbabilities(NamedTuple):
-    """Levels that the echo of one segment has to cross, (m, levels); the threshold is first."""
+    """Magnitude levels that an echo has to exceed in one segment, (m, levels), the threshold first.
+
+    A level is the larger one of the threshold and the largest other bin.
+    """
 
     probability: np.ndarray
-    """Probability of the level: that max(b, Z) is this level."""
+    """Probability that the echo has to exceed this level."""
     exponent: np.ndarray
-    """-ln P_z of the echo."""
+    """-ln of the probability that the echo exceeds this level."""
     echo_fraction: np.ndarray
-    """Fraction of the echo in the power of the bin that is equivalent to it at this level."""
+    """Echo's share of the mean power, noise included, of a bin equivalent to the echo. The bin
+    exceeds this level as often as the whole echo.
+    """
 
 
 def strongest_peak_probabilities(
     shots: Any, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Compute the outputs of shots whose strongest peak is reported.
+    """Compute detection and wrong-range probabilities if only the strongest peak is reported.
 
     Parameters
     ----------
@@ -146,7 +153,8 @@ def strongest_peak_probabilities(
 def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProbabilities:
     """Compute the :class:`SpanProbabilities` of the points of some spans.
 
-    ``pd`` (3, n) is the probability that the echo is detected, of all n shots by segment.
+    A span is a set of adjacent bins around a segment's lines. ``pd`` (3, n) is the probability that
+    the echo is detected, of all n shots by segment.
     """
     points = spans.point_numbers
     deviation, noise_sigma, threshold, negligible_signal_ratio = (
@@ -204,9 +212,9 @@ def _span_probabilities(shots: Any, spans: BinSpans, pd: np.ndarray) -> SpanProb
 
 
 def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> np.ndarray:
-    """Return y = z^2 / (2 sigma^2) of all levels, (3, m, levels), the threshold first.
+    """Return z^2 / (2 sigma^2) of all magnitude levels z, (3, m, levels), the threshold first.
 
-    ``threshold_ratio`` (m,) is the threshold over sigma.
+    sigma is the noise per quadrature. ``threshold_ratio`` (m,) is the threshold over sigma.
     """
     threshold_half_square = 0.5 * np.square(threshold_ratio)
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)
@@ -219,9 +227,10 @@ def _level_half_squares(shots: Any, spans: Any, threshold_ratio: np.ndarray) -> 
 
 
 def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.ndarray:
-    """Return -ln of the probability that no bin of noise crosses a level.
+    """Return -ln of the probability that no bin of noise exceeds a magnitude level z.
 
-    ``half_squares`` (3, m, levels) is y of the levels; the result has the same shape.
+    ``half_squares`` (3, m, levels) is z^2 / (2 sigma^2), with the noise sigma. The result has the
+    same shape.
     """
     n_bins = shots.n_searched_bins(spans.n_exempt, spans.point_numbers)[..., None]
     if shots.detection_settings.noise_bins == "correlated":
@@ -238,10 +247,11 @@ def _noise_exponents(shots: Any, spans: Any, half_squares: np.ndarray) -> np.nda
 
 
 def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
-    """Return the weights dP(Z < z) of the Gauss points, whose sum is P(Z >= b).
+    """Return the probability weights of the Gauss points of the largest bin outside the echo.
 
-    ``exponents`` (3, m, points) is -ln P(Z < z); the result has the same shape. ``p_alarm`` (3, m)
-    is P(Z >= b).
+    Their sum is ``p_alarm`` (3, m), the probability that any bin outside the echo crosses the
+    threshold. ``exponents`` (3, m, points) is -ln of the probability that none exceeds the point's
+    level. The result has the same shape.
     """
     by_interval = exponents.reshape(*exponents.shape[:2], -1, GAUSS_ORDER)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -254,11 +264,12 @@ def _level_weights(exponents: np.ndarray, p_alarm: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _joint_excess(exponent_first, exponent_second, squared_correlation):
-    """Return P(both) - e^-a e^-b of two correlated Rayleigh magnitudes.
+    """Return by how much correlation raises the joint probability of two Rayleigh magnitudes.
 
-    Alone, the first crosses its level with the probability e^-a, the second with e^-b
-    (:func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`). ``squared_correlation`` is
-    the square of the correlation of their complex amplitudes.
+    Each magnitude has to exceed a level of its own. Alone, the first exceeds its level with the
+    probability exp(-``exponent_first``), the second with exp(-``exponent_second``). The result is
+    their joint probability minus the product of both. ``squared_correlation`` is the square of the
+    correlation of their complex amplitudes.
     """
     if squared_correlation <= 0.0 or exponent_first + exponent_second > 700.0:
         return 0.0
@@ -292,7 +303,7 @@ def _evaluate_levels(
     pd_loss,
     exponents,
 ):
-    """Compute, at all levels, how much pd the echo loses and how much leaked signal adds.
+    """Compute, at all magnitude levels, the echo's loss of pd and the effect of leaked signal.
 
     Parameters
     ----------
