@@ -230,9 +230,9 @@ def phase_rotated_look_covariances(
 def mean_power_tails(
     look_speckle: LookSpeckle, n_looks: int, snr: np.ndarray, threshold: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the probability that the sum of the looks' powers exceeds a threshold, and 1 - it.
+    """Return the probabilities that the sum of the looks' powers is above and below a threshold.
 
-    Equation (1) of the module's description gives it.
+    The first is equation (1) of the module's description.
 
     Parameters
     ----------

@@ -1111,9 +1111,9 @@ def _marcum_q1_derivatives(
 
 
 def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss-Legendre nodes and weights of all intervals between successive ``ends``.
+    """Return Gauss-Legendre nodes and weights of all intervals between successive ends.
 
-    The ends are (..., k) in rising order.
+    ``interval_ends`` are (..., k) in rising order.
     """
     node, weight = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     half_width = 0.5 * np.diff(interval_ends, axis=-1)[..., None]
