@@ -357,7 +357,8 @@ def backscatter_integral(
     Notes
     -----
     The air returns P_tx A tau_o / S times the integral to the detector [W]. P_tx is the transmitted
-    power, A the aperture's area, tau_o the transmission of the optics, and S the lidar ratio [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
+    power, A the aperture's area, tau_o the transmission of the optics, and S the lidar ratio [sr].
+    The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
     nearer than r_0, the image of a point is larger than the field of view. For a
     diffraction-limited beam, Theta = 4 lambda / (pi D), it is that of a coherent lidar focused at
     infinity [1]_.
