@@ -46,8 +46,8 @@ from sweep.model.preparation import Shots
 from sweep.model.shot_records import PermanentLine
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
-"""Dotted paths of two parameters of the leaked light. The first is its optical path less that of the
-local oscillator [m], the second the ratio of transmitted to leaked power."""
+"""Dotted paths of two parameters of the leaked light. The first is its optical path less that of
+the local oscillator [m]. The second is the ratio of transmitted to leaked power."""
 
 
 def _leaked_power_and_current(

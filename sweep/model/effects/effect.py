@@ -2,7 +2,8 @@
 
 The parameters of an effect become fields of a spec. The planner evaluates the effect's error bound
 at all points, and decides for each tile (a group of points) whether the effect is simulated.
-:mod:`sweep.model.evaluation` applies it to these points; for others nothing of it is computed. :mod:`sweep.model.effects.catalogue` lists all effects.
+:mod:`sweep.model.evaluation` applies it to these points; for others nothing of it is computed.
+:mod:`sweep.model.effects.catalogue` lists all effects.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from sweep.model.effects.planner_inputs import PlannerInputs
 
 EFFECT_MODES = ("auto", "on", "off")
-"""Settings of an effect in a spec. ``auto`` simulates it where its error bound requires that, ``on``
-always and ``off`` never."""
+"""Settings of an effect in a spec. ``auto`` simulates the effect where its error bound requires
+that, ``on`` always, and ``off`` never."""
 
 
 @dataclass(frozen=True, kw_only=True)

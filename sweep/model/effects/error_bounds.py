@@ -20,7 +20,7 @@ class ErrorBound(NamedTuple):
     """Further change of |X| in the largest bin, as a fraction of the sum of all amplitudes in
     phase. It serves sums of amplitudes that may cancel, which have no relative change."""
     noise_variance_change: ArrayOrFloat = 0.0
-    """Change of a bin's noise variance if the effect is omitted, relative to the receiver's."""
+    """Relative change of a bin's noise variance if the effect is omitted."""
     threshold_follows_noise: bool = True
     """True if the threshold is set on noise that includes this effect's, as for noise that is
     always present. False for noise that comes with the signal."""
