@@ -11,8 +11,8 @@ The surface of a rotating body moves with V + omega x (P - X) at the point P, wi
 the body's centre X and the angular velocity omega. A beamlet from O along d_b meets it at the range
 R_b, at P_b = O + R_b d_b. The rotation contributes the closing speed -omega x (P_b - X) . d_b =
 -omega x (O - X) . d_b, in which R_b cancels. Rotation is thus equivalent to a velocity
--omega x (O - X) of the instrument, whatever the body's shape. Its component along the beam shifts the lines, and its
-component across the beam spreads them.
+-omega x (O - X) of the instrument, whatever the body's shape. Its component along the beam shifts
+the lines, and its component across the beam spreads them.
 """
 
 from dataclasses import replace

@@ -3,8 +3,8 @@
 **Images**: a real record has the line also at -f, which reaches the bins of f near DC and Nyquist.
 
 W is the window's transform and nu the position of a line [bins]. Bin X[k] contains W(k - nu) and,
-conjugated, W(k + nu). Past Nyquist the visible line is itself an image. Without the effect only the transform of the folded line is summed, where it is visible. The
-effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
+conjugated, W(k + nu). Past Nyquist the visible line is itself an image. Without the effect only the
+transform of the folded line is summed, where it is visible. The effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
 Let all light of a line, wherever footprint and record put it, be at least e bins from the edge (DC
 or Nyquist). Then bins within e/2 have images of at most E(3/2 e), and all others at most E(e/2) +
 E(e).
@@ -208,11 +208,11 @@ _THRESHOLD_STEP = 1.04
 """Ratio of the thresholds of successive tables of leakage bounds. Each threshold uses the table of
 the next lower tabulated one."""
 _SINGLE_BINS, _FAR_STRETCHES = 48, 24
-"""Number of bins next to the line in whose leakage bound each counts singly, and number of intervals
-that hold all bins farther away."""
+"""Numbers in the bound of leakage: that of bins near the line that count singly, and that of the
+intervals that hold all bins farther away."""
 _IMAGE_FACTOR = 1.1
-"""Factor on sidelobes far from DC and Nyquist, which allows for the images that add to them. Near DC
-and Nyquist the factor is 2."""
+"""Factor on sidelobes far from DC and Nyquist, which allows for the images that add to them. Near
+DC and Nyquist the factor is 2."""
 
 
 def leakage_bound(points: PlannerInputs) -> ErrorBound:
@@ -391,4 +391,4 @@ LEAKAGE = Effect(
     error_bound=leakage_bound,
     apply=apply_leakage,
 )
-"""Effect that evaluates false peaks: groups of bins that cross the threshold because of sidelobes."""
+"""Effect that evaluates false peaks: bins that cross the threshold because of sidelobes."""

@@ -391,7 +391,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def range_spread(self) -> OffsetMoments:
-        """Moments of the offsets [FFT bins] of all beamlets' lines from the axis's, due to range."""
+        """Moments of the offsets [FFT bins] of beamlets' lines from the axis's, due to range."""
         return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
 
     @cached_property

@@ -41,7 +41,7 @@ _BIN_MOVING_STAGES = ("lines", "record", "spectrum")
 
 
 class EffectPlan(NamedTuple):
-    """Effects that are simulated in each tile (group of points), and the error of omitting others."""
+    """Effects that are simulated in each tile (group of points), and the error of the omissions."""
 
     effect_names: tuple[str, ...]
     """Names of the effects, in the order of their application."""
