@@ -4,10 +4,10 @@
 
 W is the window's transform and nu the position of a line [bins]. Bin X[k] contains W(k - nu) and,
 conjugated, W(k + nu). Past Nyquist the visible line is itself an image. Without the effect only the
-transform of the folded line is summed, where it is visible. The effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
-Let all light of a line, wherever footprint and record put it, be at least e bins from the edge (DC
-or Nyquist). Then bins within e/2 have images of at most E(3/2 e), and all others at most E(e/2) +
-E(e).
+transform of the folded line is summed, where it is visible. The effect acts on the spectrum. Its
+error bound follows from the envelope E of the window's sidelobes. Let all light of a line, wherever
+footprint and record put it, be at least e bins from the edge (DC or Nyquist). Then bins within e/2
+have images of at most E(3/2 e), and all others at most E(e/2) + E(e).
 
 A bin at the threshold, far down the lines' sidelobes, is much smaller than the largest bin. An
 image too small to change the largest bin may still move it across the threshold. It then joins the

@@ -37,9 +37,9 @@ error is a table of frequency errors over the time in the up-chirp. It is fitted
 series (:mod:`sweep.model.effects.sweep_error_table`), whose integral over the delay is exact.
 
 Error bounds: the window w is real and even about the record's middle. A phase error has an odd and
-an even part, phi = o(x) + e(x); a constant does not matter. A line's spectrum W(y) is real except for the
-factor exp(-i pi y) and the unpaired first sample w_0. The phase error changes it by A + i B, where
-relative to sum w
+an even part, phi = o(x) + e(x); a constant does not matter. A line's spectrum W(y) is real except
+for the factor exp(-i pi y) and the unpaired first sample w_0. The phase error changes it by A + i
+B, where relative to sum w
 
     |A| <= a = <|o| + e^2 / 2>      |B| <= b = <|e|>      < > the mean weighted with |w| / sum w
 

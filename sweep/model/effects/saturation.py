@@ -41,7 +41,7 @@ _CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
 """Voltages at which integrals over a quarter period of the sine are split, less full scale, in
 standard deviations of the noise. Between them the integrands are smooth."""
 _TINY = 1e-30
-"""Positive number that replaces an amplitude of 0 where it is a divisor."""
+"""Positive voltage [V] that replaces an amplitude of 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100
 """Full-scale voltage [V] of an ADC that never clips."""
 _AMPLITUDE_MIN_SIGMA = 1e-5

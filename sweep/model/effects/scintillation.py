@@ -42,8 +42,8 @@ _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
 """Exponents, by kind of wave, of the distances to receiver and to source in the Rytov variance's
 integral over the path."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
-"""Coefficients, by kind of wave, of two terms in the log variance by large eddies. The first term is
-the aperture's, the second that of the strength of turbulence."""
+"""Coefficients, by kind of wave, of two terms in the log variance by large eddies. The first term
+is the aperture's, the second that of the strength of turbulence."""
 
 
 class TurbulenceProfile(NamedTuple):
@@ -264,9 +264,10 @@ def _log_amplitude_moments(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return |E L| and E L^2, or upper bounds of them, for scintillation.
 
-    L is half the logarithm of the total factor on the echo's power, and E the mean. The logarithm of
-    a gamma variable of shape 1/s has a mean above -(s/2 + s^2/12) and a variance below
-    s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its derivative.
+    L is half the logarithm of the total factor on the echo's power, and E the mean. Let a gamma
+    variable of mean 1 have the shape 1/s. Its logarithm has a mean above -(s/2 + s^2/12) and a
+    variance below s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its
+    derivative.
     """
     variances = [np.asarray(v, float) for leg in legs for v in leg]
     if distribution == "log_normal":

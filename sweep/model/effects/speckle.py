@@ -186,7 +186,7 @@ _DECORRELATED_KAPPA_MAX = 1e-6
 """Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
 as amplitudes. Below it the speckle may differ from segment to segment."""
 _TINY = 1e-300
-"""Positive number that replaces a power of 0 where it is a divisor."""
+"""Positive number that replaces a divisor of 0, such as the power of no light."""
 
 
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
@@ -495,7 +495,7 @@ class BeamSpread(NamedTuple):
 
 
 def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
-    """Return the spread of ranges and Doppler ratios over the beam, on a plane or by ray tracing."""
+    """Return the spread of ranges and Doppler ratios over the beam, on a plane or ray-traced."""
     moments = _beamlet_moments(shots, ground)
     if isinstance(ground, FlatGround):
         return BeamSpread(ground.gradients, ground, moments)
@@ -647,8 +647,8 @@ def _line_pair_gradients(
 
 
 _IMAGE_REACH_BINS = 2.0
-"""Distance from DC or Nyquist within which the image of an echo may make another bin the strongest,
-in bins plus as many standard deviations of the lines."""
+"""Reach from DC or Nyquist within which the image of an echo may make another bin the strongest. It
+is this number times the sum of padding factor and standard deviation of the lines [FFT bins]."""
 
 
 def _strongest_bins_with_images(
