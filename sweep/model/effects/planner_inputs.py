@@ -160,7 +160,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def carriers(self) -> np.ndarray:
-        """Frequency [Hz] of each segment whose phase the delay of the echo changes."""
+        """Frequency [Hz], by segment, that turns the echo's delay into a phase of the beat."""
         return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
     @property
