@@ -1,7 +1,8 @@
 """Probability that leaked signal makes bins cross the threshold, in addition to noise.
 
-With x = a^2/2 and y = b^2/2, a bin of amplitude a (in units of the noise per quadrature) crosses a
-threshold b with Q_1(a, b); over the e^-y of noise alone that is
+Amplitude a of a bin and threshold b are in units of the noise per quadrature; x = a^2/2 and
+y = b^2/2. The bin crosses with Marcum's Q_1(a, b). Noise alone crosses with e^-y. The leaked
+signal adds
 
     Q_1(a, b) - e^-y = e^-x sum_{n >= 1} c_n x^n / n!,    c_n = e^-y sum_{j=1..n} y^j / j!
 
@@ -9,14 +10,15 @@ threshold b with Q_1(a, b); over the e^-y of noise alone that is
 sum keeps its precision however small it is. c_n depends on the threshold alone, so all bins of a
 point are one polynomial in x, which vectorises.
 
-Adjacent bins that cross form one group. If the outermost bin of an echo crosses, with probability
-q, bins next to it that cross belong to its group. Let the bins 1, 2, .. next to the echo cross with
-c_1, c_2, ... They hold a further group with the probability
+Adjacent bins that cross count as one group. The outermost bin of an echo crosses with probability
+q. Bins next to it that cross then belong to the echo's group, and are no false peak. Let the bins
+1, 2, .. next to the echo cross with the probabilities p_1, p_2, ... They hold a separate group with
+the probability
 
-    (1 - c_1) B_2 + c_1 (1 - q + q A_2),    A_j = c_j A_(j+1) + (1 - c_j) B_(j+1).
+    (1 - p_1) B_2 + p_1 (1 - q + q A_2),    A_j = p_j A_(j+1) + (1 - p_j) B_(j+1).
 
-B_j is the probability that any bin from j on crosses, A_j that one crosses after a bin that does
-not. Bins between two echoes may join either.
+B_j is the probability that any bin from j on crosses. A_j is the probability that a bin from j on
+crosses after one that does not. Bins between two echoes may join either.
 """
 
 import math
@@ -25,32 +27,34 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.marcum import marcum_q1_excess, marcum_q1_tails
 
 BINS_PER_BATCH = 256
-"""Number of bins for which the polynomial is evaluated together."""
+"""Number of spectrum bins in one call of the evaluation of the crossing series."""
 
 SERIES_Y_MAX = 450.0
-"""Largest y = b^2/2 for which the series is used; above it, and for amplitudes above the threshold,
-Marcum's Q is evaluated bin by bin."""
+"""Largest y = b^2/2 for which the crossing series is used; b is the threshold over the noise per
+quadrature. Above it, Marcum's Q is evaluated bin by bin."""
 
 SERIES_TERMS_MAX = 800
-"""Number of terms of the series that are kept."""
+"""Size of the array of coefficients of the crossing series, and so the largest number of terms."""
 
 JOINED_PROBABILITY_MIN = 1e-9
-"""Probability that adjacent bins all cross, below which no further bin is taken to join them."""
+"""Limit for counting the bins beside an echo that may join it by crossing the threshold. The count
+ends where the probability that all bins so far cross falls to this limit."""
 
 EDGE_NOISE_DEVIATION_MIN = 0.01
-"""Lower limit of the standard deviation [sigma] of an outermost bin's noise, under the condition
-that its neighbour crosses the threshold. The deviation is a divisor."""
+"""Lower limit of the noise deviation of an echo's outermost bin, given that its neighbour crosses.
+The unit is the noise per quadrature. The limit avoids a division by zero."""
 
 _EXPONENTIAL_COEFFICIENTS = tuple((-1) ** n / math.factorial(n) for n in range(12))
-"""Taylor coefficients of e^-z in rising order; the error is 1e-16 for z <= 1/4."""
+"""Taylor coefficients (-1)^n / n! of e^-z, n = 0 .. 11. Their sum errs by 1e-16 for z <= 1/4."""
 _HIGHEST_COEFFICIENT = _EXPONENTIAL_COEFFICIENTS[-1]
 
 
 @njit(cache=True, error_model="numpy")
 def fill_crossing_series(threshold_ratio, series):
-    """Fill ``series`` with c_n y^n / n! over the probability that noise alone does not cross.
+    """Fill ``series`` with the coefficients of the crossing series of one threshold b.
 
-    All terms are filled that an amplitude below the threshold needs; none above
+    Element n is c_n y^n / n! / (1 - e^-y), with c_n = e^-y sum_{j=1..n} y^j / j! and y = b^2/2.
+    All terms are filled that an amplitude below the threshold needs. Nothing is filled for y above
     :data:`SERIES_Y_MAX`.
 
     Parameters
@@ -58,7 +62,7 @@ def fill_crossing_series(threshold_ratio, series):
     threshold_ratio
         Threshold b over the noise per quadrature; y = b^2/2.
     series
-        (terms,): the result.
+        (terms,): the coefficients; element 0 is left as it is.
     """
     y = 0.5 * threshold_ratio * threshold_ratio
     if not 0.0 < y <= SERIES_Y_MAX:
@@ -74,19 +78,27 @@ def fill_crossing_series(threshold_ratio, series):
 
 @njit(cache=True, error_model="numpy")
 def _n_series_terms(x, y):
-    """Return the number of terms that give the sum to 1e-16 for all half squares up to x <= y."""
+    """Return how many terms the crossing series needs for an error of 1e-16 in its sum.
+
+    ``x`` is half the square of the largest amplitude, ``y`` half that of the threshold, x <= y.
+    Both are in units of the noise per quadrature.
+    """
     root = math.sqrt(x * y)
     return int(8.0 + 1.3 * root + 5.0 * math.sqrt(root) + 4.0 * math.sqrt(x))
 
 
 @njit(cache=True, error_model="numpy")
 def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabilities):
-    """Fill ``probabilities`` with (Q_1 - e^-y) / (1 - e^-y), 0..1, of bins below the threshold.
+    """Fill ``probabilities`` with the crossings that a signal adds to those of noise alone.
+
+    The result is (Q_1(a, b) - e^-y) / (1 - e^-y), 0..1, with Marcum's Q_1. It is the probability
+    that the signal makes a bin cross that noise alone would not.
 
     Parameters
     ----------
     half_squares
-        (n_bins + 7,): a^2/2 of each bin, below y. The array is overwritten.
+        (n_bins + 7,): a^2/2 of each bin, below y; a is |X| without noise over the noise per
+        quadrature. The array is overwritten.
     n_bins
         Number of bins.
     threshold_ratio
@@ -126,7 +138,7 @@ def fill_added_crossings(half_squares, n_bins, threshold_ratio, series, probabil
 
 @njit(cache=True, error_model="numpy")
 def largest_or_zero(values):
-    """Return the largest of some numbers, or 0 if all are negative."""
+    """Return the largest element of an array, or 0 if all are negative."""
     maximum = 0.0
     for i in range(values.size):
         maximum = values[i] if values[i] > maximum else maximum
@@ -140,17 +152,18 @@ def _evaluate_series(half_squares, inverse_y, series, n_terms, scale, halvings, 
     Parameters
     ----------
     half_squares
-        x of each bin; overwritten by e^-x.
+        x = a^2/2 of each bin; a is |X| without noise over the noise per quadrature. Overwritten by
+        e^-x.
     inverse_y
-        1/y.
+        1/y, with y = b^2/2; b is the threshold over the noise per quadrature.
     series
-        d_n, result of :func:`fill_crossing_series`.
+        Coefficients d_n, the result of :func:`fill_crossing_series`.
     n_terms
         Number of terms.
     scale, halvings
-        2^-halvings and halvings: e^-x is computed from e^(-x scale) by repeated squaring.
+        2^-halvings, and halvings: e^-x is computed from e^(-x scale) by repeated squaring.
     probabilities
-        The result.
+        Result: probability that the signal makes each bin cross the threshold.
     """
     for i in range(half_squares.size):
         probabilities[i] = 0.0
@@ -202,7 +215,10 @@ def any_crossing_probability(probabilities, first, last):
 
 @njit(cache=True, error_model="numpy")
 def crossing_rate(probability):
-    """Return -ln(1 - p) of a crossing probability p, the rate that is additive over bins."""
+    """Return -ln(1 - p) of a crossing probability p.
+
+    The sum of this rate over independent bins is -ln of the probability that none of them crosses.
+    """
     if probability < 1e-4:
         return probability * (
             1.0 + probability * (0.5 + probability * (1.0 / 3.0 + 0.25 * probability))
@@ -212,7 +228,7 @@ def crossing_rate(probability):
 
 @njit(cache=True, error_model="numpy")
 def weighted_crossing_rate(probabilities, weights):
-    """Return the sum of weights times :func:`crossing_rate` of probabilities."""
+    """Return the weighted sum over bins of -ln(1 - p), where p is a bin's crossing probability."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = 0
     while i + 3 < probabilities.size:  # four sums, as each addition depends on the one before
@@ -243,10 +259,13 @@ def edge_crossing_probability(edge_ratio, neighbour_ratio, threshold_ratio, side
 
     Notes
     -----
-    The neighbour, of amplitude a, crosses by noise n > d = b - a in phase with its signal. Given
-    this, n has the mean m = phi(d) / (1 - Phi(d)) and the variance 1 - m (m - d). The noise of the
-    outermost bin then has the mean rho m and the variance s^2 = 1 - rho^2 m (m - d). The bin
-    crosses like one of the amplitude b - (b - a_edge - rho m) / s in noise of unit variance.
+    All amplitudes are in units of sigma. The neighbour, of amplitude a, crosses by noise n > d
+    = b - a in phase with its signal. Given this, n has the mean m = phi(d) / (1 - Phi(d)) and the
+    variance 1 - m (m - d), with the standard normal density phi and distribution function Phi.
+
+    The noise of the outermost bin then has the mean rho m and the variance s^2 = 1 - rho^2 m
+    (m - d). The bin, of amplitude a_edge, crosses like one of the amplitude b - (b - a_edge -
+    rho m) / s in noise of unit variance.
     """
     if sidelobe_correlation != 0.0:
         distance_to_threshold = threshold_ratio - neighbour_ratio
@@ -281,10 +300,12 @@ def exclude_bins_joining_echo(
     threshold,
     sidelobe_correlation,
 ):
-    """Exclude crossings that join an echo's group from crossing probabilities, in place.
+    """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
-    Next to an echo the probability of the first bin becomes that of a further group in all bins
-    that may join the echo. The probabilities of these other bins become 0.
+    Adjacent bins above the threshold count as one group. A bin beside an echo may thus join the
+    echo's group, and is no false peak then. The probability of the first bin beside an echo becomes
+    that of a separate group in all bins that may join the echo. The other bins' probabilities
+    become 0.
 
     Parameters
     ----------
@@ -293,13 +314,13 @@ def exclude_bins_joining_echo(
     first_index, end_index
         Index of the first bin to process, and of the bin after the last.
     magnitudes
-        (bins,): |X| without noise.
+        (bins,): |X| without noise [V].
     is_exempt
         (bins,) bool: True in bins that belong to an echo.
     noise_sigma
-        Noise per quadrature sigma, in the unit of |X|.
+        Standard deviation of the noise per quadrature [V].
     threshold
-        Threshold on |X| by which adjacent bins form a group.
+        Threshold on |X| [V]; adjacent bins above it form a group.
     sidelobe_correlation
         Correlation of neighbouring bins' noise components in phase with the signal.
     """
@@ -342,10 +363,10 @@ def exclude_bins_joining_echo(
 
 @njit(cache=True, error_model="numpy")
 def _count_joining_bins(probabilities, first_index, step, n_bins):
-    """Return the number of adjacent bins that may join an echo, at most ``n_bins``.
+    """Return how many bins beside an echo may join it by crossing the threshold, 1 .. ``n_bins``.
 
-    They follow from ``first_index`` by ``step``, and cross jointly with a probability above
-    :data:`JOINED_PROBABILITY_MIN`.
+    The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
+    them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.
     """
     n_joining, p_all_cross = 1, 1.0
     while n_joining < n_bins and p_all_cross > JOINED_PROBABILITY_MIN:
@@ -358,9 +379,10 @@ def _count_joining_bins(probabilities, first_index, step, n_bins):
 def _fill_further_group_probability(
     probabilities, first_index, step, n_bins, p_join_first, p_join_last
 ):
-    """Replace the crossing probability of a first bin by that of a further group in adjacent bins.
+    """Set the first bin's probability to that of a group of crossing bins apart from the echo.
 
-    The crossing probabilities of the other bins become 0.
+    A group is a run of adjacent bins that cross the threshold. The probabilities of the other
+    ``n_bins - 1`` bins become 0.
 
     Parameters
     ----------

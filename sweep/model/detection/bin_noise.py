@@ -1,25 +1,27 @@
 """Noise of a segment's bins: its correlation between neighbours, and alarms in any of many bins.
 
-The bins' noise is the transform of white noise times the window w. Bins that are y apart (in bins
-of fs/L) have the correlation W2(y) / W2(0), with W2 the transform of w^2. Alarms of n adjacent bins
-are treated as a first-order Markov chain. With the probability p that a bin crosses a threshold of
-b sigma,
+The bins' noise is the transform of white noise times the window w. W2 is the transform of w^2. Two
+bins at a distance y have the correlation W2(y) / W2(0). The unit of y is fs/L, the sample rate over
+the number of samples in the record. False alarms of n adjacent bins are treated as a first-order
+Markov chain. Let a bin cross a threshold of b sigma with the probability p, sigma being the noise
+per quadrature. Then
 
     P(none) = (1 - p) (1 - h)^(n - 1),    h = (p - p11) / (1 - p).
 
 Here h is the probability that a bin crosses after one that does not. Two neighbours both cross with
 the probability p11, the joint tail of two Rayleigh magnitudes [Simon and Alouini, Digital
-Communication over Fading Channels, 6.1.2]. With rho^2 = |W2/W2(0)|^2 of neighbours
+Communication over Fading Channels, 6.1.2]. With rho = |W2/W2(0)| of neighbours and Marcum's Q_1
 
     p - p11 = p (Q_1(s b, s rho b) - Q_1(s rho b, s b)),    s^2 = 1 / (1 - rho^2).
 
-The noise of a real record is real at DC and Nyquist and nearly real next to them, where it raises
-alarms far more often. Bins whose noise is not circular are not searched for alarms.
+The noise of a real record is real at DC and Nyquist and nearly real next to them. It raises alarms
+far more often there. Bins whose noise is not circular are not searched for alarms.
 
-n bins thus raise alarms as often as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent bins, to which
-the formulas for independent bins apply, in logarithms too. At TNR 6 the result is within 2 % of
-drawn noise for rectangular, Hamming, Hann and Blackman windows, and within 3 % for flattop and for
-Hann padded by 4.
+n bins thus raise alarms as often as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent bins. The
+formulas for independent bins apply to this number. The threshold-to-noise ratio is the threshold
+over the standard deviation of |X| in noise alone. At a ratio of 6 the result is within 2 % of
+simulated noise for rectangular, Hamming, Hann and Blackman windows. It is within 3 % for flattop,
+and for Hann in a record padded to four times its length.
 """
 
 import math
@@ -32,25 +34,27 @@ from sweep.model.detection.looks import SINGLE_LOOK, Looks
 from sweep.model.window import Window, window_samples
 
 CIRCULAR_RATIO_MAX = 0.01
-"""Largest |W2(2k)| / W2(0), the relative difference of the quadratures' variances from their mean,
-of bins whose noise counts as circular."""
+"""Limit below which a bin's noise counts as circular (equal variances in both quadratures). The
+limit is on the difference of a quadrature's variance from the mean of both, relative to the
+mean."""
 
 
 @lru_cache(maxsize=64)
 def neighbour_noise_correlation(window: Window, fft_size: int) -> float:
-    """Return the modulus of the noise correlation of adjacent bins, fs/N apart, 0..1."""
+    """Return the modulus of the noise correlation of adjacent bins of the FFT, 0..1."""
     return _noise_correlation_at(window, fft_size, 1)
 
 
 @lru_cache(maxsize=64)
 def first_circular_bin(window: Window, fft_size: int) -> int:
-    """Return the distance of the first bin with circular noise from DC or Nyquist [bins]; >= 1.
+    """Return the distance [bins] from DC or Nyquist from which on noise counts as circular; >= 1.
 
     Notes
     -----
-    In a real record, the noise k bins from DC or Nyquist has quadratures of the variances
-    sigma^2 (1 +- |W2(2k)| / W2(0)), with the transform W2 of the squared window. It counts as
-    circular if the ratio is at most :data:`CIRCULAR_RATIO_MAX`, there and in all bins beyond.
+    Circular noise has equal variances in both quadratures. In a real record, the noise k bins from
+    DC or Nyquist has the variances sigma^2 (1 +- |W2(2k)| / W2(0)), with their mean sigma^2 and the
+    transform W2 of the squared window. The noise counts as circular if the ratio is at most
+    :data:`CIRCULAR_RATIO_MAX` in this bin and in all bins farther away.
     """
     padding_factor, last_noncircular_bin = fft_size / window.length, 0
     for k in range(1, math.ceil(8 * padding_factor), max(int(padding_factor / 16), 1)):
@@ -60,7 +64,10 @@ def first_circular_bin(window: Window, fft_size: int) -> int:
 
 
 def _noise_correlation_at(window: Window, fft_size: int, bin_distance: int) -> float:
-    """Return the modulus of the noise correlation of bins at a distance [bins of fs/N], 0..1."""
+    """Return the modulus of the noise correlation of two bins ``bin_distance`` apart, 0..1.
+
+    The distance is in bins of the FFT of ``fft_size`` samples.
+    """
     squared_window = window_samples(window.name, window.length) ** 2
     exponentials = np.exp(
         -2j * np.pi * (bin_distance * np.arange(window.length) % fft_size) / fft_size
@@ -84,7 +91,7 @@ def alarm_equivalent_bins(
     correlation
         Noise correlation of neighbours, :func:`neighbour_noise_correlation`.
     looks
-        Number of looks and how they are combined.
+        Number of looks (records of each segment) and how they are combined.
     """
     n_bins = np.asarray(n_bins, float)
     equivalent_per_bin = _equivalent_bins_per_bin(
@@ -96,7 +103,11 @@ def alarm_equivalent_bins(
 def _equivalent_bins_per_bin(
     threshold_ratio: np.ndarray, correlation: float, looks: Looks
 ) -> np.ndarray:
-    """Return ln(1 - h) / ln(1 - p), the number of independent bins per additional adjacent bin."""
+    """Return by how many independent bins each further adjacent bin counts, 0..1.
+
+    It is ln(1 - h) / ln(1 - p), with the crossing probability p of a bin, and h that of a bin whose
+    neighbour does not cross.
+    """
     from sweep.model.detection.marcum import marcum_q1
 
     if correlation in (0.0, 1.0):  # 1: a record of one sample, whose bins are all equal
@@ -125,12 +136,12 @@ def _equivalent_bins_per_bin(
 
 
 NOISE_FILTER_TAPS = 17
-"""Number of independent normal numbers that make the noise of a bin."""
+"""Number of independent normal numbers whose weighted sum is the simulated noise of a bin."""
 
 
 @lru_cache(maxsize=16)
 def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the filter that makes the noise of adjacent bins from independent normal numbers.
+    """Return weights that turn independent normal numbers into the correlated noise of bins.
 
     Parameters
     ----------
@@ -149,8 +160,9 @@ def noise_filter(window: Window, fft_size: int, n_bins: int) -> tuple[np.ndarray
 
     Notes
     -----
-    The noise of a bin at the frequency y [bins of fs/L] is sum_j W(y - j) z_j, with one number z_j
-    per bin of fs/L and the window's transform W, which is real about the middle of the record.
+    The unit of frequency is fs/L, the sample rate over the number of samples in the window. The
+    noise of a bin at the frequency y is sum_j W(y - j) z_j, with one normal number z_j per unit of
+    frequency. W is the window's transform, which is real about the middle of the record.
     """
     filter_length = min(window.length, 512) // 2 * 2
     window_values = window_samples(window.name, max(filter_length, 1))

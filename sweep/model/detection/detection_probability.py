@@ -1,15 +1,15 @@
 """Probabilities of detection of segments and shots, whatever the rule of detection.
 
 Each probability of detection pd, and its complement, the miss probability, is computed once, from
-|X| without noise in the bins around an echo:
+|X| without noise (the modulus of the spectrum) in the bins around an echo:
 
 =============================  ====================================================================
 one echo in one record         :func:`sweep.model.detection.echo_detection.pd_and_miss`, by the
                                strongest bin or any bin, steady or in developed speckle
 one bin in several looks       :meth:`sweep.model.preparation.Shots.pd_and_miss_in_looks`
-the segments of points         :func:`detect_in_spans`, by one of these two laws. Spans of bins are
-                               final then: cut to the search band, and without segments that no
-                               echo reaches
+the segments of points         :func:`detect_in_spans`, by one of these two laws. A span is the
+                               range of bins around an echo; it is final then: cut to the search
+                               band, and empty in segments that no echo reaches
 both chirps of a shot          :meth:`sweep.model.preparation.Shots.joint_detection_probability`
 a shot                         :func:`shot_pd_and_miss`, by both chirps or any two of three segments
 =============================  ====================================================================
@@ -38,10 +38,10 @@ from sweep.model.detection.pseudo_variance import mean_over_phases
 
 
 def pd_follows_from_computed_spans(shots: Any) -> bool:
-    """Test if the spans of bins, as first computed, determine the probabilities of detection.
+    """Test if probabilities of detection follow from the bins around an echo as first computed.
 
-    They do not if a search band cuts the spans later, if leaked light adds a line to them, or if
-    several looks are combined.
+    They do not if a search band later removes some of these bins, if leaked light adds a line to
+    them, or if several looks (records of each segment) are combined.
 
     Parameters
     ----------
@@ -56,21 +56,22 @@ def pd_follows_from_computed_spans(shots: Any) -> bool:
 
 
 def detect_in_spans(shots: Any, spans: Any) -> Any:
-    """Set the probabilities of detection of each segment from its final span of bins.
+    """Set the probabilities of detection of each segment from the bins around its echo.
 
     Parameters
     ----------
     shots : Shots
         Prepared shots.
     spans : BinSpans
-        Spans of bins of m points. Their pd and miss are kept if
-        :func:`pd_follows_from_computed_spans`.
+        Spans (ranges of adjacent bins around the echoes) of m points. Their pd and miss are kept
+        if :func:`pd_follows_from_computed_spans` is true.
 
     Returns
     -------
     BinSpans
-        Spans with pd and miss. Where the strongest bin of an echo is not searched, the echo is not
-        detected. Both are nan in segments that do not exist.
+        Spans with the probabilities pd of detection and miss, its complement. An echo whose
+        strongest bin lies outside the search band is not detected. Both are nan in segments that do
+        not exist.
     """
     pd, miss = spans.pd, spans.miss
     if shots.looks.is_noncoherent:
@@ -108,7 +109,9 @@ def detect_in_spans(shots: Any, spans: Any) -> Any:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_table, pd, miss):
-    """Fill pd and miss (segments, m) of the echoes in all spans that are not empty.
+    """Fill the probabilities of detection and of a miss of the echoes of m points, by segment.
+
+    A span is the range of adjacent bins around an echo; empty ones are skipped.
 
     Parameters
     ----------
@@ -121,7 +124,7 @@ def _fill_span_pd_and_miss(spans, point_indices, rule, bin_thresholds, speckle_t
         :class:`~sweep.model.detection.echo_detection.BinThresholds` and
         :class:`~sweep.model.detection.echo_detection.SpeckleTable` of all points.
     pd, miss
-        (segments, m): the results.
+        (segments, m): results, the probabilities of detection and of a miss.
     """
     for s in range(spans.first_bin.shape[0]):
         for j in range(spans.first_bin.shape[1]):
@@ -158,8 +161,8 @@ def shot_pd_and_miss(
     Returns
     -------
     DetectionArrays
-        pd and miss of the shots, (n,). A miss is not computed as 1 - pd, so that both keep their
-        precision.
+        (n,): probabilities pd that a shot is detected, and miss that it is not. miss is not
+        computed as 1 - pd, so that both keep their precision.
     """
     if shots.any_two:
         return _pd_and_miss_any_two(shots, pd, miss, magnitudes)
@@ -176,7 +179,7 @@ def shot_pd_and_miss(
 def _pd_and_miss_any_two(
     shots: Any, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> DetectionArrays:
-    """Compute :func:`shot_pd_and_miss` of shots that any two of three segments detect."""
+    """Compute :func:`shot_pd_and_miss` where detection in any two of three segments suffices."""
     if shots.speckle.segment_correlations is None:
         return DetectionArrays(at_least_two_of_three(pd, miss), at_least_two_of_three(miss, pd))
     threshold_ratio = shots.threshold / shots.line_noise_sigma

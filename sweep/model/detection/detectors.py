@@ -19,8 +19,8 @@ FFT correlates the noise of neighbouring bins. The level then comes from fewer i
 and false alarms are more frequent than by design (numbers in docs/detectors.md).
 
 The same formulas give the probability of detection of a signal that fluctuates like speckle
-(Swerling 1). A cell whose mean power is 1 + snr times the noise power crosses as often as noise
-with a factor divided by 1 + snr.
+(Swerling 1). Let snr be the ratio of its mean power to the noise power. A cell with the signal
+exceeds its threshold as often as a cell of noise would with the factor divided by 1 + snr.
 
 Training cells wrap around. In a real record's spectrum, cells below DC are those below Nyquist, and
 vice versa; in a complex record's spectrum, the cells after its last bin are its first.
@@ -50,7 +50,11 @@ def cached_window_samples(window: Window) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def main_lobe_half_width(window: Window) -> float:
-    """Return the distance [bins of fs/L] of the first minimum of |W| below its half, to 1/8 bin."""
+    """Return the distance of the first minimum of |W| from the centre, to 1/8 bin.
+
+    W is the window's transform. Only minima below half its maximum count. A bin is the sample rate
+    over the number of samples in the window.
+    """
     magnitude = np.abs(np.fft.rfft(cached_window_samples(window), 8 * window.length))
     is_below_half = magnitude[:-1] < 0.5 * magnitude[0]  # flattop windows have minima above it
     return float(np.argmax(is_below_half & (np.diff(magnitude) > 0))) / 8
@@ -61,25 +65,27 @@ class SpectrumSettings:
     """Properties of spectra, and settings of the detector that is applied to them."""
 
     fft_size: int
-    """FFT size N. Spectra have the bins 0..N/2, or -N/2..N/2 - 1 of a complex record."""
+    """FFT size N. Spectra of real records have the bins 0..N/2, of complex ones -N/2..N/2 - 1."""
     sample_rate: float
     """Sample rate [Hz]; a bin is ``sample_rate / fft_size`` wide."""
     window: Window
     """Window of the record. Its length L <= N is that of the record, which is zero-padded to N."""
     noise_power: float
-    """Mean |X|^2 of a bin of noise alone, by the receiver's noise budget [V^2]."""
+    """Mean power |X|^2 of a bin of noise alone [V^2], from the receiver's noise sources."""
     threshold: float
     """Fixed threshold on |X| [V]."""
     training: int
-    """Training cells, half of them on either side; even."""
+    """Number of training cells (bins from which a CFAR detector estimates the noise level). It is
+    even; half of them lie on either side of the tested bin."""
     guard: int
-    """Guard cells on either side."""
+    """Number of guard cells (bins left out next to the tested bin) on either side."""
     rank: int
-    """Rank of the ordered statistic among the training cells, 1 for the least."""
+    """Rank of the training cell, sorted by power, whose power is the noise level of ``os_cfar``.
+    Rank 1 is the weakest cell."""
     pfa: float
     """Design probability of a false alarm in a bin of noise alone."""
     complex_record: bool = False
-    """True for records of I and Q: bin k has the index k + N/2."""
+    """True for complex records (I and Q). Bin k of their spectra has the index k + fft_size/2."""
 
     @property
     def taper(self) -> np.ndarray:
@@ -88,8 +94,9 @@ class SpectrumSettings:
 
 
 Detector = Callable[[np.ndarray, SpectrumSettings], np.ndarray]
-"""Function from the power |X|^2 of m spectra, (m, N/2 + 1) or (m, N) of complex records, and their
-settings to a bool array of the same shape, True in bins that are detected."""
+"""Function that marks the detected bins of m spectra. The arguments are the power |X|^2 and the
+settings. The power is (m, N/2 + 1) for real and (m, N) for complex records, with the FFT size N.
+The result is a bool array of the same shape, True in detected bins."""
 
 
 def cfar_crossing_probability(kind: str, factor: float, *, training: int, rank: int) -> float:
@@ -100,16 +107,18 @@ def cfar_crossing_probability(kind: str, factor: float, *, training: int, rank: 
     kind : str
         CFAR detector: ``ca_cfar``, ``goca_cfar`` or ``os_cfar``.
     factor : float
-        Threshold over the level of the training cells. If the mean power of the cell is 1 + snr
-        times theirs, the factor divided by 1 + snr.
+        Threshold over the noise level estimated from the training cells. For a cell whose mean
+        power is 1 + snr times that of the training cells, pass the factor divided by 1 + snr.
     training : int
         Number of training cells, even.
     rank : int
-        Rank of the ordered statistic, 1..training; used by ``os_cfar``.
+        Rank of the training cell that gives the noise level, 1 (weakest) .. training; used by
+        ``os_cfar``.
 
     Returns
     -------
     float
+        Probability, 0..1.
     """
     if kind == CA_CFAR:
         return float((1 + factor / training) ** -training)
@@ -145,7 +154,7 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
     Returns
     -------
     float
-        Threshold over the level of the training cells.
+        Threshold over the noise level estimated from the training cells.
     """
     from scipy.optimize import brentq  # slow to import, and used by CFAR detectors only
 
@@ -153,7 +162,7 @@ def cfar_factor(kind: str, *, training: int, rank: int, pfa: float) -> float:
         return training * math.expm1(-math.log(pfa) / training)
 
     def log_pfa_excess(log_factor: float) -> float:
-        """Return the log false-alarm probability for ln(factor) minus the design value."""
+        """Return ln of the false-alarm probability at a factor, minus ln of the design value."""
         probability = cfar_crossing_probability(
             kind, math.exp(log_factor), training=training, rank=rank
         )
@@ -171,7 +180,10 @@ def fixed_threshold(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray
 
 
 def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by the mean of their training cells; a :data:`Detector`."""
+    """Detect bins by cell averaging: the threshold follows from the mean of all training cells.
+
+    This is a :data:`Detector`.
+    """
     below, above = _training_sums(power, settings)
     return _exceeds_cfar_threshold(
         power, (below + above) / (settings.training // 2 * 2), CA_CFAR, settings
@@ -179,15 +191,19 @@ def ca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
 
 
 def goca_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by the larger mean of both halves of their training cells; a :data:`Detector`."""
+    """Detect bins by the larger of the mean powers of the training cells below and above them.
+
+    This is a :data:`Detector`.
+    """
     level = np.maximum(*_training_sums(power, settings)) / (settings.training // 2)
     return _exceeds_cfar_threshold(power, level, GOCA_CFAR, settings)
 
 
 def os_cfar(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Detect bins by an ordered statistic of their training cells; a :data:`Detector`.
+    """Detect bins by one of their training cells, sorted by power; a :data:`Detector`.
 
-    A bin is detected if at least ``rank`` training cells are below its power over the factor.
+    A bin is detected if at least ``settings.rank`` training cells have at most the bin's power
+    divided by the threshold factor.
     """
     circular_bins = _circular_bins(power, settings)
     level_max, n_below = (
@@ -209,26 +225,30 @@ DETECTORS: dict[str, Detector] = {
 
 
 def _settings_factor(kind: str, settings: SpectrumSettings) -> float:
-    """Return the threshold factor of a CFAR detector for settings."""
+    """Return the threshold over the estimated noise level of a CFAR detector with these settings.
+
+    ``kind`` is a name of :data:`DETECTORS`, such as ``ca_cfar``.
+    """
     return cfar_factor(kind, training=settings.training, rank=settings.rank, pfa=settings.pfa)
 
 
 def _circular_bins(power: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the power in bins of circular noise: all but DC and Nyquist of a real record."""
+    """Return the power in bins of circular (complex) noise: all but DC and Nyquist if real."""
     return power if settings.complex_record else power[:, 1:-1]
 
 
 def _pad_to_all_bins(flags: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Extend detections from bins of circular noise to all bins, False at DC and Nyquist."""
+    """Extend detections to all bins of a spectrum: False at DC and Nyquist of a real record."""
     return flags if settings.complex_record else np.pad(flags, ((0, 0), (1, 1)))
 
 
 def _iter_training_pairs(
     power: np.ndarray, settings: SpectrumSettings
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield pairs of training cells, one below and one above each bin of circular noise.
+    """Yield the power of training cells, in pairs: one below and one above each bin.
 
-    Each is an array of the shape of the bins. Cells wrap around the ends of the spectrum.
+    Each array has the shape of the spectra without DC and Nyquist of real records. Cells wrap
+    around the ends of the spectrum.
     """
     circular_bins, half_cells = _circular_bins(power, settings), settings.training // 2
     n_bins, reach_cells = circular_bins.shape[1], half_cells + settings.guard
@@ -239,7 +259,7 @@ def _iter_training_pairs(
 
 
 def _training_sums(power: np.ndarray, settings: SpectrumSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the training cells below and above each bin."""
+    """Return the summed power of the training cells below each bin, and of those above it."""
     below, above = np.zeros((2, *_circular_bins(power, settings).shape))
     for cells_below, cells_above in _iter_training_pairs(power, settings):
         below += cells_below
@@ -250,7 +270,7 @@ def _training_sums(power: np.ndarray, settings: SpectrumSettings) -> tuple[np.nd
 def _exceeds_cfar_threshold(
     power: np.ndarray, level: np.ndarray, kind: str, settings: SpectrumSettings
 ) -> np.ndarray:
-    """Test if the power of bins is at or above the threshold factor times a level."""
+    """Test if the power of bins is at or above the CFAR factor times their noise level."""
     return _pad_to_all_bins(
         _circular_bins(power, settings) >= _settings_factor(kind, settings) * level, settings
     )

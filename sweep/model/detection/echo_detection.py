@@ -1,8 +1,8 @@
 """Detection of an echo in the spectrum of one segment, and bins exempt from false alarms.
 
-:func:`pd_and_miss` is the law of all records that are evaluated one by one. It turns |X| of the
-echo's bins without noise, the detection rule and the threshold into a probability of detection.
-Laws of several looks and of whole shots are listed in
+:func:`pd_and_miss` gives the probability of detection of an echo in a single record. It takes the
+noiseless |X| of the echo's bins, the detection rule and the threshold. The laws of several looks
+(records of each segment) and of whole shots are listed in
 :mod:`sweep.model.detection.detection_probability`.
 """
 
@@ -32,7 +32,8 @@ from sweep.model.detection.speckle_modes import (
 )
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
-"""Standard deviation of |X| in a noise-only bin, in units of sigma (per quadrature)."""
+"""Standard deviation of |X| in a bin of noise alone, in units of the noise deviation per
+quadrature."""
 
 
 def threshold_from_tnr(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
@@ -52,8 +53,8 @@ def threshold_from_tnr(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndar
 
     Notes
     -----
-    A bin of noise alone crosses with the probability exp(-(4 - pi)/4 TNR^2). No other reading of
-    [T]'s threshold-to-noise ratio gives its Table 4.2 (PHYSICS section 6).
+    A bin of noise alone crosses with the probability exp(-(4 - pi)/4 ``tnr``^2). No other
+    definition of the threshold-to-noise ratio of [T] gives its Table 4.2 (PHYSICS section 6).
     """
     return tnr * bin_deviation * RAYLEIGH_DEVIATION
 
@@ -66,7 +67,8 @@ def negligible_signal_ratio(
     Parameters
     ----------
     leakage_probability
-        (n,): tolerated error of the leakage probability, summed over all such bins.
+        (n,): tolerated error of the probability of a false peak by leaked signal, summed over all
+        bins that count as noise alone.
     threshold_ratio
         (n,): threshold b [sigma].
     n_bins
@@ -79,12 +81,12 @@ def negligible_signal_ratio(
 
     Notes
     -----
-    With x = a^2/2 and y = b^2/2 a bin of amplitude a [sigma] adds at most
+    Let a bin have the amplitude a [sigma], with x = a^2/2 and y = b^2/2. It adds at most
 
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
-    to the leakage (:mod:`sweep.model.spectrum.leakage`). The last factor is taken at a b = 1, the
-    largest product that is returned.
+    to the probability of a false peak by leaked signal (:mod:`sweep.model.spectrum.leakage`). The
+    last factor is taken at a b = 1, the largest product that is returned.
     """
     y = 0.5 * np.square(threshold_ratio)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -103,28 +105,29 @@ class DetectionRule(NamedTuple):
     any_bin: bool
     """True if any bin of an echo may detect it, False if only its strongest bin."""
     lobe_half_width: int
-    """Half-width of the window's main lobe [bins of fs/N], rounded up; 0 unless ``any_bin``."""
+    """Half-width of the window's main lobe [FFT bins], rounded up; 0 unless ``any_bin``."""
     real_noise_at_ends: bool
     """True if the noise in bins 0 and N/2 is real, as in a real record."""
     fft_size: int
-    """FFT size N."""
+    """FFT size N, including zero padding."""
     in_speckle: bool
     """True if echoes are in developed speckle."""
     noise_correlation: float
-    """Correlation of the noise of neighbouring bins, 0..1."""
+    """Modulus of the correlation of the noise of neighbouring bins, 0..1."""
     real_record_in_speckle: bool
-    """True for echoes in developed speckle in a real record. Their amplitudes are noncircular near
-    DC and Nyquist."""
+    """True for echoes in developed speckle in a real record. Near DC and Nyquist the quadratures of
+    their amplitudes have unequal variances."""
     joint_tail_rule: JointTailRule
-    """Quadrature for the joint crossing of neighbouring bins."""
+    """Quadrature for the probability that two neighbouring bins both cross the threshold."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the noise by distance [bins] from the nearer of DC and
-    Nyquist. Empty unless ``real_noise_at_ends`` and ``in_speckle``."""
+    """(bins,): ratio E[n^2] / E[|n|^2] of the noise n, 0 if circular, by distance [bins] from the
+    nearer of DC and Nyquist. Empty unless ``real_noise_at_ends`` and ``in_speckle``."""
     mode_table: ModeTable
-    """Speckle modes of an echo; ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
+    """Table of the strongest speckle mode, the part of an echo that fades with one amplitude in all
+    its bins. ``NO_MODES`` unless ``any_bin`` and ``in_speckle``."""
     sidelobe_correlation: float = 0.0
-    """Correlation of neighbouring bins' noise components in phase with a line's sidelobes, -1..1.
-    Sidelobes alternate in sign."""
+    """Correlation, -1..1, of two neighbouring bins' noise components in phase with a line's
+    sidelobes. Sidelobes alternate in sign from bin to bin."""
 
 
 class EchoBins(NamedTuple):
@@ -135,18 +138,21 @@ class EchoBins(NamedTuple):
     is_echo: np.ndarray
     """(bins,) bool: True in bins of the echo."""
     first_bin: int
-    """Number of the first bin."""
+    """Bin number in the spectrum of the first element of the arrays."""
 
 
 class EchoSpans(NamedTuple):
-    """|X| without noise in spans of adjacent bins, one span for each segment of m points."""
+    """|X| without noise in the bins around echoes, one span for each segment of m points.
+
+    A span is a range of adjacent bins around an echo.
+    """
 
     first_bin: np.ndarray
-    """(segments, m) int64: number of the span's first bin."""
+    """(segments, m) int64: bin number in the spectrum of the span's first bin."""
     n_bins: np.ndarray
     """(segments, m) int64: number of bins of the span; 0 if it is empty."""
     peak_index: np.ndarray
-    """(segments, m) int64: index of the span's strongest bin within the span."""
+    """(segments, m) int64: index of the echo's strongest bin, counted from the span's first bin."""
     span_start: np.ndarray
     """(segments, m) int64: index of the span's first bin in ``magnitudes`` and ``is_exempt``."""
     magnitudes: np.ndarray
@@ -158,21 +164,23 @@ class EchoSpans(NamedTuple):
 class GivenMode(NamedTuple):
     """Parameters of an echo's bins given the complex amplitude z of its strongest speckle mode.
 
-    All are relative to the noise of the bin, which is receiver noise plus the other speckle modes.
+    A speckle mode is a part of the echo that fades with one amplitude in all bins. All fields are
+    relative to the noise of the bin, which is receiver noise plus the other speckle modes.
     """
 
     signal: np.ndarray
-    """(bins,): root mean square magnitude of the mode over the noise per quadrature."""
+    """(bins,): root mean square magnitude of the strongest speckle mode over the noise per
+    quadrature."""
     threshold: np.ndarray
-    """(bins,): threshold over the noise per quadrature."""
+    """(bins,): threshold on |X| over the noise per quadrature."""
     correlation: np.ndarray
     """(bins,): correlation of the bin's noise with the noise of the bin below it, -1..1."""
     pedestal: np.ndarray
-    """(bins,): mean power of the phase-noise pedestal that fades with the mode, over the noise
-    power."""
+    """(bins,): mean power of the laser's phase-noise pedestal over the noise power. Only the part
+    that fades with the strongest speckle mode counts."""
     other_echo_fraction: np.ndarray
-    """(bins,): fraction of the noise power due to other speckle modes, 0..1. Near DC and Nyquist
-    their power depends on the phase of z."""
+    """(bins,): fraction, 0..1, of the noise power that is due to other speckle modes than the
+    strongest. Near DC and Nyquist it depends on the phase of the strongest mode's amplitude."""
 
 
 class Detection(NamedTuple):
@@ -192,8 +200,8 @@ class PedestalShape(NamedTuple):
 
     Notes
     -----
-    Light of the line width dnu is mixed with itself after a delay tau. With Gamma = 2 pi dnu, the
-    power density at the angular frequency omega from the line is proportional to [1]_
+    Light of the line width dnu (FWHM) is mixed with itself after a delay tau. Let Gamma be 2 pi
+    dnu. The power density at the angular frequency omega from the line is proportional to [1]_
 
         [1 - e^(-Gamma tau) (cos omega tau + Gamma / omega sin omega tau)] / (1 + omega^2 / Gamma^2)
 
@@ -204,58 +212,61 @@ class PedestalShape(NamedTuple):
     """
 
     reach_bins: float
-    """Distance [bins] from a line up to which the pedestal's bins belong to the echo: that of the
-    last bin in which the pedestal has at least the power of the noise. 0 if it does not exceed the
-    half-width of the main lobe."""
+    """Distance [bins] from a line up to which bins belong to the echo. In the last of them the
+    pedestal has at least the power of the noise. 0 if it does not exceed the half-width of the main
+    lobe."""
     line_width_bins: float
-    """Line width dnu of the laser [bins of fs/N]."""
+    """Width (FWHM) of the laser's line [FFT bins]."""
     delay: float
-    """Delay tau of the echo, at most the record's duration [N/fs]."""
+    """Delay of the echo, at most the record's duration, in units of one over the bin width."""
 
 
 NO_PEDESTAL = PedestalShape(0.0, 0.0, 0.0)
-"""Shape without a pedestal."""
+"""Shape of a laser without phase noise, whose lines have no pedestal."""
 
 
 class BinThreshold(NamedTuple):
     """Threshold on |X| and noise in the bins of one echo [V, summed over the record].
 
-    Noise is the standard deviation per quadrature.
+    Noise is the standard deviation per quadrature. The pedestal is the noise that the laser's phase
+    noise leaves around a line.
     """
 
     line_noise: float
-    """Noise in bins that hold lines. It includes the part of the phase-noise pedestal that changes
-    |X| there."""
+    """Noise per quadrature [V] in bins that hold lines. It includes the part of the phase-noise
+    pedestal that changes |X| in these bins."""
     threshold: float
-    """Threshold on |X|."""
+    """Threshold on |X| [V]."""
     noise_without_pedestal: float
-    """Receiver noise alone."""
+    """Noise per quadrature [V] of the receiver alone, without the laser's phase noise."""
     side_noise: float
-    """Noise in bins next to the lines. It includes the whole pedestal."""
+    """Noise per quadrature [V] in bins next to the lines. It includes the whole phase-noise
+    pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
-    """Shape of the pedestal about the lines."""
+    """Shape of the phase-noise pedestal about the lines."""
 
 
 class BinThresholds(NamedTuple):
     """Threshold on |X| and noise of n points: arrays (n,) of fields of :class:`BinThreshold`."""
 
     line_noise: np.ndarray
-    """:attr:`BinThreshold.line_noise` [V]."""
+    """(n,): noise per quadrature [V] in bins with lines, :attr:`BinThreshold.line_noise`."""
     threshold: np.ndarray
-    """:attr:`BinThreshold.threshold` [V]."""
+    """(n,): threshold on |X| [V], :attr:`BinThreshold.threshold`."""
     noise_without_pedestal: np.ndarray
-    """:attr:`BinThreshold.noise_without_pedestal` [V]."""
+    """(n,): receiver noise [V], :attr:`BinThreshold.noise_without_pedestal`."""
     side_noise: np.ndarray
-    """:attr:`BinThreshold.side_noise` [V]."""
+    """(n,): noise per quadrature [V] in bins next to lines, :attr:`BinThreshold.side_noise`."""
     pedestal_reach_bins: np.ndarray
-    """:attr:`PedestalShape.reach_bins`."""
+    """(n,): distance from a line [bins] up to which bins of the phase-noise pedestal belong to the
+    echo, :attr:`PedestalShape.reach_bins`."""
     pedestal_line_width_bins: np.ndarray
-    """:attr:`PedestalShape.line_width_bins` [bins of fs/N]."""
+    """(n,): laser line width [FFT bins], :attr:`PedestalShape.line_width_bins`."""
     pedestal_delay: np.ndarray
-    """:attr:`PedestalShape.delay` [N/fs]."""
+    """(n,): delay of the echo [one over the bin width], :attr:`PedestalShape.delay`."""
 
     def select(self, points: np.ndarray) -> "BinThresholds":
-        """Select points by their indices."""
+        """Return the thresholds and noise of some points, given by their indices."""
         return BinThresholds(*(values[points] for values in self))
 
 
@@ -263,10 +274,10 @@ class BinSpeckle(NamedTuple):
     """Speckle parameters of the echo in one segment of one point."""
 
     line_deviation_bins: float
-    """Standard deviation of the positions of the footprint's lines [bins of fs/N]."""
+    """Standard deviation [FFT bins] of the frequencies of the lines of a footprint."""
     pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the signal by distance [bins] from the nearer of DC and
-    Nyquist. Empty if the echo lies far from both."""
+    """(bins,): ratio E[X^2] / E[|X|^2] of the signal X, by distance [bins] from the nearer of DC
+    and Nyquist. Empty if the echo lies far from both, where the ratio is 0."""
 
 
 NO_SPECKLE = BinSpeckle(0.0, np.empty(0))
@@ -277,18 +288,19 @@ class SpeckleTable(NamedTuple):
     """Speckle parameters of the echoes of n points, by segment."""
 
     line_deviation_bins: np.ndarray
-    """(segments, n): :attr:`BinSpeckle.line_deviation_bins`."""
+    """(segments, n): standard deviation [FFT bins] of the frequencies of an echo's lines."""
     ratio_row: np.ndarray
-    """(segments, n) int64: row of ``pseudo_variance_ratio``; 0 for echoes far from DC and
-    Nyquist."""
+    """(segments, n) int64: row of ``pseudo_variance_ratio`` for each echo. Row 0 is for echoes far
+    from DC and Nyquist."""
     pseudo_variance_ratio: np.ndarray
-    """(rows, bins): :attr:`BinSpeckle.pseudo_variance_ratio`."""
+    """(rows, bins): ratio E[X^2] / E[|X|^2] of the signal X, by distance [bins] from the nearer of
+    DC and Nyquist."""
     phase_factors: np.ndarray
-    """(rows, angles): relative power of the echo's strongest bin by the phase of the speckle,
-    :attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.phase_factors`."""
+    """(rows, phases): power of the echo's strongest bin at each phase of the speckle, over its mean
+    (:attr:`sweep.model.detection.pseudo_variance.SignalPseudoVariance.phase_factors`)."""
 
     def select(self, segment: int, points: np.ndarray) -> "SpeckleTable":
-        """Select one segment of points by their indices."""
+        """Return the table of one segment of some points, given by their indices."""
         line_deviation_bins, ratio_row = (
             values[[segment]][:, points] for values in (self.line_deviation_bins, self.ratio_row)
         )
@@ -299,7 +311,7 @@ class SpeckleTable(NamedTuple):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def bin_threshold_at(bin_thresholds, point):
-    """Return the :class:`BinThreshold` of the point with an index."""
+    """Return the :class:`BinThreshold` of point number ``point`` of :class:`BinThresholds`."""
     return BinThreshold(
         bin_thresholds.line_noise[point],
         bin_thresholds.threshold[point],
@@ -315,15 +327,19 @@ def bin_threshold_at(bin_thresholds, point):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def echo_half_width(rule, pedestal_reach_bins):
-    """Return the half-width [bins] of an echo about its lines: of its main lobe or its pedestal."""
+    """Return the half-width [bins] of an echo about its lines.
+
+    It is the larger of the half-widths of the main lobe and of the phase-noise pedestal. ``rule``
+    is a :class:`DetectionRule`.
+    """
     return max(rule.lobe_half_width, int(pedestal_reach_bins))
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pedestal_power_ratio(pedestal, distance):
-    """Return the power density of a pedestal at a distance [bins] over its density under the line.
+    """Return the power density of a phase-noise pedestal, over its density under the line.
 
-    ``pedestal`` is a :class:`PedestalShape`.
+    ``pedestal`` is a :class:`PedestalShape`; ``distance`` is that from the line [bins].
     """
     gamma, delay = 2.0 * math.pi * pedestal.line_width_bins, pedestal.delay
     coherence, omega = math.exp(-gamma * delay), 2.0 * math.pi * distance
@@ -336,7 +352,9 @@ def pedestal_power_ratio(pedestal, distance):
 
 @njit(cache=True, error_model="numpy")
 def pedestal_reach_bins(pedestal_to_noise, line_width_bins, delay, reach_max):
-    """Return the distance [bins] of the last bin whose pedestal has the power of the noise, (n,).
+    """Return the distance from a line [bins] up to which the pedestal exceeds the noise, (n,).
+
+    The pedestal is the noise around a line due to the laser's phase noise.
 
     Parameters
     ----------
@@ -369,10 +387,10 @@ def pedestal_reach_bins(pedestal_to_noise, line_width_bins, delay, reach_max):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
-    """Fill ``pedestal_ratios`` (bins,) with the pedestal's power over the noise power in each bin.
+    """Fill ``pedestal_ratios`` with the phase-noise pedestal's power over the receiver noise power.
 
-    Bins of at least half the largest magnitude count as bins with lines. Under lines only the part
-    of the pedestal that changes |X| counts, elsewhere the whole pedestal.
+    Bins of at least half the largest magnitude count as bins with lines. Bins with lines have only
+    the part of the pedestal that changes |X|, all others the whole pedestal.
 
     Parameters
     ----------
@@ -404,7 +422,10 @@ def fill_pedestal_ratios(magnitude, is_echo, bin_threshold, pedestal_ratios):
 
 @njit(cache=True, error_model="numpy")
 def bin_speckle_at(speckle_table, segment, point):
-    """Return the :class:`BinSpeckle` of a point's segment from a :class:`SpeckleTable`."""
+    """Return the :class:`BinSpeckle` of one segment of one point of a :class:`SpeckleTable`.
+
+    ``segment`` and ``point`` are indices.
+    """
     ratio_row = speckle_table.ratio_row[segment, point]
     n_bins = speckle_table.pseudo_variance_ratio.shape[1] if ratio_row > 0 else 0
     return BinSpeckle(
@@ -414,14 +435,14 @@ def bin_speckle_at(speckle_table, segment, point):
 
 
 class SegmentCorrelations(NamedTuple):
-    """Complex correlations (n,) of an echo's amplitudes in developed speckle between segments."""
+    """Complex correlations (n,) between segments of an echo's amplitudes in developed speckle."""
 
     up_doppler: np.ndarray
-    """Correlation of up and Doppler segment, of a modulus up to 1."""
+    """(n,): complex correlation of the amplitudes in up and Doppler segment, |.| <= 1."""
     up_down: np.ndarray
-    """Correlation of up and down segment."""
+    """(n,): complex correlation of the amplitudes in up and down segment, |.| <= 1."""
     doppler_down: np.ndarray
-    """Correlation of Doppler and down segment."""
+    """(n,): complex correlation of the amplitudes in Doppler and down segment, |.| <= 1."""
 
     def cholesky_factors(self) -> np.ndarray:
         """Return the Cholesky factors of the segments' correlation matrix, (6, n).
@@ -429,7 +450,7 @@ class SegmentCorrelations(NamedTuple):
         Returns
         -------
         numpy.ndarray
-            Rows m, sqrt(1 - m^2), o, Re c, Im c and d.
+            Rows m, sqrt(1 - m^2), o, Re c, Im c and d of the equations below.
 
         Notes
         -----
@@ -488,17 +509,19 @@ def joint_pd_in_speckle(
 
     Notes
     -----
-    For one bin per segment these are two correlated Rayleigh magnitudes [1]_. A and B are Th^2 over
-    the mean powers, so that the segments are detected with e^-A and e^-B. r is the squared
-    correlation of signal plus noise: ``correlation``^2 times the two SNR / (1 + SNR). Both segments
-    are detected with the probability
+    For one bin per segment these are two correlated Rayleigh magnitudes [1]_. A and B are the
+    squared threshold over the mean power of signal plus noise in either segment. The segments are
+    detected with e^-A and e^-B. r is the squared correlation of signal plus noise:
+    ``correlation``^2 times SNR / (1 + SNR) of both segments. Q_1 is Marcum's function. Both
+    segments are detected with the probability
 
         J = e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
 
-    An echo that any of its bins may detect is represented by M independent bins. Each of them is
-    detected with q = 1 - (1 - p)^(1/M), and is correlated with one bin of the other segment. Both
-    segments are missed with (1 - q_1 - q_2 + J(q_1, q_2))^M, so that both are detected with
+    An echo that any of its bins may detect is represented by M independent bins. Let p be the
+    probability of detection of a segment. Each bin is detected with q = 1 - (1 - p)^(1/M), and is
+    correlated with one bin of the other segment. Both segments are missed with
+    (1 - q_1 - q_2 + J(q_1, q_2))^M. Both are thus detected with
 
         p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
 
@@ -554,7 +577,8 @@ def joint_pd_in_speckle(
 
 
 INDEPENDENT_BINS_MAX = 1e3
-"""Largest number of independent bins that represent an echo."""
+"""Upper limit of the number of independent bins that represent an echo of several bins, as
+:func:`detection_equivalent_bins` returns it."""
 
 
 def detection_equivalent_bins(
@@ -576,8 +600,8 @@ def detection_equivalent_bins(
     Returns
     -------
     numpy.ndarray
-        M, in general not an integer, from 1 to :data:`INDEPENDENT_BINS_MAX`. 1 where pd is nan, or
-        where pd and q both round to 1.
+        M, in general not an integer, from 1 to :data:`INDEPENDENT_BINS_MAX`. It is 1 where pd is
+        nan, or where pd and q (see below) both round to 1.
 
     Notes
     -----
@@ -617,7 +641,9 @@ def at_least_two_of_three(probabilities: np.ndarray, complements: np.ndarray) ->
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
-    """Find the strongest of adjacent bins, and mark the bins that cannot raise a false alarm.
+    """Find the strongest of adjacent bins, and mark the bins that belong to an echo.
+
+    Such bins are called exempt: they cannot raise a false alarm.
 
     Parameters
     ----------
@@ -670,7 +696,7 @@ def mark_exempt_bins(magnitude, n_bins, threshold, is_exempt, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_real_bin(bin_, real_noise_at_ends, fft_size):
-    """Test if the noise of a bin is real, as in bins 0 and N/2 of a real record.
+    """Test if the noise of bin number ``bin_`` is real, as at DC and Nyquist of a real record.
 
     ``real_noise_at_ends`` and ``fft_size`` are fields of :class:`DetectionRule`.
     """
@@ -691,7 +717,7 @@ def bin_crossing_tails(signal_ratio, threshold_ratio, is_real):
     Returns
     -------
     Tails
-        Q_1(a, b) and 1 - Q_1(a, b); for real noise P(|a + n| >= b) and its complement.
+        Marcum's Q_1(a, b) and 1 - Q_1(a, b); for real noise P(|a + n| >= b) and its complement.
     """
     if not is_real:
         return marcum_q1_tails(signal_ratio, threshold_ratio)
@@ -731,9 +757,9 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 
     Notes
     -----
-    If ``rule.any_bin``, any bin of the echo may detect it: :func:`pd_and_miss_any_bin`, or
-    :func:`pd_and_miss_in_speckle`. Otherwise only the strongest bin counts. The pedestal of phase
-    noise is light of the echo and fades with it.
+    If ``rule.any_bin`` is true, any bin of the echo may detect it (:func:`pd_and_miss_any_bin`, or
+    :func:`pd_and_miss_in_speckle`). Otherwise only the strongest bin counts. The pedestal that the
+    laser's phase noise leaves around a line is light of the echo and fades with it.
     """
     if rule.in_speckle:
         if rule.any_bin:
@@ -768,9 +794,9 @@ def pd_and_miss(echo, peak_index, rule, bin_threshold, bin_speckle):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` of a single bin in developed speckle without a pedestal.
+    """Return the :class:`Detection` by one bin in developed speckle, without laser phase noise.
 
-    ``magnitude`` is the root mean square |X| of the bin's signal [V].
+    ``magnitude`` is the root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
     signal_power = magnitude * magnitude
     noise_power = 2.0 * bin_threshold.line_noise * bin_threshold.line_noise
@@ -790,9 +816,10 @@ def _pd_and_miss_of_peak_in_speckle(magnitude, bin_, rule, bin_threshold, bin_sp
 
 @njit(cache=True, error_model="numpy")
 def _pd_and_miss_of_peak_on_pedestal(magnitude, bin_, rule, bin_threshold, bin_speckle):
-    """Return the :class:`Detection` of a single bin in developed speckle with a fading pedestal.
+    """Return the :class:`Detection` by one bin in developed speckle, with laser phase noise.
 
-    ``magnitude`` is the root mean square |X| of the bin's signal [V].
+    The phase noise leaves a pedestal around the line, which fades with it. ``magnitude`` is the
+    root mean square |X| of the bin's signal [V], ``bin_`` its number.
     """
     noise = bin_threshold.noise_without_pedestal
     given_mode = _zero_given_mode(1)
@@ -819,14 +846,13 @@ def pd_and_miss_any_bin(echo, rule, bin_threshold):
     Notes
     -----
     A single bin crosses with :func:`bin_crossing_tails`. The noise of neighbouring bins is
-    correlated, in phase with a signal that keeps its phase from bin to bin as in a main lobe. Two
-    neighbours cross jointly like two correlated normal numbers of the same probabilities, which is
-    the product of these plus [1]_
+    correlated with the coefficient rho, in phase with a signal that keeps its phase from bin to bin
+    as in a main lobe. Two neighbours are taken to cross jointly like two correlated normal numbers
+    that exceed s and t with the same probabilities. That is the product of these plus [1]_
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
-    with the normal deviates s and t, by the quadrature ``rule.joint_tail_rule``. Bins are treated
-    as a first-order Markov chain.
+    by the quadrature ``rule.joint_tail_rule``. Bins are treated as a first-order Markov chain.
 
     References
     ----------
@@ -880,29 +906,31 @@ def _pd_and_miss_on_pedestal(echo, rule, bin_threshold):
 
 @njit(cache=True, error_model="numpy")
 def _zero_given_mode(n_bins):
-    """Return a :class:`GivenMode` of bins, filled with zeros."""
+    """Return a :class:`GivenMode` for ``n_bins`` bins, all of whose fields are zero."""
     rows = np.zeros((5, n_bins))  # one allocation instead of five
     return GivenMode(rows[0], rows[1], rows[2], rows[3], rows[4])
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_given_neighbour_below(tails, previous_p_stay, previous_deviate, joint_tail_rule):
-    """Return a bin's :class:`.Tails` given that the bin below does not cross, and its deviate.
+    """Return a bin's crossing probability given that the bin below does not cross.
 
     Parameters
     ----------
     tails
         Unconditional :class:`.Tails` of the bin.
     previous_p_stay, previous_deviate
-        Probability that the bin below does not cross, and the bin's normal deviate. The probability
-        is negative if no bin of the echo lies below.
+        Probability that the bin below does not cross, and the number that a standard normal
+        variable exceeds as often as that bin crosses. The probability is negative if no bin of the
+        echo lies below.
     joint_tail_rule
         :class:`sweep.model.detection.joint_tail.JointTailRule` of the noise of neighbours.
 
     Returns
     -------
     given_neighbour, deviate
-        Conditional :class:`.Tails`, and the normal deviate of ``tails``.
+        Conditional :class:`.Tails`, and the number that a standard normal variable exceeds with
+        ``tails.above``.
     """
     deviate = _normal_deviate_of_tails(tails)
     if not previous_p_stay > 0.0:
@@ -950,8 +978,9 @@ def any_crossing_of_chain(probabilities, n_bins, joint_tail_rule):
 def clear_image_exemptions(magnitude, is_exempt, first_bin, fft_size, image_gain):
     """Clear the exemption of bins that an I/Q image dominates; return the number still exempt.
 
-    The image of a line lies at the opposite frequency and has ``image_gain`` times its |X|. It
-    dominates a bin if it makes at least half of the bin's |X|.
+    Exempt bins belong to an echo and raise no false alarm. An image lies at the opposite frequency
+    of its line and has ``image_gain`` times the line's |X|. It dominates a bin if it makes at least
+    half of the bin's |X|.
 
     Parameters
     ----------
@@ -1032,16 +1061,19 @@ def pd_and_miss_in_speckle(echo, rule, bin_threshold, bin_speckle):
 
 
 _GAUSS_ORDER = 7
-"""Order of the Gauss-Legendre quadrature over the mode's magnitude |z|."""
+"""Number of nodes, in each interval, of the Gauss-Legendre quadrature over the magnitude of the
+strongest speckle mode."""
 _THRESHOLD_REACH_SIGMA = 4.5
-"""Distance [sigma] of |X| from the threshold beyond which crossing is taken as certain or
-impossible."""
+"""Distance of the noiseless |X| from the threshold beyond which a crossing counts as certain or
+impossible, in units of the noise per quadrature."""
 _MODE_MAGNITUDE_MAX = 6.0
-"""Largest magnitude |z| of the mode, in units of its root mean square, in the quadrature."""
+"""Upper end of the quadrature over the magnitude of the strongest speckle mode, in units of its
+root mean square."""
 _RARE_CROSSING_MAX = 1e-6
 """Crossing probability below which a bin counts as independent of its neighbours."""
 _NEGLIGIBLE_PROBABILITY, _NEGLIGIBLE_FRACTION = 1e-8, 1e-6
-"""Contribution of a bin to pd that may be neglected: absolute, and relative to pd and to 1 - pd."""
+"""Largest contribution of a bin to the probability of detection pd that may be neglected. The first
+is absolute, the second relative to the smaller of pd and 1 - pd."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 
 
@@ -1049,7 +1081,8 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(_GAUSS_ORDER)
 def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
     """Return the :class:`Detection` of one stretch of an echo in developed speckle.
 
-    The stretch is the bins begin .. end - 1 of ``echo``; see :func:`pd_and_miss_in_speckle`.
+    A stretch is a run of adjacent bins that fade together, bins begin .. end - 1 of ``echo``
+    (:func:`pd_and_miss_in_speckle`).
     """
     magnitude, is_echo = echo.magnitude, echo.is_echo
     nyquist_bin = rule.fft_size // 2 if rule.real_record_in_speckle else 0
@@ -1123,7 +1156,10 @@ def _pd_and_miss_of_stretch(echo, begin, end, rule, bin_threshold, bin_speckle):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
-    """Return the mean :class:`Detection` over the mode's power, and over its phase if needed."""
+    """Return the mean :class:`Detection` over the power of the strongest speckle mode.
+
+    Near DC and Nyquist of a real record it is also the mean over the mode's phase.
+    """
     if bin_speckle.pseudo_variance_ratio.size == 0:
         return _mean_over_mode_power(given_mode, echo, rule.real_noise_at_ends, rule.fft_size)
     return _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle)
@@ -1131,10 +1167,10 @@ def _mean_over_mode_phase(given_mode, echo, rule, bin_speckle):
 
 @njit(cache=True, error_model="numpy")
 def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
-    """Return the mean :class:`Detection` over power and phase t of the mode, for noncircular bins.
+    """Return the mean :class:`Detection` over power and phase t of the strongest speckle mode.
 
-    At the phase t the power of all modes in a bin is 1 + q cos t times its mean over t, with the
-    pseudo-variance ratio q of the bin.
+    This is for bins near DC and Nyquist. Let q be the ratio E[X^2] / E[|X|^2] of a bin X. At the
+    phase t the power of all modes in the bin is 1 + q cos t times the mean over t.
     """
     pd, miss, n_bins = 0.0, 0.0, echo.is_echo.size
     given_phase = GivenMode(
@@ -1167,8 +1203,8 @@ def _mean_over_noncircular_mode_phase(given_mode, echo, rule, bin_speckle):
 def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
     """Return the mean :class:`Detection` over the power of the strongest speckle mode.
 
-    Given z the signal of a bin is |z| times ``given_mode.signal``, and |z| has the density
-    2 z e^(-z^2).
+    The mode has the amplitude z in all bins. The signal of a bin is |z| times
+    ``given_mode.signal``. The density of |z| at z is 2 z e^(-z^2).
 
     Parameters
     ----------
@@ -1263,9 +1299,10 @@ def _mean_over_mode_power(given_mode, echo, real_noise_at_ends, fft_size):
 def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligible_probability):
     """Return the squared distance [sigma^2] below the threshold beyond which bins are negligible.
 
-    A bin of signal a < b adds at most e^(-(b - a)^2 / 2) times the miss probability of the
-    strongest bin. That is less than e^(-(a - b)^2 / 2) for its signal a > b, or the root of this
-    for real noise.
+    The threshold b and signals are in units of sigma, the noise per quadrature. A bin of signal
+    a < b adds at most e^(-(b - a)^2 / 2) times the miss probability of the strongest bin. With the
+    strongest bin's signal A > b, that probability is less than e^(-(A - b)^2 / 2), or the root of
+    this for real noise.
 
     Parameters
     ----------
@@ -1294,7 +1331,7 @@ def _squared_reach_given_mode(z, given_mode, strongest_index, is_real, negligibl
 def _pd_and_miss_given_mode(
     given_mode, z, echo, real_noise_at_ends, fft_size, squared_reach, negligible_probability
 ):
-    """Return the :class:`Detection` by any bin given the magnitude z of the strongest mode.
+    """Return the :class:`Detection` by any bin given the magnitude z of the strongest speckle mode.
 
     The law is that of :func:`pd_and_miss_any_bin`, with a noise correlation r of each pair of
     neighbours. The powers of two neighbours, with signals a and b over the noise, are correlated by
@@ -1355,7 +1392,10 @@ def _pd_and_miss_given_mode(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _normal_deviate_of_tails(tails):
-    """Return the number that a standard normal variable exceeds with ``tails.above``."""
+    """Return the number that a standard normal variable exceeds with ``tails.above``.
+
+    ``tails`` is a :class:`.Tails`, whose smaller probability is used for precision.
+    """
     if tails.above < tails.below:
         return _normal_deviate(tails.above)
     return -_normal_deviate(tails.below)
@@ -1365,7 +1405,7 @@ def _normal_deviate_of_tails(tails):
 def _normal_deviate(probability):
     """Return the number that a standard normal variable exceeds with a probability <= 1/2.
 
-    The error is about 1e-4.
+    The error of the returned number is about 1e-4.
     """
     if probability < 1e-300:
         return 37.0
@@ -1380,6 +1420,8 @@ def _normal_deviate(probability):
 def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
     """Return the indices of the first and last bin of the echo around a group of bins.
 
+    A group is a run of adjacent bins at or above the threshold.
+
     Parameters
     ----------
     magnitude
@@ -1389,7 +1431,7 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
     threshold
         Threshold on |X|.
     lobe_half_width
-        Half-width [bins] of an echo about its lines; with 0 the echo is the group.
+        Half-width [bins] of an echo about its lines. With 0 the echo is the group itself.
 
     Notes
     -----
@@ -1414,7 +1456,7 @@ def echo_bounds(magnitude, first, last, threshold, lobe_half_width):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _largest_and_count(magnitude, threshold):
-    """Return the largest magnitude, and the number of bins at or above the threshold."""
+    """Return the largest |X| of bins, and the number of bins whose |X| reaches the threshold."""
     largest, n_above = magnitude[0], 0
     for i in range(magnitude.size):
         largest = magnitude[i] if magnitude[i] > largest else largest
@@ -1424,9 +1466,9 @@ def _largest_and_count(magnitude, threshold):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _exempt_group(first, last, n_bins, is_exempt):
-    """Mark the bins first .. last and their two neighbours as exempt; return their number.
+    """Mark the bins first .. last and the two next to them as exempt; return their number.
 
-    ``n_bins`` is the number of bins, beyond which there are no neighbours.
+    Exempt bins belong to an echo and raise no false alarm. ``n_bins`` is the number of all bins.
     """
     first, last = max(first - 1, 0), min(last + 1, n_bins - 1)
     is_exempt[first : last + 1] = True
@@ -1437,17 +1479,18 @@ class SpectrumDetections(NamedTuple):
     """Results of detection in the noiseless spectra of m points, arrays (m,)."""
 
     pd: np.ndarray
-    """Probability of detection, 0..1."""
+    """(m,): probability that the echo is detected, 0..1."""
     miss: np.ndarray
-    """Probability of a miss, 1 - pd."""
+    """(m,): probability that the echo is missed, 1 - pd, 0..1."""
     magnitude: np.ndarray
-    """|X| of the strongest bin [V, summed over the record]."""
+    """(m,): |X| of the strongest bin without noise [V, summed over the record]."""
     frequency: np.ndarray
-    """Frequency of the strongest bin [Hz]."""
+    """(m,): frequency of the strongest bin [Hz]."""
     n_exempt: np.ndarray
-    """Number of bins that can raise no false alarm."""
+    """(m,): number of bins that belong to the echo and so can raise no false alarm."""
     leakage: np.ndarray
-    """Probability of a false peak by leakage: 0, as leakage is not evaluated."""
+    """(m,): zeros in place of the probability of a false peak by leaked signal, which is not
+    evaluated here."""
 
 
 @njit(cache=True, error_model="numpy")

@@ -11,8 +11,9 @@ half a record per bin; those of a single tone are then real and even in the dist
   their logarithms [Smith and Serra, PARSHL, 1987]; biased between bins.
 - ``jacobsen``: Q Re[(Z_+ - Z_-) / (2 Z_0 - Z_- - Z_+)] for tapered windows, and
   Re[(Z_+ - Z_-) / (2 Z_0 + Z_- + Z_+)] where the neighbours of a tone on a bin vanish [Jacobsen and
-  Kootsookos, IEEE Signal Process. Mag. 24(3), 123, 2007], Q the window's factor, by least squares
-  over half a bin (equal to the published table to its digits); biased between bins.
+  Kootsookos, IEEE Signal Process. Mag. 24(3), 123, 2007]. Z_0 is the peak bin, Z_- and Z_+ are its
+  neighbours. Q is the window's factor, by least squares over half a bin (equal to the published
+  table to its digits); biased between bins.
 - ``candan``: the second form for every window, without its bias. Candan's factor [IEEE Signal
   Process. Lett. 18, 351, 2011, and 20, 913, 2013; Signal Process. 114, 245, 2015, for windows] is
   the slope at the bin; here the whole curve is inverted.
@@ -65,13 +66,14 @@ from sweep.model.waveform import DEFAULT_CHIRP_SLOPES
 from sweep.model.window import Window
 
 Estimator = Callable[[np.ndarray, np.ndarray, SpectrumSettings], np.ndarray]
-"""Function from complex spectra, indices of their peaks and settings to frequencies (m,) [bins].
+"""Function that estimates the frequencies (m,) [bins] of the peaks of m complex spectra.
 
-Spectra are (m, N/2 + 1), and peaks (m,) int64 in 1..N/2 - 1; of complex records (m, N), and indices
-0..N - 1."""
+The arguments are the spectra, the indices (m,) int64 of their peak bins, and the settings. With the
+FFT size N, spectra are (m, N/2 + 1) for real and (m, N) for complex records. Peak indices are
+1..N/2 - 1 for real and 0..N - 1 for complex records."""
 
 PEAK_BIN = "peak_bin"
-"""Name of the estimator by the peak bin itself."""
+"""Name of the estimator that returns the frequency of the strongest bin."""
 
 DETECTOR_PREFIX, ESTIMATOR_PREFIX = (
     "instrument.processing.detector.",
@@ -88,19 +90,22 @@ SPECTRUM_METHOD_DEFAULTS: dict[str, float | int | str] = {
 """Default parameters, by dotted path, of detector and estimator in full spectra."""
 
 _TABLE_STEPS = 512
-"""Number of steps per bin between the tabulated offsets, -1..1 bin, of a tone from a bin."""
+"""Number of steps per bin in tables over the offset, -1..1 bin, of a tone from a bin."""
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""|X| of the neighbours of a tone on a bin, over the bin's, below which they count as vanishing."""
+"""Limit below which the neighbours of a tone on a bin count as vanishing. It is the |X| of a
+neighbour over that of the bin."""
 _CENTROID_REACH_CELLS = 2
-"""Number of resolution cells fs/L on either side of the peak in a centroid."""
+"""Number of resolution cells on either side of the peak over which the centroid is taken. A cell is
+the sample rate over the number of samples in the record."""
 _ZOOM_POINTS_PER_BIN = 32
-"""Number of points of the chirp-z transform per bin."""
+"""Number of frequencies per FFT bin at which the chirp-z transform is evaluated."""
 _WINDOW_FRACTION_MIN = 1e-3
-"""Window value over its maximum below which samples are excluded when the window is undone."""
+"""Limit on the window value, over its maximum, of samples that are divided by the window. Samples
+with smaller values are left out."""
 _NEWTON_STEPS = 6
-"""Largest number of steps of Newton's method."""
+"""Largest number of steps of Newton's method in the maximum-likelihood estimate."""
 _NEWTON_REACH_BINS = 0.5
-"""Largest distance from the start in Newton's method [bins]."""
+"""Largest distance [FFT bins] by which Newton's method may depart from its starting frequency."""
 
 
 def peak_bin(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
@@ -120,13 +125,19 @@ def parabolic_log(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSett
 
 
 def jacobsen(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Estimate by Jacobsen's ratio times the window's factor; an :data:`Estimator`."""
+    """Estimate by Jacobsen's ratio of three complex bins times a factor; an :data:`Estimator`.
+
+    The factor depends on the window.
+    """
     sign, factor = jacobsen_coefficients(settings.window, settings.fft_size)
     return peak + factor * _jacobsen_ratio(_three_bins_about_middle(spectrum, peak, settings), sign)
 
 
 def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Invert Jacobsen's ratio of a single tone in the window; an :data:`Estimator`."""
+    """Estimate by Jacobsen's ratio of three complex bins; an :data:`Estimator`.
+
+    A table of the ratio for single tones in this window is inverted, so there is no bias.
+    """
     offset, tone_bins = _tone_bins(settings.window, settings.fft_size)
     tone_ratios = np.maximum.accumulate(_jacobsen_ratio(tone_bins, 1))
     return peak + np.interp(
@@ -135,7 +146,10 @@ def candan(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -
 
 
 def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the centroid of the power minus the mean noise power; an :data:`Estimator`."""
+    """Return the centroid of the power around the peak; an :data:`Estimator`.
+
+    The mean noise power is subtracted from each bin.
+    """
     reach_bins = math.ceil(_CENTROID_REACH_CELLS * settings.fft_size / settings.window.length)
     distance = np.arange(-reach_bins, reach_bins + 1)
     bins = peak[:, None] + distance
@@ -150,7 +164,10 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings)
 
 
 def chirp_z(spectrum: np.ndarray, peak: np.ndarray, settings: SpectrumSettings) -> np.ndarray:
-    """Return the maximum of the spectrum by a chirp-z transform; an :data:`Estimator`."""
+    """Return the frequency of the spectrum's maximum; an :data:`Estimator`.
+
+    A chirp-z transform samples the spectrum finely around the peak bin.
+    """
     zoom, positions = (
         _zoom_transform(settings.window.length, settings.fft_size),
         np.empty(peak.size),
@@ -235,7 +252,8 @@ def _parabola_vertex(values: np.ndarray) -> np.ndarray:
 def _jacobsen_ratio(three_bins: np.ndarray, neighbour_sign: int) -> np.ndarray:
     """Return Jacobsen's ratio Re[(Z_+ - Z_-) / (2 Z_0 +- (Z_- + Z_+))], -1..1, of bins (m, 3).
 
-    ``neighbour_sign`` is the sign in the denominator.
+    Z_-, Z_0 and Z_+ are the complex bins below, at and above a peak. ``neighbour_sign`` is the sign
+    in the denominator.
     """
     below, middle, above = three_bins.T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -245,9 +263,9 @@ def _jacobsen_ratio(three_bins: np.ndarray, neighbour_sign: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return offsets -1 .. 1 [bins], and three bins of tones at these offsets, (k, 3).
+    """Return offsets -1 .. 1 [bins] of tones from a bin, and three bins of each tone, (k, 3).
 
-    Bins are real, as their phases are relative to the record's middle.
+    The values are real, as their phases are relative to the record's middle.
     """
     from sweep.model.detection.sub_bin_interpolation import tone_spectrum
 
@@ -257,7 +275,11 @@ def _tone_bins(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=16)
 def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
-    """Return the sign of the neighbours in Jacobsen's denominator, and the factor of his ratio."""
+    """Return sign and factor of Jacobsen's estimate for a window and an FFT size.
+
+    The sign is that of the two neighbours in the denominator of his ratio. The factor turns the
+    ratio into an offset [bins].
+    """
     offset, tone_bins = _tone_bins(window, fft_size)
     _, centre, above = tone_bins[_TABLE_STEPS]
     if abs(above) < _NEIGHBOUR_HEIGHT_MIN * centre:
@@ -269,7 +291,7 @@ def jacobsen_coefficients(window: Window, fft_size: int) -> tuple[int, float]:
 
 @lru_cache(maxsize=4)
 def _zoom_transform(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the chirp-z transform of records of a length, from -1 to 1 bin of fs/N."""
+    """Return the chirp-z transform of records of a given length, from -1 to 1 FFT bin."""
     from scipy import signal  # slow to import
 
     edge = 1.0 / fft_size
@@ -290,15 +312,16 @@ def _record_from_spectrum(spectrum: np.ndarray, settings: SpectrumSettings) -> n
 
 
 def _shift_bin_to_zero(record: np.ndarray, bin_: int, settings: SpectrumSettings) -> np.ndarray:
-    """Shift a record in frequency such that a bin is moved to zero."""
+    """Return a record shifted in frequency so that the bin ``bin_`` comes to frequency 0."""
     cycles = np.arange(record.size) * bin_ % settings.fft_size / settings.fft_size
     return np.asarray(record * np.exp(-2j * np.pi * cycles))
 
 
 def _refine_maximum(record: np.ndarray, start: float, fft_size: float) -> float:
-    """Return the position [bins] of the maximum of |sum x e^{-2 pi i n f / N}|^2 next to a start.
+    """Return the frequency [FFT bins] of the periodogram's maximum next to a starting frequency.
 
-    The start is returned if Newton's method does not converge near it.
+    The periodogram is |sum_n x_n e^{-2 pi i n f / N}|^2 of the record x, with the FFT size N. The
+    start is returned if Newton's method does not converge near it.
     """
     from sweep.model.detection.sub_bin_interpolation import complex_exponentials
 
@@ -329,9 +352,9 @@ class RangeVelocityDeviation(NamedTuple):
     """Least standard deviations of range and radial velocity, by the Cramer-Rao bound."""
 
     range: np.ndarray
-    """Standard deviation of the range [m]."""
+    """Least standard deviation of an unbiased estimate of the range [m]."""
     radial_velocity: np.ndarray
-    """Standard deviation of the radial velocity [m/s]."""
+    """Least standard deviation of an unbiased estimate of the radial velocity [m/s]."""
 
 
 def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
@@ -340,7 +363,7 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
     Parameters
     ----------
     snr
-        Power of the strongest bin over its noise power.
+        Power of the strongest bin over the mean noise power of a bin, after the FFT.
     window
         Window of the record.
 
@@ -476,7 +499,7 @@ def range_velocity_deviation(
     Returns
     -------
     RangeVelocityDeviation
-        inf where the used beats do not determine both.
+        Both standard deviations; inf where the used beats do not determine range and velocity.
     """
     two_over_c = 2 / SPEED_OF_LIGHT
     delay, beta = two_over_c * np.asarray(range, float), two_over_c * np.asarray(radial_velocity)

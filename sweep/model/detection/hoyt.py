@@ -7,9 +7,9 @@ J. 26, 318, 1947]. Equivalently, |X|^2 is exponential with the mean P (1 + q cos
 phase t uniform in 0 .. pi. It exceeds r^2 with the probability [Paris, Electron. Lett. 45, 210,
 2009]
 
-    P(|X| > r) = 1 - Q_1(a r, b r) + Q_1(b r, a r),    a, b = (v_1 +- v_2) / (2 v_1 v_2).
+    P(|X| > r) = 1 - Q_1(a r, b r) + Q_1(b r, a r),    a, b = (v_1 +- v_2) / (2 v_1 v_2)
 
-For q = +-1 only one part of X is left, and the probability is erfc(r / sqrt(2 P)).
+with Marcum's Q_1. For q = +-1 one part of X is 0, and the probability is erfc(r / sqrt(2 P)).
 """
 
 import math
@@ -20,22 +20,25 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.marcum import Tails, marcum_q1_tails
 
 N_PHASE_NODES = 8
-"""Number of nodes t_j = pi (j + 1/2) / N_PHASE_NODES of the midpoint rule over the phase t."""
+"""Number of nodes of the midpoint rule for averages over a speckle phase t in 0 .. pi. The nodes
+are t_j = pi (j + 1/2) / N_PHASE_NODES."""
 
 PHASE_COSINES = np.cos(np.pi * (np.arange(N_PHASE_NODES) + 0.5) / N_PHASE_NODES)
-"""cos t_j at these nodes."""
+"""Cosines of the N_PHASE_NODES phases pi (j + 1/2) / N_PHASE_NODES over which is averaged."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def pseudo_variance_ratio_at(bin_, nyquist_bin, ratios):
-    """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin; 0 far from DC and Nyquist.
+    """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin with the amplitude X.
+
+    It is 0 for a circular X, as in bins far from DC and Nyquist.
 
     Parameters
     ----------
     bin_
-        Number of the bin, 0 .. N/2.
+        Number of the bin, 0 .. ``nyquist_bin``.
     nyquist_bin
-        N/2.
+        Number of the bin at the Nyquist frequency, half the FFT size.
     ratios
         (k,): q at distances of 0 .. k - 1 bins from the nearer of DC and Nyquist.
     """

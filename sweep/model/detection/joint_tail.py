@@ -1,7 +1,7 @@
 """Joint tail probability of two correlated standard normal numbers [Owen, 1956].
 
-The joint probability that two neighbouring bins cross the threshold is taken to be that of such
-numbers with the same probabilities (:func:`sweep.model.detection.echo_detection.pd_and_miss`).
+Two neighbouring bins are taken to cross the threshold jointly as often as two such numbers, each
+with the crossing probability of its bin (:func:`sweep.model.detection.echo_detection.pd_and_miss`).
 """
 
 import math
@@ -32,11 +32,12 @@ class JointTailRule(NamedTuple):
     """
 
     sine: np.ndarray
-    """(k,): sin u at the nodes u in 0 .. asin(rho); k is 12, or 0 for independent numbers."""
+    """(k,): sin u at the quadrature nodes u in 0 .. asin(rho), with the correlation rho. k is 12,
+    or 0 for independent numbers."""
     weight: np.ndarray
-    """(k,): weights of the nodes, over 2 pi."""
+    """(k,): quadrature weights of the nodes u, divided by 2 pi."""
     exponent: np.ndarray
-    """(k,): 1 / (2 cos^2 u)."""
+    """(k,): factor 1 / (2 cos^2 u) of the integrand's exponent at the nodes u."""
 
 
 @lru_cache(maxsize=64)
@@ -52,10 +53,10 @@ def joint_tail_rule(correlation: float) -> JointTailRule:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
-    """Return P(S > s, T > t) - P(S > s) P(T > t) of two correlated standard normal numbers.
+    """Return P(S > s, T > t) - P(S > s) P(T > t) of correlated standard normal numbers S and T.
 
-    ``deviate`` is s and ``previous_deviate`` t; ``joint_tail_rule`` is the
-    :class:`JointTailRule` of their correlation.
+    ``deviate`` is s and ``previous_deviate`` is t. ``joint_tail_rule`` is the
+    :class:`JointTailRule` of the correlation of S and T.
     """
     excess = 0.0
     for k in range(joint_tail_rule.sine.size):
@@ -72,7 +73,10 @@ def joint_tail_excess(deviate, previous_deviate, joint_tail_rule):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def joint_tail_excess_by_four_nodes(deviate, previous_deviate, correlation):
-    """Compute :func:`joint_tail_excess` for any ``correlation``, by 4 nodes in place of 12."""
+    """Compute :func:`joint_tail_excess` for a given ``correlation``, with 4 quadrature nodes.
+
+    It is less precise than the 12 nodes of a :class:`JointTailRule`, and needs none.
+    """
     excess, half_angle = 0.0, 0.5 * math.asin(correlation)
     for j in range(_JOINT_TAIL_NODES.size):
         sine = math.sin(half_angle * (_JOINT_TAIL_NODES[j] + 1.0))

@@ -3,12 +3,13 @@
 In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s_k, a circular
 complex Gaussian number of power 1, times the root of the look's SNR x_k, plus noise of power 1. The
 speckle of looks k and l has the correlation mu(l - k), by equation (2) of
-:mod:`sweep.model.detection.speckle_correlation` with the phase F beta (l - k) T of a scatterer
-between two looks that start a time T apart. If the echo spreads over bins, mu follows from equation
-(3). A line that moves to other bins has less power in this bin in some looks.
+:mod:`sweep.model.detection.speckle_correlation`. The phase [cycles] of a scatterer turns between
+them by F beta (l - k) T, with the optical frequency F, the scatterer's Doppler ratio beta, and the
+time T from look to look. If the echo spreads over bins, mu follows from equation (3). A line that
+moves to other bins has less power in this bin in some looks.
 
-**Mean power.** Let x be the mean SNR, and c_j the eigenvalues of the matrix sqrt(x_k x_l) mu(l - k)
-over x, of which the sum is N. The sum of |z_k|^2 is one of independent exponential variables, of
+**Mean power.** Let x be the mean SNR of the N looks. The matrix sqrt(x_k x_l) mu(l - k) / x has the
+eigenvalues c_j, whose sum is N. The sum of |z_k|^2 is one of independent exponential variables, of
 means 1 + x c_j. It exceeds y with
 
     P(y) = 1 / (2 pi i) int exp(-s y) / s prod_j (1 - (1 + x c_j) s)^(-m_j) ds                 (1)
@@ -20,15 +21,17 @@ their speckle is uncorrelated over this spacing, one eigenvalue of multiplicity 
 replaces all: a gamma variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007,
 4.6].
 
-**Votes.** Given the speckle, records cross independently, by Q_1. The probability that enough of
-them cross is averaged over SPECKLE_LATTICE_SIZE fixed realisations, a Kronecker lattice whose
-second moments are made exact. The error of the lattice is known for looks of independent speckle,
-whose law is binomial. This error times (M - 1) / (N - 1) is subtracted.
+**Votes.** A shot may be detected if enough looks cross the threshold in a bin. Given the speckle,
+looks cross independently, by Marcum's Q_1. The probability that enough of them cross is averaged
+over SPECKLE_LATTICE_SIZE fixed realisations, a Kronecker lattice whose second moments are made
+exact. The error of the lattice is known for looks of independent speckle, whose law is binomial.
+This error times (M - 1) / (N - 1) is subtracted.
 
 **Two segments.** Let r be the correlation of the segments' mean powers,
 
     r = sum_kl |mu_12(k, l)|^2 / sqrt(sum_kl |mu_11|^2 sum_kl |mu_22|^2).
 
+mu_12 is the correlation between looks of the two segments, mu_11 and mu_22 that within a segment.
 With the same speckle in both segments the joint probability is the mean over the speckle of the
 product of both probabilities. For r < 1 the covariance of the two detections is a fraction of that
 mean's: for M = 1 the fraction of two Rayleigh magnitudes with the correlation r, for large M r.
@@ -44,41 +47,52 @@ from sweep.kernel_cache import njit
 from sweep.model.detection.marcum import marcum_q1_tails
 
 MATRIX_LOOKS_MAX = 64
-"""Number of looks up to which the full correlation matrix is used."""
+"""Largest number of looks whose full correlation matrix is used. More looks are represented by this
+number of looks at a larger spacing."""
 
 GAMMA_SHAPE_MIN = 32.0
-"""Effective number of looks from which, with more than MATRIX_LOOKS_MAX looks, the mean power is
-treated as a gamma variable."""
+"""Limit for treating the looks' mean power as a gamma variable. It applies to more than
+MATRIX_LOOKS_MAX looks, if they equal more than this number of looks of independent speckle."""
 
 SPECKLE_LATTICE_SIZE = 2048
-"""Number of lattice points (joint speckles of all looks) over which votes are averaged."""
+"""Number of fixed realisations of the speckle of all looks. The probability that enough looks cross
+the threshold is averaged over them."""
 
 _CONTOUR_NODES = 40
-"""Number of nodes of the quadrature of equation (1) on the upper half of the parabola."""
+"""Number of quadrature nodes on the upper half of the parabola in the complex plane along which
+equation (1) of this module is integrated."""
 _CONTOUR_END = 4.6
-"""Largest value of asinh(Im s / scale) on the parabola."""
+"""End of the integration along the parabola of equation (1): largest asinh(Im s / scale), with the
+integration variable s and the scale of the integrand's peak."""
 _BISECTION_STEPS = 60
 _CROSSING_TABLE_STEPS = 512
-"""Number of steps in the table of crossing probabilities by speckle magnitude."""
+"""Number of steps in the table of a look's crossing probability over the magnitude of speckle."""
 _TABULATED_SPECKLE_MAX = 5.0
 """Largest tabulated speckle magnitude, in units of its root mean square."""
 
 
 class LookSpeckle(NamedTuple):
-    """Correlation of the speckle between the N looks of a shot, by segment and point."""
+    """Correlation of the speckle between the N looks of a shot, by segment and point.
+
+    A look is one record of each segment.
+    """
 
     eigenvalue: np.ndarray
-    """(3, n, k): eigenvalues c_j of the looks' correlation matrix."""
+    """(3, n, k): eigenvalues of the correlation matrix of the looks' speckle, by segment and
+    point."""
     multiplicity: np.ndarray
-    """(3, n, k): multiplicities m_j, 0 for unused entries; sum_j c_j m_j = N."""
+    """(3, n, k): multiplicities of the eigenvalues, 0 for unused entries. The sum of eigenvalue
+    times multiplicity is the number of looks."""
     effective_looks: np.ndarray
-    """(3, n): number M of looks of independent speckle that are equivalent to the looks, 1 .. N."""
+    """(3, n): number of looks of independent speckle that are equivalent to the N looks, 1 .. N."""
     segment_correlation: np.ndarray
-    """(3, n): sqrt(r) for the pairs (up, Doppler), (up, down), (Doppler, down)."""
+    """(3, n): square root of the correlation of two segments' mean powers. The rows are the pairs
+    (up, Doppler), (up, down), (Doppler, down)."""
     correlation_by_lag: np.ndarray
-    """(3, n, N) complex: correlation mu of the speckle of two looks by their lag 0 .. N - 1."""
+    """(3, n, N) complex: correlation of the speckle of two looks, by their distance of 0 .. N - 1
+    looks."""
     look_power: np.ndarray
-    """(3, n, N): relative power of each look in the strongest bin; mean 1."""
+    """(3, n, N): power of each look in the echo's strongest bin, over the mean of all looks."""
 
     @classmethod
     def from_correlations(
@@ -116,14 +130,14 @@ class LookSpeckle(NamedTuple):
         )
 
     def select(self, points: np.ndarray | slice) -> "LookSpeckle":
-        """Select points by their indices."""
+        """Return the correlations of some points, given by their indices."""
         return LookSpeckle(*(column[:, points] for column in self))
 
     def covariance_root(self, segment: int, point: int) -> np.ndarray:
         """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle amplitudes.
 
-        For independent circular complex Gaussian z of power 1, A z are speckle amplitudes of the N
-        looks.
+        A^H is the conjugate transpose. For a vector z of independent circular complex Gaussian
+        numbers of power 1, A z are speckle amplitudes of the N looks.
         """
         correlation_by_lag = self.correlation_by_lag[segment, point]
         covariance = look_covariances(
@@ -135,7 +149,8 @@ class LookSpeckle(NamedTuple):
     def covariance_roots(self) -> np.ndarray:
         """Return :meth:`covariance_root` of all segments and points, (3, n, N, k).
 
-        Only the first k columns are kept, those with a noticeable power at any point.
+        Only the first k columns are kept. The others have less than the fraction
+        :data:`_POWER_FRACTION_MIN` of the power at all points.
         """
         n_looks = self.correlation_by_lag.shape[2]
         eigenvalues, eigenvectors = np.linalg.eigh(
@@ -153,14 +168,18 @@ _POWER_FRACTION_MIN = 1e-7
 def look_covariances(
     correlation_by_lag: np.ndarray, look_power: np.ndarray, looks_max: int = MATRIX_LOOKS_MAX
 ) -> np.ndarray:
-    """Return the covariance matrices sqrt(x_k x_l) mu(l - k) of the looks' speckle, (..., k, k).
+    """Return the covariance matrices of the looks' speckle amplitudes, (..., k, k).
+
+    Looks i and j have the covariance sqrt(x_i x_j) mu(j - i), with their relative powers x and the
+    correlation mu by lag.
 
     Parameters
     ----------
     correlation_by_lag, look_power
         (..., N): as of :class:`LookSpeckle`.
     looks_max
-        Largest number k of looks; more are represented by :func:`representative_look_positions`.
+        Largest number k of rows. More looks are represented by this number of looks, at
+        :func:`representative_look_positions`.
     """
     n_looks = correlation_by_lag.shape[-1]
     position = representative_look_positions(n_looks, looks_max)
@@ -179,9 +198,10 @@ def look_covariances(
 
 
 def representative_look_positions(n_looks: int, looks_max: int = MATRIX_LOOKS_MAX) -> np.ndarray:
-    """Return positions of at most ``looks_max`` looks that represent ``n_looks`` looks.
+    """Return where in the sequence of looks at most ``looks_max`` representative looks lie.
 
-    Positions count looks from 0, and need not be integers. Their variance is that of all looks.
+    Positions count looks from 0 and need not be integers. They have the variance of the positions
+    of all ``n_looks`` looks.
     """
     n_kept = min(n_looks, looks_max)
     position_step = math.sqrt((n_looks**2 - 1) / (n_kept**2 - 1)) if n_kept < n_looks else 1.0
@@ -210,7 +230,9 @@ def phase_rotated_look_covariances(
 def mean_power_tails(
     look_speckle: LookSpeckle, n_looks: int, snr: np.ndarray, threshold: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return P(sum of the looks' powers > threshold), equation (1), and its complement.
+    """Return the probabilities that the sum of the looks' powers is above and below a threshold.
+
+    The first is equation (1) of the module's description.
 
     Parameters
     ----------
@@ -285,7 +307,9 @@ def _saddle_point(
     scaled_threshold: np.ndarray,
     is_rare: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the saddle point of the integrand of (1) and two derivatives of its logarithm there.
+    """Return the saddle point of a tail integral, and two derivatives of the integrand's logarithm.
+
+    The integral is equation (1) of the module's description.
 
     The saddle point lies between 0 and the first pole for the upper tail, and below 0 for the lower
     tail.
@@ -320,11 +344,11 @@ def _saddle_point(
 
 @lru_cache(maxsize=8)
 def speckle_lattice(n_looks: int) -> np.ndarray:
-    """Return fixed realisations of the independent speckle amplitudes of N looks.
+    """Return fixed realisations of the speckle amplitudes of N looks of independent speckle.
 
-    They are (SPECKLE_LATTICE_SIZE, N) complex: a Kronecker lattice of the roots of primes,
-    transformed to circular Gaussian numbers and standardised to mean 0 and the unit covariance
-    matrix.
+    They are (SPECKLE_LATTICE_SIZE, N) complex. A Kronecker lattice of the roots of primes is
+    transformed to circular Gaussian numbers. These are standardised to mean 0 and the unit
+    covariance matrix.
     """
     primes = [2]
     while len(primes) < 2 * n_looks:
@@ -342,7 +366,9 @@ def speckle_lattice(n_looks: int) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def correlated_speckle_magnitudes(speckle, covariance_root):
-    """Return magnitudes |A z| of correlated speckle amplitudes of N looks, (m, N).
+    """Return the magnitudes of the correlated speckle of N looks in m realisations, (m, N).
+
+    They are |A z|, with the matrix A and independent amplitudes z.
 
     Parameters
     ----------
@@ -365,14 +391,14 @@ def correlated_speckle_magnitudes(speckle, covariance_root):
 
 @njit(cache=True, error_model="numpy")
 def vote_probability_given_speckle(signal, threshold_ratio, votes_needed, magnitude, is_real=False):
-    """Return the probability that at least ``votes_needed`` looks cross, given their speckle, (m,).
+    """Return the probability that enough looks cross the threshold, given their speckle, (m,).
 
     Parameters
     ----------
     signal, threshold_ratio
         Root mean square signal and threshold of one look, over the noise per quadrature.
     votes_needed
-        Number of looks that have to cross.
+        Smallest number of looks that must cross for a detection.
     magnitude
         (m, N): magnitudes of the looks' speckle, of mean square 1.
     is_real

@@ -17,7 +17,7 @@ three ways:
 An echo in developed speckle fades. All looks have the same speckle (``speckle: common``), or each
 look has independent speckle, as when the beam moves by its width from look to look (``speckle:
 independent``). With x = a^2 / 2 the mean SNR of one record and Y = N b^2 / 2, the mean of Q_N over
-common speckle is Swerling's first case,
+common speckle is Swerling's first case (Q and P are the regularised incomplete Gamma functions),
 
     Q(N-1, Y) + (1 + 1 / (N x))^(N-1) e^(-Y / (1 + N x)) P(N-1, Y / (1 + 1 / (N x))),
 
@@ -61,24 +61,28 @@ LOOKS_DEFAULTS: dict[str, float | int | str | np.ndarray] = {
 }
 
 DRIFT_POSITIONS_MAX = 64
-"""Largest number of positions that represent a line which moves from look to look."""
+"""Largest number of line positions that are evaluated where a line moves from look to look. More
+looks are represented by this number."""
 
 _CERTAIN_MARGIN_SIGMA = 40.0
-"""Distance of magnitude and threshold [sigma] beyond which the smaller tail is 0 in float64."""
+"""Distance of a bin's |X| from the threshold beyond which a crossing counts as certain or
+impossible, in units of the noise per quadrature."""
 _BISECTION_STEPS = 60
 _LOG_POWER_GRID = -5.0, math.log(16.0), 64
-"""First and last ln(power), and number of nodes, of the quadrature over the speckle's power."""
+"""Grid of the quadrature over the speckle's power (mean 1): ln(power) of the first and of the last
+node, and number of nodes."""
 _GAUSS_NODES = 24
-"""Number of Gauss points in each interval of the quadrature over the speckle's magnitude."""
+"""Number of Gauss-Legendre nodes in each interval of the quadrature over the magnitude of
+speckle."""
 
 
 class DetectionArrays(NamedTuple):
     """Probabilities of detection and of a miss of bins or shots, arrays of one shape."""
 
     pd: np.ndarray
-    """Probability of detection, 0..1."""
+    """Probability that a bin or shot is detected, 0..1."""
     miss: np.ndarray
-    """Probability of a miss, 1 - pd; precise where pd is near 1."""
+    """Probability that a bin or shot is missed, 1 - pd. It is precise where pd is near 1."""
 
 
 class Looks(NamedTuple):
@@ -94,17 +98,21 @@ class Looks(NamedTuple):
     number: int = 1
     """Number N of records of each segment."""
     combine: str = COMBINE_POWER
-    """How records are combined, one of :data:`COMBINE_KINDS`."""
+    """How the records of a segment are combined, one of :data:`COMBINE_KINDS`."""
     votes: int = 1
-    """Number M of records that must cross in a bin; used by ``binary``."""
+    """Number of records that must cross the threshold in a bin for a detection. Only used if
+    ``combine`` is ``binary``."""
     has_independent_speckle: bool = False
-    """True if the speckle of looks is independent."""
+    """True if the echo fades independently from record to record."""
     has_moving_speckle: bool = False
-    """True if the correlation of the looks' speckle follows from the motion between them."""
+    """True if the correlation of the speckle between records follows from the target's motion."""
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "Looks":
-        """Return the looks from parameters by dotted path; a single look by default."""
+        """Return the looks that a spec states, from its parameters by dotted path.
+
+        The default is a single look.
+        """
         number, combine_kind, votes, speckle = (
             np.asarray(parameters.get(path, value)).flat[0]
             for path, value in LOOKS_DEFAULTS.items()
@@ -120,7 +128,10 @@ class Looks(NamedTuple):
 
     @property
     def is_noncoherent(self) -> bool:
-        """True if several looks are combined by power or by votes, and not as one record."""
+        """True if the powers or threshold crossings of several records are combined.
+
+        False for a single record, and for records that are added as amplitudes.
+        """
         return self.number > 1 and self.combine != COMBINE_COHERENT
 
     @property
@@ -135,14 +146,18 @@ class Looks(NamedTuple):
 
     @property
     def amplitude_gain_max(self) -> float:
-        """Largest gain in amplitude over noise by which one record could equal all looks."""
+        """Upper bound of the gain in signal over noise that combining the looks can bring.
+
+        It is that of the amplitude: sqrt(N) for N looks whose powers or crossings are combined,
+        else 1.
+        """
         return math.sqrt(self.number) if self.is_noncoherent else 1.0
 
     def equivalent_threshold_ratio(self, threshold_ratio: np.ndarray) -> np.ndarray:
-        """Return the threshold over sigma at which one equivalent record detects as often.
+        """Return the threshold at which a single equivalent record detects as often as the looks.
 
-        The amplitudes over sigma of the equivalent record are ``amplitude_gain_max`` times those of
-        one look.
+        Thresholds are over the noise per quadrature. The equivalent record has
+        ``amplitude_gain_max`` times the amplitudes of one look.
         """
         scaled = np.asarray(self.amplitude_gain_max * threshold_ratio)
         if self.n_power_averaged == 1:
@@ -292,7 +307,10 @@ class Looks(NamedTuple):
         return DetectionArrays(pd, 1 - pd)
 
     def _lattice_magnitudes(self) -> np.ndarray:
-        """Return magnitudes (nodes, N) of the speckle of N looks with independent speckle."""
+        """Return speckle magnitudes of N looks of independent speckle, in fixed realisations.
+
+        The shape is (realisations, N).
+        """
         from sweep.model.detection.look_speckle import speckle_lattice
 
         return np.abs(speckle_lattice(self.number))
@@ -300,7 +318,10 @@ class Looks(NamedTuple):
     def _correlated_magnitudes(
         self, look_speckle: "LookSpeckle", segment: int, point: int
     ) -> np.ndarray:
-        """Return magnitudes (nodes, N) of the correlated speckle of a segment's N looks."""
+        """Return speckle magnitudes of the N looks of one segment of one point.
+
+        Looks are correlated as in ``look_speckle``. The shape is (fixed realisations, N).
+        """
         from sweep.model.detection.look_speckle import (
             correlated_speckle_magnitudes,
             speckle_lattice,
@@ -317,21 +338,23 @@ class Looks(NamedTuple):
         threshold_ratio: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> tuple[list[np.ndarray], np.ndarray]:
-        """Compute pd of segments given the speckle of all looks, the same in all segments.
+        """Compute probabilities of detection of segments given the speckle of all looks.
+
+        Every segment sees the same speckle.
 
         Parameters
         ----------
         signals
             (..., n) for each segment: root mean square |X| over the noise per quadrature.
         threshold_ratio
-            (..., n): threshold over the same.
+            (..., n): threshold over the noise per quadrature.
         look_speckle
             Correlation of the looks' speckle if it is partial.
 
         Returns
         -------
         list
-            pd (..., n, k) of each segment, in k realisations of the speckle.
+            Probability of detection (..., n, k) of each segment, in k realisations of the speckle.
         numpy.ndarray
             (..., k): weights of the realisations, of the sum 1.
         """
@@ -382,7 +405,7 @@ class Looks(NamedTuple):
         signal_first, signal_second
             (..., n): root mean square |X| of the segments' bins over the noise per quadrature.
         threshold_ratio
-            (n,): threshold over the same.
+            (n,): threshold over the noise per quadrature.
         correlation
             (n,): modulus of the correlation of the segments' signal amplitudes.
         look_speckle
@@ -391,7 +414,7 @@ class Looks(NamedTuple):
         Returns
         -------
         numpy.ndarray
-            (..., n)
+            (..., n): probability that both segments are detected.
 
         Notes
         -----
@@ -493,7 +516,10 @@ class Looks(NamedTuple):
         correlation: np.ndarray,
         look_speckle: "LookSpeckle | None",
     ) -> np.ndarray:
-        """Return the covariance of two segments' detections over that in the same speckle, 0..1.
+        """Return the covariance of two segments' detections, relative to equal speckle, 0..1.
+
+        It is divided by the covariance that the detections would have if both segments had the same
+        speckle.
 
         Parameters
         ----------
@@ -520,7 +546,7 @@ class Looks(NamedTuple):
         return np.asarray(inverse_looks * fraction + (1 - inverse_looks) * np.square(correlation))
 
     def _effective_looks(self, look_speckle: "LookSpeckle | None") -> np.ndarray | float:
-        """Return the number M of looks of independent speckle equivalent to all looks."""
+        """Return how many looks of independent speckle fade as little as all looks together."""
         if look_speckle is not None:
             return np.asarray(look_speckle.effective_looks.mean(axis=0))
         return float(self.number if self.has_independent_speckle else 1)
@@ -635,7 +661,11 @@ class Looks(NamedTuple):
             return np.minimum(special.logsumexp(log_combinations + log_terms, axis=-1), 0.0)
 
     def threshold_ratio_from_log_pfa(self, log_pfa: np.ndarray) -> np.ndarray:
-        """Return the threshold over sigma at which :meth:`log_pfa` equals ``log_pfa``."""
+        """Return the threshold at which noise alone is detected with a given probability.
+
+        ``log_pfa`` is the natural logarithm of that probability (:meth:`log_pfa`). The threshold is
+        over the noise per quadrature of one record.
+        """
         if self.is_noncoherent:
             return solve_threshold_ratio(np.asarray(log_pfa, float), self.log_pfa)
         return np.asarray(np.sqrt(-2 * np.asarray(log_pfa)))
@@ -671,7 +701,9 @@ class Looks(NamedTuple):
         Sums of powers have a bivariate Gamma distribution [1]_. With r = correlation^2 and
         Y = N b^2 / 2, both bins cross with
 
-            sum_j C(N+j-1, j) (1-r)^N r^j Q(N+j, Y / (1-r))^2.
+            sum_j C(N+j-1, j) (1-r)^N r^j Q(N+j, Y / (1-r))^2,
+
+        with N looks, binomial coefficients C and the regularised incomplete Gamma function Q.
 
         References
         ----------
@@ -714,7 +746,7 @@ class Looks(NamedTuple):
     def p_votes_first_only(
         self, p_first: np.ndarray, p_second: np.ndarray, p_both: np.ndarray
     ) -> np.ndarray:
-        """Return the probability that enough records cross in the first of two bins only.
+        """Return the probability that enough records cross in the first of two bins, not the other.
 
         Parameters
         ----------
@@ -740,20 +772,21 @@ class Looks(NamedTuple):
         return probability
 
     def added_crossing_probability(self, signal: np.ndarray, threshold_ratio: float) -> np.ndarray:
-        """Compute the crossing probability that bins' signals add to noise.
+        """Compute the probability that signal makes a bin cross where noise alone does not.
 
         Parameters
         ----------
         signal
             (m,): |X| without noise over the noise per quadrature of one record.
         threshold_ratio
-            Threshold over the same.
+            Threshold over the noise per quadrature of one record.
 
         Returns
         -------
         numpy.ndarray
-            (m,): increase of the crossing probability, over the probability that noise alone does
-            not cross. It is interpolated in a table, within 1e-4 of its value.
+            (m,): increase of the crossing probability by the signal, over the probability that
+            noise alone does not cross. It is interpolated in a table, with a relative error of up
+            to 1e-4.
         """
         log_signals, log_added = _added_crossing_table(self, float(threshold_ratio))
         with np.errstate(divide="ignore"):
@@ -770,9 +803,9 @@ class Looks(NamedTuple):
     def negligible_signal_ratio(
         self, *, leakage_probability: np.ndarray, threshold_ratio: np.ndarray, n_bins: int
     ) -> np.ndarray:
-        """Return the signal [sigma of one record] below which bins may count as noise alone, (n,).
+        """Return the signal amplitude below which bins may count as noise alone, (n,).
 
-        Parameters are as of
+        It is in units of the noise per quadrature of one record. Parameters are those of
         :func:`sweep.model.detection.echo_detection.negligible_signal_ratio`.
         """
         # At small signals the added probability is proportional to the signal's power.
@@ -797,7 +830,7 @@ class Looks(NamedTuple):
         return np.asarray(np.minimum(signal_max, 1 / (self.number * threshold_ratio)))
 
     def vote_probabilities(self, p_cross: np.ndarray, p_stay: np.ndarray) -> DetectionArrays:
-        """Return the probabilities that enough records cross, and that they do not.
+        """Return the probabilities that ``votes`` or more records cross, and that fewer do.
 
         ``p_cross`` and ``p_stay`` are the probabilities that one record crosses and does not.
         """
@@ -810,10 +843,10 @@ class Looks(NamedTuple):
     def speckle_power_quadrature(
         self, look_speckle: "LookSpeckle | None", segment: int, point: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes and weights of a mean over the speckle power that all looks have together.
+        """Return nodes and weights of a mean over the speckle power, averaged over all looks.
 
-        The power, of mean 1, is treated as a gamma variable whose shape is the number M of looks of
-        independent speckle. Weights have the sum 1.
+        The power, of mean 1, is treated as a gamma variable. Its shape is the number of looks of
+        independent speckle that equal these looks. Weights have the sum 1.
 
         Parameters
         ----------
@@ -845,7 +878,7 @@ class Looks(NamedTuple):
         threshold_ratio
             (...): threshold over the noise per quadrature.
         *signals
-            (...): root mean square |X| of each segment over the same.
+            (...): root mean square |X| of each segment over the noise per quadrature.
         gamma_shape
             Shape of the gamma distribution of the speckle's power, of mean 1; 1 is exponential.
         """
@@ -882,13 +915,15 @@ class Looks(NamedTuple):
 
 
 SINGLE_LOOK = Looks()
-"""One record of each segment."""
+"""Looks of a shot with a single record of each segment."""
 
 
 def coherent_gain(
     looks: Looks, *, acceleration: np.ndarray, carrier: np.ndarray, look_period: np.ndarray
 ) -> np.ndarray:
-    """Return the amplitude of the mean of coherent looks over that of one, under acceleration.
+    """Return how much an accelerated target's amplitude falls when looks are added coherently.
+
+    It is the amplitude of the mean over all looks, relative to that of one look.
 
     Parameters
     ----------
@@ -920,10 +955,10 @@ def coherent_gain(
 def solve_threshold_ratio(
     log_pfa: np.ndarray, log_pfa_law: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Return the threshold over sigma (n,) at which ln(pfa) has a given value, by bisection.
+    """Return the threshold (n,) at which noise is detected with a given probability pfa.
 
-    ``log_pfa_law`` is the decreasing function from the threshold to ln(pfa); ``log_pfa`` (n,) are
-    the given values.
+    It is found by bisection, in units of the noise per quadrature. ``log_pfa_law`` is the
+    decreasing function from the threshold to ln(pfa). ``log_pfa`` (n,) are the given ln(pfa).
     """
     # n bins raise an alarm at least as often as one, and at most n times as often.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
@@ -951,7 +986,7 @@ def pd_and_miss_any_two_in_speckle(
     Returns
     -------
     DetectionArrays
-        (n,); nan where the pd of a segment is.
+        (n,): both probabilities; nan where the probability of detection of a segment is nan.
 
     Notes
     -----
@@ -1059,7 +1094,11 @@ def pd_and_miss_any_two_in_speckle(
 def _marcum_q1_derivatives(
     signal_ratio: np.ndarray, threshold_ratio: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Q_1'(a, b), Q_1'' + Q_1' / a and Q_1'' - Q_1' / a, derivatives by the signal a."""
+    """Return Q_1', Q_1'' + Q_1' / a and Q_1'' - Q_1' / a of Marcum's Q_1(a, b).
+
+    Primes are derivatives by the signal a. The threshold is b; both are over the noise per
+    quadrature.
+    """
     x = np.maximum(signal_ratio * threshold_ratio, 1e-12)
     # special.ive is nan from arguments of 1e9 on.
     scaled_i0, scaled_i1 = (
@@ -1072,7 +1111,10 @@ def _marcum_q1_derivatives(
 
 
 def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss points and weights of all intervals between successive ends (..., k)."""
+    """Return Gauss-Legendre nodes and weights of all intervals between successive ends.
+
+    ``interval_ends`` are (..., k) in rising order.
+    """
     node, weight = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     half_width = 0.5 * np.diff(interval_ends, axis=-1)[..., None]
     position = interval_ends[..., :-1, None] + half_width * (node + 1)
@@ -1083,9 +1125,10 @@ def _gauss_in_intervals(interval_ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @lru_cache(maxsize=4096)
 def _added_crossing_table(looks: Looks, threshold_ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ln(signal) and ln(added crossing probability), the table behind the interpolation.
+    """Return the table that :meth:`Looks.added_crossing_probability` interpolates.
 
-    See :meth:`Looks.added_crossing_probability`.
+    It holds ln(signal), and ln of the probability that the signal makes a bin cross where noise
+    alone does not.
     """
     signal = np.geomspace(1e-3 / math.sqrt(looks.number), threshold_ratio + 1.0, 300)
     noise = looks.pd_and_miss_steady(np.zeros(1), np.array([threshold_ratio]))

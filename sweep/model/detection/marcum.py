@@ -25,16 +25,19 @@ from sweep.kernel_cache import njit
 from sweep.model.elementary_functions import exact_product
 
 _SERIES_PRODUCT_MAX = 30.0
-"""Largest product a b for which the series of Bessel functions is used."""
+"""Largest product of signal a and threshold b, over the noise per quadrature, for which Marcum's
+Q_1(a, b) is computed as a series of Bessel functions."""
 _MIDPOINT_STEP = 0.7
-"""Step h of the midpoint rule: its error is exp(-(2 pi / h)^2 / 2) = 3e-18 of the result."""
+"""Step h of the midpoint rule by which the tail integral of Marcum's Q is computed. The relative
+error is exp(-(2 pi / h)^2 / 2) = 3e-18."""
 
 _MIDPOINT_NODES = tuple((_MIDPOINT_STEP * (k + 0.5)) ** 2 for k in range(13))
 _MIDPOINT_WEIGHTS = tuple(_MIDPOINT_STEP / math.pi * math.exp(-0.5 * v) for v in _MIDPOINT_NODES)
 _POLE_REACH = 2.0 * math.pi / _MIDPOINT_STEP
 
 _SQUARED_DISTANCE_MAX = 1500.0
-"""(a - b)^2 above which the smaller tail, about exp(-(a - b)^2 / 2), is 0 in float64."""
+"""Limit of (a - b)^2 above which the smaller tail of Marcum's Q_1(a, b) is 0 in float64. The tail
+is about exp(-(a - b)^2 / 2)."""
 
 # Excess crossings, K terms: 1/(m+1) and 1/m^2 for m = K .. 1, so that no step divides.
 _EXCESS_TERMS_MAX = 24
@@ -43,7 +46,8 @@ _INVERSE_SQUARE = (0.0, *(1.0 / m**2 for m in range(1, _EXCESS_TERMS_MAX + 1)))
 
 _LN2 = math.log(2.0)
 _LOG_P_TINY = -600.0
-"""Below this ln p, 1-(1-p)^n and n p are the same double for any n up to 1e240."""
+"""Limit on ln p of a trial's success probability p. Below it, 1-(1-p)^n and n p are the same double
+for any number of trials n up to 1e240."""
 
 
 class Tails(NamedTuple):
@@ -53,18 +57,19 @@ class Tails(NamedTuple):
     """
 
     above: float
-    """P(|X| >= threshold), 0..1."""
+    """Probability that |X| is at or above the threshold, 0..1."""
     below: float
-    """P(|X| < threshold), 0..1."""
+    """Probability that |X| is below the threshold, 0..1."""
 
 
 class MarcumQ(NamedTuple):
-    """Both tails of the Rice distribution, arrays of one shape."""
+    """Both tails of the Rice distribution of a magnitude in noise, arrays of one shape."""
 
     q: np.ndarray
-    """Q1(a, b), the probability to exceed b; 0..1."""
+    """Marcum's Q1(a, b), the probability, 0..1, that a magnitude of amplitude a exceeds b."""
     p: np.ndarray
-    """1 - Q1(a, b); 0..1. Precise where Q1 is near 1."""
+    """Probability 1 - Q1(a, b), 0..1, that the magnitude does not exceed b. It is precise where Q1
+    is near 1."""
 
 
 def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
@@ -250,10 +255,10 @@ def log_at_least_one_probability(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
 
 
 def log_either_probability(log_p_first: np.ndarray, log_p_second: np.ndarray) -> np.ndarray:
-    """Return the logarithm of the probability of at least one of two independent events.
+    """Return the natural logarithm of the probability of at least one of two independent events.
 
-    It is ln(p + q (1 - p)), from ln p (``log_p_first``) and ln q (``log_p_second``); -inf where
-    both probabilities are 0.
+    It is ln(p + q (1 - p)), where ``log_p_first`` is ln p and ``log_p_second`` is ln q. The result
+    is -inf where both probabilities are 0.
     """
     with np.errstate(divide="ignore"):
         return np.minimum(

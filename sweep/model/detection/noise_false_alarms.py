@@ -1,8 +1,9 @@
 """False alarms of noise alone in closed form, and the noise that follows from published figures.
 
-A bin of noise crosses the threshold of TNR standard deviations of its magnitude with the
-probability p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a shot, of N bins each, raise a
-false alarm with the probability (1 - (1 - p)^N)^2, as printed in Tables 4.3 to 4.5 of the thesis.
+The threshold-to-noise ratio TNR is the threshold over the standard deviation of |X| in a bin of
+noise. The bin crosses it with the probability p = exp(-x), x = (4 - pi)/4 TNR^2. Both segments of a
+shot, of N bins each, raise a false alarm with the probability (1 - (1 - p)^N)^2. These
+probabilities are printed in Tables 4.3 to 4.5 of the thesis.
 """
 
 from __future__ import annotations
@@ -20,12 +21,18 @@ from sweep.model.threshold import segment_alarm_bins
 
 
 def bin_pfa_exponent(tnr: float) -> float:
-    """Return x = (4 - pi)/4 TNR^2, the negative logarithm of a bin's false-alarm probability."""
+    """Return -ln of a bin's false-alarm probability, (4 - pi)/4 ``tnr``^2.
+
+    ``tnr`` is the threshold over the standard deviation of |X| in a bin of noise alone.
+    """
     return (4 - math.pi) / 4 * tnr**2
 
 
 def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
-    """Return the probability that a bin of noise alone crosses the threshold [T Table 4.2]."""
+    """Return the probability that a bin of noise alone crosses the threshold [T Table 4.2].
+
+    ``tnr`` is the threshold over the standard deviation of |X| in such a bin of one record.
+    """
     if looks.is_noncoherent:
         return math.exp(looks.log_pfa(np.asarray(tnr * RAYLEIGH_DEVIATION)))
     return math.exp(-bin_pfa_exponent(tnr))
@@ -34,16 +41,16 @@ def bin_pfa(tnr: float, looks: Looks = SINGLE_LOOK) -> float:
 def alarm_equivalent_bins(
     parameters: Mapping[str, Any], pfa_in_bin: ArrayLike, segment: str = "up"
 ) -> np.ndarray:
-    """Return the number of independent bins that raise a false alarm as often as a segment.
+    """Return how many independent noise bins raise a false alarm as often as a segment's bins.
 
     Parameters
     ----------
     parameters
-        Parameters by dotted path.
+        Parameters of the instrument by dotted path.
     pfa_in_bin
-        Probability of a false alarm in one bin, which gives the threshold.
+        Probability of a false alarm in one bin. The threshold follows from it.
     segment
-        Name of the segment.
+        Name of the segment, such as ``up``.
     """
     threshold_ratio = Looks.from_parameters(parameters).threshold_ratio_from_log_pfa(
         np.log(np.maximum(pfa_in_bin, 1e-300))
@@ -52,7 +59,10 @@ def alarm_equivalent_bins(
 
 
 def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
-    """Return the probability of a false alarm in any of N independent bins, 1 - (1 - p)^N."""
+    """Return the probability of a false alarm in any of ``n_bins`` independent bins of noise.
+
+    It is 1 - (1 - p)^n_bins, with p = ``pfa_in_bin``.
+    """
     with np.errstate(divide="ignore"):
         return np.asarray(-np.expm1(np.asarray(n_bins) * np.log1p(-np.asarray(pfa_in_bin))))
 
@@ -60,7 +70,8 @@ def segment_pfa(pfa_in_bin: np.ndarray, n_bins: ArrayLike) -> np.ndarray:
 def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
     """Return the relative excess e of the noise variance that explains a bin's false alarms.
 
-    It solves exp(-x / (1 + e)) = ``probability``; nan unless 0 < ``probability`` < 1.
+    It solves exp(-x / (1 + e)) = ``probability``, with x = (4 - pi)/4 ``tnr``^2. The result is nan
+    unless 0 < ``probability`` < 1.
     """
     if not 0.0 < probability < 1.0:
         return math.nan
@@ -70,8 +81,8 @@ def variance_excess_from_bin_pfa(probability: float, tnr: float) -> float:
 def variance_excess_from_shot_pfa(probability: float, tnr: float, n_bins: float) -> float:
     """Return the relative excess e of the noise variance that explains a shot's false alarms.
 
-    It solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability`` with N = ``n_bins``; nan unless
-    0 < ``probability`` < 1.
+    It solves (1 - (1 - exp(-x / (1 + e)))^N)^2 = ``probability``, with x = (4 - pi)/4 ``tnr``^2
+    and N = ``n_bins`` in each of two segments. The result is nan unless 0 < ``probability`` < 1.
     """
     if not 0.0 < probability < 1.0:
         return math.nan

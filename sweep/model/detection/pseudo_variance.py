@@ -6,8 +6,9 @@ Bin k of lines at the positions nu is
 
     X = sum_b (A_b G(k - nu_b) + conj(A_b) G(k + nu_b)) + noise.
 
-With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number of the mean
-power S + 2 sigma^2 and the pseudo-variance
+With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number. The mean
+power is S + 2 sigma^2, with the signal's power S and the noise per quadrature sigma. The
+pseudo-variance is
 
     E[X^2] = 2 sum_b P_b G(k - nu_b) G(k + nu_b) + 2 sigma^2 W2(2k) / W2(0),
 
@@ -41,22 +42,26 @@ from sweep.model.spectrum.search_restriction import axis_line_positions, beamlet
 from sweep.model.window import Window, window_samples
 
 RATIO_MIN = 0.05
-"""Pseudo-variance ratio |q| below which bins are treated as circular; pd changes by less than
-2e-4."""
+"""Limit below which a bin X in speckle is treated as circular. It is on |E[X^2]| / E[|X|^2], which
+is 0 for circular X. The probability of detection errs by less than 2e-4."""
 
 
 class SignalPseudoVariance(NamedTuple):
-    """Pseudo-variance ratio q of echoes near DC and Nyquist, where lines overlap their images."""
+    """Pseudo-variance ratio q of echoes near DC and Nyquist, where lines overlap their images.
+
+    A bin X has q = E[X^2] / E[|X|^2], which is 0 for circular X.
+    """
 
     ratio_row: np.ndarray
-    """(segments, n) int64: row of ``ratio`` and ``phase_factors``. Row 0, in which q is 0, is that
-    of echoes far from DC and Nyquist."""
+    """(segments, n) int64: row of ``ratio`` and ``phase_factors`` for each echo. Row 0, in which
+    the pseudo-variance ratio is 0, is for echoes far from DC and Nyquist."""
     ratio: np.ndarray
-    """(rows, bins): q by distance [bins] from the nearer of DC and Nyquist."""
+    """(rows, bins): pseudo-variance ratio E[X^2] / E[|X|^2] of a bin X, by distance [bins] from the
+    nearer of DC and Nyquist."""
     phase_factors: np.ndarray
-    """(rows, N_PHASE_NODES): echo power at each phase node t_j over its mean over the phase, 1 + q
-    cos t_j of the strongest bin. With ``any_bin`` detection the numerator is the power of the bin
-    that is strongest at that phase."""
+    """(rows, N_PHASE_NODES): echo power at each phase t of the speckle over the mean over t. It is
+    1 + q cos t, with the pseudo-variance ratio q of the strongest bin. With ``any_bin`` detection
+    the numerator is the power of the bin that is strongest at that phase."""
 
 
 def signal_pseudo_variance(shots: Any) -> SignalPseudoVariance:
@@ -132,9 +137,9 @@ def mean_over_phases(
 
     Notes
     -----
-    At the phase t a bin is detected like a circular number of f = 1 + q cos t times the mean power,
-    with exp(-A / f). A is such that the mean over t is the given probability. Phases of different
-    segments are independent.
+    The echo's power at the phase t is f = 1 + q cos t times its mean, with the pseudo-variance
+    ratio q. The bin is detected with exp(-A / f), like a circular number of this power. A is such
+    that the mean over t is the given probability. Phases of different segments are independent.
     """
     pd_at_phases = [
         _pd_at_phases(*arguments) for arguments in zip(pd_by_segment, phase_factors, strict=True)
@@ -153,9 +158,10 @@ def mean_over_phases(
 
 
 def _pd_at_phases(mean_pd: np.ndarray, phase_factors: np.ndarray) -> np.ndarray:
-    """Return detection probabilities exp(-A / f) at all phase nodes, (N_PHASE_NODES, ..., n).
+    """Return probabilities of detection at all speckle phases, (N_PHASE_NODES, ..., n).
 
-    A is found by bisection so that their mean over the nodes is ``mean_pd`` (..., n).
+    They are exp(-A / f), with the relative echo power f at each phase. A is found by bisection so
+    that the mean over the phases is ``mean_pd`` (..., n).
     """
     phase_factors = phase_factors.T.reshape(N_PHASE_NODES, *[1] * (mean_pd.ndim - 1), -1)
     is_defined = np.isfinite(mean_pd)
@@ -181,14 +187,17 @@ def lines_overlap_images(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def n_tabulated_bins(window: Window, fft_size: int) -> int:
-    """Return the number of bins from DC or Nyquist whose pseudo-variance is tabulated."""
+    """Return how many bins next to DC or Nyquist have a tabulated pseudo-variance."""
     last_bin = (_image_reach(window) + main_lobe_half_width(window) + 1) * fft_size / window.length
     return min(math.ceil(last_bin) + 1, fft_size // 4 + 1)
 
 
 @lru_cache(maxsize=64)
 def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
-    """Return the pseudo-variance ratio W2(2k) / W2(0) of white noise in bins k >= 0, (bins,)."""
+    """Return the pseudo-variance ratio E[n^2] / E[|n|^2] of white noise n by bin, (bins,).
+
+    It is W2(2k) / W2(0) for bins k = 0, 1, .. from DC, with the transform W2 of the squared window.
+    """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
     bin_numbers = np.arange(n_tabulated_bins(window, fft_size))
@@ -200,13 +209,18 @@ def noise_pseudo_variance_ratio(window: Window, fft_size: int) -> np.ndarray:
 
 
 def _image_reach(window: Window) -> float:
-    """Return the distance of a line from DC [bins of fs/L] beyond which its image is negligible."""
+    """Return the distance of a line from DC beyond which its image is negligible.
+
+    The unit is the sample rate over the number of samples in the record. The image is the line's
+    mirror at the opposite frequency.
+    """
     distance = window.envelope_distances[np.argmax(window.sidelobe_envelope < RATIO_MIN / 2)]
     return 0.5 * min(float(distance), 12.0)
 
 
 _POWER_FRACTION_MIN = 1e-7
-"""Fraction of the looks' power below which an eigenvalue of the covariance is neglected."""
+"""Limit below which an eigenvalue of the covariance of the looks' echo amplitudes is neglected. It
+is a fraction of the power of all looks."""
 
 
 def multilook_pd_and_miss_near_ends(
@@ -217,7 +231,9 @@ def multilook_pd_and_miss_near_ends(
     noise_pseudo_variance: np.ndarray,
     look_covariance: np.ndarray,
 ) -> DetectionArrays:
-    """Return pd and miss probability of bins near DC or Nyquist in several looks in speckle.
+    """Return probabilities of detection and of a miss in several looks, near DC or Nyquist.
+
+    The echo is in developed speckle, and each point has one bin.
 
     Parameters
     ----------
@@ -276,7 +292,10 @@ def multilook_pd_and_miss_near_ends(
         n_represented = covariance_matrix.shape[-1]
 
         def mean_vote_probability(amplitudes: np.ndarray, bin_index: int = bin_index) -> float:
-            """Return the probability of enough votes, averaged over amplitudes (m, k) of looks."""
+            """Return the probability that enough looks cross, averaged over m speckle draws.
+
+            The echo amplitudes of the k looks in these draws are (m, k).
+            """
             magnitudes = np.hypot(
                 math.sqrt(1 + signal_pseudo_variance[bin_index]) * amplitudes.real,
                 math.sqrt(max(1 - signal_pseudo_variance[bin_index], 0.0)) * amplitudes.imag,

@@ -6,8 +6,9 @@ that starts at t_s, the beat phase
     -2 pi F tau + 2 pi F beta (t_s + t_c),    F = f + S (t_c - tau_0)                            (1)
 
 with the carrier f and the signed chirp rate S of the segment, and the delay tau_0 on the beam's
-axis. F is the optical frequency of the echo in the middle of the record. If the echo fills only
-part of the record, t_c is the centroid of the window over that part. The phase difference between
+axis. The Doppler ratio is 2 v / c for the radial velocity v. F is the optical frequency of the echo
+in the middle of the record. If the echo fills only part of the record, t_c is the centroid of the
+window over that part. The phase difference between
 two segments depends on the scatterer's position. If all scatterers lie in one bin, the two
 amplitudes are circular complex Gaussian numbers with the correlation
 
@@ -22,8 +23,9 @@ the places nu_i(y) of the lines, y the coordinate along which they spread most,
     mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
     S_i = int p G(k_i - nu_i)^2 dy                                                              (3)
 
-Line positions are taken as linear in y. (3) thus neglects Doppler shifts that change as the square
-of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) includes.
+with the beam's power density p over y, the strongest bins k_i, and the phase difference t per unit
+of y. Line positions are taken as linear in y. (3) thus neglects Doppler shifts that change as the
+square of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) includes.
 
 The probability that both bins cross a threshold is that of two correlated Rayleigh magnitudes,
 :func:`sweep.model.detection.echo_detection.joint_pd_in_speckle`, by |mu|.
@@ -37,59 +39,72 @@ import numpy as np
 from sweep.model.window import Window, window_samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
-"""Pairs of segments in the order of arrays: (up, Doppler), (up, down), (Doppler, down)."""
+"""Pairs of segment indices (0 up, 1 Doppler, 2 down), in the order of arrays over pairs."""
 
 LINE_SHIFT_MIN_BINS = 0.01
-"""Line shift per standard deviation of the beam [bins of fs/L] below which one bin holds all
-lines."""
+"""Limit below which all lines of a footprint count as lying in one bin. It is the line shift per
+standard deviation of the beam, in units of the sample rate over the number of samples."""
 
 TRANSFORM_REACH_BINS = 6.0
-"""Half-width of the window transform in the integrals (3) [bins of fs/L]."""
+"""Distance from its centre up to which the window's transform counts in correlation integrals. The
+unit is the sample rate over the number of samples in the record."""
 
 TRANSFORM_SAMPLES_PER_BIN = 64
-"""Samples of the tabulated window transform per bin of fs/L."""
+"""Number of samples of the tabulated window transform per resolution cell. A cell is the sample
+rate over the number of samples in the record."""
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
 _BEAM_DEVIATIONS_MAX = 5.0
-"""Largest half-width of the integration interval [standard deviations of the beam]."""
+"""Largest half-width of the interval across the beam over which the correlation is integrated, in
+standard deviations of the beam's power."""
 _RESOLVED_PHASE_MAX = 40.0
-"""Largest phase [rad] at the ends of the interval that the quadrature nodes resolve."""
+"""Largest phase [rad] of the integrand, at the ends of the interval of integration, that the
+quadrature resolves."""
 
 
 class LineGradients(NamedTuple):
     """Gradients of line position and phase across the beams of n points, along two coordinates."""
 
     line_shift: np.ndarray
-    """(n, 3, 2): line shift per standard deviation of the beam [bins of fs/N], with the sign of the
-    beat frequency."""
+    """(n, 3, 2): shift of the line per standard deviation of the beam [FFT bins], by point, segment
+    and coordinate. It is positive towards higher beat frequency."""
     phase: np.ndarray
-    """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
+    """(n, 3, 2): phase of the line per standard deviation of the beam, less that in the up segment
+    [rad]. The axes are point, segment and coordinate."""
 
     def select(self, points: np.ndarray) -> "LineGradients":
-        """Select points by their indices."""
+        """Return the gradients of some points, given by their indices."""
         return LineGradients(self.line_shift[points], self.phase[points])
 
 
 class LinePairGradients(NamedTuple):
-    """Gradients across the beam of the lines of two segments, arrays (n,)."""
+    """Gradients across the beam of the lines of two segments, arrays (n,).
+
+    They are along the coordinate y across the beam in which the lines spread most. The unit of
+    frequency is fs/L, the sample rate over the number of samples in the record.
+    """
 
     bin_distance: tuple[np.ndarray, np.ndarray]
-    """Distance k - nu of each segment's strongest bin from the line on the beam's axis [bins of
-    fs/L]."""
+    """Frequency [fs/L] of each segment's strongest bin less that of the line on the beam's axis.
+    fs/L is the sample rate over the number of samples in the record."""
     line_shift: tuple[np.ndarray, np.ndarray]
-    """Line shift of each segment per standard deviation of the beam along y [bins of fs/L],
-    signed."""
+    """Signed shift [fs/L] of each segment's line per standard deviation of the beam. fs/L is the
+    sample rate over the number of samples in the record."""
     phase_difference: np.ndarray
-    """Phase difference t between the segments per standard deviation of the beam along y [rad]."""
+    """Change across the beam of the phase between the two segments [rad per standard deviation of
+    the beam]."""
     power_slope: np.ndarray
-    """Relative change of the echo's power per standard deviation of the beam along y."""
+    """Relative change of the echo's power across the beam, per standard deviation of the beam."""
 
     @property
     def line_shift_max(self) -> np.ndarray:
-        """Larger modulus of the two line shifts [bins of fs/L]."""
+        """Larger of the two segments' line shifts, in modulus, per standard deviation of the beam.
+
+        The unit is the sample rate over the number of samples in the record.
+        """
         return np.maximum(np.abs(self.line_shift[0]), np.abs(self.line_shift[1]))
 
     def select(self, points: np.ndarray) -> "LinePairGradients":
-        """Select points by their indices."""
+        """Return the gradients of some points, given by their indices."""
         (distance_first, distance_second), (shift_first, shift_second) = (
             self.bin_distance,
             self.line_shift,
@@ -103,10 +118,11 @@ class LinePairGradients(NamedTuple):
 
 
 def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
-    """Return the correlation mu, equation (3), of the strongest bins of two segments, (n,) complex.
+    """Return the correlation of the speckle in the strongest bins of two segments, (n,) complex.
 
-    If the phase varies too fast over y for the quadrature, the result is |mu| for a Gaussian window
-    transform of the same half-width, which is close to 0 then.
+    It is mu of equation (3) of the module's description. If the phase varies too fast across the
+    beam for the quadrature, the result is |mu| for a Gaussian window transform of the same
+    half-width. That is close to 0 then.
     """
     from sweep.model.detection.speckle_correlation_integral import (
         fill_peak_bin_correlation,  # a compiler is slow to import
@@ -135,10 +151,10 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
 
 
 def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.ndarray:
-    """Return |mu| for the Gaussian transform G(x) = exp(-x^2 / (4 v)), (n,).
+    """Return the modulus of the speckle correlation (3) for a Gaussian window transform, (n,).
 
-    v is such that G falls to 1/2 at the same distance as the window's transform. All factors of the
-    integrals (3) are then Gaussian.
+    The transform is exp(-x^2 / (4 v)). The variance v is such that it falls to 1/2 at the same
+    distance as the window's own transform. All factors of the integrals are then Gaussian.
     """
     transform_variance = _half_maximum_distance(window) ** 2 / (4 * np.log(2))
     (shift_first, shift_second), (distance_first, distance_second) = (
@@ -170,7 +186,8 @@ def _gaussian_correlation(window: Window, gradients: LinePairGradients) -> np.nd
 def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
 
-    ``distance`` is in bins of fs/L. G is set to 0 beyond 2 TRANSFORM_REACH_BINS.
+    ``distance`` is in units of the sample rate over the window's number of samples. G is set to 0
+    beyond 2 TRANSFORM_REACH_BINS.
 
     >>> from sweep.model.window import get_window
     >>> float(np.round(window_transform(get_window("hann", 1024), np.array([1.0]))[0], 3))
@@ -182,7 +199,10 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def centroid_delay(window: Window) -> np.ndarray:
-    """Return the shift [samples] of a window's centroid without its first k samples, (L + 1,)."""
+    """Return the shift [samples] of a window's centroid without its first k samples, (L + 1,).
+
+    Element k is the shift for k = 0 .. L, with the number of samples L.
+    """
     w, n = window_samples(window.name, window.length), np.arange(window.length)
     sum_from = np.cumsum(w[::-1])[::-1]
     moment_from = np.cumsum((w * n)[::-1])[::-1]
@@ -194,7 +214,10 @@ def centroid_delay(window: Window) -> np.ndarray:
 
 
 def _half_maximum_distance(window: Window) -> float:
-    """Return the distance [bins of fs/L] at which G is 1/2, at most 2 TRANSFORM_REACH_BINS."""
+    """Return the distance at which a window's normalised transform falls to 1/2.
+
+    It is in units of the sample rate over the number of samples, at most 2 TRANSFORM_REACH_BINS.
+    """
     distances, transform = transform_table(window)
     is_below_half = transform < 0.5  # nowhere if all samples but one are 0, as in Hann's of two
     first_below_half = int(np.argmax(is_below_half)) if is_below_half.any() else transform.size - 1
@@ -205,7 +228,10 @@ def _half_maximum_distance(window: Window) -> float:
 
 @lru_cache(maxsize=16)
 def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances 0 .. 2 TRANSFORM_REACH_BINS [bins of fs/L], and G at these distances."""
+    """Return distances 0 .. 2 TRANSFORM_REACH_BINS, and a window's transform at these distances.
+
+    The unit of distance is the sample rate over the number of samples. The transform is 1 at 0.
+    """
     distances = (
         np.arange(int(2 * TRANSFORM_REACH_BINS * TRANSFORM_SAMPLES_PER_BIN) + 1)
         / TRANSFORM_SAMPLES_PER_BIN

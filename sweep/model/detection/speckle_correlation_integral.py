@@ -24,7 +24,9 @@ def fill_peak_bin_correlation(
     weights,
     correlation,
 ):
-    """Integrate equation (3) and fill ``correlation`` at points given by their indices.
+    """Fill ``correlation`` with the speckle correlation of two segments at the given points.
+
+    It is mu of equation (3) of :mod:`sweep.model.detection.speckle_correlation`.
 
     Parameters
     ----------
@@ -72,7 +74,10 @@ def fill_peak_bin_correlation(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _interpolate_transform(distance, transform, samples_per_bin):
-    """Interpolate the tabulated window transform G at a distance [bins of fs/L]; 0 beyond."""
+    """Interpolate a tabulated window transform at a distance; it is 0 beyond the table's end.
+
+    The unit of distance is the sample rate over the number of samples in the record.
+    """
     table_position = abs(distance) * samples_per_bin
     if table_position >= transform.size - 1:
         return transform[transform.size - 1] if table_position == transform.size - 1 else 0.0

@@ -23,11 +23,14 @@ from sweep.model.detection.added_crossings import crossing_rate, fill_added_cros
 from sweep.model.detection.marcum import marcum_q1_tails
 
 SPECKLE_POWER_MAX = 16.0
-"""Largest speckle power (mean 1) in averages of leakage; a fraction e^-16 of draws exceeds it."""
+"""Largest speckle power (mean 1) in averages over the fading of leaked signal. A fraction e^-16 of
+all speckle exceeds it."""
 N_SPECKLE_OCTAVES = 9
-"""Number of octaves below SPECKLE_POWER_MAX over which leakage is computed."""
+"""Number of octaves of speckle power, below SPECKLE_POWER_MAX, for which the false alarms by leaked
+signal are computed."""
 POWERS_PER_OCTAVE_MAX = 2
-"""Largest number of speckle powers per octave."""
+"""Largest number of speckle powers per octave at which the false alarms by leaked signal are
+computed."""
 
 N_SPECKLE_POWERS = POWERS_PER_OCTAVE_MAX * N_SPECKLE_OCTAVES + 2
 """Number of tabulated speckle powers: those of the octaves, and a fainter one that completes whole
@@ -36,59 +39,69 @@ SIMD vectors."""
 TABULATED_SPECKLE_POWERS = SPECKLE_POWER_MAX * 2.0 ** (
     -np.arange(N_SPECKLE_POWERS - 1, -1, -1) / POWERS_PER_OCTAVE_MAX
 )
-"""(N_SPECKLE_POWERS,): speckle powers in rising order."""
+"""(N_SPECKLE_POWERS,): speckle powers (mean 1), in rising order, at which false alarms by leaked
+signal are computed."""
 
 INTERPOLATION_POINTS = 6
-"""Number of table entries of the interpolation."""
+"""Number of adjacent table entries from which a rate is interpolated."""
 
 CERTAIN_CROSSING_RATE = 40.0
-"""Rate above which a bin counts as certain to cross."""
+"""Rate -ln(1 - c), with a bin's crossing probability c, above which it counts as certain to cross
+the threshold."""
 
 _LOG_AMPLITUDE_PER_POWER = 0.5 * math.log(2.0) / POWERS_PER_OCTAVE_MAX
-"""Spacing of two tabulated speckle powers in ln(amplitude)."""
+"""Natural logarithm of the ratio of the amplitudes at two successive tabulated speckle powers."""
 _LOG_AMPLITUDE_AT_FAINTEST_POWER = (
     0.5 * math.log(SPECKLE_POWER_MAX) - (N_SPECKLE_POWERS - 1) * _LOG_AMPLITUDE_PER_POWER
 )
 _CONSTANT_RATE_PRODUCT_MAX = 0.01
-"""Product a b at the largest power below which rho is taken as constant, with an error of
-1.3e-5."""
+"""Limit on signal times threshold, each over the noise per quadrature, at the largest speckle
+power. Below it the rate is taken as proportional to power, with a relative error of 1.3e-5."""
 _LOG_RATE_STEP_MAX = 0.3
-"""Largest change of ln(rho) between entries; the interpolation error is then 4e-6 of rho."""
+"""Largest change of ln(rho) between two table entries of the relative crossing rate rho. The
+interpolated rho then has a relative error of 4e-6."""
 _CERTAIN_MARGIN_SIGMA = 9.0
-"""Amplitude above the threshold [sigma] beyond which the rate is CERTAIN_CROSSING_RATE."""
+"""Excess of amplitude over threshold beyond which a bin's rate is set to CERTAIN_CROSSING_RATE, in
+units of the noise per quadrature."""
 _ENTRIES_PER_POWER_MIN, _ENTRIES_PER_POWER_MAX = 4, 256
 """Smallest and largest number of table entries between two speckle powers."""
 
 
 class SpeckleCrossingRates(NamedTuple):
-    """Table of the relative rate rho for one threshold."""
+    """Table of the relative rate of threshold crossings by leaked signal, for one threshold.
+
+    The relative rate rho is the rate -ln(1 - c) over the squared amplitude. c is the probability
+    that the signal makes a bin cross where noise alone does not. Amplitudes are over the noise per
+    quadrature.
+    """
 
     log_amplitude_first: float
-    """ln(amplitude) of the first entry."""
+    """ln(amplitude) of the first table entry; amplitudes are over the noise per quadrature."""
     log_amplitude_step: float
-    """Spacing of entries in ln(amplitude)."""
+    """Difference of ln(amplitude) between successive table entries."""
     position_max: float
-    """Largest fractional entry number at which all speckle powers can be interpolated."""
+    """Largest fractional entry number at mean speckle power for which the rates at all speckle
+    powers lie in the table."""
     relative_rates: np.ndarray
-    """(p + 5, columns): rho, with p entries between two speckle powers. Entry number p c + r is in
-    row r and column c. The powers of a bin are thus adjacent in a row, and the six entries of an
-    interpolation are in six successive rows."""
+    """(p + 5, columns): relative rates, with p entries between two speckle powers. Entry number
+    p c + r is in row r and column c. The powers of a bin are thus adjacent in a row, and the six
+    entries of an interpolation are in six successive rows."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def empty_crossing_rates():
-    """Return a table without entries."""
+    """Return a :class:`SpeckleCrossingRates` without entries."""
     return SpeckleCrossingRates(0.0, 1.0, 0.0, np.empty((0, 0)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def tabulate_crossing_rates(threshold_ratio, crossing_series):
-    """Tabulate the relative rate rho for a threshold.
+    """Tabulate the relative rate of threshold crossings by leaked signal, for one threshold.
 
     Parameters
     ----------
     threshold_ratio
-        Threshold [sigma].
+        Threshold over the noise per quadrature.
     crossing_series
         Result of :func:`sweep.model.detection.added_crossings.fill_crossing_series` for this
         threshold.
@@ -155,7 +168,10 @@ def tabulate_crossing_rates(threshold_ratio, crossing_series):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
-    """Add a bin's rates at all speckle powers, over the power and times a weight, to sums.
+    """Add a bin's crossing rates at all speckle powers to sums over bins.
+
+    Each rate -ln(1 - c), with the crossing probability c by leaked signal, is divided by the
+    speckle power and multiplied by the bin's weight.
 
     Parameters
     ----------
@@ -211,7 +227,9 @@ def add_rates_by_power(squared_ratio, weight, rate_table, rate_sums):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def rate_at_brightest_speckle(squared_ratio, rate_table):
-    """Return the rate of a bin at SPECKLE_POWER_MAX, by linear interpolation.
+    """Return a bin's crossing rate -ln(1 - c) at SPECKLE_POWER_MAX, by linear interpolation.
+
+    c is the probability that leaked signal makes the bin cross the threshold.
 
     ``squared_ratio`` and ``rate_table`` are as of :func:`add_rates_by_power`.
     """

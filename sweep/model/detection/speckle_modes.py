@@ -29,56 +29,65 @@ from sweep.model.window import COSINE_SUM_COEFFICIENTS, Window, get_window
 LINE_DEVIATIONS = np.array(
     [0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0, 4.5, 7.0, 11.0]
 )
-"""Standard deviations of p in the tables, in units of max(1, h/2) bins of fs/L. h is the half-width
-of the main lobe [bins of fs/L]."""
+"""Standard deviations of the lines' Gaussian density for which speckle modes are tabulated. The
+unit is max(1, h/2) fs/L, with the sample rate fs, the record's number of samples L, and the main
+lobe's half-width h [fs/L]."""
 
 N_OFFSETS = 9
-"""Number of positions of p's centre in the tables, evenly spaced over -1/2 .. 1/2 bin of fs/N."""
+"""Number of tabulated positions of an echo's centre relative to the nearest bin. They are evenly
+spaced over -1/2 .. 1/2 FFT bin."""
 
 _STAND_IN_LENGTH = 1024
-"""Length of the window that replaces longer windows of the same shape in the tables."""
+"""Number of samples of the window with which tables are computed in place of longer windows of the
+same shape."""
 _POWER_ITERATIONS = 80
 _NODES_MIN = 41
 _NODE_DISTANCE = 0.4
 """Largest spacing of the lines that represent a Gaussian density, in units of LINE_DEVIATIONS."""
 _NODE_DEVIATIONS_MAX = 4.5
-"""Distance of the outermost of these lines [standard deviations]."""
+"""Distance from the centre of the outermost line that represents a Gaussian density, in standard
+deviations of the density."""
 _TABLE_DEVIATION_MAX = 3.0
-"""Standard deviation, in units of LINE_DEVIATIONS, up to which tables reach two deviations beyond
-the main lobe."""
+"""Largest standard deviation, in units of LINE_DEVIATIONS, for which tables reach two deviations
+beyond the main lobe."""
 
 
 class ModeTable(NamedTuple):
-    """Power fraction of the strongest speckle mode, and correlation of neighbouring bins."""
+    """Power fraction of the strongest speckle mode, and correlation of neighbouring bins.
+
+    A speckle mode is a part of an echo that fades with one amplitude in all bins. The lines of the
+    echo have a Gaussian density of positions. The tables are over its standard deviation, and over
+    its centre relative to the nearest bin.
+    """
 
     line_deviation_bins: np.ndarray
-    """(s,): standard deviations of the lines' density p [bins of fs/N]; empty in NO_MODES."""
+    """(s,): tabulated standard deviations of the lines' positions [FFT bins]; empty in NO_MODES."""
     power_fraction: np.ndarray
-    """(s, N_OFFSETS, k): fraction of a bin's power in the strongest mode, for k bins about the bin
-    nearest to the centre of p."""
+    """(s, N_OFFSETS, k): fraction of a bin's power in the strongest speckle mode. The k bins lie
+    about the bin nearest to the echo's centre."""
     neighbour_correlation: np.ndarray
     """(s, N_OFFSETS, k): correlation of the echo's amplitudes in a bin and in the bin below it,
     -1..1."""
     power_asymmetry: np.ndarray
-    """(s, N_OFFSETS): :func:`power_asymmetry` of the three bins about the nearest bin. It rises
-    with the offset."""
+    """(s, N_OFFSETS): :func:`power_asymmetry` of the bin nearest to the echo's centre and its two
+    neighbours. It rises with the centre's offset from that bin."""
 
 
 NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
-"""Table without entries, for shots that need none."""
+"""Speckle-mode table without entries, for shots whose detection needs none."""
 
 
 class ModeTableCell(NamedTuple):
-    """Cell of a :class:`ModeTable`, and weights of bilinear interpolation in it."""
+    """Place in a :class:`ModeTable`: indices of a cell, and weights of bilinear interpolation."""
 
     deviation_index: int
-    """Index of the line deviation at the lower end of the cell."""
+    """Index in the table of the line deviation at the lower end of the cell."""
     deviation_weight: float
-    """Weight of the next line deviation, 0..1."""
+    """Interpolation weight, 0..1, of the table's next larger line deviation."""
     offset_index: int
-    """Index of the offset at the lower end of the cell."""
+    """Index in the table of the position of the echo's centre at the lower end of the cell."""
     offset_weight: float
-    """Weight of the next offset, 0..1."""
+    """Interpolation weight, 0..1, of the next position of the echo's centre."""
 
 
 @lru_cache(maxsize=32)
@@ -167,7 +176,7 @@ def _strongest_mode(
         the lines' amplitudes. With more bins than lines it is not formed, as it may have millions
         of elements in padded spectra.
     mode
-        (bins,): start of the power iteration.
+        (bins,): vector from which the power iteration starts.
     """
     covariance, eigenvalue = None, 1.0
     if len(bin_transforms) <= line_weights.size:
@@ -191,10 +200,11 @@ def _strongest_mode(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def power_asymmetry(below, middle, above):
-    """Return (P_above - P_below) / (P_above + P_below) of the powers next to the strongest bin.
+    """Return the relative difference of the powers above and below the strongest bin, -1..1.
 
-    Arguments are the magnitudes |X| of three adjacent bins. The sign shows on which side of the bin
-    the echo's centre lies. The result is 0 if both neighbours are faint.
+    It is (P_above - P_below) / (P_above + P_below). Arguments are the |X| of three adjacent bins.
+    The sign shows on which side of the bin the echo's centre lies. The result is 0 if both
+    neighbours are faint.
     """
     neighbour_power = below * below + above * above
     if not neighbour_power > 1e-6 * middle * middle:

@@ -42,20 +42,23 @@ from sweep.kernel_cache import njit
 from sweep.model.window import Window, window_samples
 
 _TABLE_INTERVALS = 2048
-"""Number of intervals in the tables; the error of linear interpolation is about 1e-7 bins."""
+"""Number of intervals in the tables that turn magnitudes into an offset of a tone from a bin.
+Linear interpolation in them errs by about 1e-7 bins."""
 
 _N_SPREAD_POSITIONS, _SPREAD_BINS = 129, 0.05
-"""Number of positions, and standard deviation [bins], at which ``spread_error_factor`` is
-evaluated."""
+"""Number of positions between bins at which ``spread_error_factor`` is evaluated, and standard
+deviation [bins] of the spread lines in this evaluation."""
 
 _TONE_DEGREE = 32
-"""Degree of the polynomial that represents a tone's complex bin within +-2 bins."""
+"""Degree of the polynomial that gives a bin's complex value at -2 .. 2 bins from a tone."""
 
 _NEIGHBOUR_HEIGHT_MIN = 0.25
-"""|X| of a centred tone's neighbours over the centre's, below which TWO_BINS is used."""
+"""Limit below which the position is found by TWO_BINS. It is the |X| of the neighbours of a tone on
+a bin, over the |X| of that bin."""
 
 THREE_BINS, TWO_BINS = 0, 1
-"""Measures of the position: by three bins, or by the centre bin and its larger neighbour."""
+"""Kinds of measure from which a tone's position between bins is found. THREE_BINS uses the |X| of
+three bins, TWO_BINS that of the centre bin and its larger neighbour."""
 
 
 class Interpolator(NamedTuple):
@@ -65,32 +68,41 @@ class Interpolator(NamedTuple):
     """
 
     measure_kind: int
-    """THREE_BINS or TWO_BINS."""
+    """Kind of measure, THREE_BINS or TWO_BINS: how many bins give the position of a tone."""
     measure_at_centre: float
-    """Measure of a tone on the centre bin."""
+    """Value of the measure (a ratio of the bins' |X|) for a tone on the centre bin."""
     measure_step: float
-    """Spacing of the measures at which ``offset`` is tabulated."""
+    """Spacing of the values of the measure (a ratio of the bins' |X|) at which ``offset`` is
+    tabulated."""
     offset: np.ndarray
-    """(m,): |delta| [bins], 0 .. 1, for measures from ``measure_at_centre`` by ``measure_step``."""
+    """(m,): distance of the tone from the centre bin [bins], 0 .. 1. The measure (a ratio of |X|)
+    rises from ``measure_at_centre`` by ``measure_step``."""
     weight: np.ndarray
-    """(3, m): least-squares weights by |delta| of the smaller neighbour, the centre bin and the
-    larger neighbour, for magnitudes over the centre's. Zero for TWO_BINS."""
+    """(3, m): least-squares weights of the |X| of the smaller neighbour, the centre bin and the
+    larger neighbour, each over that of the centre bin. They are tabulated over the tone's distance
+    from the centre bin. Zero for TWO_BINS."""
     error_at_sigma: np.ndarray
-    """(m,): standard error [bins] by |delta| if the centre bin's magnitude equals sigma."""
+    """(m,): standard error of the position [bins], by the tone's distance from the centre bin. It
+    holds if the centre bin's |X| equals the noise per quadrature, and falls as 1/|X|."""
     noise_mixing: tuple[float, float, float, float]
-    """Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins. With independent
-    standard normal numbers z0, z1, z2, the noise in one quadrature is z0 in the centre bin,
+    """Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins. Let z0, z1, z2 be
+    independent standard normal numbers. The noise in one quadrature is z0 in the centre bin,
     m0 z0 + m1 z1 above and m0 z0 + m2 z1 + m3 z2 below."""
     sidelobe_correlation: float
     """Correlation of neighbouring bins' noise components in phase with a tone's sidelobes. Of N
-    successive sidelobe bins L change their sign from one to the next, for records of L samples."""
+    successive sidelobe bins, L change sign from one to the next. N is the FFT size, L the number of
+    samples in the record."""
     spread_error_factor: np.ndarray
-    """(m,): position error by |delta| over the variance of lines that add as powers [1/bins]."""
+    """(m,): error of the position [bins] over the variance [bins^2] of lines that add as powers. It
+    is tabulated over the tone's distance from the centre bin."""
 
 
 @lru_cache(maxsize=64)
 def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, float]:
-    """Return the noise correlations of bins one and two apart, in phase with a tone's main lobe."""
+    """Return the noise correlations of two bins that are one bin apart, and two bins apart.
+
+    They are those of the noise components in phase with the main lobe of a tone.
+    """
     squared_window = window_samples(window.name, window.length) ** 2
     record_position = (np.arange(window.length) - window.length / 2) / fft_size
     correlation_1, correlation_2 = (
@@ -100,7 +112,7 @@ def neighbour_noise_correlations(window: Window, fft_size: int) -> tuple[float, 
 
 
 def sidelobe_correlation(window: Window, fft_size: int) -> float:
-    """Return the noise correlation of adjacent bins in phase with a tone's sidelobes.
+    """Return the correlation of adjacent bins' noise components in phase with a tone's sidelobes.
 
     See :attr:`Interpolator.sidelobe_correlation`.
     """
@@ -161,16 +173,19 @@ def complex_exponentials(cycles: float, n_values: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def tone_spectrum(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from a distance -2 .. 2 [bins] to the complex bin at it from a tone.
+    """Return a function that gives the complex value of a bin at -2 .. 2 bins from a tone.
 
     The linear phase of half a record is removed, so that the value is real for a symmetric window.
-    The remaining phase changes by at most one cycle, so that a polynomial represents the value to
+    The remaining phase changes by at most one cycle. A polynomial thus represents the value to
     1e-14 of the largest bin.
     """
     w, record_middle = window_samples(window.name, window.length), window.length / 2
 
     def bin_values(distances: np.ndarray) -> np.ndarray:
-        """Return the complex bins at distances from the tone, without the linear phase."""
+        """Return the complex values of bins at distances -2 .. 2 [bins] from the tone.
+
+        The linear phase of half a record is removed.
+        """
         values = [
             (w * complex_exponentials(distance / fft_size, w.size)).sum() for distance in distances
         ]
@@ -192,7 +207,9 @@ def _least_squares_weights(
     *,
     two_bins: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return minimum-variance weights of three bins for a change of delta, and the standard error.
+    """Return weights that give a tone's position from three bins, and its standard error.
+
+    The weights have the smallest variance.
 
     Parameters
     ----------
@@ -213,8 +230,8 @@ def _least_squares_weights(
     Notes
     -----
     The weights respond with 0 to a change of the amplitude and with 1 to a change of delta, for
-    |X| = 1 in the centre bin: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone, its slope), with the
-    noise covariance C.
+    |X| = 1 in the centre bin. They are u = C^-1 G (G' C^-1 G)^-1 (0, 1)', with the noise covariance
+    C. The columns of G are the tone's magnitudes and their derivatives by delta.
     """
     slope = np.gradient(tone_magnitudes, offset, axis=1)
     used_bins = slice(1 if two_bins else 0, 3)
@@ -238,10 +255,11 @@ def _least_squares_weights(
 
 
 def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpolator) -> np.ndarray:
-    """Return the position error over the variance of a narrow Gaussian spread, by |delta| (m,).
+    """Return the error of a position over the variance of the lines' narrow Gaussian spread, (m,).
 
-    Three lines of weights 1/6, 2/3, 1/6 represent the spread; their moments are those of a Gaussian
-    up to the fifth.
+    It is tabulated over the distance of the lines' mean from the centre bin [1/bins]. Three lines
+    of weights 1/6, 2/3, 1/6 represent the spread. Their moments up to the fifth are those of a
+    Gaussian.
     """
     positions = np.linspace(0.0, 1.0, _N_SPREAD_POSITIONS)
     power = np.zeros((3, _N_SPREAD_POSITIONS))
@@ -257,7 +275,11 @@ def _spread_error_factor(window: Window, fft_size: int, interpolation: Interpola
 
 
 def _noise_mixing(correlation_1: float, correlation_2: float) -> tuple[float, float, float, float]:
-    """Return the Cholesky factors m0 .. m3 of the noise covariance of bins 0, +1, -1."""
+    """Return the Cholesky factors m0 .. m3 of the noise covariance of three adjacent bins.
+
+    The order is the centre bin, the bin above and the bin below, as in
+    :attr:`Interpolator.noise_mixing`.
+    """
     above_own = math.sqrt(max(1 - correlation_1**2, 0.0))
     below_from_above = (correlation_2 - correlation_1**2) / above_own if above_own > 0 else 0.0
     return (
@@ -366,13 +388,16 @@ def drift_error(offset: np.ndarray, drift: np.ndarray, window: Window, fft_size:
 
 _DRIFTS_BINS = np.array([0.5, 1.0, 2.0, 4.0])
 _DRIFT_POSITIONS_BINS = np.linspace(0.0, 1.0, 17)
-"""Drifts of a tone within the record, and its positions in the middle of the record, in the tables
-[bins]."""
+"""Tabulated drifts [bins] of a tone over the record, and tabulated positions [bins] of the tone in
+the middle of the record."""
 
 
 @lru_cache(maxsize=32)
 def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
-    """Tabulate the position error over a tone's squared drift [1/bins], (drifts, positions)."""
+    """Tabulate the error of a drifting tone's position over its squared drift [1/bins].
+
+    The shape is (drifts, positions), for drifts over the record and positions in its middle.
+    """
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
     record_position = np.arange(w.size) / w.size - 0.5
     error_factor = np.empty((_DRIFTS_BINS.size, _DRIFT_POSITIONS_BINS.size))
@@ -393,22 +418,24 @@ def _drift_error_table(window: Window, fft_size: int) -> np.ndarray:
 
 
 _N_LATE_POSITIONS = 65
-"""Number of positions in 0 .. 1 bin in the tables of late echoes."""
+"""Number of tone positions, in 0 .. 1 bin, in the tables for echoes that arrive late, after the
+record has begun."""
 _MISSING_FRACTIONS = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
-"""Fractions of the record without an echo in the tables of late echoes."""
+"""Tabulated fractions of the record that pass before the echo arrives."""
 _SLOPE_MIN = 0.05
-"""Smallest slope of the estimated over the true position in error estimates."""
+"""Lower limit of the derivative of the estimated by the true position. Errors are divided by it."""
 _DIFFERENCE_STEP = 1e-4
-"""Step of numerical derivatives by |X|, over |X| of the centre bin."""
+"""Step in a bin's |X| for numerical derivatives, as a fraction of the centre bin's |X|."""
 
 
 class LateEchoCorrection(NamedTuple):
     """Correction of the sub-bin offset of echoes that arrive after the record has begun."""
 
     shift: np.ndarray
-    """Correction to add to the estimated offset [bins]."""
+    """Number of bins to add to the estimated offset of the tone from the centre bin."""
     error_factor: np.ndarray
-    """Factor on the standard error of :func:`sub_bin_standard_error`."""
+    """Factor on the offset's standard error, :func:`sub_bin_standard_error`, because the echo lacks
+    samples."""
 
 
 def late_echo_correction(
@@ -442,7 +469,7 @@ def late_echo_correction(
 
 @lru_cache(maxsize=32)
 def _late_echo_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate shift [bins] and error factor of late echoes, (missing fractions, positions)."""
+    """Tabulate the fields of :class:`LateEchoCorrection`, (missing fractions, positions) each."""
     w, interpolation = window_samples(window.name, window.length), interpolator(window, fft_size)
     first_sample = np.minimum(np.rint(_MISSING_FRACTIONS * w.size).astype(int), w.size - 2)
     positions = np.linspace(0.0, 1.0, _N_LATE_POSITIONS)

@@ -4,14 +4,15 @@ An amplifier of gain G and inversion factor n_sp emits, besides the light that i
 
     N = n_sp (G - 1) h nu                                                       [W/Hz]
 
-into the mode of that light, in its polarisation [1]_. Its noise figure is 2 n_sp (G - 1) / G + 1 /
-G. The part of the emission that reaches the detector beats with the local oscillator's power P_lo.
+into the mode of that light, in its polarisation [1]_. h nu is the photon energy. The amplifier's
+noise figure is 2 n_sp (G - 1) / G + 1 / G. The part of the emission that reaches the detector beats
+with the local oscillator's power P_lo.
 This signal-spontaneous beat noise has the current variance
 
     4 (M Re)^2 P N' B_e                                                         [2]_, eq. 12
 
 within the electrical bandwidth B_e, for light of power P and emission of density N' on both sides
-of it. The emission takes two paths:
+of it. M is the detector's gain and Re its responsivity. The emission takes two paths:
 
 - **With the transmitted light.** A circulator of isolation I, a window or a splice sends 1 / I of
   the transmitted light, and of its emission, onto the detector. P is the part eta P_lo that mixes,
@@ -51,7 +52,9 @@ SENT_LIGHT, SENT_AND_OSCILLATOR_LIGHT = "sent", "sent and local oscillator"
 
 
 def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the density n_sp (G - 1) h nu [W/Hz] of spontaneous emission in one polarisation.
+    """Return the power density of an amplifier's spontaneous emission in one polarisation [W/Hz].
+
+    It is n_sp (G - 1) h nu, with the inversion factor n_sp, the gain G and the photon energy h nu.
 
     >>> given = {_INVERSION_PATH: 1.0, _GAIN_PATH: 1001.0, LASER_PREFIX + "wavelength": 1550e-9}
     >>> f"{spontaneous_emission_density(given):.3g}"
@@ -64,7 +67,7 @@ def spontaneous_emission_density(parameters: Mapping[str, np.ndarray]) -> np.nda
 def emission_beat_current_variance(
     parameters: Mapping[str, np.ndarray], amplified_light: str
 ) -> np.ndarray:
-    """Compute the current variance of the beat of light with spontaneous emission.
+    """Compute the current variance of the beat of the local oscillator with spontaneous emission.
 
     Parameters
     ----------
@@ -76,7 +79,8 @@ def emission_beat_current_variance(
     Returns
     -------
     ndarray
-        Variance 4 (M Re)^2 P N' B_e [A^2], summed over both paths.
+        Variance [A^2], summed over the emission with the transmitted light and with the local
+        oscillator (see the module's description).
     """
     oscillator_power = parameters[RECEIVER_PREFIX + "local_oscillator_power"]
     mixing_factor = parameters[RECEIVER_PREFIX + "mixing_efficiency"] / parameters[_ISOLATION_PATH]
@@ -97,10 +101,10 @@ def emission_beat_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the noise variance of spontaneous emission over that of all noise without an echo.
+    """Return the noise variance of spontaneous emission over that of the noise without an echo.
 
-    The value is exact, not a bound. The threshold is set on the changed noise, and rises with it.
-    None for direct detection or without spontaneous emission.
+    The value is exact, not a bound. The threshold is set on the noise with the emission. The result
+    is None for direct detection or without spontaneous emission.
     """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_INVERSION_PATH):
         return None
@@ -119,7 +123,7 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Current variance 4 (M Re)^2 P N' B_e, as of :func:`emission_beat_current_variance`.
+    The current variance is that of :func:`emission_beat_current_variance`.
     """
     if shots.waveform.architecture == "direct":
         return shots
@@ -172,4 +176,4 @@ SPONTANEOUS_EMISSION = Effect(
         ),
     ),
 )
-"""Effect of an optical amplifier's spontaneous emission."""
+"""Effect that adds the beat noise of an optical amplifier's spontaneous emission."""

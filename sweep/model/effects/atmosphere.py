@@ -37,12 +37,15 @@ from sweep.model.preparation import Shots
 from sweep.model.receiver_chain import aperture_area
 
 _HEIGHT_DIFFERENCE_MIN = 1e-9
-"""Difference of height [m] assigned to level paths, about their middle, so that a mean is defined.
-"""
+"""Smallest difference of height [m] between the ends of a path. Level paths are given it, so that
+the mean extinction over height is defined."""
 
 
 class ExtinctionProfile(NamedTuple):
-    """Table of extinction over height."""
+    """Extinction coefficient of the air, tabulated over height above the ground.
+
+    It is exponential between two heights, constant below the first, and 0 above the last.
+    """
 
     height: tuple[float, ...]
     """Heights above the ground [m], ascending; a height appears twice for a step."""
@@ -51,14 +54,14 @@ class ExtinctionProfile(NamedTuple):
 
 
 def exponential_profile(*, surface_extinction: float, scale_height: float) -> ExtinctionProfile:
-    """Return an exponential atmosphere, 40 scale heights high.
+    """Return the extinction profile of an exponential atmosphere, 40 scale heights high.
 
     Parameters
     ----------
     surface_extinction : float
         Extinction coefficient at the ground [1/m].
     scale_height : float
-        Height over which the extinction falls by e [m].
+        Height [m] over which the extinction falls by the factor e.
     """
     top_scale_heights = 40.0
     return ExtinctionProfile(
@@ -68,7 +71,7 @@ def exponential_profile(*, surface_extinction: float, scale_height: float) -> Ex
 
 
 def layer_profile(*, optical_depth: float, depth: float) -> ExtinctionProfile:
-    """Return a uniform layer on the ground.
+    """Return the extinction profile of a uniform layer on the ground.
 
     Parameters
     ----------
@@ -132,13 +135,13 @@ EXTINCTION_PROFILES = {
     "mars_dusty": _dust_profile(1.0),
     "mars_storm": _dust_profile(5.0),
 }
-"""Extinction profiles by name."""
+"""Extinction profiles of the atmospheres that a spec can select, by name."""
 
 
 def optical_depth(
     profile: ExtinctionProfile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
 ) -> np.ndarray:
-    """Compute the one-way optical depth of a straight path.
+    """Compute the one-way optical depth (the integral of extinction) of a straight path.
 
     Parameters
     ----------
@@ -173,7 +176,7 @@ def optical_depth(
 def _mean_extinction(
     start: np.ndarray, end: np.ndarray, z0: float, z1: float, a0: float, a1: float
 ) -> np.ndarray | float:
-    """Return the mean extinction between two heights within one row of the table."""
+    """Return the mean extinction [1/m] over heights that lie between two rows of a profile."""
     if a0 == a1 or z0 == z1 or not math.isfinite(z0):
         return a0
     if a0 > 0 and a1 > 0:
@@ -185,7 +188,10 @@ def _mean_extinction(
 
 
 def extinction_profile(parameters: Mapping[str, np.ndarray]) -> ExtinctionProfile | None:
-    """Return the extinction profile of points of one category; None without an atmosphere."""
+    """Return the extinction profile of points that share all text parameters.
+
+    None without an atmosphere.
+    """
     name = str(parameters["atmosphere.profile"])
     surface_extinction, depth = (
         float(parameters["atmosphere.extinction"]),
@@ -241,7 +247,10 @@ def apply_extinction(shots: Shots, context: EffectContext) -> Shots:
 
 
 def extinction_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the loss of the echo by extinction, and of the shot noise of light from the target."""
+    """Bound the changes that omitting extinction makes to the echo and to the shot noise.
+
+    The shot noise is that of light from the target.
+    """
     profile = extinction_profile(points.parameters)
     if profile is None:
         return None
@@ -308,14 +317,16 @@ EXTINCTION = Effect(
         ),
     ),
 )
-"""Effect of the extinction of light by air, haze and dust."""
+"""Effect that attenuates echo and sunlight by the extinction of air, haze and dust."""
 
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(16)
 _CUT_E_FOLDINGS = (0.0, 1.0, 3.0, 7.0, 15.0, 40.0)
-"""Positions at which the integral splits a row of the table, in e-foldings of its extinction."""
+"""Positions at which the backscatter integral is split between two rows of the extinction table.
+The unit is one e-folding of the extinction between these rows."""
 _CUT_RANGE_RATIOS = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
-"""Positions at which the integral splits the path, in units of r_0."""
+"""Ranges at which the backscatter integral splits the path, in units of the near range (aperture
+diameter over full angle of the field of view)."""
 
 
 def backscatter_integral(
@@ -326,7 +337,7 @@ def backscatter_integral(
     range: ArrayLike,
     near_range: ArrayLike,
 ) -> np.ndarray:
-    """Integrate the backscatter that a continuous beam sends to the detector.
+    """Integrate the backscatter of the air from a continuous beam over the path to the target.
 
     Parameters
     ----------
@@ -340,12 +351,14 @@ def backscatter_integral(
     Returns
     -------
     ndarray
-        Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], to 1e-8.
+        Integral of alpha(r) T(r)^2 / (r^2 + r_0^2) over 0..R [1/m^2], to 1e-8, with the one-way
+        transmission T(r) to the range r.
 
     Notes
     -----
-    The air returns P_tx A tau_o / S times the integral to the detector [W], with the lidar ratio S
-    [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
+    The air returns P_tx A tau_o / S times the integral to the detector [W]. P_tx is the transmitted
+    power, A the aperture's area, tau_o the transmission of the optics, and S the lidar ratio [sr].
+    The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
     nearer than r_0, the image of a point is larger than the field of view. For a
     diffraction-limited beam, Theta = 4 lambda / (pi D), it is that of a coherent lidar focused at
     infinity [1]_.
@@ -388,7 +401,10 @@ def backscatter_integral(
 
 
 def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
-    """Return heights between which extinction is smooth and falls by at most a few e-foldings."""
+    """Return the heights [m] at which the backscatter integral is split.
+
+    Between two of them extinction is smooth and falls by at most a few factors of e.
+    """
     cuts = [profile.height[0]]
     rows = [*zip(profile.height, profile.extinction, strict=True)]
     for (z0, a0), (z1, a1) in itertools.pairwise(rows):
@@ -400,7 +416,10 @@ def _integration_heights(profile: ExtinctionProfile) -> np.ndarray:
 
 
 def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
-    """Return the backscattered light [W] from :func:`backscatter_integral`."""
+    """Return the power [W] of light that the air returns to the detector.
+
+    It follows from :func:`backscatter_integral`.
+    """
     collected_power = parameters[LASER_PREFIX + "power"] * aperture_area(
         beam.receiving_aperture_and_angle(parameters)[0]
     )
@@ -411,8 +430,9 @@ def _backscattered_power(parameters: Mapping[str, np.ndarray], integral: np.ndar
 def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
     """Add the shot noise of backscattered light.
 
-    Its beat with the local oscillator, from ever new grains, is spread over the bins from the
-    nearest range to the target's, and is neglected. [T 3.3.1] counts it as noise as well.
+    The beat of this light with the local oscillator is neglected. It comes from ever new grains,
+    and is spread over the bins from the nearest range to the target's. [T 3.3.1] counts
+    backscatter as noise as well.
     """
     parameters = context.parameters
     profile = extinction_profile(parameters)
@@ -432,10 +452,11 @@ def apply_backscatter(shots: Shots, context: EffectContext) -> Shots:
 
 
 def backscatter_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an upper bound on backscatter; the threshold follows it.
+    """Bound the shot noise of backscattered light, over the receiver's noise.
 
-    It is the smaller of two bounds: the path filled with the air of its lower end, without
-    extinction; or all the light lost on the path, returned from the beam's near end.
+    The threshold is set on the noise with it. The bound is the smaller of two. The first takes the
+    path as filled with the air of its lower end, without extinction. The second returns all light
+    that is lost on the path from the beam's near end.
     """
     parameters = points.parameters
     profile = extinction_profile(parameters)
@@ -475,4 +496,4 @@ BACKSCATTER = Effect(
         ),
     ),
 )
-"""Effect of the shot noise of light that the air returns."""
+"""Effect that adds the shot noise of light that the air scatters back to the receiver."""

@@ -59,20 +59,22 @@ EFFECTS: tuple[Effect, ...] = (
     speckle.SPECKLE,
     scintillation.SCINTILLATION,
 )
-"""All effects, in the order of their application; the bit of an effect in flags is its index."""
+"""All effects, in the order in which they are applied to shots. Effect number i is bit i of the
+flags in a store."""
 
 EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
-"""Names of the effects, in the order of EFFECTS."""
+"""Names of all effects, in the order in which they are applied to shots."""
 
 EFFECT_PARAMETERS: tuple[Parameter, ...] = tuple(
     parameter for effect in EFFECTS for parameter in effect.parameters
 )
-"""Fields that effects add to a spec."""
+"""All fields that effects add to a spec, effect by effect."""
 
 EFFECT_CATEGORY_PATHS = tuple(
     parameter.path for parameter in EFFECT_PARAMETERS if parameter.is_category_key
 )
-"""Paths of numeric parameters of effects that points must share to be prepared together."""
+"""Dotted paths of the effects' numeric parameters that must be equal in all points that are
+computed together."""
 
 PARAMETER_DEFAULTS: dict[str, float | int | str | np.ndarray] = (
     beam.BEAM_DEFAULTS
@@ -87,12 +89,14 @@ DEFAULT_EFFECTS = (
     "footprint", "footprint_phase", "several_returns", "doppler", "doppler_spread",
     "signal_shot_noise", "solar_background", "image", "leakage",
 )  # fmt: skip
-"""Effects that the model's functions simulate by default: ideal lines and their noise."""
+"""Names of the effects that the model's functions simulate by default. They are those of ideal
+lines and their noise."""
 
 SEPARATE_BATCHES_MASK = np.uint32(
     sum(1 << k for k, effect in enumerate(EFFECTS) if effect.needs_separate_batches)
 )
-"""Bit mask of effects for which points with and without the effect are computed separately."""
+"""Mask of effect flags (bit i for effect i). Points with and without one of these effects are
+computed separately."""
 
 
 def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
@@ -102,12 +106,15 @@ def pack_effect_flags(is_kept: np.ndarray) -> np.ndarray:
 
 
 def unpack_effect_flags(flags: int) -> tuple[str, ...]:
-    """Return the names of the effects whose bits are set."""
+    """Return the names of the effects whose bits are set in a mask of :func:`pack_effect_flags`."""
     return tuple(name for k, name in enumerate(EFFECT_NAMES) if flags >> k & 1)
 
 
 def effect_flag_attributes() -> dict[str, Any]:
-    """Return attributes that describe the flags by the CF conventions."""
+    """Return attributes of a store's variable that name the bits of effect flags.
+
+    They follow the CF conventions.
+    """
     return {
         "units": "1",
         "long_name": "effects that were simulated",

@@ -1,14 +1,18 @@
 """Light that leaks from the transmitter to the detector, through circulator, splice or window.
 
 A fraction 1 / I of the transmitted light P_tx (I is the isolation) reaches the detector over a path
-d longer than the local oscillator's, with the delay tau = d / c. It is present in every record:
+d longer than the local oscillator's, with the delay tau = d / c. It is present in every record.
+Below, q is the elementary charge, M the detector's gain, F its excess noise factor, Re its
+responsivity, B_e the electrical bandwidth, eta the mixing efficiency, P_lo the power of the local
+oscillator, S the chirp rate:
 
 - **A line** (:mod:`sweep.model.spectrum.permanent_line`). It beats with the local oscillator as an
   echo does. Its photocurrent is i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0
   in the Doppler segment. Its phase drifts with the path's temperature.
 - **Shot noise** 2 q M^2 F Re P_tx / I B_e.
 - **Intensity noise**. A balanced receiver rejects that of the light, but not that of the beat. The
-  variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
+  variance is RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2). RIN is the laser's relative
+  intensity noise, CMRR the common-mode rejection, and P_l = P_tx / I.
 - **Phase noise** of a Lorentzian laser of width v. The beat carries theta(t) - theta(t - tau), of
   density 4 v sin^2(pi f tau) / (pi f^2), which is 4 pi v tau^2 for f << 1 / tau [1]_. A line turns
   it into noise of i^2 / 2 times that density. It is assumed to be white within B_e, and at most 2
@@ -42,8 +46,8 @@ from sweep.model.preparation import Shots
 from sweep.model.shot_records import PermanentLine
 
 LEAK_LENGTH_PATH, ISOLATION_PATH = TELESCOPE_PREFIX + "leak_path", TELESCOPE_PREFIX + "isolation"
-"""Parameters of the leaked light: its optical path beyond the local oscillator's [m], and the ratio
-of transmitted to leaked power."""
+"""Dotted paths of two parameters of the leaked light. The first is its optical path less that of
+the local oscillator [m]. The second is the ratio of transmitted to leaked power."""
 
 
 def _leaked_power_and_current(
@@ -57,7 +61,7 @@ def _leaked_power_and_current(
 def leak_beat_current_variance(
     parameters: Mapping[str, np.ndarray], architecture: str, line_shape: str
 ) -> np.ndarray:
-    """Compute the current variance [A^2] of the noise of the leaked light's beat.
+    """Compute the variance [A^2] of the noise current from the beat of the leaked light.
 
     Parameters
     ----------
@@ -70,7 +74,7 @@ def leak_beat_current_variance(
 
     Notes
     -----
-    Intensity noise and phase noise of the module's description.
+    It is the sum of the intensity noise and phase noise of the module's description.
     """
     if architecture == "direct":
         return np.zeros(())
@@ -105,7 +109,10 @@ def leak_beat_current_variance(
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the exact noise of the leak, and an error of 1, as its line may hide any echo."""
+    """Return the noise of the leaked light, and an error of 1 that keeps the effect.
+
+    The noise is exact, not a bound. The line of the leaked light may hide any echo.
+    """
     if not points.any_nonzero(LEAK_LENGTH_PATH):
         return None
     parameters, receiver_noise = points.parameters, points.receiver_noise
@@ -130,9 +137,8 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    The line has the amplitude 2 M Re sqrt(eta P_lo P_tx / I) times the transimpedance, and the
-    delay d / c. The noise is the shot noise, intensity noise and phase noise of the module's
-    description; departures are stated there.
+    The module's description has the equations of the line's amplitude and delay, and of its shot
+    noise, intensity noise and phase noise. It also states what is neglected.
     """
     parameters = context.parameters
     power, beat_current = _leaked_power_and_current(parameters, shots.waveform.architecture)
@@ -175,4 +181,4 @@ CIRCULATOR_LEAK = Effect(
         ),
     ),
 )
-"""Effect of light that leaks from transmitter to detector."""
+"""Effect that adds the line and the noise of light that leaks from transmitter to detector."""

@@ -1,15 +1,18 @@
 """Doppler: the shift 2 v_r / lambda of every line, its spread over the beam, rotating bodies.
 
-Without the shift, nothing is measured of velocity, whatever the detection probability. It is
-skipped only if lines would not move by a significant fraction of a bin. The spread matters if
-2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad: 1.4 bins of 4.6 kHz).
-So does v (1 - cos theta) of a velocity along a wide beam.
+v_r is the radial velocity and lambda the wavelength. Without the shift, nothing is measured of
+velocity, whatever the detection probability. The shift is skipped only if lines would not move by a
+significant fraction of a bin. Let v_perp be the velocity across the beam and div the beam's
+divergence. The spread matters if 2/lambda |v_perp| div is not small against a bin (100 m/s across
+and 50 urad: 1.4 bins of 4.6 kHz). So does v (1 - cos theta), for a velocity v along a wide beam and
+the angle theta from its axis.
 
-The surface of a rotating body moves with V + omega x (P - X). A beamlet from O along d_b meets it
-at P_b = O + R_b d_b. The rotation contributes the closing speed -omega x (P_b - X) . d_b = -omega x
-(O - X) . d_b, in which R_b cancels. Rotation is thus equivalent to a velocity -omega x (O - X) of
-the instrument, whatever the body's shape. Its component along the beam shifts the lines, and its
-component across the beam spreads them.
+The surface of a rotating body moves with V + omega x (P - X) at the point P, with the velocity V of
+the body's centre X and the angular velocity omega. A beamlet from O along d_b meets it at the range
+R_b, at P_b = O + R_b d_b. The rotation contributes the closing speed -omega x (P_b - X) . d_b =
+-omega x (O - X) . d_b, in which R_b cancels. Rotation is thus equivalent to a velocity
+-omega x (O - X) of the instrument, whatever the body's shape. Its component along the beam shifts
+the lines, and its component across the beam spreads them.
 """
 
 from dataclasses import replace
@@ -23,8 +26,8 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 from sweep.model.preparation import Shots
 
 OMITTED_SHIFT_MAX_BINS = 0.1
-"""Largest shift of lines [bins] for which the Doppler effect may be skipped; a larger shift counts
-as an error of 1."""
+"""Largest Doppler shift of lines [FFT bins] for which the effect may be skipped. A larger shift
+counts as an error of 1, so that the effect is always simulated."""
 
 
 def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -32,9 +35,10 @@ def doppler_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    The shift is 2 v_r / lambda. It changes the receiver's gain and the line's position between two
-    bins. Its size in bins counts as well, as it is the measure of velocity. A line that moves
-    further than :data:`OMITTED_SHIFT_MAX_BINS` is never skipped.
+    The shift is 2 v_r / lambda, with the radial velocity v_r and the wavelength lambda. It changes
+    the receiver's gain and the line's position between two bins. Its size in bins counts as well,
+    as the velocity is measured by it. A shift above :data:`OMITTED_SHIFT_MAX_BINS` is never
+    skipped.
     """
     if not points.any_nonzero("target.radial_velocity"):
         return None
@@ -49,7 +53,7 @@ def line_shift_bound(points: PlannerInputs, shift_bins: np.ndarray) -> ErrorBoun
     Parameters
     ----------
     points : PlannerInputs
-        Points of a tile.
+        Points that are planned together.
     shift_bins : ndarray (segments, n)
         Shift of the lines of each segment [bins].
 
@@ -87,7 +91,8 @@ def apply_doppler(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    The Doppler ratio of the line on the axis becomes beta = 2 v_r / c, of first order in v_r / c.
+    The Doppler ratio of the line on the axis becomes 2 v_r / c, to first order in v_r / c, with the
+    radial velocity v_r.
     """
     return replace(shots, motion=shots.motion._replace(doppler_ratio=shots.target.doppler_ratio))
 
@@ -99,7 +104,7 @@ DOPPLER = Effect(
     error_bound=doppler_bound,
     apply=apply_doppler,
 )
-"""Effect of the radial velocity on all lines."""
+"""Effect that shifts all lines of an echo by the radial velocity on the beam's axis."""
 
 
 def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -107,9 +112,10 @@ def doppler_spread_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    The bound follows from mean and rms of the lines' shifts 2 (v_b - v_0) / lambda
-    (:meth:`~sweep.model.effects.planner_inputs.PlannerInputs.power_change_bound`). If amplitudes
-    add, that of their sum in phase follows from the largest shift.
+    Let v_b be the radial velocity of beamlet b, and v_0 that on the axis. The bound follows from
+    mean and rms of the lines' shifts 2 (v_b - v_0) / lambda
+    (:meth:`~sweep.model.effects.planner_inputs.PlannerInputs.power_change_bound`). If beamlets add
+    as amplitudes, the bound is relative to their sum in phase and follows from the largest shift.
     """
     velocity_spread = points.velocity_spread
     if not np.any(velocity_spread.extreme):
@@ -131,8 +137,8 @@ def apply_doppler_spread(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Beamlet b has the Doppler ratio beta_0 + (beta_b - beta_0), beta = 2 V.d / c for the velocity V
-    of the instrument relative to the ground and the direction d of the beamlet.
+    Beamlet b gets the Doppler ratio 2 V.d / c in place of that of the axis. V is the velocity of
+    the instrument relative to the ground, and d the direction of the beamlet.
     """
     doppler_ratios = context.ground.beamlets.doppler_ratio_offset
     if shots.footprint.doppler_ratio_offset.shape != doppler_ratios.shape:
@@ -167,13 +173,14 @@ DOPPLER_SPREAD = Effect(
     ),
     parent="footprint",
 )
-"""Effect of radial velocities that differ over the footprint."""
+"""Effect that gives each beamlet of a footprint the Doppler shift of its own radial velocity."""
 
 
 def rotation_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 if a body rotates, so that the effect is kept; None otherwise.
+    """Return an error of 1 if any body of the scene rotates, else None.
 
-    The velocities of rotating surfaces are part of the scene.
+    The effect is thus kept wherever it is present. The velocities of rotating surfaces are part of
+    the scene.
     """
     return ErrorBound(probability_change=1.0) if points.has_rotating_body else None
 

@@ -1,8 +1,9 @@
 """Interface of physical effects: stage, change of the shots, and error bound.
 
-The parameters of an effect become fields of a spec. The planner evaluates its error bound at the
-points of each tile. :mod:`sweep.model.evaluation` applies it where a point needs it; otherwise
-nothing of it is computed. :mod:`sweep.model.effects.catalogue` lists all effects.
+The parameters of an effect become fields of a spec. The planner evaluates the effect's error bound
+at all points, and decides for each tile (a group of points) whether the effect is simulated.
+:mod:`sweep.model.evaluation` applies it to these points; for others nothing of it is computed.
+:mod:`sweep.model.effects.catalogue` lists all effects.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from sweep.model.effects.planner_inputs import PlannerInputs
 
 EFFECT_MODES = ("auto", "on", "off")
-"""Settings of an effect in a spec: planned by its error bound, always on, or off."""
+"""Settings of an effect in a spec. ``auto`` simulates the effect where its error bound requires
+that, ``on`` always, and ``off`` never."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,35 +30,38 @@ class Parameter:
     """Field that an effect adds to a spec: a number with a unit, or one of several words."""
 
     path: str
-    """Dotted path."""
+    """Dotted path of the field in a spec."""
     description: str
-    """Description for users."""
+    """Description of the field for users of specs."""
     default: float | int | str = 0.0
-    """Default value, in SI units; 0 or ``none`` disables the effect."""
+    """Value in SI units if the spec states none; 0 or ``none`` disables the effect."""
     example: str = ""
-    """Example of a value, as a user would write it."""
+    """Example of a value with its unit, as a user would write it in a spec."""
     limits: tuple[str, str | None] = ("", None)
-    """Smallest and largest value, as a user would write them."""
+    """Smallest and largest allowed value with their units, as a user would write them in a spec.
+    None if there is no largest value."""
     si_unit: str | None = None
-    """SI unit; by default the unit of the smallest value."""
+    """SI unit of the value. None stands for the SI unit of the smallest value in ``limits``."""
     options: tuple[str, ...] = ()
-    """Possible words; empty for a number."""
+    """Allowed words of a text field; empty if the field is a number."""
     is_table: bool = False
-    """True for a table over time, given as text (:mod:`sweep.model.effects.sweep_error_table`)."""
+    """True if the value is a table over time, given as text
+    (:mod:`sweep.model.effects.sweep_error_table`)."""
     is_sole_cause: bool = True
     """True if the effect is absent unless this parameter, or another with this flag, differs from
     its default."""
     is_category_key: bool = False
-    """True if points must share the value to be computed together; words always are shared."""
+    """True if only points with an equal value can be computed together. This always holds for text
+    fields, whatever the flag."""
 
     @property
     def unit(self) -> str:
-        """SI unit; empty for words and dimensionless numbers."""
+        """SI unit of the value; empty for words and dimensionless numbers."""
         return self.limits[0].partition(" ")[2] if self.si_unit is None else self.si_unit
 
     @property
     def enables_effect(self) -> bool:
-        """True if the default disables the effect and other values enable it.
+        """True if the default of this parameter disables the effect, and other values enable it.
 
         False if the parameter only modifies the effect.
         """
@@ -64,17 +69,21 @@ class Parameter:
 
 
 class EffectContext(NamedTuple):
-    """Parameters and ground that an effect may use in addition to the shots."""
+    """Parameters and ground of n points, which an effect may use in addition to their shots."""
 
     parameters: Mapping[str, np.ndarray]
-    """Parameters by dotted path, (n,) or scalar."""
+    """Values of the spec's parameters by dotted path, each (n,) or scalar."""
     ground: Ground
-    """Ground that the beams meet."""
+    """Ground that the beams of the points meet."""
     presence: Mapping[str, np.ndarray] = MappingProxyType({})
-    """Masks (n,) of effects that not all points have: 1.0 where enabled, else 0.0."""
+    """Masks (n,), by name, of the effects that only some points have: 1.0 where the point has the
+    effect, else 0.0."""
 
     def presence_factor(self, effect: str) -> np.ndarray | float:
-        """Return 1 for points that have an effect and 0 for others: (n,), or one number for all."""
+        """Return 1 for points that have the named effect and 0 for others, (n,).
+
+        If all points are alike, the result is a single number.
+        """
         return self.presence.get(effect, 1.0)
 
     def select_beamlets(
@@ -104,41 +113,41 @@ class EffectContext(NamedTuple):
 
 
 class DrawAddresses(NamedTuple):
-    """Addresses of the random numbers of points: each point has its own key."""
+    """Keys and draw numbers from which the random numbers of n points follow."""
 
     point_keys: np.ndarray
-    """(n, 2) uint64: random key of each point."""
+    """(n, 2) uint64: key of each point's own random stream."""
     draw_numbers: np.ndarray
-    """(n,) int64: number of each point's draw."""
+    """(n,) int64: number of each point's draw, that is of one realisation of all that is random."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """Physical effect, with its error bound and its change of the shots; compared by identity.
 
-    An effect has `apply`, or for draws one of `perturb_parameters` and `perturb_shots`. An effect
-    of the scene alone has none of them.
+    A deterministic effect has `apply`. A random one has `perturb_parameters` or `perturb_shots`,
+    called for each draw (random realisation). An effect of the scene alone has none of them.
     """
 
     name: str
-    """Name in specs and stores."""
+    """Name of the effect in specs and stores."""
     description: str
-    """Description in a few words, for tables and help."""
+    """Description of the effect in a few words, for tables and help."""
     stage: str
     """Stage of application, in this order: ``lines`` of a footprint; returning ``light``;
     ``noise``; ``record`` and its phases; ``spectrum``; ``detection``; and ``draws``, random changes
     of any of these."""
     error_bound: "Callable[[PlannerInputs], ErrorBound | None]"
-    """Function of :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of n points. It
-    returns the upper bound on the output change if the effect is omitted, or None if the effect is
-    absent."""
+    """Function that bounds the change of results at n points if the effect is omitted. It takes
+    their :class:`~sweep.model.effects.planner_inputs.PlannerInputs`, and returns None where the
+    effect is absent."""
     phase_error_bound: "Callable[[PlannerInputs], PhaseErrorBound | None] | None" = None
-    """Function of :class:`~sweep.model.effects.planner_inputs.PlannerInputs` of n points. It
-    returns the bound of the phase error over the record, or None. All phase-error bounds are known
-    before any `error_bound` is evaluated."""
+    """Function that bounds the phase error that the effect adds over the record, at n points. It
+    takes their :class:`~sweep.model.effects.planner_inputs.PlannerInputs`, and may return None. It
+    is evaluated for all effects before any `error_bound`."""
     apply: Callable[[Shots, EffectContext], Shots] | None = None
-    """Function of prepared shots and their :class:`EffectContext` that returns the changed shots.
-    """
+    """Function that simulates the effect. It takes prepared shots and their :class:`EffectContext`,
+    and returns the changed shots."""
     perturb_parameters: (
         Callable[[dict[str, np.ndarray], DrawAddresses], dict[str, np.ndarray]] | None
     ) = None
@@ -148,7 +157,7 @@ class Effect:
     """Function of shots, :class:`EffectContext` and :class:`DrawAddresses` that returns randomly
     changed shots, after all other effects except spectrum and detection."""
     parameters: tuple[Parameter, ...] = ()
-    """Fields that the effect adds to a spec."""
+    """Parameters of the effect, which become fields of a spec."""
     parent: str = ""
     """Name of the effect that this one is part of. The parent is kept wherever this effect is, and
     this effect is off where the parent is."""
@@ -166,7 +175,7 @@ class Effect:
 
     @property
     def is_random(self) -> bool:
-        """True if the effect is simulated by draws."""
+        """True if the effect is simulated by random draws, and not once for all."""
         return self.perturb_parameters is not None or self.perturb_shots is not None
 
     def is_absent(self, parameters: Parameters) -> np.ndarray:
@@ -181,5 +190,5 @@ class Effect:
 
 
 def add_noise_sources(shots: Shots, **variances: np.ndarray) -> Shots:
-    """Return shots with additional noise sources: variances at the ADC [V^2] by source."""
+    """Return shots with additional noise sources, given as variances at the ADC [V^2] by name."""
     return replace(shots, noise=shots.noise.with_sources(**variances))

@@ -1,4 +1,4 @@
-"""Bounds of the change of outputs if an effect is left out, and of its phase errors."""
+"""Records of bounds: of the change of results if an effect is left out, and of phase errors."""
 
 from typing import NamedTuple
 
@@ -8,58 +8,66 @@ ArrayOrFloat = np.ndarray | float
 
 
 class ErrorBound(NamedTuple):
-    """Upper bound on the output change at each point if an effect is omitted.
+    """Upper bound on the change of results at each of n points if an effect is omitted.
 
-    Values are scalars, (n,), or (segments, n).
+    The fields bound changes of different quantities. Values are scalars, (n,), or (segments, n).
     """
 
     magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude; 1 or more means no knowledge of it."""
+    """Relative change of |X| in the largest bin, if the effect is omitted. 1 or more means that
+    nothing is known of |X|."""
     coherent_sum_change: ArrayOrFloat = 0.0
-    """Additional absolute change of the largest bin's magnitude, as a fraction of the sum of all
-    amplitudes in phase. Sums that may cancel have no relative change."""
+    """Further change of |X| in the largest bin, as a fraction of the sum of all amplitudes in
+    phase. It serves sums of amplitudes that may cancel, which have no relative change."""
     noise_variance_change: ArrayOrFloat = 0.0
-    """Relative change of a bin's noise variance."""
+    """Relative change of a bin's noise variance if the effect is omitted."""
     threshold_follows_noise: bool = True
-    """True if the threshold is set on the changed noise, as for noise that is always present; False
-    for noise that comes with the signal."""
+    """True if the threshold is set on noise that includes this effect's, as for noise that is
+    always present. False for noise that comes with the signal."""
     shift_bins: ArrayOrFloat = 0.0
-    """Shift of measured frequencies [bins]; it counts like a change of a probability."""
+    """Shift of measured frequencies [FFT bins] if the effect is omitted. One bin counts as much as
+    a change of a probability by 1."""
     log10_pfa_change: ArrayOrFloat = 0.0
-    """Change of log10 of a shot's probability of a false alarm, due to bins that cross the
-    threshold."""
+    """Change of log10 of a shot's false-alarm probability if the effect is omitted. It is due to
+    bins that the effect moves across the threshold."""
     leaking_bin_change_sigma: ArrayOrFloat = 0.0
-    """Change of bins with leaked signal [sigma], in addition to their share of the largest bin's
-    change."""
+    """Change of |X| in bins with signal from sidelobes, in units of the noise per quadrature. It
+    adds to their part of the largest bin's change."""
     probability_change: ArrayOrFloat = 0.0
-    """Change of a probability itself, summed over the segments if there is one for each."""
+    """Change of a probability (of detection or false alarm) if the effect is omitted, 0..1. Values
+    by segment are summed."""
     residual_magnitude_change: ArrayOrFloat = 0.0
-    """Relative change of the largest bin's magnitude that remains when the effect is simulated."""
+    """Relative error of |X| in the largest bin that remains although the effect is simulated."""
     residual_coherent_sum_change: ArrayOrFloat = 0.0
-    """Residual change as a fraction of the sum of all amplitudes in phase; the smaller of the two
-    residuals counts."""
+    """Error of |X| in the largest bin that remains although the effect is simulated, as a fraction
+    of the sum of all amplitudes in phase. The smaller of the two residual errors counts."""
 
 
 class PhaseErrorBound(NamedTuple):
-    """Bound of an effect's change of lines over the record: a phase, or a shift of positions.
+    """Bound of the phase error that an effect adds to lines over the record.
 
-    Values are by segment, or scalars. Coefficients are those of powers of the position x in the
-    record, -1..1, in cycles.
+    It is a polynomial in the position x in the record, -1..1, with a remainder; or a shift of
+    frequencies. Values are by segment, or scalars.
     """
 
     coefficients: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """Magnitudes of the coefficients of x, x^2, x^3, x^4 [cycles]."""
+    """Largest magnitudes of the phase's coefficients of x, x^2, x^3, x^4 [cycles]. x is the
+    position in the record, -1..1."""
     non_polynomial: np.ndarray | float = 0.0
-    """Largest magnitude of the phase that is no polynomial [cycles]."""
+    """Largest magnitude [cycles] of the part of the phase error beyond the polynomial."""
     constant: np.ndarray | float = 0.0
-    """Magnitude of the phase in the record's middle [cycles], which matters to lines near their
-    images."""
+    """Largest magnitude of the phase error in the record's middle [cycles]. It only matters to
+    lines near their images."""
     extra_shift_window_bins: np.ndarray | float = 0.0
-    """Shift of light in addition to the slopes of the polynomial [bins of fs/L]."""
+    """Shift of a line's light in frequency, beyond that of the polynomial's slopes. The unit is the
+    sample rate over the number of samples in the record."""
 
     @property
     def shift_window_bins(self) -> np.ndarray | float:
-        """Largest shift of light [bins of fs/L]."""
+        """Largest shift of a line's light in frequency by the phase error.
+
+        The unit is the sample rate over the number of samples in the record.
+        """
         slope_window_bins = sum(2 * (k + 1) * value for k, value in enumerate(self.coefficients))
         return slope_window_bins + self.extra_shift_window_bins
 
@@ -74,9 +82,12 @@ class PhaseErrorBound(NamedTuple):
 
 
 NO_PHASE_ERROR = PhaseErrorBound()
-"""Bound of no phase error."""
+"""Phase-error bound of effects without a phase error: all fields are 0."""
 
 
 def magnitude_change_from_power(power_change: np.ndarray) -> np.ndarray:
-    """Return the relative decrease of a magnitude for one of its power, larger than an increase."""
+    """Return the relative decrease of a magnitude, given the relative decrease of its square.
+
+    An equal relative increase of the square changes the magnitude by less.
+    """
     return np.asarray(1 - np.sqrt(1 - np.minimum(power_change, 1.0)))

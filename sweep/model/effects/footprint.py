@@ -1,7 +1,9 @@
 """Footprint: beamlets at their own ranges, on one surface or several, with or without phases.
 
-Without the effect, a beam has one line on its axis, with all of its echo's power. The effect
-matters if S 2/c R div cot(grazing) N/fs is not small.
+A beamlet is one of the rays that sample the beam. Without the effect, a beam has one line on its
+axis, with all of its echo's power. The effect matters if lines spread over bins, that is if
+S 2/c R div cot(grazing) N/fs is not small. S is the chirp rate, R the range, div the divergence, N
+the FFT size and fs the sample rate.
 """
 
 from dataclasses import replace
@@ -19,7 +21,10 @@ from sweep.model.preparation import Shots
 
 
 def axis_surface_spread(points: PlannerInputs) -> OffsetMoments:
-    """Return moments of lines' offsets [bins] by ranges of beamlets on the axis's surface."""
+    """Return moments of the lines' offsets [FFT bins] from the line on the beam's axis.
+
+    They are due to the ranges of beamlets on the surface that the axis meets.
+    """
     return points.footprint_extent.axis_surface_range_offsets.scaled_by(
         points.bins_per_relative_range
     )
@@ -31,9 +36,9 @@ def footprint_bound(points: PlannerInputs) -> ErrorBound | None:
     Notes
     -----
     The ranges of beamlets spread their lines, and their echoes add up to another total. The bound
-    is for powers, without velocities, other surfaces or phases, which are separate effects. In
-    direct detection the echoes' beats always add as amplitudes, with the phases 4 pi f (R_b - R_0)
-    / c that the ranges give to the radio frequency f.
+    is for beamlets that add as powers. Velocities, other surfaces and optical phases are separate
+    effects. In direct detection the beats always add as amplitudes. Beamlet b then has the phase
+    4 pi f (R_b - R_0) / c at the radio frequency f, with its range R_b and that of the axis, R_0.
     """
     if points.n_beamlets == 1:
         return None
@@ -60,8 +65,8 @@ def apply_footprint(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Beamlet b has the range R_0 (1 + r_b), with the relative offset r_b of the ground
-    (:mod:`sweep.model.ground`), and the square root of its echo as amplitude.
+    Beamlet b has the range R_0 (1 + r_b). R_0 is the range of the axis, and r_b the relative offset
+    of the ground (:mod:`sweep.model.ground`). Its amplitude is the square root of its echo power.
     """
     row, range_offset, _, echo = context.ground.beamlets
     if context.ground.off_axis_surface is not None:
@@ -95,7 +100,7 @@ FOOTPRINT = Effect(
         ),
     ),
 )
-"""Effect of beamlets at their own ranges."""
+"""Effect that gives each beamlet (ray of the beam) its own range and echo."""
 
 
 def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -104,10 +109,11 @@ def footprint_phase_bound(points: PlannerInputs) -> ErrorBound | None:
     Notes
     -----
     The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. If that is not small
-    against 1, the sum may be anything from 0 to sqrt(N) times (Cauchy and Schwarz) the sum of
-    powers. If it is small, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2) times that, which
-    is as large a change. So the effect is kept wherever there are several beamlets. The line of a
-    single beamlet adds to its own image.
+    against 1, the magnitude of the sum of N beamlets may be anything from 0 to sqrt(N) times
+    (Cauchy and Schwarz) the root of the sum of their powers. If it is small, beamlets of the
+    amplitudes a_b add in phase to sum a_b / sqrt(sum a_b^2) times that root, which is as large a
+    change. So the effect is kept wherever there are several beamlets. The line of a single beamlet
+    adds to its own image.
     """
     if not points.adds_field_amplitudes:
         return None
@@ -141,7 +147,7 @@ FOOTPRINT_PHASE = Effect(
     apply=apply_footprint_phase,
     parent="footprint",
 )
-"""Effect of the optical phases of a smooth surface."""
+"""Effect that adds beamlets as complex amplitudes, with the optical phases of a smooth surface."""
 
 
 def several_returns_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -216,4 +222,4 @@ SEVERAL_RETURNS = Effect(
     parent="footprint",
     needs_separate_batches=False,
 )
-"""Effect of more than one surface in a footprint."""
+"""Effect that gives beamlets on other surfaces than the axis's their own ranges."""

@@ -2,12 +2,12 @@
 
 **Images**: a real record has the line also at -f, which reaches the bins of f near DC and Nyquist.
 
-Bin X[k] contains W(k - nu) and, conjugated, W(k + nu). Past Nyquist the visible line is itself an
-image. Without the effect only the transform of the folded line is summed, where it is visible. The
-effect acts on the spectrum. Its error bound follows from the envelope E of the window's sidelobes.
-Let all light of a line, wherever footprint and record put it, be at least e bins from the edge (DC
-or Nyquist). Then bins within e/2 have images of at most E(3/2 e), and all others at most E(e/2) +
-E(e).
+W is the window's transform and nu the position of a line [bins]. Bin X[k] contains W(k - nu) and,
+conjugated, W(k + nu). Past Nyquist the visible line is itself an image. Without the effect only the
+transform of the folded line is summed, where it is visible. The effect acts on the spectrum. Its
+error bound follows from the envelope E of the window's sidelobes. Let all light of a line, wherever
+footprint and record put it, be at least e bins from the edge (DC or Nyquist). Then bins within e/2
+have images of at most E(3/2 e), and all others at most E(e/2) + E(e).
 
 A bin at the threshold, far down the lines' sidelobes, is much smaller than the largest bin. An
 image too small to change the largest bin may still move it across the threshold. It then joins the
@@ -16,17 +16,20 @@ one. If lines are d bins away, such a bin has images at 2 e - d. If these move i
 the threshold, it must lie that near to the threshold. Bins whose sidelobes fall no slower than 1/d
 lie there with a probability of x d.
 
-**Leakage**: additional groups of bins raised by the signal in bins below the threshold.
+**Leakage**: further groups of bins that cross the threshold because of signal in sidelobes. A group
+is a run of adjacent bins above the threshold.
 
-It changes no detecting bin, and so no detection probability, but ``p_leakage``. It acts on the
-detection: without the effect only bins of the echo's groups are evaluated. By the union bound
+Leakage changes no detecting bin, and so no detection probability, but ``p_leakage``. It acts on the
+detection: without the effect only bins of the echo's groups are evaluated. By the union bound, with
+Marcum's Q_1,
 
     p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E_k, b),
 
-over the bins that may leak, with the magnitude A of all lines together, the largest |W| at the
-distances that light may have from bin k, E_k, and the threshold b, all over sigma. The detecting
-bin and its neighbours are excluded. By Parseval's theorem the bins together have at most ENBW times
-the power A^2, and the probability rises faster than a^2. So the sum is at most ENBW times that of
+over the bins that may leak. A is the magnitude of all lines together and b the threshold, both over
+the noise per quadrature. E_k is the largest relative |W| at the distances that light may have from
+bin k. The detecting bin and its neighbours are excluded. By Parseval's theorem the bins together
+have at most ENBW (the window's equivalent noise bandwidth in bins) times the power A^2, and the
+probability rises faster than a^2. So the sum is at most ENBW times that of
 one bin of A, or A^2 / b^2 times that of one at the threshold.
 """
 
@@ -47,9 +50,10 @@ from sweep.model.window_response import window_response
 
 _LN_10 = math.log(10)
 _RATIO_MAX = 1e12
-"""Upper limit of signal ratios, against overflow."""
+"""Upper limit of signals over the noise per quadrature, which avoids overflow."""
 _EXPECTED_BINS_MIN = 1e-4
-"""Expected number of a shot's bins at the threshold below which they are neglected."""
+"""Limit on the expected number of a shot's bins that images may move across the threshold. Fewer
+bins are neglected."""
 
 
 def image_bound(points: PlannerInputs) -> ErrorBound | None:
@@ -57,9 +61,10 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
 
     Notes
     -----
-    If powers add, the bound follows from the largest sidelobes at e/2, e and 3 e/2 bins, as the
-    module's description states. If amplitudes add, the sum may be anything; images add at most E(e)
-    of all lines in phase to any bin of 0..N/2.
+    Let all light be at least e bins from DC and Nyquist. If powers add, the bound follows from the
+    window's largest sidelobes at e/2, e and 3 e/2 bins, as the module's description states. If
+    amplitudes add, they may cancel. Images then add to any bin at most the largest sidelobe at e
+    bins, relative to the sum of all lines in phase.
     """
     if points.option(RECORD_PATH) == "complex":
         return None
@@ -93,13 +98,13 @@ def image_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
-    """Bound the change of leakage by images that add as powers.
+    """Bound the change that images make to false peaks by leaked signal, if lines add as powers.
 
-    It is the change of one bin at the threshold, or of all bins, whichever is larger.
-
-    For small a, bins cross with probabilities of y e^-y a^2 / 2, y = b^2 / 2. Images fall at least
-    as 1 / k from ``bins_to_image`` on, so all bins together have ``bins_to_image`` times the a^2 of
-    the nearest.
+    It is the change of one bin at the threshold, or of all bins, whichever is larger. For small
+    amplitudes a, bins cross with probabilities of y e^-y a^2 / 2, with y = b^2 / 2 and the
+    threshold b, all over the noise per quadrature. Images fall at least as the inverse distance
+    from ``bins_to_image`` on. All bins together thus have ``bins_to_image`` times the a^2 of the
+    nearest.
     """
     image_ratio = (
         points.line_signal_ratio
@@ -119,10 +124,11 @@ def _leaking_bin_change(points: PlannerInputs) -> np.ndarray:
 
 
 def _log10_pfa_change(points: PlannerInputs) -> np.ndarray | float:
-    """Bound the change of log10 pfa of a shot due to bins that images move across the threshold.
+    """Bound the change of log10 of a shot's false-alarm probability by images.
 
-    It is the change by the expected number of such bins, with lines anywhere between two bins, and
-    at least that of one bin. It is 0 if fewer than ``_EXPECTED_BINS_MIN`` are expected.
+    Images move bins across the threshold, which then count as part of an echo or no longer do. The
+    bound is that of the expected number of such bins, and at least of one. It is 0 if fewer than
+    ``_EXPECTED_BINS_MIN`` are expected.
     """
     if points.option(PROCESSING_PREFIX + "bins_counted") == "all":
         return 0.0
@@ -176,7 +182,8 @@ def apply_image(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    X[k] = W(k - nu) a / 2 + (W(k + nu) a / 2)^*, for a line at the position nu [bins].
+    Bin k is X[k] = W(k - nu) a / 2 + (W(k + nu) a / 2)^*, for a line of amplitude a at the position
+    nu [bins]. W is the window's transform, and ^* the complex conjugate.
     """
     return replace(shots, images=shots.images._replace(are_summed=not shots.complex_record))
 
@@ -188,20 +195,24 @@ IMAGE = Effect(
     error_bound=image_bound,
     apply=apply_image,
 )
-"""Effect of lines at negative frequencies, near DC and Nyquist."""
+"""Effect that adds the images of lines, at negative frequencies, in bins of real records."""
 
 
 _TABULATED_REACH_BINS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 16.0)
-"""Shifts of light [bins] up to which there is one table each."""
+"""Largest shifts of light from its line [bins], for each of which there is a table of leakage
+bounds."""
 _ROWS_PER_OCTAVE, _OCTAVE_MIN, _OCTAVE_MAX = 2, -8, 30
-"""Number of rows per octave of A over the threshold, and the first and last octave."""
+"""Rows of tables of leakage bounds: number per octave, and first and last octave, of the magnitude
+of all lines over the threshold."""
 _THRESHOLD_STEP = 1.04
-"""Ratio of the thresholds of successive tables; a threshold uses the table of the next lower one.
-"""
+"""Ratio of the thresholds of successive tables of leakage bounds. Each threshold uses the table of
+the next lower tabulated one."""
 _SINGLE_BINS, _FAR_STRETCHES = 48, 24
-"""Number of bins evaluated singly, and number of intervals of bins beyond."""
+"""Numbers in the bound of leakage: that of bins near the line that count singly, and that of the
+intervals that hold all bins farther away."""
 _IMAGE_FACTOR = 1.1
-"""Factor for images added to sidelobes far from the edge; near the edge it is 2."""
+"""Factor on sidelobes far from DC and Nyquist, which allows for the images that add to them. Near
+DC and Nyquist the factor is 2."""
 
 
 def leakage_bound(points: PlannerInputs) -> ErrorBound:
@@ -248,11 +259,11 @@ def _leakage_probability(
     Parameters
     ----------
     points : PlannerInputs
-        Points of a tile.
+        Points that are planned together.
     window_name : str
         Window whose sidelobes count.
     ratio_to_threshold : ndarray
-        Magnitude of the lines over the threshold.
+        Magnitude of all lines together over the threshold.
     reach_bins : ndarray
         Distance by which light may be shifted [bins].
     """
@@ -292,7 +303,7 @@ def _leakage_probability(
 def leakage_table(
     window_name: str, length: int, fft_size: int, threshold_ratio: float, looks: Looks = SINGLE_LOOK
 ) -> np.ndarray:
-    """Tabulate bounds of the probability of leakage.
+    """Tabulate bounds of the probability that leaked signal makes bins cross the threshold.
 
     Parameters
     ----------
@@ -301,14 +312,15 @@ def leakage_table(
     length, fft_size : int
         Length of the record and FFT size.
     threshold_ratio : float
-        Threshold b over sigma.
+        Threshold over the noise per quadrature.
     looks : Looks
         Number and combination of records.
 
     Returns
     -------
     ndarray (reaches + 1, rows)
-        By shift of light and by octaves of A over the threshold; the last row is Parseval's bound.
+        Bounds, 0..1. The first axis is the shift of light from its line; its last element is
+        Parseval's bound. The second is the magnitude of all lines over the threshold.
     """
     response, n_rows = (
         window_response(window_name, length, fft_size),
@@ -379,4 +391,4 @@ LEAKAGE = Effect(
     error_bound=leakage_bound,
     apply=apply_leakage,
 )
-"""Effect of additional groups raised by sidelobes below the threshold."""
+"""Effect that evaluates false peaks: bins that cross the threshold because of sidelobes."""

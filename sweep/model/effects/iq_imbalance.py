@@ -1,6 +1,8 @@
 """Imbalance of I and Q: a complex record shows an image of each line at its negative frequency.
 
-With I = cos(w t) and Q = g sin(w t + p), the record is
+I and Q are the two quadratures of a complex record. The ratio of their amplitudes is g, and the
+departure of their phase from 90 degrees is p. With I = cos(w t) and Q = g sin(w t + p), the record
+is
 
     I + i Q = (1 + g e^(i p)) / 2 e^(i w t) + (1 - g e^(-i p)) / 2 e^(-i w t),
 
@@ -32,13 +34,13 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
     Parameters
     ----------
     gain : array_like
-        Power of Q over that of I, g^2.
+        Power of Q over that of I; g is the square root of it.
     phase : array_like
         Departure p of their phase from 90 degrees [rad].
 
     Notes
     -----
-    |1 - g e^(i p)| / |1 + g e^(i p)|.
+    The ratio is |1 - g e^(i p)| / |1 + g e^(i p)|.
 
     Examples
     --------
@@ -51,7 +53,10 @@ def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1 where I and Q are unequal, as an image may be a peak of its own."""
+    """Return an error of 1 where I and Q are unequal, so that the effect is simulated.
+
+    An image at a line's negative frequency may be a peak of its own.
+    """
     image_amplitude = image_gain(
         gain=points[GAIN_IMBALANCE_PATH], phase=points[PHASE_IMBALANCE_PATH]
     )
@@ -101,4 +106,4 @@ IQ_IMBALANCE = Effect(
         ),
     ),
 )
-"""Effect of unequal I and Q."""
+"""Effect that adds images of lines at negative frequencies, due to unequal I and Q channels."""

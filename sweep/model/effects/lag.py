@@ -2,8 +2,10 @@
 
 A scanner has turned by omega 2R/c when the light returns, so the receiver looks to the side of the
 transmitted beam. The parallax of a bistatic pair and a misalignment have the same effect. Of the
-light that one mode collects, the fraction exp(-2 d^2 / (w_T^2 + w_L^2)) remains, where d is the
-distance of the axes (:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing is lost.
+light that one mode collects, the fraction exp(-2 d^2 / (w_T^2 + w_L^2)) remains. Here d is the
+distance of the axes at the target, and w_T and w_L are the radii of the transmitted and the
+received beam at the target (:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing
+is lost.
 """
 
 from dataclasses import replace
@@ -18,9 +20,10 @@ from sweep.model.preparation import Shots
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the loss of the echo and of its shot noise.
+    """Return the changes of the echo and of its shot noise if the offset of the axes is omitted.
 
-    None if the axes coincide, or if all light in the aperture mixes.
+    None if the axes of transmitted and received beam coincide, or if all light in the aperture
+    mixes.
     """
     paths = beam.SCAN_RATE_PATH, beam.SEPARATION_PATH, beam.MISALIGNMENT_PATH
     if not (beam.is_single_mode(points.parameters) and points.any_nonzero(*paths)):
@@ -39,7 +42,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Power by exp(-2 d^2 / (w_T^2 + w_L^2)), the beat's amplitude by the square root of that.
+    The echo's power is multiplied by exp(-2 d^2 / (w_T^2 + w_L^2)), with the distance d of the axes
+    and the beam radii w_T and w_L at the target. The beat's amplitude is multiplied by the square
+    root of that.
     """
     if not beam.is_single_mode(context.parameters):
         return shots
@@ -82,4 +87,4 @@ LAG = Effect(
         ),
     ),
 )
-"""Effect of the offset between transmitted and received beam."""
+"""Effect that reduces the echo by the offset between transmitted and received beam."""

@@ -33,21 +33,29 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.window import zero_first_samples
 
 _LINE_REACH_DEVIATIONS = 6.0
-"""Standard deviations of a Gaussian line beyond which its light is neglected."""
+"""Distance from the centre of a Gaussian line beyond which its light is neglected, in standard
+deviations of the line."""
 
 _DENSEST_PEDESTAL_EXPONENT = 1.7932821329
-"""Gamma tau at which the pedestal's density under its line is largest: e^g = 1 + g + g^2."""
+"""Solution g of e^g = 1 + g + g^2. A phase-noise pedestal is densest under its line if 2 pi times
+the line width (FWHM) times the delay of the echo equals g."""
 
 _WIDTH_PATH, _SHAPE_PATH = LASER_PREFIX + "line_width", LASER_PREFIX + "line_shape"
 
 
 def _line_deviation_window_bins(points: PlannerInputs) -> np.ndarray:
-    """Return the standard deviation of a Gaussian line [bins of fs/L]."""
+    """Return the standard deviation of a Gaussian laser line.
+
+    The unit is the sample rate over the number of samples in the record.
+    """
     return DEVIATION_PER_FWHM * points[_WIDTH_PATH] * points.record.duration
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the distance to which a Gaussian line moves light [bins]; None for other lines."""
+    """Return how far from a line's centre a Gaussian laser line spreads light.
+
+    It is given as the shift of a :class:`PhaseErrorBound`. None for other line shapes.
+    """
     if not points.any_nonzero(_WIDTH_PATH) or points.option(_SHAPE_PATH) != "gaussian":
         return None
     return PhaseErrorBound(
@@ -106,7 +114,10 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
-    """Bound the loss of the pure line and the noise of the pedestal, for a Lorentzian line."""
+    """Bound the changes if the width of a Lorentzian laser line is omitted.
+
+    They are the power that the pure line loses, and the pedestal of noise around it.
+    """
     line_width, delay = points[_WIDTH_PATH], np.minimum(points.target.delay, points.record.duration)
     coherent_fraction = pure_line_power_fraction(
         line_width=line_width, delay=delay, duration=np.asarray(np.inf)
@@ -126,7 +137,10 @@ def _lorentzian_bound(points: PlannerInputs) -> ErrorBound:
 
 
 def _apparent_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the power fraction of the line and the pedestal, as the echo's samples show them."""
+    """Return the power fraction that a laser's pure line keeps, and the pedestal of phase noise.
+
+    Both are those of the samples of the record that hold the echo.
+    """
     looks = shots.looks.n_coherent
     if shots.echo_record.n_samples_before is None:
         return apparent_line_and_pedestal(window=shots.window, looks=looks, **timing)
@@ -222,4 +236,4 @@ LINE_WIDTH = Effect(
         ),
     ),
 )
-"""Effect of the width of the laser's line."""
+"""Effect that spreads each beat over the spectrum by the width of the laser's line."""

@@ -1,6 +1,8 @@
 """Noise in addition to the receiver's own: of the echo, the sun, the local oscillator and the ADC.
 
-Each effect adds a variance at the ADC. Its error bound is that variance over the receiver's.
+Each effect adds a noise variance at the ADC. Its error bound is that variance over the variance of
+the receiver's noise. Symbols in the equations: the elementary charge q, the detector's gain M,
+excess noise factor F and responsivity Re, the optical power P, and the electrical bandwidth B_e.
 """
 
 from collections.abc import Mapping
@@ -29,12 +31,19 @@ from sweep.model.preparation import Shots
 
 
 def signal_shot_noise_bound(points: PlannerInputs) -> ErrorBound:
-    """Return the shot noise of the echo, which the threshold does not follow."""
+    """Return the variance of the echo's shot noise over that of the receiver's noise.
+
+    The threshold is set without it, because it comes with the echo.
+    """
     return ErrorBound(noise_variance_change=points.echo_noise_ratio, threshold_follows_noise=False)
 
 
 def apply_signal_shot_noise(shots: Shots, context: EffectContext) -> Shots:
-    """Add the shot noise of the total echo, 2 q M^2 F Re P B_e."""
+    """Add the shot noise of the total echo, of the current variance 2 q M^2 F Re P B_e.
+
+    q is the elementary charge, M the detector's gain, F its excess noise factor, Re its
+    responsivity, P the echo's power and B_e the electrical bandwidth.
+    """
     variance = (
         shots.receiver_noise.shot_noise_variance_per_watt
         * shots.echo_power
@@ -51,7 +60,7 @@ SIGNAL_SHOT_NOISE = Effect(
     apply=apply_signal_shot_noise,
     needs_separate_batches=False,
 )
-"""Effect of the echo's own shot noise."""
+"""Effect that adds the shot noise of the echo's own light."""
 
 
 _IRRADIANCE_PATH, _SUN_DISTANCE_PATH = "target.solar_irradiance", "target.sun_distance"
@@ -84,7 +93,8 @@ def solar_irradiance(
 
     Notes
     -----
-    Planck's radiance: pi B(wavelength, T) (R / d)^2 sin(elevation).
+    It is pi B (R / d)^2 sin(elevation), with Planck's radiance B of a black body of the temperature
+    SUN_TEMPERATURE, and the sun's radius R.
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
@@ -101,8 +111,8 @@ def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     Notes
     -----
     The surface fills the field of view with the radiance E rho / pi, where E is the spectral
-    irradiance [W/m^3]. It is multiplied by the aperture's area, the field's solid angle and the
-    optical passband.
+    irradiance [W/m^3] and rho the reflectance. The radiance is multiplied by the aperture's area,
+    the field's solid angle and the optical passband.
     """
     irradiance = parameters[_IRRADIANCE_PATH] + solar_irradiance(
         wavelength=parameters[LASER_PREFIX + "wavelength"],
@@ -121,7 +131,10 @@ def received_sunlight(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def solar_background_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the shot noise of sunlight, without extinction; the threshold follows it."""
+    """Return the variance of sunlight's shot noise over that of the receiver's noise.
+
+    Extinction in the air is neglected. The threshold is set on the noise with sunlight.
+    """
     if not points.any_nonzero(_IRRADIANCE_PATH, _SUN_DISTANCE_PATH):
         return None
     return ErrorBound(
@@ -136,8 +149,8 @@ def apply_solar_background(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    Current variance 2 q M^2 F Re P B_e, with the power P of :func:`received_sunlight` times the
-    air's transmission.
+    The current variance is 2 q M^2 F Re P B_e, with the symbols of the module's description. The
+    power P is that of :func:`received_sunlight` times the air's transmission.
     """
     presence = context.presence_factor("solar_background")
     light = received_sunlight(context.parameters) * shots.link_scales.ground_transmission * presence
@@ -176,7 +189,7 @@ SOLAR_BACKGROUND = Effect(
         ),
     ),
 )
-"""Effect of the shot noise of sunlight on the target."""
+"""Effect that adds the shot noise of sunlight from the target."""
 
 
 _RIN_PATH, _REJECTION_PATH = (
@@ -190,8 +203,10 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 
     Notes
     -----
-    One diode has (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
-    fluctuation and subtract it, except for their mismatch. The common-mode rejection (in dB 20
+    One diode has (M Re P_lo)^2 RIN B_e. M is its gain, Re its responsivity, P_lo the power of the
+    local oscillator, RIN the relative intensity noise [1/Hz] and B_e the electrical bandwidth. The
+    two diodes of a balanced receiver see the same fluctuation and subtract it, except for their
+    mismatch. The common-mode rejection (in dB 20
     log10 of the ratio of their currents) divides the variance. Both are assumed to be constant over
     the electrical bandwidth. The echo's own intensity noise is neglected: it is smaller by P /
     P_lo.
@@ -206,7 +221,10 @@ def intensity_noise_current_variance(parameters: Mapping[str, np.ndarray]) -> np
 
 
 def relative_intensity_noise_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the exact intensity noise; the threshold follows it."""
+    """Return the variance of the local oscillator's intensity noise over that of the receiver's.
+
+    It is exact, not a bound. The threshold is set on the noise with it.
+    """
     if points.waveform.architecture == "direct" or not points.any_nonzero(_RIN_PATH):
         return None
     current_variance = intensity_noise_current_variance(points.parameters)
@@ -222,7 +240,7 @@ def apply_relative_intensity_noise(shots: Shots, context: EffectContext) -> Shot
 
     Notes
     -----
-    Current variance (M Re P_lo)^2 RIN B_e / CMRR, as of :func:`intensity_noise_current_variance`.
+    The current variance is that of :func:`intensity_noise_current_variance`.
     """
     if shots.waveform.architecture == "direct":
         return shots
@@ -255,18 +273,18 @@ RELATIVE_INTENSITY_NOISE = Effect(
         ),
     ),
 )
-"""Effect of fluctuations of the local oscillator's power."""
+"""Effect that adds the noise of fluctuations of the local oscillator's power."""
 
 
 _BITS_PATH = PROCESSING_PREFIX + "bits"
 
 
 def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return the noise of rounding, without clipping; the threshold follows it.
+    """Return the noise of the ADC's rounding over the receiver's noise, without clipping.
 
-    It is white, and is compared with the density of the receiver's noise at the line. If a spectrum
-    is whitened, its lines are scaled by the root of both densities together; without the effect, by
-    that of the receiver's alone.
+    Rounding noise is white, and is compared with the density of the receiver's noise at the line.
+    The threshold is set on the noise with it. A whitened spectrum has its lines divided by the root
+    of the noise density: of both noises with the effect, of the receiver's alone without it.
     """
     if not points.any_nonzero(_BITS_PATH):
         return None
@@ -283,11 +301,13 @@ def quantisation_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def apply_quantisation(shots: Shots, context: EffectContext) -> Shots:
-    """Add white noise of variance lsb^2/12, if the ADC has a number of bits.
+    """Add the ADC's rounding noise, if a number of bits is stated.
+
+    It is white, of the variance lsb^2/12 for steps of lsb [V].
 
     Notes
     -----
-    Variance of :func:`sweep.model.receiver_chain.quantisation_variance`, which has the source.
+    :func:`sweep.model.receiver_chain.quantisation_variance` computes it and cites the source.
     """
     return add_noise_sources(shots, **{ADC_NOISE_SOURCE: adc_noise_variance(context.parameters)})
 
@@ -307,4 +327,4 @@ QUANTISATION = Effect(
         ),
     ),
 )
-"""Effect of the ADC's quantisation."""
+"""Effect that adds the noise of rounding to the ADC's steps."""

@@ -50,11 +50,15 @@ from sweep.model.preparation import Shots
 from sweep.model.window_response import window_max_near
 
 _LINE_FRACTION_WITH_IMAGE_MIN = 0.9
-"""Smallest fraction of a line's amplitude that remains when a distant image is added to it."""
+"""Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
+opposite frequency far away, are added to it."""
 
 
 def error_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the output change if missing samples are ignored; None if none are missing."""
+    """Bound the change of results if records are taken as full although the echo arrives late.
+
+    None if no samples lack the echo.
+    """
     missing = points.missing_samples
     if missing is None:
         return None
@@ -106,7 +110,9 @@ def error_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 def residual_bound(points: PlannerInputs) -> np.ndarray:
-    """Bound the error because all beamlets and looks share the first sample of the beam's axis.
+    """Bound the error because one number of missing samples serves all beamlets and looks.
+
+    It is the number of samples before the echo on the beam's axis, in the middle look.
 
     Returns
     -------
@@ -151,8 +157,9 @@ def apply(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s), limited to 0..L, as of
-    :meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`.
+    Of L samples, the first n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s) lack the echo, limited to
+    0..L. tau_0 is the delay of the echo, beta its Doppler ratio, t_0 the start of the record and
+    f_s the sample rate (:meth:`sweep.model.link_budget.RecordSettings.count_samples_before_echo`).
     """
     n_samples_before = np.zeros((len(shots.waveform_segments), shots.size), np.int64)
     for segment_index in np.flatnonzero(shots.has_segment):
@@ -174,4 +181,4 @@ OVERLAP = Effect(
     error_bound=error_bound,
     apply=apply,
 )
-"""Effect of echoes that arrive after the record has begun."""
+"""Effect that leaves out the samples at the start of a record before the echo arrives."""

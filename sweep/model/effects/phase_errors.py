@@ -10,6 +10,9 @@ tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
     psi(t) = s S beta (1 + beta / 2) t^2                                                range walk
     psi(t) = f_seg alpha t^2 + s S [ -tau_0 alpha t^2 + alpha (1 + beta) t^3 + alpha^2 t^4 / 2 ]
 
+v_r is the radial velocity, a the acceleration, f_seg the segment's carrier, S the chirp rate, and s
+the sign of the chirp, 1, 0 or -1.
+
 Range walk is a frequency drift of 2 s S (2 v_r / c), of opposite sign in up- and down-chirp, and 0
 in the Doppler segment. Half of it comes from the range, half from the chirp's rising Doppler shift.
 Acceleration is mostly a drift of 2 a / lambda, positive when the radial velocity grows. If the beam
@@ -33,10 +36,10 @@ about -tau e(t): 0 at range 0, and growing with range. The Doppler segment has n
 error is a table of frequency errors over the time in the up-chirp. It is fitted once by a Chebyshev
 series (:mod:`sweep.model.effects.sweep_error_table`), whose integral over the delay is exact.
 
-Error bounds: w is real and even about the record's middle. A phase error has an odd and an even
-part, phi = o(x) + e(x); a constant does not matter. A line's spectrum W(y) is real except for the
-factor exp(-i pi y) and the unpaired first sample w_0. The phase error changes it by A + i B, where
-relative to sum w
+Error bounds: the window w is real and even about the record's middle. A phase error has an odd and
+an even part, phi = o(x) + e(x); a constant does not matter. A line's spectrum W(y) is real except
+for the factor exp(-i pi y) and the unpaired first sample w_0. The phase error changes it by A + i
+B, where relative to sum w
 
     |A| <= a = <|o| + e^2 / 2>      |B| <= b = <|e|>      < > the mean weighted with |w| / sum w
 
@@ -77,34 +80,41 @@ from sweep.model.shot_records import PhaseError
 from sweep.model.window import Window, window_samples
 
 _N_NODES = 256
-"""Number of positions in the record for means under the window."""
+"""Number of positions in the record at which the window is sampled, for means weighted by it."""
 _RADIANS_PER_CYCLE = 2 * math.pi
-"""Factor 2 pi."""
+"""Factor 2 pi that converts a phase from cycles to radians."""
 _LINE_FRACTION_WITH_IMAGE_MIN = 0.9
-"""Smallest fraction of a line's amplitude that remains when a distant image is added to it."""
+"""Smallest fraction of a line's amplitude that remains when the sidelobes of its image, at the
+opposite frequency far away, are added to it."""
 
 
 class WindowMoments(NamedTuple):
-    """Means of powers 1..4 of the position x under a window's |w| / sum w, and related numbers."""
+    """Means under a window w of powers 1..4 of the position x in the record, -1..1.
+
+    The mean < > is the sum weighted with |w| / sum w.
+    """
 
     mean_absolute: tuple[float, ...]
-    """<|x^k|> of odd powers, <|x^k - <x^k>|> of even powers."""
+    """Means of |x^k| for k = 1, 3, and of |x^k - <x^k>| for k = 2, 4. x is the position in the
+    record, -1..1, and < > the mean weighted by the window."""
     root_mean_square: tuple[float, ...]
-    """Square root of <(x^k - <x^k>)^2> of even powers, 0 of odd powers."""
+    """Root mean squares of x^k about its mean for k = 2, 4, and 0 for k = 1, 3. x is the position
+    in the record, -1..1; means are weighted by the window."""
     linear_slope: tuple[float, ...]
-    """Slope of the best straight line to odd powers, 0 for even powers; last, that to any function
-    within -1..1."""
+    """Slopes of the best straight line to x^k, k = 1 .. 4, with the position x in the record,
+    -1..1. They are 0 for even k. The fifth is the largest for any function within -1..1."""
     magnitude_sum: float
-    """Sum |w| over sum w, >= 1."""
+    """Sum of the window's magnitudes |w| over the sum of its values w, >= 1."""
     first_weight: float
-    """|w_0| over sum w."""
+    """Magnitude of the window's first value over the sum of its values."""
     position_variance: float
-    """Variance of the position in the record under |w| [records^2]."""
+    """Variance of the position in the record under the window's |w|, over the square of the
+    record's length."""
 
 
 @lru_cache(maxsize=16)
 def window_moments(window: Window) -> WindowMoments:
-    """Compute the means under a window that bounds of phase errors need."""
+    """Return the means of powers of the position in the record, weighted by a window."""
     node = (2 * np.arange(_N_NODES) + 1) / _N_NODES - 1
     w = window_samples(window.name, window.length)
     sample_position = 2 * np.arange(window.length + 1) / window.length - 1
@@ -135,19 +145,19 @@ def window_moments(window: Window) -> WindowMoments:
 def phase_over_record(
     points: PlannerInputs, coefficient_by_power: Mapping[int, np.ndarray]
 ) -> PhaseErrorBound:
-    """Return the polynomial in the record's position x of a phase sum_j c_j t^j.
+    """Return the phase sum_j c_j t^j as a polynomial in the position x in the record.
 
     Parameters
     ----------
     points : PlannerInputs
-        Points of a tile.
+        Points that are planned together.
     coefficient_by_power : mapping
         Coefficients c_j [cycles/s^j] by power j of the time since the segment's start.
 
     Returns
     -------
     PhaseErrorBound
-        Magnitudes of the coefficients of x^0..x^4.
+        Magnitudes of the coefficients of x^0..x^4, for x = -1..1.
     """
     half_duration = 0.5 * points.record.duration
     record_middle = points.record.acquisition_delay + half_duration
@@ -174,7 +184,7 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
     Returns
     -------
     ndarray
-        <|phi|>, the mean weighted with |w| / sum w.
+        Mean of |phi| over the record, weighted with |w| / sum w for the window w.
     """
     moments = window_moments(window)
     total = phase_bound.non_polynomial * moments.magnitude_sum
@@ -184,10 +194,10 @@ def mean_phase_bound(phase_bound: PhaseErrorBound, window: Window) -> np.ndarray
 
 
 def coherent_phase_change(points: PlannerInputs, phase_bound: PhaseErrorBound) -> np.ndarray:
-    """Return a phase error's change of sums of amplitudes of lines and images, as of `ErrorBound`.
+    """Return the change that a phase error makes to sums of lines and images as amplitudes.
 
-    Lines next to their images also change by the phase in the record's middle, and so does a line
-    to which a distant image is added.
+    It is :attr:`ErrorBound.coherent_sum_change`. The phase in the record's middle matters to lines
+    next to their images, and to a line to which a distant image is added.
     """
     moments = window_moments(points.window)
     phase_anywhere = np.minimum(
@@ -210,7 +220,7 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
     Parameters
     ----------
     points : PlannerInputs
-        Points of a tile, whose `phase_error_bounds` are known.
+        Points that are planned together, whose `phase_error_bounds` are known.
     name : str
         Name of the effect.
 
@@ -290,7 +300,10 @@ def phase_omission_bound(points: PlannerInputs, name: str) -> ErrorBound | None:
 def _add_phase_error(
     shots: Shots, phase_function: Callable[..., np.ndarray], **values: Any
 ) -> Shots:
-    """Return shots with an additional phase error."""
+    """Return shots whose records have an additional phase error.
+
+    ``phase_function`` gives the phase [cycles] at positions in the record, from ``values``.
+    """
     phase_error = PhaseError(phase_function, values | shots.echo_record_times)
     return replace(
         shots,
@@ -320,7 +333,7 @@ def record_times(position: np.ndarray, *, start: np.ndarray, duration: np.ndarra
 
 
 def _as_column(value: np.ndarray) -> np.ndarray:
-    """Return a value as a column, (n, 1) or (1, 1)."""
+    """Return a scalar or an array (n,) as a column, (1, 1) or (n, 1)."""
     return np.atleast_1d(np.asarray(value, float))[:, None]
 
 
@@ -355,7 +368,8 @@ def range_walk_phase(
     Returns
     -------
     ndarray (n, m)
-        s S (beta (1 + beta / 2) + (u - v_r) / c) t^2 [cycles].
+        s S (beta (1 + beta / 2) + (u - v_r) / c) t^2 [cycles], with beta = 2 v_r / c and the time t
+        since the segment's start.
     """
     doppler_ratio = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
     drift_rate = (
@@ -368,7 +382,10 @@ def range_walk_phase(
 
 
 def range_walk_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that range walk adds over the record; None without range walk."""
+    """Return the bound of the phase that range walk adds over the record.
+
+    Range walk is the drift of the beat as the range changes. None without it.
+    """
     doppler_ratio_growth = points.stack_segments(
         *(
             link_budget.doppler_ratio(points.target.acceleration * segment.start_time)
@@ -411,8 +428,9 @@ def apply_range_walk(shots: Shots, context: EffectContext) -> Shots:
 def chirp_drift_time(shots: Shots) -> np.ndarray:
     """Return the mean slope of t^2 over the records of both chirps [s], (n,) or scalar.
 
-    It is the slope of the best straight line under the window, over the samples that hold the echo.
-    For a full record this is twice the time of its middle.
+    t is the time since the segment's start. The slope is that of the best straight line, weighted
+    by the window, over the samples that hold the echo. For a full record it is twice the time of
+    the middle.
     """
     drift_time = 2 * shots.record.acquisition_delay + shots.record.duration
     if shots.echo_record.n_samples_before is None:
@@ -425,10 +443,10 @@ def chirp_drift_time(shots: Shots) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _square_slope_by_first_sample(window: Window) -> np.ndarray:
-    """Return the slope of the best line to x^2 over the samples from each one on, (L + 1,).
+    """Return the slope of the best straight line to x^2 without the first k samples, (L + 1,).
 
-    Samples are weighted by the window. The positions x of all samples are -1..1, for which the
-    slope is 0.
+    x is the position in the record, -1..1, and element k = 0 .. L of the result is for the samples
+    from k on. Samples are weighted by the window. The slope over all samples is 0.
     """
     position = 2 * np.arange(window.length) / window.length - 1
     powers = (window.samples() * position**exponent for exponent in range(4))
@@ -453,7 +471,7 @@ RANGE_WALK = Effect(
     phase_error_bound=range_walk_phase_bound,
     apply=apply_range_walk,
 )
-"""Effect of the drift of the beat as the target moves."""
+"""Effect that lets the beats of both chirps drift over the record, as the range changes."""
 
 
 _ACCELERATION_PATH = "target.acceleration"
@@ -489,7 +507,9 @@ def acceleration_phase(
     Returns
     -------
     ndarray (n, m)
-        alpha t^2 (f_seg + s S (-tau_0 + (1 + beta) t + alpha t^2 / 2)) [cycles].
+        alpha t^2 (f_seg + s S (-tau_0 + (1 + beta) t + alpha t^2 / 2)) [cycles]. alpha is the
+        acceleration over c, tau_0 the delay and beta the Doppler ratio at the segment's start, and
+        t the time since then.
     """
     alpha = _as_column(np.asarray(acceleration) / SPEED_OF_LIGHT)
     beta = _as_column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
@@ -501,7 +521,7 @@ def acceleration_phase(
 
 
 def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that acceleration adds over the record; None without acceleration."""
+    """Return the bound of the phase that acceleration adds over the record; None without it."""
     if not points.any_nonzero(_ACCELERATION_PATH):
         return None
     alpha = points[_ACCELERATION_PATH] / SPEED_OF_LIGHT
@@ -515,9 +535,10 @@ def acceleration_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
 
 
 def acceleration_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Bound the change of the largest bin by drift within a record and over coherent looks.
+    """Bound the change of the largest bin if the target's acceleration is omitted.
 
-    The loss of looks that are added in amplitude is exact.
+    It makes lines drift within a record and from look to look (record of each segment). The loss of
+    looks that are added in amplitude is exact.
     """
     bound = phase_omission_bound(points, "acceleration")
     if bound is None or points.looks.n_coherent == 1:
@@ -568,7 +589,7 @@ ACCELERATION = Effect(
         ),
     ),
 )
-"""Effect of the drift of the Doppler frequency."""
+"""Effect that lets the Doppler frequency drift over the record, as the target accelerates."""
 
 
 _ERROR_SHAPES = ("quadratic", "cubic", "sinusoidal")
@@ -595,7 +616,7 @@ def error_table_phase(
     position : ndarray (m,)
         Positions x in the record, -1..1.
     table : SweepErrorTable
-        Measured frequency error over the time in the up-chirp.
+        Measured frequency error of the sweep over the time in the up-chirp.
     sign : int
         Sign s of the chirp; 0 for the Doppler segment.
     chirp_duration : ndarray
@@ -612,8 +633,8 @@ def error_table_phase(
 
     Notes
     -----
-    The down-chirp passes the table backwards. Before the first row and after the last the error is
-    constant.
+    E is the integral of the frequency error over time, and tau(t) the echo's delay. The down-chirp
+    passes the table backwards. Before the first row and after the last the error is constant.
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
@@ -653,14 +674,15 @@ def chirp_nonlinearity_phase(
     quadratic, cubic, sinusoidal : ndarray
         Peaks q, k and p of the error [Hz], of either sign.
     periods : ndarray
-        Number m > 0 of periods of the sine over the sweep.
+        Number > 0 of periods of the sine over the sweep.
     start, duration : ndarray
         Start since the segment's start, and duration, of the echo's record [s].
 
     Returns
     -------
     ndarray (n, m)
-        E(t - tau(t)) - E(t) [cycles].
+        E(t - tau(t)) - E(t) [cycles], with the integral E of the frequency error over time, and the
+        echo's delay tau(t).
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(position)))
@@ -684,10 +706,11 @@ def chirp_nonlinearity_phase(
 
 
 def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the phase that the sweep's error adds over the record; None without an error.
+    """Return the bound of the phase that the sweep's frequency error adds over the record.
 
-    Square and cube are polynomials in the position in the record. The sine, and a table's departure
-    from the middle of its span, are taken at their largest.
+    Quadratic and cubic errors are polynomials in the position in the record. A sine, and a table's
+    departure from the middle of its range of values, are taken at their largest. None without an
+    error.
     """
     table_text = points.option(ERROR_TABLE_PATH)
     if not points.any_nonzero(*_ERROR_PEAK_PATHS):
@@ -740,7 +763,11 @@ def chirp_nonlinearity_phase_bound(points: PlannerInputs) -> PhaseErrorBound | N
 
 
 def _error_table_phase_bound(points: PlannerInputs, table: SweepErrorTable) -> PhaseErrorBound:
-    """Bound the phase -tau e of a table's error e, by the middle of its span, the rest, and e'."""
+    """Bound the phase that a measured frequency error of the sweep adds over the record.
+
+    The phase is about minus the echo's delay times the error. It is bounded by the middle of the
+    error's range of values, the largest departure from it, and the error's derivative.
+    """
     position = np.cos(np.linspace(0, np.pi, 16 * table.chebyshev_coefficients.size + 1))
     errors, slope_coefficients = (
         table.frequency_error(position),
@@ -784,8 +811,8 @@ def apply_chirp_nonlinearity(shots: Shots, context: EffectContext) -> Shots:
 
     Notes
     -----
-    psi(t) = E(t - tau(t)) - E(t), with the integral E of the frequency error over time, as the
-    module's description states.
+    The phase is E(t - tau(t)) - E(t), with the integral E of the frequency error over time, and the
+    echo's delay tau(t). The module's description has the equations.
     """
     parameters, phase_inputs = (
         context.parameters,
@@ -845,4 +872,4 @@ CHIRP_NONLINEARITY = Effect(
         ),
     ),
 )
-"""Effect of the sweep's departure from a straight line."""
+"""Effect that adds the phase of a sweep whose frequency is no straight line over time."""

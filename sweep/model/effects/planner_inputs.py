@@ -43,11 +43,12 @@ from sweep.model.window_response import (
 )
 
 _CHEBYSHEV_DEVIATIONS = (1.4, 2.5, 8.0)
-"""Half-widths t in standard deviations for Chebyshev's inequality, of which the best bound is
-taken."""
+"""Half-widths, in standard deviations of the lines' positions, for which Chebyshev's inequality
+bounds the power of the largest bin. The best of these bounds is taken."""
 _NEAR_IMAGE_WINDOW_BINS = 8.0
-"""Distance from line to image [window bins] beyond which F is below 0.4 % of the bin's, and F', F''
-below 5 %."""
+"""Distance of a line from its image beyond which they cannot add up or cancel. The unit is the
+sample rate over the number of samples. The power of the image's sidelobes is below 0.4 % there, and
+its derivatives are below 5 %."""
 
 
 class PlannerInputs(LinkBudget):
@@ -96,23 +97,24 @@ class PlannerInputs(LinkBudget):
         self.existing_chirp_rates = self.stack_segments(
             *self._of_existing_segments(self.waveform.chirp_slopes)
         )
-        """Chirp rates of the existing segments over that of the up-chirp, signed."""
+        """Signed chirp rate of each existing segment, relative to that of the up-chirp."""
         is_direct = self.waveform.architecture == "direct"
         is_coherent = self.option("footprint.phases") == "coherent"
         self.adds_amplitudes = is_coherent or is_direct
         self.adds_field_amplitudes = is_coherent and not is_direct
-        """True if amplitudes, the roots of echoes, add."""
+        """True if beamlets add as optical amplitudes (roots of their echo powers), and not as
+        powers."""
 
     def __getitem__(self, path: str) -> np.ndarray:
-        """Return a numeric parameter."""
+        """Return the values of the numeric parameter with a dotted path."""
         return self.parameters[path]
 
     def option(self, path: str) -> str:
-        """Return a text parameter."""
+        """Return the text parameter with a dotted path; all points share it."""
         return str(self.parameters[path])
 
     def shared_integer(self, path: str) -> int:
-        """Return an integer that all points share."""
+        """Return the integer parameter with a dotted path; all points share it."""
         return int(self.parameters[path].flat[0])
 
     def any_nonzero(self, *paths: str) -> bool:
@@ -125,7 +127,7 @@ class PlannerInputs(LinkBudget):
         return [value for name, value in named_values if name in self.waveform.segment_order]
 
     def stack_segments(self, *values: np.ndarray | float) -> np.ndarray:
-        """Stack values of segments along a new first axis."""
+        """Stack arrays of the segments along a new first axis, after broadcasting them."""
         template = np.zeros((1,) * self.ndim)
         return np.stack(np.broadcast_arrays(template, *values)[1:]).astype(float)
 
@@ -133,7 +135,7 @@ class PlannerInputs(LinkBudget):
 
     @property
     def fft_size(self) -> int:
-        """FFT size N."""
+        """FFT size N, including zero padding."""
         return self.record.fft_size
 
     @property
@@ -153,19 +155,20 @@ class PlannerInputs(LinkBudget):
 
     @property
     def padding_factor(self) -> float:
-        """Bins of the FFT per bin of fs/L."""
+        """FFT size over the number of samples in the record."""
         return self.window_response.padding_factor
 
     @cached_property
     def carriers(self) -> np.ndarray:
-        """Frequency that the delay turns into phase [Hz], by segment."""
+        """Frequency [Hz], by segment, that turns the echo's delay into a phase of the beat."""
         return self.stack_segments(*self._of_existing_segments(self.waveform.carriers))
 
     @property
     def noise_maximum_ratio(self) -> float | None:
-        """Magnitude over sigma that any bin's noise exceeds with a probability of at most 0.001.
+        """Level that the noise of all bins together exceeds with a probability of at most 0.001.
 
-        None if segments report all peaks that cross the threshold.
+        It is a level of |X| over the noise per quadrature. None if segments report all peaks that
+        cross the threshold.
         """
         if self.option(waveform.PEAKS_PATH) == waveform.ALL_PEAKS:
             return None
@@ -180,12 +183,12 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def footprint_angles(self) -> beam.FootprintAngles:
-        """Full angles of the footprint [rad]."""
+        """Full angles of the beam that the footprint covers [rad]."""
         return beam.footprint_angles(self.parameters)
 
     @cached_property
     def footprint_extent(self) -> FootprintExtent:
-        """Extent of the footprint, as given, or on a plane."""
+        """Extent of the footprint: that found by ray tracing if given, else that on a plane."""
         if (extent := self._given_extent) is not None:
             return extent if self.adds_field_amplitudes else extent._replace(amplitude_gain_max=1.0)
         grazing_angle = self["target.grazing_angle"]
@@ -226,7 +229,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def echo_noise_ratio(self) -> np.ndarray:
-        """Shot noise of the total echo over the receiver's noise variance."""
+        """Variance of the echo's shot noise over that of the receiver's noise."""
         total_echo = self.footprint_extent.axis_echo * np.maximum(
             self.footprint_extent.total_echo_ratio, 1.0
         )
@@ -241,7 +244,7 @@ class PlannerInputs(LinkBudget):
 
     @property
     def middle_look_delay(self) -> np.ndarray | float:
-        """Time from the first look to the middle one [s]."""
+        """Time from the first look (record of each segment) to the middle one [s]."""
         return self.waveform.middle_look_delay(self.looks)
 
     @cached_property
@@ -297,7 +300,7 @@ class PlannerInputs(LinkBudget):
     def sidelobe_max(self, distance: np.ndarray) -> np.ndarray:
         """Return the largest relative magnitude of a bin at least ``distance`` [bins] from a line.
 
-        It is relative to the peak of a full record.
+        It is relative to the line's peak in a record that the echo fills.
         """
         response_max = self.window_response.sidelobe_max(distance)
         if self.missing_samples is None:
@@ -312,9 +315,10 @@ class PlannerInputs(LinkBudget):
         )
 
     def power_without_missing(self, power: np.ndarray) -> np.ndarray:
-        """Return a lower bound of the largest bin's power, from that of a full record.
+        """Return a lower bound of the largest bin's power if the echo lacks samples of the record.
 
-        Both are relative to the power of all lines on a bin.
+        ``power`` is the bound in a record that the echo fills. Both are relative to the power that
+        all lines together would have on one bin.
         """
         if self.missing_samples is None:
             return power
@@ -328,26 +332,29 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def bins_to_edge(self) -> np.ndarray:
-        """Distance of the folded line from the nearer of DC and Nyquist [bins]."""
+        """Distance of the line from the nearer of DC and Nyquist [FFT bins], after aliasing."""
         nyquist_bin = self.fft_size / 2
         nyquist_position = self.beat_frequency / (self.record.bin_width * nyquist_bin)
         return np.abs(nyquist_position - np.rint(nyquist_position)) * nyquist_bin
 
     @cached_property
     def transfer_gain(self) -> np.ndarray:
-        """Receiver's gain |H| at the line relative to DC."""
+        """Amplitude gain of the receiver at the line's frequency, relative to that at DC."""
         return self.receiver_filter.gain(self.beat_frequency)
 
     @cached_property
     def gain_slope_max(self) -> np.ndarray:
-        """Bound on the relative change of |H|^2 per bin [1/bin]."""
+        """Bound on the relative change of the receiver's power gain per FFT bin [1/bin]."""
         receiver_filter = self.receiver_filter
         bandwidths = receiver_filter.detector_bandwidth, receiver_filter.amplifier_bandwidth
         return np.asarray(sum(1 / bandwidth for bandwidth in bandwidths) * self.record.bin_width)
 
     @cached_property
     def line_signal_ratio(self) -> np.ndarray:
-        """Magnitude over sigma of the line on the axis, if it lay on a bin, by segment."""
+        """|X| of the line on the beam's axis if it lay on a bin, over the noise per quadrature.
+
+        By segment.
+        """
         receiver_filter, noise = self.receiver_filter, self.noise
         # Where an anti-alias filter passes almost no noise, the ADC's noise remains.
         if receiver_filter.antialias_filter and receiver_filter.noise_shape != "white":
@@ -360,12 +367,15 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def peak_ratio(self) -> np.ndarray:
-        """Magnitude over sigma of the largest bin of the line on the axis, by segment."""
+        """|X| in the largest bin of the line on the beam's axis, over the noise per quadrature.
+
+        By segment.
+        """
         return self.line_signal_ratio * self.window_response.scalloping_gain(self.bin_offset)
 
     @cached_property
     def bins_per_relative_range(self) -> np.ndarray:
-        """Shift of a line [bins] per relative change of range, by segment."""
+        """Shift of a line [FFT bins] per relative change of the target's range, by segment."""
         beat_per_relative_range = (
             self.waveform.chirp_rate * self.target.delay * (1 + np.abs(self.target.doppler_ratio))
         )
@@ -373,7 +383,7 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def bins_per_velocity(self) -> np.ndarray:
-        """Shift of a line [bins] per 1 m/s, by segment."""
+        """Shift of a line [FFT bins] per m/s of radial velocity, by segment."""
         return bins_per_velocity(
             range=self.range, carrier=self.carriers, chirp_rate=self.waveform.chirp_rate,
             bin_width=self.record.bin_width,
@@ -381,17 +391,23 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def range_spread(self) -> OffsetMoments:
-        """Moments of lines' offsets [bins] due to the ranges of all beamlets."""
+        """Moments of the offsets [FFT bins] of beamlets' lines from the axis's, due to range."""
         return self.footprint_extent.range_offsets.scaled_by(self.bins_per_relative_range)
 
     @cached_property
     def velocity_spread(self) -> OffsetMoments:
-        """Mean, rms and extreme of the lines' offsets [bins] due to the velocities of beamlets."""
+        """Mean, rms and extreme of the offsets [FFT bins] of beamlets' lines from the axis's.
+
+        These offsets are due to the beamlets' radial velocities.
+        """
         return self.footprint_extent.velocity_offsets.scaled_by(self.bins_per_velocity)
 
     @cached_property
     def line_spread(self) -> OffsetMoments:
-        """Bounds of moments of lines' offsets [bins] due to ranges and velocities of beamlets."""
+        """Bounds of the moments of offsets [FFT bins] of beamlets' lines from the axis's.
+
+        They include offsets due to both range and radial velocity.
+        """
         return self.range_spread.sum_bound(self.velocity_spread)
 
     @cached_property
@@ -404,12 +420,12 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def phase_error_shift_bins(self) -> np.ndarray | float:
-        """Largest shift of light by phase errors over the record [bins]."""
+        """Largest shift in frequency of a line's light by phase errors over the record [bins]."""
         return self.total_phase_error_bound.shift_window_bins * self.padding_factor
 
     @cached_property
     def bins_to_image(self) -> np.ndarray:
-        """Distance from DC and Nyquist to the nearest light of a line [bins]."""
+        """Distance from DC and Nyquist to the nearest light of any line [FFT bins]."""
         return self.bins_to_edge - self.line_spread.extreme - self.phase_error_shift_bins
 
     @cached_property
@@ -419,7 +435,10 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def image_bound(self) -> np.ndarray:
-        """Largest addition of images to the largest bin, over the magnitude of lines in phase."""
+        """Largest |X| that images (at negative frequencies) can add to the largest bin.
+
+        It is relative to the |X| of all lines in phase.
+        """
         smear_factor = 1 + 2 * self.phase_error_shift_bins / self.padding_factor
         gain_rise = np.exp(np.minimum(self.gain_slope_max * self.line_spread.extreme, 50.0))
         image_response = self.sidelobe_max(self.bins_to_image) * np.sqrt(smear_factor)
@@ -441,7 +460,10 @@ class PlannerInputs(LinkBudget):
 
     @cached_property
     def peak_power_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bound of the largest bin's power, over that of all lines on a bin."""
+        """Lower and upper bound of the largest bin's power.
+
+        Both are relative to the power that all lines together would have on one bin.
+        """
         return self.peak_power_bounds_for(self.line_spread)
 
     def peak_power_bounds_for(self, moments: OffsetMoments) -> tuple[np.ndarray, np.ndarray]:
@@ -460,8 +482,8 @@ class PlannerInputs(LinkBudget):
         Notes
         -----
         The bounds follow from Taylor's series, the line of the strongest beamlet, and Chebyshev's
-        inequality: a fraction 1 - 1/t^2 of the power lies within t s, and the largest bin there
-        holds at least the mean.
+        inequality. A fraction 1 - 1/t^2 of the power lies within t standard deviations of the
+        lines' offsets, and the largest bin in this interval holds at least the mean.
         """
         response, gain_slope, (mean, rms, extreme) = (
             self.window_response,
@@ -514,12 +536,14 @@ class PlannerInputs(LinkBudget):
 
         Notes
         -----
-        P_k = sum_b p_b F(k - x_0 - X_b), and with bounds F1, F2 on |F'| and |F''|
+        Bin k has the power P_k = sum_b p_b F(k - x_b), with the power p_b of beamlet b, and the
+        power F of a line by distance. F1 and F2 are bounds on |F'| and |F''|. Added offsets X_b
+        change it by
 
             |P_k(with) - P_k(without)| <= F1 |m| + F2 (S s + s^2 / 2) + c s
 
-        for the mean m and the rms s of X, added to lines of rms S, with c due to the receiver's
-        poles.
+        for the mean m and the rms s of X, added to lines of rms S. c is due to the slope of the
+        receiver's gain.
         """
         response, power_min = self.window_response, self.peak_power_bounds_for(present_moments)[0]
         power_change = response.slope_max * (added_moments.mean + shift_bins)
@@ -536,8 +560,8 @@ class PlannerInputs(LinkBudget):
     def coherent_sum_bound(self, shift_bins: np.ndarray | float) -> np.ndarray:
         """Bound the relative change of a sum of amplitudes whose lines move by ``shift_bins``.
 
-        It is relative to the sum in phase, and follows from |W'|, |H'| and the phase at mid-record,
-        of line and image.
+        It is relative to the sum in phase. It follows from the derivatives of the window's
+        transform and of the receiver's gain, and from the phases at mid-record of line and image.
         """
         phase_per_bin = (
             2

@@ -1,11 +1,14 @@
-"""Planning: the effects that are simulated in each tile are those that any of its points needs.
+"""Planning: choice of the effects that are simulated in each tile (a group of points).
+
+A tile has the effects that any of its points needs.
 
 The change if an effect is omitted is bounded at each point; a tile has the largest of its points.
 The effects with the smallest changes are omitted, as long as the sum of their changes is within the
 tolerance. A tighter tolerance keeps all effects that a looser one keeps.
 
-With x = ln a, and signal a and threshold b over sigma, dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2} is
-at most sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}. This has one maximum, at a (a - b) = 1/2. It is
+A bin is detected with Marcum's Q_1(a, b), with the signal a and the threshold b over the noise per
+quadrature sigma. Its derivative by x = ln a, dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2}, is at most
+sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}. This has one maximum, at a (a - b) = 1/2. It is
 evaluated at its largest value between the smallest and the largest a that all effects together may
 leave. An absolute change of a magnitude counts by dQ_1/da <= 1/2 e^{-(a - b)^2 / 2}. Noise that the
 threshold does not follow counts by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
@@ -32,13 +35,13 @@ from sweep.model.effects.planner_inputs import PlannerInputs
 
 _LN_10 = math.log(10.0)
 _CHANGE_MAX = 1e12
-"""Upper limit of changes and ratios, against overflow."""
+"""Upper limit of relative changes and of signals over noise, which avoids overflow."""
 _BIN_MOVING_STAGES = ("lines", "record", "spectrum")
-"""Stages of effects that move light from bin to bin."""
+"""Stages whose effects move light from bin to bin of the spectrum."""
 
 
 class EffectPlan(NamedTuple):
-    """Effects that are simulated in each tile."""
+    """Effects that are simulated in each tile (group of points), and the error of the omissions."""
 
     effect_names: tuple[str, ...]
     """Names of the effects, in the order of their application."""
@@ -48,15 +51,15 @@ class EffectPlan(NamedTuple):
     """(effects, tiles): change if the effect is omitted, 0..1. The largest change of pd, log10
     pfa or the relative |X| at any point of the tile, as of :func:`omission_errors`."""
     total_error: np.ndarray
-    """(tiles,): sum of the changes of omitted effects, and :attr:`residual_error`. It exceeds the
-    tolerance only by the latter, and by effects that are off."""
+    """(tiles,): sum of the changes by omitted effects, plus :attr:`residual_error`. Only the latter
+    and effects that are off can make it exceed the tolerance."""
     residual_error: np.ndarray
-    """(tiles,): change due to what simulated effects neglect."""
+    """(tiles,): error, 0..1, of pd or the relative |X| due to what simulated effects neglect."""
     keeps_all_optional: np.ndarray
     """(tiles,) bool: True if every effect is kept that is not forced on or off."""
 
     def select(self, tile_mask: np.ndarray) -> "EffectPlan":
-        """Return the plan of the tiles of a mask."""
+        """Return the plan of the tiles (groups of points) that a mask selects."""
         is_kept, omission_error = self.is_kept[:, tile_mask], self.omission_error[:, tile_mask]
         total_error, residual_error = self.total_error[tile_mask], self.residual_error[tile_mask]
         return EffectPlan(
@@ -172,7 +175,11 @@ def error_bounds(
 
 
 def _forced_modes(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
-    """Return the effects that are on or off by their mode, or by that of a parent or a child."""
+    """Return ``on`` or ``off`` by name of each effect that is not planned by its error bound.
+
+    Its own mode in the spec decides, or that of its parent or child. A child is an effect that is
+    part of another, the parent.
+    """
     forced_modes = {name: mode for name, mode in modes.items() if mode != "auto"}
     for name, parent in _child_parent_pairs(effects):
         if forced_modes.get(parent) == "off":
@@ -316,7 +323,10 @@ def omission_errors(
 def residual_errors(
     bounds: Mapping[str, ErrorBound], points: PlannerInputs
 ) -> dict[str, np.ndarray]:
-    """Bound the change of pd or |X| that remains although an effect is simulated, by name."""
+    """Bound the error of pd or relative |X| that simulated effects leave, by name of the effect.
+
+    pd is the probability of detection. Effects without such an error are left out.
+    """
     residuals = {
         name: bound.residual_magnitude_change
         for name, bound in bounds.items()
@@ -358,7 +368,10 @@ def residual_errors(
 def signal_ratio_bounds(
     bounds: Mapping[str, ErrorBound], points: PlannerInputs
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bound the largest bin's magnitude over sigma, below and above, for any set of effects."""
+    """Return a lower and an upper bound of |X| in the largest bin over the noise per quadrature.
+
+    They hold whichever of the effects are simulated.
+    """
     signal_ratio_min = signal_ratio_max = points.peak_ratio * points.looks.amplitude_gain_max
     coherent_change: np.ndarray | float = 0.0
     for bound in bounds.values():

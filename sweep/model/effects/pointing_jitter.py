@@ -34,7 +34,7 @@ from sweep.model.effects.error_bounds import (
 from sweep.model.effects.planner_inputs import PlannerInputs
 
 RARE_DRAW_PROBABILITY = 1e-6
-"""Probability of a draw whose deflection exceeds that assumed by the error bound."""
+"""Probability that the random deflection of a beam is larger than the error bound assumes."""
 
 _JITTER_PATH = "target.pointing_jitter"
 
@@ -43,11 +43,11 @@ class PerturbedGeometry(NamedTuple):
     """Geometry of a deflected beam, in the broadcast shape; nan where the beam misses the plane."""
 
     range: np.ndarray
-    """Range [m]."""
+    """Range [m] along the deflected beam."""
     grazing_angle: np.ndarray
-    """Grazing angle [rad]."""
+    """Angle [rad] between the deflected beam and the plane."""
     radial_velocity: np.ndarray
-    """Radial velocity [m/s], positive when closing."""
+    """Radial velocity [m/s] along the deflected beam, positive when the range shrinks."""
 
 
 def draw_jitter_angles(draw_addresses: DrawAddresses, sigma: np.ndarray) -> np.ndarray:
@@ -83,7 +83,7 @@ def perturb_geometry(
     Returns
     -------
     PerturbedGeometry
-        Equations of the module's description.
+        Range, grazing angle and radial velocity, by the equations of the module's description.
     """
     aimed_grazing, offsets = np.asarray(grazing_angle, float), np.asarray(jitter_angles, float)
     total_angle = np.hypot(offsets[..., 0], offsets[..., 1])
@@ -104,10 +104,10 @@ def perturb_geometry(
 
 
 def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest relative change of range and shift of lines [bins], in all but rare draws.
+    """Return the largest relative change of range, and shift of lines [bins], by beam deflections.
 
-    The lowest beamlets are included; the change of range is infinite if one may pass over the
-    horizon.
+    They hold in all draws but a fraction :data:`RARE_DRAW_PROBABILITY`, and for the lowest beamlets
+    too. The change of range is infinite if a beamlet may pass over the horizon.
     """
     turn_max = points[_JITTER_PATH] * math.sqrt(2 * math.log(1 / RARE_DRAW_PROBABILITY))
     rim_angle: np.ndarray | float = 0.0
@@ -139,7 +139,10 @@ def _largest_turn(points: PlannerInputs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def phase_error_bound(points: PlannerInputs) -> PhaseErrorBound | None:
-    """Return the reach of lines that draws shift; None without jitter."""
+    """Return how far random deflections of the beam shift lines; None without jitter.
+
+    It is given as the shift of a :class:`PhaseErrorBound`.
+    """
     if not points.any_nonzero(_JITTER_PATH):
         return None
     return PhaseErrorBound(extra_shift_window_bins=_largest_turn(points)[1] / points.padding_factor)
@@ -219,4 +222,4 @@ POINTING_JITTER = Effect(
         ),
     ),
 )
-"""Effect of random deflections of the beam from shot to shot."""
+"""Effect that deflects the beam at random from shot to shot."""

@@ -38,24 +38,24 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(32)
 _CUT_DEVIATIONS = np.array([-8.0, 0.0, 8.0])
-"""Voltages at which the quarter period is split, in noise deviations from full scale; the
-integrands are smooth in between."""
+"""Voltages at which integrals over a quarter period of the sine are split, less full scale, in
+standard deviations of the noise. Between them the integrands are smooth."""
 _TINY = 1e-30
-"""Smallest amplitude, which stands for 0 where a positive number is needed."""
+"""Positive voltage [V] that replaces an amplitude of 0 where a positive number is needed."""
 _UNLIMITED_VOLTAGE = 1e100
-"""Voltage that stands for no limit."""
+"""Full-scale voltage [V] of an ADC that never clips."""
 _AMPLITUDE_MIN_SIGMA = 1e-5
-"""Smallest amplitude [noise deviations]. The gain of weaker beats is the same to the square of this
-number, and could not be separated from the rounding of 1."""
+"""Smallest beat amplitude for which the gain is computed, in standard deviations of the noise. The
+gain of weaker beats is the same to the square of this number."""
 
 
 class ClippingGains(NamedTuple):
-    """Gains of a sine with noise due to clipping, (n,) each."""
+    """Factors by which clipping reduces a sine and the noise added to it, (n,) each."""
 
     signal_gain: np.ndarray
-    """Factor on the line's amplitude, 0..1."""
+    """Factor, 0..1, by which clipping multiplies the amplitude of the line."""
     noise_gain: np.ndarray
-    """Factor on the noise variance, 0..1."""
+    """Factor, 0..1, by which clipping multiplies the variance of the noise."""
 
 
 def clipping_gains(
@@ -75,7 +75,7 @@ def clipping_gains(
     Returns
     -------
     ClippingGains
-        Equations of the module's description.
+        Factors on line and noise, by the equations of the module's description.
     """
     voltages = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
     a, s, v = (value[..., None] for value in np.broadcast_arrays(*voltages))
@@ -127,8 +127,8 @@ def _clipping_loss(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndar
 _FULL_SCALE_PATH = PROCESSING_PREFIX + "full_scale"
 
 FULL_SCALE_EXCESS_MAX = 1e6
-"""Largest ratio of signal or noise to full scale; the result loses as many digits as the ratio has.
-"""
+"""Largest allowed ratio of the signal or noise to the ADC's full scale. The result loses as many
+digits as the ratio has."""
 
 
 def apply(shots: Shots, context: EffectContext) -> Shots:
@@ -239,4 +239,4 @@ SATURATION = Effect(
         ),
     ),
 )
-"""Effect of clipping at the ADC's full scale."""
+"""Effect that clips records at the ADC's full scale."""

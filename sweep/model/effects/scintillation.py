@@ -39,13 +39,18 @@ from sweep.model.link_budget import ECHO_NOISE_SOURCES, LASER_PREFIX, TELESCOPE_
 from sweep.model.preparation import Shots
 
 _DISTANCE_EXPONENTS = {"plane": (5 / 6, 0.0), "spherical": (5 / 6, 5 / 6)}
-"""Exponents of the distances to receiver and source in the integral over the path."""
+"""Exponents, by kind of wave, of the distances to receiver and to source in the Rytov variance's
+integral over the path."""
 _LARGE_EDDY_COEFFICIENTS = {"plane": (0.65, 1.11), "spherical": (0.18, 0.56)}
-"""Coefficients of the aperture and of the strength in the log variance of large eddies."""
+"""Coefficients, by kind of wave, of two terms in the log variance by large eddies. The first term
+is the aperture's, the second that of the strength of turbulence."""
 
 
 class TurbulenceProfile(NamedTuple):
-    """Profile of the refractive index's structure constant over height above the ground."""
+    """Structure constant C_n^2 of the air's refractive index over height above the ground.
+
+    It is the sum of a uniform part and of the three terms of Hufnagel and Valley's model.
+    """
 
     uniform: float = 0.0
     """Part of C_n^2 that is the same at all heights [m^(-2/3)]. If the other fields are 0, it is
@@ -68,9 +73,9 @@ class LogIrradianceVariances(NamedTuple):
     """Variances of the logarithm of the irradiance by large and by small eddies, (n,) each."""
 
     large_eddies: np.ndarray
-    """(n,): log variance by large eddies."""
+    """(n,): variance of the logarithm of the irradiance factor that large eddies cause."""
     small_eddies: np.ndarray
-    """(n,): log variance by small eddies."""
+    """(n,): variance of the logarithm of the irradiance factor that small eddies cause."""
 
 
 def structure_constant(turbulence: TurbulenceProfile, height: ArrayLike) -> np.ndarray:
@@ -148,7 +153,11 @@ def rytov_variance(
 
 @lru_cache(maxsize=2)
 def _path_quadrature(wave: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return fractions of the path from source to receiver, and weights that include the powers."""
+    """Return quadrature nodes and weights for the Rytov variance's integral over the path.
+
+    Nodes are fractions of the path from source to receiver. Weights include the powers of the
+    distances to both.
+    """
     to_receiver, to_source = _DISTANCE_EXPONENTS[wave]
     nodes, weights = special.roots_jacobi(64, to_receiver, to_source)
     return (1 + nodes) / 2, weights / 2 ** (1 + to_receiver + to_source)
@@ -205,11 +214,13 @@ def log_irradiance_variances(
 
 
 IRRADIANCE_DISTRIBUTIONS = ("log_normal", "gamma_gamma")
-"""Names of the irradiance's distributions."""
+"""Names of the distributions of the irradiance that a spec can select."""
 _GAMMA_VARIANCE_MIN = 1e-5
-"""Variance below which a gamma distribution is approximated by Wilson and Hilferty."""
+"""Variance of a gamma variable of mean 1 below which Wilson and Hilferty's approximation gives its
+quantiles."""
 _PD_SLOPE_MAX, _PD_CURVATURE_MAX = 0.5, 0.5
-"""Suprema over a of |dQ_1(a, b)/d ln a| over 1 + b, and of its second derivative over 1 + b^2."""
+"""Bounds on derivatives of Marcum's Q_1(a, b) by ln a, with the signal a and the threshold b over
+the noise per quadrature. The first is 1 + b, the second 1 + b^2, times these numbers."""
 
 
 def draw_scintillation_factors(
@@ -251,10 +262,12 @@ def draw_scintillation_factors(
 def _log_amplitude_moments(
     distribution: str, legs: Sequence[LogIrradianceVariances]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return |E L| and E L^2, or upper bounds, of half the logarithm L of the total factor.
+    """Return |E L| and E L^2, or upper bounds of them, for scintillation.
 
-    ln I of a gamma distribution of shape 1/s has a mean above -(s/2 + s^2/12) and a variance below
-    s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its derivative.
+    L is half the logarithm of the total factor on the echo's power, and E the mean. Let a gamma
+    variable of mean 1 have the shape 1/s. Its logarithm has a mean above -(s/2 + s^2/12) and a
+    variance below s + s^2/2 + s^3/6, by the enveloping series of the digamma function and its
+    derivative.
     """
     variances = [np.asarray(v, float) for leg in legs for v in leg]
     if distribution == "log_normal":
@@ -437,4 +450,4 @@ SCINTILLATION = Effect(
         ),
     ),
 )
-"""Effect of turbulence on the power of the echo."""
+"""Effect that lets turbulence vary the power of the echo at random from shot to shot."""

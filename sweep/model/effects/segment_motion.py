@@ -41,12 +41,12 @@ from sweep.model.preparation import Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 LOOK_DRIFT_MAX_WINDOW_BINS = 0.25
-"""Largest drift from the first look to the last [bins of fs/L] that counts as none: 1 % of the
-power."""
+"""Largest drift of a line from the first look to the last that may be ignored. The unit is the
+sample rate over the number of samples in the record. The error is 1 % of the power."""
 
 
 def range_drift_max(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound of the target's motion from the shot's start to each segment's [m]."""
+    """Return an upper bound [m] of the change of range from the shot's start to each segment's."""
     end_time = points.segment_starts + points.middle_look_delay
     target = points.target
     return np.asarray(
@@ -55,7 +55,10 @@ def range_drift_max(points: PlannerInputs) -> np.ndarray:
 
 
 def line_drift_max_bins(points: PlannerInputs) -> np.ndarray:
-    """Return an upper bound of the line's motion from the shot's start to each segment's [bins]."""
+    """Return an upper bound [bins] of the line's shift from the shot's start to each segment's.
+
+    The line shifts because the range and velocity of the target change.
+    """
     target = points.target
     velocity_change = np.abs(target.acceleration) * (
         points.segment_starts + points.middle_look_delay
@@ -206,4 +209,4 @@ SEGMENT_MOTION = Effect(
     apply=apply,
     defines_scene_if_off=True,
 )
-"""Effect of range and velocity that change from segment to segment."""
+"""Effect that starts the segments one after the other, while range and velocity change."""

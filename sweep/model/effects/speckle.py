@@ -64,8 +64,8 @@ from sweep.model.shot_records import EchoSpeckle
 _ROUGHNESS_PATH = "target.roughness"
 _SPECKLE_PATH = "footprint.speckle"
 _DIFFUSE_RATIO_MAX = 5.0
-"""Bound on a bin's diffuse amplitude over its root mean square; exceeded in one of a million draws.
-"""
+"""Bound on the ratio of a bin's diffuse (random) amplitude to its root mean square. It is exceeded
+in one of a million draws."""
 
 
 def coherent_echo_fraction(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
@@ -183,10 +183,10 @@ def speckle_bound(points: PlannerInputs) -> ErrorBound | None:
 
 
 _DECORRELATED_KAPPA_MAX = 1e-6
-"""Coherent fraction kappa of coherent footprints below which the segments' speckles are
-decorrelated."""
+"""Limit on the fraction of the echo's power that keeps its phase, for footprints whose beamlets add
+as amplitudes. Below it the speckle may differ from segment to segment."""
 _TINY = 1e-300
-"""Smallest power, so that divisions are defined."""
+"""Positive number that replaces a divisor of 0, such as the power of no light."""
 
 
 def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddresses) -> Shots:
@@ -254,9 +254,10 @@ def perturb_shots(shots: Shots, context: EffectContext, draw_addresses: DrawAddr
 
 
 def fading_bound(points: PlannerInputs) -> ErrorBound | None:
-    """Return an error of 1, as fading changes the law of detection; None if it is absent.
+    """Return an error of 1 where developed speckle is selected, so that fading is simulated.
 
-    The error is that of pd for the mean power in place of the fluctuating one (Swerling).
+    Without the effect, the probability of detection would be that of a steady echo of the mean
+    power. None if fading is absent.
     """
     is_smooth = points.adds_field_amplitudes or points.waveform.architecture == "direct"
     return (
@@ -303,7 +304,10 @@ def apply_fading(shots: Shots, context: EffectContext) -> Shots:
 
 
 def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
-    """Return the standard deviation of the beamlets' lines [bins of fs/N], (segments, n)."""
+    """Return the standard deviation of the frequencies of beamlets' lines [bins], (segments, n).
+
+    Bins are those of the FFT.
+    """
     bins_per_hertz = shots.fft_size / shots.sample_rate
     delay = 2 * shots.range / SPEED_OF_LIGHT
     weights = np.array(
@@ -320,10 +324,11 @@ def _line_deviation_bins(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
 
 
 _N_LINE_NODES, _LINE_DEVIATIONS_MAX = 81, 4.0
-"""Number of lines of a footprint, evenly spaced so that they do not form a comb, and their extent
-[deviations]."""
+"""Number of evenly spaced lines that represent the lines of a footprint, and distance of the
+outermost ones from the centre, in standard deviations of the beam."""
 _DECORRELATION_MIN = 1e-9
-"""Loss of correlation between looks below which all looks share one speckle."""
+"""Largest loss of correlation between looks (records of a segment) for which all looks count as
+having the same speckle."""
 
 
 def _set_look_speckle(shots: Shots, beam_spread: "BeamSpread") -> Shots:
@@ -442,14 +447,14 @@ def _look_powers(shots: Shots, slopes: BeamGradients) -> np.ndarray:
 
 
 class BeamSpread(NamedTuple):
-    """Spread of ranges and Doppler ratios over the beam on the ground."""
+    """Spread of ranges and Doppler ratios (2 v / c) over the beam on the ground."""
 
     slopes: BeamGradients
-    """Gradients across the beam."""
+    """Gradients of range and Doppler ratio across the beam."""
     plane: FlatGround | None
-    """Plane; None for ray-traced ground."""
+    """Plane that the beam meets; None for ray-traced ground."""
     moments: "BeamletMoments"
-    """Moments of the beamlets' Doppler ratio and relative range."""
+    """Power-weighted moments of the Doppler ratio and the relative range of the beam's rays."""
 
     def correlation(
         self, shots: Shots, pair: tuple[int, int], phase: "PhaseDifference"
@@ -468,6 +473,7 @@ class BeamSpread(NamedTuple):
         Returns
         -------
         ndarray (n,) complex
+            Correlation of the echo's amplitudes, of a modulus up to 1.
         """
         if self.plane is not None:
             correlations = self.plane.mean_phasor(*phase).astype(complex)
@@ -489,7 +495,7 @@ class BeamSpread(NamedTuple):
 
 
 def _beam_spread(shots: Shots, ground: Ground) -> BeamSpread:
-    """Return the spread over the beam, of a plane or of ray-traced beamlets."""
+    """Return the spread of ranges and Doppler ratios over the beam, on a plane or ray-traced."""
     moments = _beamlet_moments(shots, ground)
     if isinstance(ground, FlatGround):
         return BeamSpread(ground.gradients, ground, moments)
@@ -536,12 +542,16 @@ def _line_gradients(shots: Shots, ground: FlatGround | RayTracedGround) -> LineG
 
 
 class PhaseDifference(NamedTuple):
-    """Coefficients of a scatterer's phase difference between two segments, (n,) each."""
+    """Coefficients of a scatterer's phase difference between two segments, (n,) each.
+
+    The phase difference is linear in the scatterer's Doppler ratio (2 v / c) and relative range.
+    """
 
     doppler_cycles: np.ndarray
-    """Cycles per unit of the Doppler ratio beta."""
+    """Phase difference between two segments [cycles] per unit of the Doppler ratio 2 v / c."""
     delay_cycles: np.ndarray
-    """Cycles per unit of relative range, with the sign reversed."""
+    """Phase difference between two segments [cycles] per unit of relative range, with the sign
+    reversed."""
 
     def phase_per_deviation(self, slopes: BeamGradients) -> np.ndarray:
         """Return the phase difference per standard deviation of the beam [rad], (n,)."""
@@ -637,8 +647,8 @@ def _line_pair_gradients(
 
 
 _IMAGE_REACH_BINS = 2.0
-"""Distance from DC or Nyquist [bins], and deviations of lines, within which the image of an echo
-may make another bin the strongest."""
+"""Reach from DC or Nyquist within which the image of an echo may make another bin the strongest. It
+is this number times the sum of padding factor and standard deviation of the lines [FFT bins]."""
 
 
 def _strongest_bins_with_images(
@@ -685,12 +695,13 @@ def _strongest_bins_with_images(
 
 
 class BeamletMoments(NamedTuple):
-    """Power-weighted moments of the beamlets' (Doppler ratio, relative range)."""
+    """Power-weighted moments of the Doppler ratio and relative range of the rays of a beam."""
 
     mean: np.ndarray
-    """(2, n): means."""
+    """(2, n): means of the Doppler ratio and of the relative range."""
     covariance: np.ndarray
-    """(2, 2, n): covariance matrix, about each surface's own mean."""
+    """(2, 2, n): covariance matrix of the Doppler ratio and the relative range, about the mean of
+    each surface."""
 
 
 def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
@@ -771,7 +782,7 @@ FADING = Effect(
         ),
     ),
 )
-"""Effect of developed speckle of a rough surface, in closed form."""
+"""Effect that computes detection of echoes in developed speckle in closed form, without draws."""
 
 
 SPECKLE = Effect(
@@ -790,4 +801,4 @@ SPECKLE = Effect(
         ),
     ),
 )
-"""Effect of random amplitudes of a rough surface, by draws."""
+"""Effect that draws the random amplitudes that a rough surface returns from each beamlet."""

@@ -11,27 +11,29 @@ from typing import NamedTuple
 import numpy as np
 
 RESIDUAL_MAX_OVER_SPAN = 1e-3
-"""Largest residual of a table's Chebyshev series, over the span of the table's values."""
+"""Largest allowed departure of a Chebyshev series from the table that it fits, over the table's
+largest less its smallest value."""
 CHEBYSHEV_DEGREE_MAX = 64
-"""Largest degree of the Chebyshev series."""
+"""Largest degree of the Chebyshev series that is fitted to a table of frequency errors."""
 
 
 class SweepErrorTable(NamedTuple):
     """Measured frequency error of the sweep over the time in the up-chirp."""
 
     first_time: float
-    """Time of the first row [s]."""
+    """Time in the up-chirp of the table's first row [s]."""
     last_time: float
-    """Time of the last row [s]."""
+    """Time in the up-chirp of the table's last row [s]."""
     chebyshev_coefficients: np.ndarray
-    """Chebyshev coefficients of the error [Hz] over those times."""
+    """Chebyshev coefficients [Hz] of the frequency error from the table's first to its last
+    time."""
 
     def frequency_error(self, position: np.ndarray | float) -> np.ndarray:
-        """Return the error [Hz] at positions -1..1 over the table's times."""
+        """Return the frequency error [Hz] at positions between first (-1) and last time (1)."""
         return np.asarray(np.polynomial.chebyshev.chebval(position, self.chebyshev_coefficients))
 
     def integrate_error(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Integrate the error between two times [cycles].
+        """Return the integral of the frequency error between two times [cycles].
 
         Parameters
         ----------
