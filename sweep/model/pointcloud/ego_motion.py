@@ -127,8 +127,10 @@ class EgoMotion(NamedTuple):
 
         The slip is the closing speed minus the speed at which the range falls.
 
-        Notes ----- It is sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 +
-        slope^2)), with the priors ``terrain_slope`` as slope and ``target_speed`` as speed.
+        Notes
+        -----
+        The variance isslope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 +
+        slope^2), with the priors ``terrain_slope`` as slope and ``target_speed`` as speed.
         """
         slope_deviation, speed_deviation, _ = self.priors
         at_range_0, per_range = self.slip_per_slope, self.slip_per_slope_per_range
@@ -188,7 +190,9 @@ def ego_motion_of_beams(
     priors
         Prior standard deviations of unknown motion.
 
-    Notes ----- Let z be the vertical, R the range, and u the speed at which the range falls. Then
+    Notes
+    -----
+    Let z be the vertical, R the range, and u the speed at which the range falls. Then
     minus the slip is u - V.d = V.z / d.z - V.d + R d'.z / d.z.
     """
     closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
