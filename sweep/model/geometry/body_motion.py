@@ -159,7 +159,8 @@ class AttitudeTrack:
     quaternions: Sequence[Sequence[float]] | np.ndarray
     """(n, 4): attitudes at ``times``, as quaternions (w, x, y, z) from body to world."""
     _rotation_steps: np.ndarray = field(init=False, repr=False)
-    """(n - 1, 3): rotation vectors between successive attitudes [rad]."""
+    """(n - 1, 3): rotation vectors from each of the given attitudes to the next [rad]. A rotation
+    vector points along the axis and has the length of the angle."""
 
     def __post_init__(self) -> None:
         times, quaternions = require_rising_times(self.times), np.asarray(self.quaternions, float)
@@ -237,11 +238,11 @@ class Motion(NamedTuple):
     """
 
     position: np.ndarray
-    """Position [m]."""
+    """(n, 3): position of the point in the world's frame [m]."""
     velocity: np.ndarray
-    """Velocity [m/s]."""
+    """(n, 3): velocity of the point in the world's frame [m/s]."""
     acceleration: np.ndarray
-    """Acceleration [m/s^2]."""
+    """(n, 3): acceleration of the point in the world's frame [m/s^2]."""
 
 
 class BodyState(NamedTuple):
@@ -279,13 +280,13 @@ class ConstantAcceleration:
     """Trajectory of a point under constant acceleration; a straight line if that is 0."""
 
     position: FloatSequence
-    """(3,): position at time 0 [m]."""
+    """(3,): position of the point at time 0 [m], in the world's frame."""
     velocity: FloatSequence
-    """(3,): velocity at time 0 [m/s]."""
+    """(3,): velocity of the point at time 0 [m/s], in the world's frame."""
     acceleration: FloatSequence
-    """(3,): acceleration [m/s^2]."""
+    """(3,): constant acceleration of the point [m/s^2], in the world's frame."""
     duration: float
-    """Duration [s], > 0."""
+    """Duration of the trajectory [s], above 0."""
     start: float = field(default=0.0, init=False)
     """Time at which the trajectory begins [s]."""
 
@@ -428,7 +429,7 @@ class MovingBody:
     """Body that follows a trajectory and an attitude law, and may carry an instrument."""
 
     trajectory: Trajectory
-    """Trajectory of the body's reference point."""
+    """Trajectory of the body's reference point, the origin of its frame."""
     attitude_law: AttitudeLaw
     """Law that gives the attitude of the body over time."""
     lever_arm: FloatSequence = (0.0, 0.0, 0.0)

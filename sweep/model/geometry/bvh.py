@@ -151,9 +151,10 @@ def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> np.ndarray:
-    """Return the box of each leaf, (n, 6) float32 [m]: lower bounds, and upper bounds negated.
+    """Return the bounding box of each leaf, (n, 6) float32 [m].
 
-    `leaves` is the result of :func:`_order_into_leaves`.
+    A box has its lower bounds along x, y, z, and then its upper bounds negated. ``leaves`` is the
+    result of :func:`_order_into_leaves`.
     """
     slack = _BOX_SLACK * float(max(vertices.max(), -vertices.min()))
     boxes = np.empty((leaves.size // LEAF_TRIANGLES_MAX, 6), np.float32)
@@ -176,10 +177,10 @@ def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> 
 def _build_nodes(
     vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return :attr:`BoxTree.bounds` and :attr:`BoxTree.children` of all nodes.
+    """Build all nodes of the tree; return :attr:`BoxTree.bounds` and :attr:`BoxTree.children`.
 
-    Nodes are in the order of their levels, from those above the leaves to the root. `leaves` is the
-    result of :func:`_order_into_leaves`.
+    Nodes are in the order of their levels, from those above the leaves to the root. ``leaves`` is
+    the result of :func:`_order_into_leaves`.
     """
     boxes = _leaf_boxes(vertices, faces, leaves)
     triangle_count = (

@@ -25,7 +25,7 @@ class DoubleDouble(NamedTuple):
     """Numbers with twice the digits of float64, each stored as the sum of two float64."""
 
     high: np.ndarray
-    """The numbers, rounded to float64."""
+    """The numbers, each rounded to the nearest float64."""
     low: np.ndarray
     """Differences of the numbers and their rounded values ``high``, as float64."""
 
@@ -52,7 +52,7 @@ def quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
 
 
 def _split_digits(a: np.ndarray) -> DoubleDouble:
-    """Split float64 numbers into two summands, each of half as many digits."""
+    """Split float64 numbers into sums of two float64, each of half as many digits."""
     scaled = a * _SPLIT_FACTOR
     high = scaled - (scaled - a)
     return DoubleDouble(high, a - high)

@@ -38,7 +38,7 @@ class SurfaceMaterial:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangle mesh. Vertices are relative to an origin, so large coordinates keep their digits.
+    """Triangle mesh whose vertices are relative to an origin, which keeps the digits of positions.
 
     Raises
     ------
@@ -47,7 +47,7 @@ class Mesh:
     """
 
     vertices: np.ndarray
-    """(n, 3) float64 [m], relative to `origin`."""
+    """(n, 3) float64: positions of the vertices relative to ``origin`` [m]."""
     faces: np.ndarray
     """(m, 3) int32: indices of each triangle's three vertices. Their order may be either winding,
     since both sides are visible."""
@@ -168,7 +168,7 @@ def plane_distances(
     ray_origin: DoubleDouble,
     ray_direction: DoubleDouble,
 ) -> DoubleDouble:
-    """Compute the distances of facets' planes along rays.
+    """Compute the distances along rays from their origins to the planes of facets (triangles).
 
     Parameters
     ----------

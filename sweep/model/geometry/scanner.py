@@ -60,7 +60,9 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
 
 def corner_directions(angle: float) -> np.ndarray:
-    """Return the four beams of :func:`steered_directions` with both angles at +-`angle` [rad].
+    """Return the directions of four beams, steered by +-`angle` [rad] from nadir about both axes.
+
+    The steerer is that of :func:`steered_directions`.
 
     Returns
     -------
@@ -136,7 +138,7 @@ class ScanShots(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BeamCycle:
-    """Beams at fixed angles, fired in a repeated sequence of patterns."""
+    """Scan pattern of beams at fixed angles, fired in a repeated sequence of groups (patterns)."""
 
     directions: Sequence[Sequence[float]] | np.ndarray
     """(b, 3): directions of the beams in the body frame; vectors of any length above 0."""
@@ -152,7 +154,7 @@ class BeamCycle:
     _unit_directions: np.ndarray = field(init=False, repr=False)
     """(b, 3): unit vectors along `directions`."""
     _pattern_table: np.ndarray = field(init=False, repr=False)
-    """(p, k) int64: `patterns` as an array."""
+    """(p, k) int64: indices of the k beams in each of p patterns, as an array."""
     _shot_interval: float = field(init=False, repr=False)
     """Time from one shot to the next of a measurement cycle [s]: ``interval``, or the even spacing
     if that is None."""

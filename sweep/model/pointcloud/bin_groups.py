@@ -56,7 +56,10 @@ class BinGroups(NamedTuple):
 
     @property
     def magnitude(self) -> np.ndarray:
-        """|X| of the strongest bin [V, summed over the record], (n, 3, groups)."""
+        """Noiseless |X| of each group's strongest bin [V, summed over the record].
+
+        The result is (n, 3, groups).
+        """
         return self.neighbour_magnitudes[..., 1]
 
     def without_unused_groups(self) -> "BinGroups":
@@ -185,9 +188,10 @@ def find_groups_in_spans(
 
 
 def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers of bins of spans, and |X|, without bins outside echoes that are not searched.
+    """Return the numbers of bins and |X| [V], with |X| set to 0 outside unsearched echoes.
 
-    Sidelobes of an echo that is not searched are no groups, but leakage.
+    This holds for segments whose strongest bin is outside the search band. Sidelobes of such an
+    echo are leaked signal and no groups.
     """
     n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
     for s, j in np.argwhere(~spans.peak_is_searched):
@@ -216,7 +220,10 @@ def _fill_groups(
     neighbour_magnitudes,
     pd,
 ):
-    """Find the groups of every span, and write them into arrays with the shapes of BinGroups.
+    """Find groups in every span, and write them into arrays with the shapes of :class:`BinGroups`.
+
+    A group is a run of adjacent bins at or above the threshold. A span holds the adjacent bins
+    around the lines of a segment.
 
     Parameters
     ----------

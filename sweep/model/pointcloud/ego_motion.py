@@ -92,7 +92,8 @@ class EgoMotion(NamedTuple):
     """(n, 3): derivative of the slip at range 0 [m/s] with respect to the gradient (rise over run)
     of the surface."""
     slip_per_slope_per_range: np.ndarray
-    """(n, 3): derivative of ``slip_per_slope`` with respect to the range [1/s]."""
+    """(n, 3): derivative of ``slip_per_slope``, which is at range 0, with respect to the range
+    [(m/s)/m]."""
     slip_per_target_speed: np.ndarray
     """Standard deviation of the slip by motion of the surface, over the standard deviation of one
     component of the surface's velocity (a ratio)."""
@@ -119,7 +120,10 @@ class EgoMotion(NamedTuple):
         return np.asarray(slip + per_range * distance)
 
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the speed [m/s] at which ranges (n, ...) [m] to level ground at rest fall."""
+        """Return the speed [m/s] at which the range to level ground at rest falls.
+
+        It depends on the range: ``distance`` (n, ...) holds ranges [m] of each beam.
+        """
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:

@@ -46,14 +46,16 @@ INSTRUMENT_KEY_NUMBER = -1.0
 
 
 class ErrorFloor(NamedTuple):
-    """Standard deviations of an instrument's errors; all 0 for an instrument without errors.
+    """Standard deviations of those errors of an instrument that do not depend on the echo.
+
+    All are 0 for an instrument without such errors.
 
     >>> ErrorFloor(clock=0.03, wavelength=0.04).velocity_scale_error
     0.05
     """
 
     pointing: float = 0.0
-    """Standard deviation of a beam's known direction, on each of two axes [rad]."""
+    """Standard deviation of the error of a beam's known direction, on each of two axes [rad]."""
     clock: float = 0.0
     """Standard deviation of the relative error of the sampling clock's frequency."""
     wavelength: float = 0.0
@@ -73,7 +75,7 @@ class ErrorFloor(NamedTuple):
         return float(np.hypot(self.clock, self.wavelength))
 
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
-        """Return the standard errors of radial velocities [m/s] by the error floor.
+        """Return the standard errors of radial velocities [m/s] by the instrument's own errors.
 
         `radial_velocity` and `speed_across` are the instrument's velocity along and across the beam
         [m/s].
@@ -87,7 +89,7 @@ class ErrorFloor(NamedTuple):
 
 
 NO_ERROR_FLOOR = ErrorFloor()
-"""Error floor of an instrument without errors."""
+"""Standard deviations, all 0, of an instrument whose errors all depend on the echo."""
 
 
 def apply_error_floor(

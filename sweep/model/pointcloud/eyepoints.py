@@ -62,9 +62,10 @@ class Eyepoints(NamedTuple):
     velocity: np.ndarray
     """(n, 3): velocity of the instrument [m/s]."""
     direction: np.ndarray
-    """(n, 3): unit vector along the beam's axis, as commanded."""
+    """(n, 3): unit vector along the beam's axis, as commanded, in the world's frame."""
     range: np.ndarray
-    """(n,): range R_0 of the reference beamlet [m]; inf for a shot that hits nothing."""
+    """(n,): range of the reference beamlet, the first that hits a surface [m]; inf for a shot that
+    hits nothing."""
     offset: np.ndarray
     """(n, b): range of each beamlet minus the range of the reference beamlet [m]; nan for a beamlet
     that misses."""
@@ -97,7 +98,7 @@ class Eyepoints(NamedTuple):
 
     @property
     def has_target(self) -> np.ndarray:
-        """True for shots of which any beamlet hits a surface, (n,) bool."""
+        """Mask (n,) that is True for shots of which any beamlet hits a surface."""
         return np.isfinite(self.range)
 
     @property

@@ -7,7 +7,8 @@ probability that it adds to noise,
 
     c_k(z) = (Q_1(a_k, z) - e^(-z^2 / 2)) / (1 - e^(-z^2 / 2)),
 
-at the threshold z = b. Both together leave the bin below any level z with the probability
+at the threshold z = b. Q_1 is Marcum's function, the probability that signal and noise together
+exceed z. Both together leave the bin below any level z with the probability
 
     (1 - e^(-z^2 / 2)) (1 - c_k(z)) = 1 - Q_1(a_k, z)
 

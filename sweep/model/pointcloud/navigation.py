@@ -102,7 +102,7 @@ STATUS_UNDETERMINED = 3
 """Status of a cycle without a solution: its beams are too few, or nearly coplanar."""
 
 ArraysByName = Mapping[str, np.ndarray]
-"""Arrays by the name of their output variable."""
+"""Mapping from names of output variables to their arrays."""
 
 
 class FittedCycles(NamedTuple):
@@ -418,7 +418,7 @@ def _fit_plane(
     ground_points: np.ndarray, directions: np.ndarray, errors: np.ndarray, is_used: np.ndarray,
     gradient: np.ndarray, slope: float, relief: float,
 ) -> _GroundPlane:  # fmt: skip
-    """Fit planes to n cycles' ground points by weighted least squares.
+    """Fit a plane to the ground points of each of n cycles by weighted least squares.
 
     Parameters
     ----------

@@ -11,10 +11,10 @@ interpolated position has a normal error of the reported standard error. ``noise
 bins of a group's echo, or, if only the strongest bin detects, to that bin and its two neighbours. A
 neighbour may then be the largest bin.
 
-Ranges and velocities are those at the shot's start, as the truth is. Range walk shifts the
-interpolated range by v_r (T_w + 2 t_0), and motion between segments shifts range and velocity. The
-measured velocity corrects both. The beats contain no information on the acceleration, or on ground
-that slides under the beam. The instrument's known motion corrects the points for both
+Ranges and velocities are those at the shot's start, as the truth is. Motion within a record (range
+walk) shifts the interpolated range. Motion between segments shifts range and velocity. The measured
+velocity corrects both. The beats contain no information on the acceleration, or on ground that
+slides under the beam. The instrument's known motion corrects the points for both
 (:mod:`sweep.model.pointcloud.ego_motion`). If segments have slopes other than 1, 0 and -1, a return
 is the fit of all its peaks.
 
@@ -176,7 +176,8 @@ class Returns(NamedTuple):
     """Probability that up and down segment both detect the echo of the return; nan if a peak is
     false."""
     flags: np.ndarray
-    """uint8: bits of :data:`sweep.model.pointcloud.pairing.FLAG_BITS`; 0 without a return."""
+    """uint8: bits that compare the return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
     """int32: index of the beamlet whose surface a true or misread return measures; -1 for other
     returns."""
@@ -347,10 +348,10 @@ def _iter_spectra(
 
 
 class DrawConfig(NamedTuple):
-    """Settings of drawing that are common to all points."""
+    """Settings for draws of peaks that are common to all points."""
 
     first_draw: int
-    """Number of the first draw."""
+    """Number of the first draw that is made."""
     in_noise: bool
     """True if noise is added to the bins of an echo; False if random numbers are compared with
     probabilities of detection."""
@@ -470,7 +471,7 @@ class DrawInputs(NamedTuple):
     """(n,) in each field: thresholds of bins by their distance from the line
     (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa_noise: np.ndarray
-    """(n, 3): probability of a false alarm by noise alone."""
+    """(n, 3): probability that noise alone raises a false alarm in a segment."""
     doppler_prediction: np.ndarray
     """(n, 3): coefficients of the up and down beat in the predicted Doppler beat, and the effect of
     known motion on it [bins] (:func:`sweep.model.pointcloud.pairing.find_confirming_peak`)."""
@@ -562,7 +563,8 @@ class DrawnPeaks(NamedTuple):
     """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
     down peak belong, or FALSE_PEAK or NO_PEAK."""
     flags: np.ndarray
-    """(n, draws, returns) uint8: bits of FLAG_BITS; 0 without a return."""
+    """(n, draws, returns) uint8: bits that compare each return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
     """(n, draws, returns) int32: index of the beamlet whose surface a true or misread return
     measures; -1 for other returns."""
@@ -595,7 +597,8 @@ class ListedReturns(NamedTuple):
     """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
     belong, or FALSE_PEAK or NO_PEAK."""
     flags: np.ndarray
-    """(m,) uint8: bits of FLAG_BITS."""
+    """(m,) uint8: bits that compare each return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
     beamlet: np.ndarray
     """(m,) int32: index of the beamlet whose surface a true or misread return measures; -1 for
     other returns."""
@@ -809,13 +812,15 @@ class Measurements(NamedTuple):
     """
 
     range: np.ndarray
-    """(m, 2): range [m]."""
+    """(m, 2): range of each return [m], by whole bins and by positions between bins."""
     radial_velocity: np.ndarray
-    """(m, 2): radial velocity [m/s]."""
+    """(m, 2): radial velocity of each return [m/s], by whole bins and by positions between bins."""
     range_error: np.ndarray
-    """(m, 2): standard error of the range by noise [m]."""
+    """(m, 2): standard error by noise of ``range`` [m], by whole bins and by positions between
+    bins."""
     velocity_error: np.ndarray
-    """(m, 2): standard error of the radial velocity by noise [m/s]."""
+    """(m, 2): standard error by noise of ``radial_velocity`` [m/s], by whole bins and by positions
+    between bins."""
     range_per_half_bin: np.ndarray
     """(m,): difference of range that shifts the beats of the chirps by half a bin [m]."""
     velocity_per_half_bin: np.ndarray
@@ -1595,7 +1600,11 @@ def fill_detection_weights(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
-    """Draw the speckle of a point's groups, and the factors (groups, 3) on their magnitudes."""
+    """Draw the speckle of a point's echoes, and set factors on their magnitudes.
+
+    ``speckle_factors`` (groups, 3), a result, has one row for each echo (group of adjacent bins)
+    and one column for each segment. The complex amplitudes are written into ``speckle``.
+    """
     for g in range(speckle.n_bins.shape[0]):
         speckle_factors[g] = 1.0
         if speckle.n_bins[g].max() == 0:
@@ -2091,7 +2100,9 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 def detect_in_speckle(
     address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
 ):
-    """Draw a group in developed speckle; return True and set its peak if it is detected.
+    """Draw an echo in developed speckle; return True and set its peak if it is detected.
+
+    The bins of the echo are a group of adjacent bins.
 
     The group's amplitude is a complex Gaussian number: echo plus noise, with ``echo_fraction`` of
     the mean power in the echo. The group is detected if its power exceeds the level that is
@@ -2221,7 +2232,7 @@ strongest. Each echo has a range of indices."""
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_bin_pd):
-    """Return True if an independent bin of a group, other than its strongest bin, is detected.
+    """Return True if an echo is detected by an independent bin other than its strongest bin.
 
     ``single_bin_pd`` is the probability of detection of one bin. The last of the bins is a fraction
     of one.

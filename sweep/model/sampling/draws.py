@@ -448,7 +448,8 @@ class NoiselessSpectra(NamedTuple):
     """(bins,): |X| over sigma, the noise of a bin per quadrature, of the bins of all points and
     segments."""
     is_echo: np.ndarray
-    """(bins,) bool: True for bins of the echo."""
+    """(bins,) bool: True for bins that belong to an echo, of the bins of all points and segments.
+    """
     n_noise_bins: np.ndarray
     """(m, 3): equivalent number of independent bins that hold noise alone and may raise a false
     alarm."""
@@ -1105,7 +1106,7 @@ def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_crossings(address, stream, pair_index, crossing, random_words, is_marked):
-    """Mark the draws in which a bin, with its noise, reaches the threshold.
+    """Mark the draws in which signal plus noise of one bin reaches the threshold.
 
     ``pair_index`` is the stream index of the pair of numbers that make the noise. ``crossing``
     holds |X| / sigma; the noise's deviations in phase and in quadrature; the square of the

@@ -179,7 +179,10 @@ class EchoPeaks(NamedTuple):
 
 
 class EchoWindow(NamedTuple):
-    """Bins of an echo whose speckle is drawn, by their index in the spectrum."""
+    """First, last, strongest and middle bin of an echo whose speckle is drawn.
+
+    Bins are stated by their index in the spectrum.
+    """
 
     strongest_bin: int
     """Index of the strongest bin of the echo."""
@@ -646,7 +649,7 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return a signal with the fields that draws of its speckle need.
+    """Return a segment's signal with the records that draws of its speckle need.
 
     These are :attr:`SegmentSignal.footprint_records` and :attr:`SegmentSignal.record_scalings`.
     """
@@ -691,7 +694,10 @@ def add_footprint_records(
 def _draw_speckle_from_records(
     shots: Shots, signal: SegmentSignal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Draw the factors (m, bins) of :func:`draw_bin_speckle` from the records of the echoes."""
+    """Draw the factors (m, bins) by which speckle multiplies a segment's bins, from records.
+
+    Each echo has one :class:`FootprintRecord`.
+    """
     assert signal.footprint_records is not None
     factors = np.empty((draws.size, signal.spectrum.size), complex)
     for echo_number, record in enumerate(signal.footprint_records):
@@ -846,7 +852,7 @@ class SegmentDetections(NamedTuple):
     """Detections, false alarms and estimated frequency of a segment in m draws, (m,) each."""
 
     is_detected: np.ndarray
-    """(m,) bool: True if the detector flags a bin of the echo."""
+    """(m,) bool: True for draws in which the detector flags a bin of the echo."""
     n_false_groups: np.ndarray
     """(m,) int64: number of runs of adjacent flagged bins outside the bins of the echo: false
     alarms."""

@@ -65,7 +65,7 @@ _SHIFT_32, _SHIFT_12 = np.uint64(32), np.uint64(12)
 
 
 class DrawAddress(NamedTuple):
-    """Address of the random numbers of one draw of a point, for compiled code."""
+    """Address of the random numbers of one draw of a point: random key and number of the draw."""
 
     key_0: np.uint64
     """First 64-bit word of the point's random key (:func:`point_keys`)."""
@@ -234,9 +234,9 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
 
 @njit(cache=True, nogil=True)
 def _fill_uniforms(keys, draws, stream, out):
-    """Fill the rows of `out` (m, count) with the uniform numbers of a stream; see :func:`uniforms`.
+    """Fill the rows of ``out`` (m, count) with the first uniform numbers of a stream.
 
-    The count is a multiple of 4.
+    The arguments are those of :func:`uniforms`. The count is a multiple of 4.
     """
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):

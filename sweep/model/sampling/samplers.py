@@ -71,8 +71,8 @@ FFT_SIZE_PATH = "instrument.processing.fft_size"
 """Dotted path of the parameter for the FFT size."""
 
 SPECTRA_METHOD = "spectra"
-"""Name of the method of drawing that makes full spectra. The others are ``probabilities`` and
-``noise``."""
+"""Name of the method that draws full spectra with noise in every bin. The other methods are
+``probabilities`` and ``noise``."""
 
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
@@ -173,7 +173,7 @@ class Sampler(ABC):
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
-        """Return the parameters of selected points by dotted path."""
+        """Return the values of all parameters for selected points, by dotted path."""
         return {
             path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
             for path, v in self.parameters.items()

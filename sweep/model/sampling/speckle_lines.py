@@ -237,7 +237,7 @@ def _rotate_to_steepest(
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
 
     def rotate(vectors: np.ndarray) -> np.ndarray:
-        """Rotate vectors (n, 3, 2) by the angle of their point."""
+        """Rotate each point's vectors, (n, 3, 2) in all, by the angle of the point."""
         first, second = vectors[..., 0], vectors[..., 1]
         return np.stack([cosine * first + sine * second, cosine * second - sine * first], axis=-1)
 
@@ -655,8 +655,8 @@ class FootprintRecord(NamedTuple):
 
     The record is that of a lone tone at the middle of the echo, times a factor that varies slowly
     from sample to sample. The factor is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b .
-    (y, x) (n - middle) / N)``, with the symbols of the module, represented by a series of Chebyshev
-    polynomials in the sample number n.
+    (y, x) (n - middle) / N)``, with the symbols of the module and the sample number n. It is
+    represented by a series of Chebyshev polynomials in n.
     """
 
     series_coefficients: np.ndarray
@@ -681,7 +681,7 @@ class FootprintRecord(NamedTuple):
         first_sample: int,
         fft_size: int,
     ) -> "FootprintRecord":
-        """Prepare the record of a point in a segment.
+        """Prepare the record from which the speckle of a point's echo in a segment is drawn.
 
         Parameters
         ----------
@@ -830,7 +830,7 @@ def _n_chebyshev_coefficients(phase_max: float) -> int:
 
 @lru_cache(maxsize=64)
 def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and a matrix by which a Chebyshev series is fitted to a function.
+    """Return the nodes and the matrix that fit a Chebyshev series to a function.
 
     Returns
     -------
@@ -1123,7 +1123,7 @@ class PeakShapeErrors(NamedTuple):
 def _peak_shape_error_table(
     window: Window, fft_size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate the errors of :class:`PeakShapeErrors` by the peak's offset.
+    """Tabulate errors of peak positions by deformed peaks, by the peak's offset from its bin.
 
     Returns
     -------
