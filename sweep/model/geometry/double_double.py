@@ -27,7 +27,7 @@ class DoubleDouble(NamedTuple):
     high: np.ndarray
     """The numbers, each rounded to the nearest float64."""
     low: np.ndarray
-    """Differences of the numbers and their rounded values ``high``, as float64."""
+    """The numbers minus their rounded values ``high``, as float64."""
 
     @classmethod
     def from_float64(cls, values: np.ndarray) -> DoubleDouble:

@@ -133,7 +133,7 @@ class EgoMotion(NamedTuple):
 
         Notes
         -----
-        The variance isslope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 +
+        The variance is slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 +
         slope^2), with the priors ``terrain_slope`` as slope and ``target_speed`` as speed.
         """
         slope_deviation, speed_deviation, _ = self.priors

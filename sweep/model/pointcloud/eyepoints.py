@@ -84,7 +84,7 @@ class Eyepoints(NamedTuple):
     direction_rate: np.ndarray
     """(n, 3): time derivative of the commanded ``direction`` [1/s]."""
     platform_acceleration: np.ndarray
-    """(n, 3): acceleration of the instrument [m/s^2]."""
+    """(n, 3): acceleration of the instrument in the world's frame [m/s^2]."""
     velocity_offset: np.ndarray
     """(n, b): radial velocity of each beamlet minus that of the reference beamlet [m/s]; nan for a
     beamlet that misses."""

@@ -162,8 +162,8 @@ def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float)
 
     Notes
     -----
-    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), with the value in the exponent, of those
-    that a takes, that is nearest to b.
+    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), where the exponent takes the value of a
+    that is nearest to b.
     """
     distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
     bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)

@@ -296,8 +296,8 @@ def make_echo_noise_filter(
 
 
 ROOT_BINS_MAX = 16
-"""Largest number of adjacent bins whose correlated noise is made from as many independent numbers
-as there are bins."""
+"""Largest number of adjacent bins whose correlated noise is made by a Cholesky factor, from one
+independent number for each bin."""
 
 
 def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:

@@ -180,7 +180,7 @@ class Sampler(ABC):
         }
 
     def n_detected(self) -> np.ndarray:
-        """Numbers of draws so far with a detection, (4, n), in the order of PD_OUTPUTS."""
+        """Return the numbers of draws with a detection, (4, n), in the order of PD_OUTPUTS."""
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
@@ -220,7 +220,7 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Return False, so that no draws are left out.
+    """Return False, so that drawing goes on until all draws are made.
 
     It is the default of ``should_stop``.
     """
@@ -541,10 +541,10 @@ class SpectraSampler(Sampler):
                 yield point_spectra, np.array([draw_number])
 
     def _nan_for_missing_segments(self) -> np.ndarray:
-        """Return an array (4, n) that is nan for outputs of segments that do not exist, else 0.
+        """Return terms (4, n) that, added to outputs, set those of missing segments to nan.
 
-        Rows are in the order of PD_OUTPUTS. Added to outputs, it sets those of missing segments to
-        nan.
+        A term is nan for a segment that does not exist, else 0. Rows are in the order of
+        PD_OUTPUTS.
         """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(

@@ -72,8 +72,8 @@ QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
 along one coordinate of the beam."""
 
 _QUADRATURE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
-"""Largest phase per standard deviation of the beam [rad] that a Gaussian quadrature integrates with
-an error of 1e-3. There is one value for each number of nodes in QUADRATURE_NODE_COUNTS."""
+"""Largest slope of a phase [rad per standard deviation of the beam] for which a Gaussian quadrature
+errs by at most 1e-3. There is one value for each number of nodes in QUADRATURE_NODE_COUNTS."""
 
 _LINE_WEIGHT_MIN = 1e-6
 """Smallest fraction of the beam's power for which a line of the footprint is included."""
@@ -98,12 +98,13 @@ class SpeckleLineGrid(NamedTuple):
     """
 
     line_shift: np.ndarray
-    """(n, 3, 2): shift of a line's frequency [bins] per standard deviation of the beam by which the
-    line lies off the axis. It is given by segment and coordinate, and positive towards higher bins.
-    """
+    """(n, 3, 2): derivative of a line's frequency [bins] with respect to its distance from the
+    beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate of the
+    beam; positive values are towards higher bins."""
     phase: np.ndarray
-    """(n, 3, 2): phase of a line's amplitude [rad] per standard deviation of the beam by which the
-    line lies off the axis. It is given by segment and coordinate, relative to the up segment."""
+    """(n, 3, 2): derivative of the phase of a line's amplitude [rad] with respect to its distance
+    from the beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate
+    of the beam. Phases are relative to the up segment."""
     quadrature_index: np.ndarray
     """(n, 2) int64: index, in :data:`QUADRATURE_NODE_COUNTS`, of the Gaussian quadrature along each
     coordinate of the beam."""
@@ -118,8 +119,8 @@ class SpeckleLineGrid(NamedTuple):
     n_nodes: np.ndarray
     """(quadratures,) int64: number of nodes of each Gaussian quadrature, without padding."""
     window_transform: np.ndarray
-    """(m,): transform of the window at distances 0, 1, 2 .. from the line, divided by
-    ``samples_per_bin`` [bins]."""
+    """(m,): transform of the window, sampled at distances from the line of 0, 1, 2 .. times 1 /
+    ``samples_per_bin`` bins."""
     samples_per_bin: float
     """Number of samples of ``window_transform`` per bin of fs/N, with the sampling rate fs and the
     FFT size N."""
