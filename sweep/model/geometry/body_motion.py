@@ -45,7 +45,7 @@ class NadirAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         if self.heading is not None:
             return np.tile(quat.from_axis_angle(2, self.heading), (len(times), 1)), np.zeros(
                 (len(times), 3)
@@ -67,7 +67,7 @@ class AlongTrackAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
         horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
         pitch = np.arctan2(velocity[:, 2], horizontal_speed)
@@ -118,7 +118,7 @@ class FixedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         q = quat.normalise(np.asarray(self.quaternion, float))
         return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
 
@@ -137,7 +137,7 @@ class SpinningAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         angular_velocity = np.asarray(self.angular_velocity, float)
         rotation = quat.from_rotation_vector(
             (times - self.initial_time)[:, None] * angular_velocity
@@ -182,7 +182,7 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
         interval_duration = np.diff(times)[interval]
@@ -210,7 +210,7 @@ class MountedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         q, angular_velocity = self.vehicle_attitude.attitude_and_rate(times, velocity, acceleration)
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 

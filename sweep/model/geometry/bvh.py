@@ -215,8 +215,8 @@ def _build_nodes(
 def _order_into_leaves(centres: np.ndarray) -> np.ndarray:
     """Sort triangles into leaves of the tree; return the triangle number of each slot, int32.
 
-    A leaf holds triangles that are close in space. Leaves of equal size follow each other, and the
-    number of slots is a power of two. An empty slot has the value m, the number of triangles.
+    A slot is a place for a triangle in a leaf, and a leaf holds triangles that are close in space.
+    The number of slots is a power of two. An empty slot has the value m, the number of triangles.
     """
     n_triangles, n_slots = len(centres), LEAF_TRIANGLES_MAX
     while n_slots < n_triangles:

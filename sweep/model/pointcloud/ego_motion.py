@@ -87,16 +87,18 @@ class EgoMotion(NamedTuple):
     """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
     falls."""
     slip_per_range: np.ndarray
-    """Derivative of the slip with respect to the range [(m/s)/m]."""
+    """Derivative with respect to the range [(m/s)/m] of the slip, the closing speed minus the speed
+    at which the range falls."""
     slip_per_slope: np.ndarray
     """(n, 3): derivative of the slip at range 0 [m/s] with respect to the gradient (rise over run)
-    of the surface."""
+    of the surface. The slip is the closing speed minus the speed at which the range falls."""
     slip_per_slope_per_range: np.ndarray
     """(n, 3): derivative of ``slip_per_slope``, which is at range 0, with respect to the range
     [(m/s)/m]."""
     slip_per_target_speed: np.ndarray
-    """Standard deviation of the slip by motion of the surface, over the standard deviation of one
-    component of the surface's velocity (a ratio)."""
+    """Ratio of two standard deviations: of the slip by motion of the surface, and of one component
+    of the surface's velocity. The slip is the closing speed minus the speed at which the range
+    falls."""
     turn_rate: np.ndarray
     """Angular speed at which the beam's direction turns [rad/s]."""
     priors: MotionPriors

@@ -58,16 +58,17 @@ from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_o
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 N_RATES = 2048
-"""Number of signal amplitudes at which a table holds the rate -ln(1 - c), with c the probability
-that signal raises a bin above the threshold."""
+"""Number of signal amplitudes at which the rate -ln(1 - c) is tabulated. c is the probability that
+signal lifts a bin above the threshold."""
 
 CERTAIN_MARGIN_SIGMA = 12.0
 """Amplitude above the threshold, in standard deviations of the noise, from which signal is taken to
 raise a bin above the threshold with certainty."""
 
 TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
-"""Lowest signal amplitude of the table of rates, in standard deviations of the noise. At lower
-amplitudes the rate is proportional to the amplitude squared."""
+"""Lowest signal amplitude, in standard deviations of the noise, at which rates -ln(1 - c) are
+tabulated. c is the probability that signal lifts a bin above the threshold. At lower amplitudes the
+rate is proportional to the amplitude squared."""
 
 LEAKAGE_MIN = 1e-9
 """Smallest probability of a false peak by leaked signal in a segment for which such peaks are
@@ -93,8 +94,8 @@ LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
 """Limits of the integral over speckle, in ln(speckle power). The mean speckle power is 1."""
 
 LOG_POWER_MIN_FAINT = -5.0
-"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal: sums of
-rates up to FAINT_RATE_SUM_MAX. Below this limit the integrand is extrapolated."""
+"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal, whose
+sum of rates is at most FAINT_RATE_SUM_MAX. The part below this limit is extrapolated."""
 FAINT_RATE_SUM_MAX = 0.1
 """Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
 speckle begins at LOG_POWER_MIN_FAINT. c is the probability that a bin crosses the threshold."""
@@ -104,8 +105,8 @@ LOG_POWER_STEP_MAX = 0.25
 then 1e-8."""
 
 JOINING_RATE_MIN = 1e-2
-"""Smallest rate -ln(1 - c) in bright speckle at which a bin next to leaked bins of an echo may
-extend them. c is the probability that the bin crosses the threshold."""
+"""Smallest rate -ln(1 - c), in bright speckle, at which one more adjacent bin is considered part of
+an echo. c is the probability that leaked signal lifts the bin before it above the threshold."""
 BRIGHT_LOG_AMPLITUDE = math.log(4.0)
 """ln of the factor on the signal amplitude in bright speckle, at which JOINING_RATE_MIN is tested.
 """
@@ -118,12 +119,12 @@ So faint bins hardly ever cross the threshold together, or together with an adja
 """
 
 MEAN_TABLE_STRIDE = 8
-"""Step, in entries of the table of rates, between amplitudes at which a bin's mean probability over
-speckle is integrated. Entries between them are interpolated."""
+"""Number of table steps between signal amplitudes at which the mean over speckle of a bin's
+crossing probability is integrated. Amplitudes between them are interpolated."""
 
 N_BOUND_POWERS = 5
-"""Number of speckle powers 1, 2, 4 .. at which upper bounds of a segment's sum of rates are stored.
-The mean speckle power is 1."""
+"""Number of speckle powers 1, 2, 4 .. (mean 1) at which upper bounds of the sum of a segment's
+rates -ln(1 - c) are stored. c is the probability that signal lifts a bin above the threshold."""
 
 EDGE_LOG_POWER_STEP = 0.75
 """Step in ln(speckle power) between values at which the probability that an echo's outermost bin
@@ -133,8 +134,9 @@ EDGE_LOG_POWER_DEPTH = 3.0
 threshold is computed. At lower powers the value at this power is used."""
 
 LOG_RATE_STEP_MAX = 0.5
-"""Largest step of ln(rate) between successive nodes of the integral over speckle. With larger steps
-the mean errs by more than 1e-7."""
+"""Largest difference of ln(rate) between successive nodes of the integral over speckle; with more
+the mean errs by over 1e-7. The rate is -ln(1 - c), with c the probability that signal lifts a bin
+above the threshold."""
 
 
 class LeakageBins(NamedTuple):
@@ -202,7 +204,8 @@ class LeakageBins(NamedTuple):
     """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
     equivalent to all looks."""
     sidelobe_correlation: float
-    """Correlation of the noise of two adjacent bins, of its part in phase with the signal."""
+    """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
+    the signal."""
 
     @classmethod
     def empty(cls, n_points: int) -> "LeakageBins":
@@ -800,8 +803,8 @@ class SpeckleQuadrature(NamedTuple):
     """
 
     node_stride: int
-    """Distance of successive nodes, in steps of the table's ln(amplitude). ln(power) is twice
-    ln(amplitude)."""
+    """Distance of successive nodes of the rule, in steps of ln(amplitude) of the table of rates. A
+    node's ln(power) is twice its ln(amplitude)."""
     n_below_mean: int
     """Number of nodes whose speckle power is below the mean, which is 1."""
     weights: np.ndarray

@@ -678,15 +678,15 @@ class BeamMotion(NamedTuple):
     """
 
     position: np.ndarray
-    """Position of the instrument [m]."""
+    """(..., 3): position of the instrument in the world's frame [m]."""
     velocity: np.ndarray
-    """Velocity of the instrument [m/s]."""
+    """(..., 3): velocity of the instrument in the world's frame [m/s]."""
     direction: np.ndarray
-    """Unit vector along the beam, away from the instrument."""
+    """(..., 3): unit vector along the beam, away from the instrument."""
     direction_rate: np.ndarray
-    """Time derivative of the beam's ``direction`` [1/s]."""
+    """(..., 3): time derivative of the beam's ``direction`` [1/s]."""
     acceleration: np.ndarray
-    """Acceleration of the instrument [m/s^2]."""
+    """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
     def by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
         """Reshape the arrays (n, 3) of n shots to (cycles, beams, 3)."""

@@ -763,7 +763,7 @@ def _doppler_prediction(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return two coefficients, of the up and the down beat, that predict the Doppler beat.
 
-    The third value is the error of that prediction by the instrument's known motion [bins].
+    The third value is the mismatch of that prediction [bins] by the instrument's known motion.
     """
     _, doppler, down = shots.waveform.chirp_slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)

@@ -82,7 +82,8 @@ class CountConfig(NamedTuple):
     """Filter that makes the correlated noise of an echo's bins. It has no bins if only the
     strongest bin may detect the echo."""
     sidelobe_correlation: float
-    """Correlation of the noise of two adjacent bins, of its part in phase with the signal."""
+    """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
+    the signal."""
     pseudo_variance_ratio: np.ndarray
     """(ratio rows, bins): ratio E[X^2] / E[|X|^2] of complex amplitudes X in bins near frequency 0
     (DC) and Nyquist (:class:`sweep.model.detection.echo_detection.SpeckleTable`)."""
