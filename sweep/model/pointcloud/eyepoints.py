@@ -351,10 +351,10 @@ def _reference_beam_motion(
     Notes
     -----
     The body that is hit rotates with the angular velocity w, and is thought to extend to the
-    instrument. V is the velocity of the instrument relative to this extended body. d is the
-    direction of the beam, R the range and n the normal of the surface; a prime is a time
-    derivative. The closing speed V.d grows at the rate V'.d + V.d'. The range falls at the speed (V
-    + R (d' - w x d)).n / d.n. Bodies are assumed to rotate at steady rates.
+    instrument. The velocity of the instrument relative to this extended body is V. The beam has the
+    direction d and the range R, and the surface has the normal n. A prime is a time derivative. The
+    closing speed V.d grows at the rate V'.d + V.d'. The range falls at the speed (V + R (d' - w x
+    d)).n / d.n. Bodies are assumed to rotate at steady rates.
     """
     rows, reference = np.arange(len(ray_directions)), np.maximum(bundle.reference_beamlet, 0)
     ray, body = ray_directions[rows, reference], bundle.body_index[rows, reference]

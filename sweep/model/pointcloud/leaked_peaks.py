@@ -166,9 +166,9 @@ class LeakageBins(NamedTuple):
     """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
     c is the probability that a bin crosses the threshold."""
     rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's bins, at
-    speckle powers 1, 2, 4 .. times the mean. c is the probability that a bin crosses the threshold.
-    """
+    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's bins. c is
+    the probability that a bin crosses the threshold. Bounds are for speckle powers of 1, 2, 4 ..
+    times the mean."""
     mean_probability_sum: np.ndarray
     """(m, 3): sum over a segment's bins of the probability, averaged over speckle, that leaked
     signal lifts the bin above the threshold; nan if not computed."""

@@ -721,13 +721,13 @@ def _select_beams(
     Returns
     -------
     dict of str to ndarray
-        Arrays (cycles, draws, beams), nan for a shot without such a point: ``range`` and
-        ``radial_velocity`` with their ``_standard_error``, without errors common to all beams or by
-        an unknown slip (closing speed minus the speed at which the range falls);
-        ``radial_velocity_slip_error``, the error by an unknown slip [m/s]; ``velocity_per_slip``;
-        ``delay``, the time from the shot's start to that of the beats [s]; ``range_then``, the
-        range at that time [m]. If pointing has an error, ``position`` (cycles, draws, beams, 3)
-        [m].
+        Arrays (cycles, draws, beams), nan for a shot without such a point. The slip is the closing
+        speed minus the speed at which the range falls. Standard errors exclude errors common to all
+        beams and errors by an unknown slip. The names are ``range`` and ``radial_velocity``, and
+        both with ``_standard_error``; ``radial_velocity_slip_error``, the error by an unknown slip
+        [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats
+        [s]; ``range_then``, the range at that time [m]. If pointing has an error, ``position``
+        (cycles, draws, beams, 3) [m].
     """
     flags = point_arrays["flags"][shot_slice]
     values_by_name: dict[str, np.ndarray] = {}

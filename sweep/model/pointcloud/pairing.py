@@ -228,9 +228,9 @@ def find_confirming_peak(
     doppler
         (k,): positions of the Doppler peaks [bins].
     doppler_prediction
-        (3,): coefficient of the up beat, and of the down beat, in the predicted Doppler beat; and
-        the change of the Doppler beat by the instrument's motion between the segments [bins], which
-        is added to the tolerance.
+        (3,): coefficients of the up beat and of the down beat in the predicted Doppler beat, and a
+        mismatch [bins]. The mismatch is the shift of the Doppler beat by the instrument's motion
+        between the segments. It is added to the tolerance.
     fft_size
         FFT size N.
     down_beat_sign
@@ -339,7 +339,7 @@ def _match_pairs(cost):
 def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
     """Compare a return's peaks with the truth; return its flag and the nearest beamlet.
 
-    Whether the peaks were converted to the right range and velocity is not compared here.
+    Range and velocity, to which the peaks are converted, are not compared here.
 
     Parameters
     ----------

@@ -1014,11 +1014,12 @@ def position_error_moments(
     Notes
     -----
     An error is the sum of two parts: the wander, by equation (3) and :func:`wander_covariance`, and
-    the error by the shape of the peak (:class:`PeakShapeErrors`). The complex variance V of
-    :class:`PeakShapeErrors` has a real part with the mean b^2, where b is the lines' spread [bins],
-    and the variance b^4 (v / q^2 + v^2 / q^4), with the peak's power q^2 and its echo fraction v.
-    If only the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
-    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the variance.
+    the error by the shape of the peak (:class:`PeakShapeErrors`). The real part of the complex
+    variance V of :class:`PeakShapeErrors` has the mean b^2 and the variance b^4 (v / q^2 + v^2 /
+    q^4). Here b is the spread of the lines [bins], q^2 the peak's power over its mean, and v the
+    echo fraction. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1
+    + variance / WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
+    variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
     has_peak = np.isfinite(peaks.relative_power) & np.isfinite(peaks.offset)
