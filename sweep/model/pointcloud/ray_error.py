@@ -67,8 +67,8 @@ _UNAFFECTED_DISTANCE_SIGMA = 15.0
 magnitude's error changes no probability. The density there is e^-112 of the largest."""
 
 _PROBABILITY_CHANGE_MIN = 1e-9
-"""Smallest bound on the change of a probability of detection for which the error of a shot by too
-few rays is computed."""
+"""Smallest effect on a result for which the error of a shot by too few rays is computed. It is a
+bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
 
 
 class FoldedLattice(NamedTuple):

@@ -468,7 +468,7 @@ class DrawInputs(NamedTuple):
     """(n,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
     per quadrature."""
     bin_thresholds: BinThresholds
-    """(n,) in each field: thresholds of bins by their distance from the line
+    """(n,) in each field: threshold on |X| and noise of each point's bins
     (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa_noise: np.ndarray
     """(n, 3): probability that noise alone raises a false alarm in a segment."""

@@ -103,8 +103,8 @@ class CountInputs(NamedTuple):
     """(m,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
     per quadrature."""
     bin_thresholds: BinThresholds
-    """(m,) in each field: thresholds of an echo's bins, if any bin may detect the echo
-    (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
+    """(m,) in each field: threshold on |X| and noise of an echo's bins, if any bin may detect the
+    echo (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa: np.ndarray
     """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
     one."""

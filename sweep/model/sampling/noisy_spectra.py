@@ -187,7 +187,7 @@ class EchoWindow(NamedTuple):
     strongest_bin: int
     """Index of the strongest bin of the echo."""
     position: float
-    """Middle of the echo, as a fractional index."""
+    """Middle of the echo, as a fractional index in the spectrum."""
     first_bin: int
     """Index of the first bin whose speckle is drawn."""
     last_bin: int
