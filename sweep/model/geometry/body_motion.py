@@ -18,12 +18,13 @@ from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
 
 _HORIZONTAL_FRACTION_MIN = 1e-9
-"""Smallest ratio of horizontal speed to speed for which a heading is defined."""
+"""Smallest ratio of horizontal speed to total speed at which the direction of motion has a heading.
+"""
 _HORIZONTAL_SPEED_MIN = 1e-100
-"""Smallest horizontal speed [m/s] for which a heading is defined."""
+"""Smallest horizontal speed [m/s] at which the direction of motion has a heading."""
 
 FloatSequence = Sequence[float] | np.ndarray
-"""Sequence or array of numbers."""
+"""Sequence or array of real numbers (type of an argument)."""
 
 AttitudeAndRate = tuple[np.ndarray, np.ndarray]
 """Quaternions (n, 4), body to world, and angular velocities (n, 3) [rad/s] in the world's frame.
@@ -35,16 +36,16 @@ AttitudeAndRate = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class NadirAttitude:
-    """Level attitude, so that a beam along -z points straight down."""
+    """Attitude of a level body, so that a beam along the body's -z points straight down."""
 
     heading: float | None = 0.0
-    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]. With None
-    the forward axis follows the horizontal velocity, which must not be 0."""
+    """Angle of the forward axis from the world's x, counter-clockwise seen from above [rad]. With
+    None the forward axis follows the horizontal velocity, which must not be 0."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         if self.heading is not None:
             return np.tile(quat.from_axis_angle(2, self.heading), (len(times), 1)), np.zeros(
                 (len(times), 3)
@@ -55,7 +56,10 @@ class NadirAttitude:
 
 @dataclass(frozen=True)
 class AlongTrackAttitude:
-    """Attitude with the forward axis along the velocity, rolled about it by a constant angle."""
+    """Attitude of a body whose forward axis points along the velocity.
+
+    The body is rolled about this axis by a constant angle.
+    """
 
     roll: float = 0.0
     """Roll angle, positive with the left side up [rad]; at 0 the left axis is horizontal."""
@@ -63,7 +67,7 @@ class AlongTrackAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         heading, yaw_rate = _heading_and_rate(velocity, acceleration)
         horizontal_speed = np.hypot(velocity[:, 0], velocity[:, 1])
         pitch = np.arctan2(velocity[:, 2], horizontal_speed)
@@ -82,7 +86,10 @@ class AlongTrackAttitude:
 def _heading_and_rate(
     velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heading of velocities (n, 3) [rad] and its rate [rad/s], (n,) each.
+    """Return heading [rad] and turn rate [rad/s] of moving bodies, (n,) each.
+
+    The heading is the angle of the horizontal velocity from x, counter-clockwise from above.
+    ``velocity`` [m/s] and ``acceleration`` [m/s^2] are (n, 3).
 
     Raises
     ------
@@ -103,7 +110,7 @@ def _heading_and_rate(
 
 @dataclass(frozen=True, eq=False)
 class FixedAttitude:
-    """Constant attitude."""
+    """Attitude that does not depend on time."""
 
     quaternion: FloatSequence
     """(4,): quaternion (w, x, y, z), body to world; it is normalised to length 1."""
@@ -111,26 +118,26 @@ class FixedAttitude:
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         q = quat.normalise(np.asarray(self.quaternion, float))
         return np.tile(q, (len(times), 1)), np.zeros((len(times), 3))
 
 
 @dataclass(frozen=True, eq=False)
 class SpinningAttitude:
-    """Rotation at a constant rate about an axis that is fixed in the body and in the world."""
+    """Attitude of a body that rotates at a constant rate about an axis fixed in the world."""
 
     angular_velocity: FloatSequence
     """(3,): angular velocity in the world frame [rad/s]."""
     initial_quaternion: FloatSequence = (1.0, 0.0, 0.0, 0.0)
-    """(4,): attitude at `initial_time`, body to world."""
+    """(4,): quaternion (w, x, y, z), body to world, at the time ``initial_time``."""
     initial_time: float = 0.0
-    """Time of the initial attitude [s]."""
+    """Time at which the attitude is ``initial_quaternion`` [s]."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         angular_velocity = np.asarray(self.angular_velocity, float)
         rotation = quat.from_rotation_vector(
             (times - self.initial_time)[:, None] * angular_velocity
@@ -148,11 +155,12 @@ class AttitudeTrack:
     """
 
     times: FloatSequence
-    """(n,): ascending times [s]."""
+    """(n,): ascending times at which attitudes are given [s]."""
     quaternions: Sequence[Sequence[float]] | np.ndarray
-    """(n, 4): attitudes at these times, body to world."""
+    """(n, 4): attitudes at ``times``, as quaternions (w, x, y, z) from body to world."""
     _rotation_steps: np.ndarray = field(init=False, repr=False)
-    """(n - 1, 3): rotation vectors between successive attitudes [rad]."""
+    """(n - 1, 3): rotation vectors from each of the given attitudes to the next [rad]. A rotation
+    vector points along the axis and has the length of the angle."""
 
     def __post_init__(self) -> None:
         times, quaternions = require_rising_times(self.times), np.asarray(self.quaternions, float)
@@ -174,7 +182,7 @@ class AttitudeTrack:
     def attitude_and_rate(
         self, query_times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         times, quaternions = np.asarray(self.times), np.asarray(self.quaternions)
         interval = np.clip(np.searchsorted(times, query_times, side="right") - 1, 0, len(times) - 2)
         interval_duration = np.diff(times)[interval]
@@ -192,23 +200,24 @@ class AttitudeTrack:
 
 @dataclass(frozen=True, eq=False)
 class MountedAttitude:
-    """Attitude of an instrument that is mounted on a vehicle at a constant rotation."""
+    """Attitude of an instrument that is fixed to a vehicle at a constant rotation."""
 
     vehicle_attitude: AttitudeLaw
-    """Attitude law of the vehicle."""
+    """Attitude law (attitude over time) of the vehicle."""
     mounting: FloatSequence
-    """(4,): quaternion from the instrument's frame to the vehicle's."""
+    """(4,): quaternion (w, x, y, z) from the instrument's frame to the vehicle's."""
 
     def attitude_and_rate(
         self, times: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> AttitudeAndRate:
-        """Return attitudes (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
+        """Return quaternions (n, 4) and angular velocities (n, 3) [rad/s] at times (n,) [s]."""
         q, angular_velocity = self.vehicle_attitude.attitude_and_rate(times, velocity, acceleration)
         return quat.multiply(q, quat.normalise(np.asarray(self.mounting, float))), angular_velocity
 
 
 _TIME_TOLERANCE = 1e-9
-"""Fraction of a trajectory's duration by which a time may lie outside it, because of rounding."""
+"""Largest distance of a time from the trajectory's interval, as a fraction of the trajectory's
+duration, that counts as rounding."""
 
 
 AttitudeLaw = (
@@ -219,22 +228,25 @@ AttitudeLaw = (
     | AttitudeTrack
     | MountedAttitude
 )
-"""Attitude over time: any class with a method ``attitude_and_rate``."""
+"""Attitude of a body over time: any class with a method ``attitude_and_rate``."""
 
 
 class Motion(NamedTuple):
-    """Motion of a point at n times, (n, 3) each, in the world's frame."""
+    """Position, velocity and acceleration of a point at n times, in the world's frame.
+
+    Each array is (n, 3).
+    """
 
     position: np.ndarray
-    """Position [m]."""
+    """(n, 3): position of the point in the world's frame [m]."""
     velocity: np.ndarray
-    """Velocity [m/s]."""
+    """(n, 3): velocity of the point in the world's frame [m/s]."""
     acceleration: np.ndarray
-    """Acceleration [m/s^2]."""
+    """(n, 3): acceleration of the point in the world's frame [m/s^2]."""
 
 
 class BodyState(NamedTuple):
-    """Pose and motion, at n times, of an instrument on a body, in the world's frame."""
+    """Position, attitude and motion at n times of an instrument on a body, in the world's frame."""
 
     position: np.ndarray
     """(n, 3): position of the instrument [m]."""
@@ -245,16 +257,16 @@ class BodyState(NamedTuple):
     angular_velocity: np.ndarray
     """(n, 3): angular velocity of the body [rad/s]."""
     acceleration: np.ndarray
-    """(n, 3): acceleration of the instrument [m/s^2], for a constant angular velocity."""
+    """(n, 3): acceleration of the instrument [m/s^2]. The angular velocity is taken as constant."""
 
 
 def _clip_to_duration(times: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Return times (n,) [s], moved into the trajectory if rounding has put them just outside.
+    """Return times (n,) [s], clipped to the trajectory's interval if rounding put them outside.
 
     Raises
     ------
     ValueError
-        If a time lies outside the trajectory.
+        If a time lies outside the interval by more than rounding.
     """
     times = np.atleast_1d(np.asarray(times, float))
     tolerance = _TIME_TOLERANCE * max(stop - start, 1.0)
@@ -268,15 +280,15 @@ class ConstantAcceleration:
     """Trajectory of a point under constant acceleration; a straight line if that is 0."""
 
     position: FloatSequence
-    """(3,): position at time 0 [m]."""
+    """(3,): position of the point at time 0 [m], in the world's frame."""
     velocity: FloatSequence
-    """(3,): velocity at time 0 [m/s]."""
+    """(3,): velocity of the point at time 0 [m/s], in the world's frame."""
     acceleration: FloatSequence
-    """(3,): acceleration [m/s^2]."""
+    """(3,): constant acceleration of the point [m/s^2], in the world's frame."""
     duration: float
-    """Duration [s], > 0."""
+    """Duration of the trajectory [s], above 0."""
     start: float = field(default=0.0, init=False)
-    """First time [s]."""
+    """Time at which the trajectory begins [s]."""
 
     def __post_init__(self) -> None:
         if not (self.duration > 0 and math.isfinite(self.duration)):
@@ -284,11 +296,11 @@ class ConstantAcceleration:
 
     @property
     def stop(self) -> float:
-        """Last time [s]."""
+        """Time at which the trajectory ends [s]."""
         return self.duration
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Return the motion at times (n,) [s] from start to stop."""
+        """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, 0.0, self.duration)[:, None]
         x0, v0, a = np.array([self.position, self.velocity, self.acceleration], float)
         return Motion(x0 + (v0 + 0.5 * a * times) * times, v0 + a * times, a + 0 * times)
@@ -331,20 +343,21 @@ def straight_trajectory(
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Trajectory through positions at given times."""
+    """Trajectory that passes through given positions at given times."""
 
     times: FloatSequence
-    """(n,): ascending times [s], at least two."""
+    """(n,): ascending times at which positions are given [s], at least two."""
     positions: Sequence[Sequence[float]] | np.ndarray
-    """(n, 3): positions at these times [m]."""
+    """(n, 3): positions of the point at ``times`` [m]."""
     is_smooth: bool = True
-    """True for a cubic spline, whose velocity and acceleration are continuous (a line or a parabola
-    through two or three points); False for straight lines at constant velocities."""
+    """True to connect the positions by a cubic spline, whose velocity and acceleration are
+    continuous (a line or a parabola through two or three points). False to connect them by straight
+    lines at constant velocities."""
     _interpolant: Any = field(init=False, repr=False)
-    """Function of the time [s], and of the order of a derivative by time: positions relative to the
-    first one [m]."""
+    """Function of the time [s] and of the order of a time derivative. It returns this derivative of
+    the position relative to the first position [m]."""
     _origin: np.ndarray = field(init=False, repr=False)
-    """(3,): first position [m]."""
+    """(3,): first of the given positions [m]."""
 
     def __post_init__(self) -> None:
         from scipy.interpolate import CubicSpline, PPoly  # slow to import
@@ -369,16 +382,16 @@ class Waypoints:
 
     @property
     def start(self) -> float:
-        """First time [s]."""
+        """Time of the first position [s]."""
         return float(self._interpolant.x[0])
 
     @property
     def stop(self) -> float:
-        """Last time [s]."""
+        """Time of the last position [s]."""
         return float(self._interpolant.x[-1])
 
     def motion(self, times: np.ndarray) -> Motion:
-        """Return the motion at times (n,) [s] from start to stop."""
+        """Return position, velocity and acceleration at times (n,) [s] from start to stop."""
         times = _clip_to_duration(times, self.start, self.stop)
         return Motion(
             self._interpolant(times) + self._origin,
@@ -407,32 +420,35 @@ def require_rising_times(time: FloatSequence) -> np.ndarray:
 
 
 Trajectory = ConstantAcceleration | Waypoints
-"""Motion of a point over time, from `start` to `stop` [s]."""
+"""Motion of a point over time, from ``start`` to ``stop`` [s]: any of the classes of trajectories.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBody:
-    """Body with a trajectory and an attitude law, which may carry an instrument."""
+    """Body that follows a trajectory and an attitude law, and may carry an instrument."""
 
     trajectory: Trajectory
-    """Trajectory of the body's reference point."""
+    """Trajectory of the body's reference point, the origin of its frame."""
     attitude_law: AttitudeLaw
-    """Attitude of the body over time."""
+    """Law that gives the attitude of the body over time."""
     lever_arm: FloatSequence = (0.0, 0.0, 0.0)
     """(3,): position of the instrument in the body frame [m]."""
 
     @property
     def start(self) -> float:
-        """First time [s]."""
+        """Time at which the trajectory begins [s]."""
         return self.trajectory.start
 
     @property
     def stop(self) -> float:
-        """Last time [s]."""
+        """Time at which the trajectory ends [s]."""
         return self.trajectory.stop
 
     def state(self, times: np.ndarray) -> BodyState:
-        """Return pose and motion of the instrument at times (n,) [s] from start to stop.
+        """Return position, attitude and motion of the instrument at times (n,) [s].
+
+        Times are from ``start`` to ``stop``.
 
         Raises
         ------

@@ -24,93 +24,103 @@ import numpy as np
 from sweep.kernel_cache import njit
 
 CHILDREN_PER_NODE = 8
-"""Number of children of a node. Their boxes fill one vector register of float64 with AVX-512, two
-with AVX2."""
+"""Number of children of a tree node. The coordinates of their boxes fill one vector register of
+float64 with AVX-512, or two with AVX2."""
 
 LEAF_TRIANGLES_MAX = 2
 """Largest number of triangles in a leaf. It is below 8, so that a leaf's first triangle and its
 number of triangles fit one integer (:attr:`BoxTree.children`)."""
 
 _BOX_SLACK = 2.0**-30
-"""Distance by which boxes are widened, over the largest coordinate. It is far above the rounding of
-a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5 times the mesh's
-size), and below the resolution of float32."""
+"""Distance by which boxes are widened, as a fraction of the largest coordinate. It is far above the
+rounding of a hit's position across the ray (some 1e-15 of the range, for ranges up to 1e5 times the
+mesh's size), and below the resolution of float32."""
 
 _EMPTY_BOX_BOUND = np.float32(3e38)
-"""Lower bound of the empty box; its upper bound is minus this."""
+"""Lower bound of an empty box along each axis [m]. Its upper bound is minus this value, so that no
+ray enters the box."""
 
 _TRIANGLES_PER_BATCH = 1 << 20
-"""Number of triangles whose boxes are computed together."""
+"""Number of triangles whose bounding boxes are computed in one step, which limits memory."""
 
 _STACK_SIZE = 8 * 16
-"""Size of the stack of a traversal. The deepest tree needs seven entries a level."""
+"""Number of entries of the stack that a traversal of the tree uses. The deepest tree needs seven
+entries per level."""
 
 _DIRECTION_MIN = 1e-200
-"""Direction components below this count as possibly zero, so that their reciprocal is finite."""
+"""Size of a direction's component below which it is replaced when reciprocals are computed, so that
+these are finite."""
 
 _ENTRY_SLACK = 1.0 + 1e-14
-"""Factor by which the distance of a box's exit is increased, more than its rounding (5e-16)."""
+"""Factor by which the distance at which a ray leaves a box is increased. It exceeds the rounding
+error of this distance (5e-16)."""
 
 _TIE_SLACK = 1.0 + 1e-12
-"""Factor by which a hit's distance is increased before boxes beyond it are skipped. Rounding then
-skips no box that holds an equally near triangle."""
+"""Factor by which the distance of the nearest hit is increased before farther boxes are skipped.
+Rounding then skips no box that holds an equally near triangle."""
 
 _BUNDLE_TESTS_MAX = np.int64(128)
-"""Number of triangles tested against a whole bundle, after which its rays traverse the tree alone.
-"""
+"""Largest number of triangles that are tested against a whole bundle of rays. Beyond it each ray of
+the bundle traverses the tree alone."""
 _UNLIMITED_TESTS = np.int64(1 << 62)
-"""Number of triangle tests that is never reached."""
+"""Number of triangle tests that no traversal reaches, which stands for no limit."""
 
 _X, _Y, _Z = range(3)
 """Indices of the coordinate axes."""
 _LOW_X, _LOW_Y, _LOW_Z, _HIGH_X, _HIGH_Y, _HIGH_Z = range(6)
-"""Rows of a node in :attr:`BoxTree.bounds`."""
+"""Indices of a box's lower and upper bounds along x, y, z in :attr:`BoxTree.bounds`."""
 _SHEAR_X, _SHEAR_Y, _RECIPROCAL = range(3)
-"""Rows of :attr:`_Scratch.shears`."""
+"""Indices of the rows of :attr:`_Scratch.shears`: the constants of a ray's triangle tests."""
 (
     _RECIPROCAL_HIGH, _RECIPROCAL_LOW, _NEAR_TERM_HIGH, _NEAR_TERM_LOW, _FAR_TERM_HIGH,
     _FAR_TERM_LOW,
 ) = range(6)  # fmt: skip
-"""Rows of :attr:`_Scratch.box_test`."""
+"""Indices of the rows of :attr:`_Scratch.box_test`: the constants of a bundle's box tests."""
 
 
 class BoxTree(NamedTuple):
-    """Nested boxes over the triangles of one mesh, the root last."""
+    """Tree of nested bounding boxes over the triangles of one mesh; the root is the last node."""
 
     bounds: np.ndarray
     """(nodes, 6, 8) float32 [m]: lower bounds x, y, z and upper bounds x, y, z of each child's box.
     """
     children: np.ndarray
-    """(nodes, 8) int32: index of a child that is a node. A child that is a leaf has -1 - (8 start +
-    count), with the index `start` of its first triangle in `faces` and their number `count`."""
+    """(nodes, 8) int32: each child as an integer. A child node is its index. A leaf is -1 - (8
+    start + count), with the index ``start`` of its first triangle in ``faces`` and its number
+    ``count`` of triangles."""
     faces: np.ndarray
-    """(m, 3) int32: vertices of each triangle; the triangles are in the order of the leaves."""
+    """(m, 3) int32: indices in ``vertices`` of each triangle's corners. The triangles are in the
+    order of the leaves."""
     mesh_face_index: np.ndarray
-    """(m,) int32: index in the mesh of each triangle of `faces`."""
+    """(m,) int32: index in the original mesh of each triangle of ``faces``."""
     vertices: np.ndarray
     """(n, 3) float64 [m]: the mesh's vertices in the order in which `faces` first uses them."""
 
 
 class _Scratch(NamedTuple):
-    """Arrays that a traversal works in."""
+    """Arrays that a traversal of the tree uses for intermediate results."""
 
     shears: np.ndarray
-    """(3, b): result of :func:`_prepare_bundle`, by ray."""
+    """(3, b): constants of the triangle tests of each ray (:func:`_prepare_bundle`)."""
     box_test: np.ndarray
-    """(6, 3): result of :func:`_prepare_bundle`, by coordinate axis."""
+    """(6, 3): constants of the box tests of a bundle of rays, for each coordinate axis
+    (:func:`_prepare_bundle`)."""
     child_entry: np.ndarray
-    """(8,): distance at which rays may enter each child's box; inf if none can."""
+    """(8,): smallest distance at which a ray may enter each child's box, in lengths of the
+    direction; inf if none can."""
     node_stack: np.ndarray
-    """(_STACK_SIZE,) int64: nodes and leaves that are still to be visited, as in
+    """(_STACK_SIZE,) int64: nodes and leaves still to be visited, encoded as in
     :attr:`BoxTree.children`."""
     entry_stack: np.ndarray
-    """(_STACK_SIZE,): distance at which rays may enter each of them."""
+    """(_STACK_SIZE,): smallest distance at which a ray may enter each element of ``node_stack``, in
+    lengths of the direction."""
 
 
 def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
-    """Build the tree of a mesh.
+    """Build the tree of bounding boxes of a mesh.
 
-    The triangles are halved recursively into leaves. A node's children are eight neighbours.
+    The triangles are halved recursively into leaves. The children of a node are eight boxes that
+    are close in space.
 
     Parameters
     ----------
@@ -128,7 +138,10 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> BoxTree:
 
 
 def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return twice the centres of triangles' boxes, (m, 3) float32, by which leaves are sorted."""
+    """Return twice the centres of triangles' bounding boxes, (m, 3) float32 [m].
+
+    Triangles are sorted into leaves by them.
+    """
     centres = np.empty((len(faces), 3), np.float32)
     for begin in range(0, len(faces), _TRIANGLES_PER_BATCH):  # in batches, to save memory
         rows = slice(begin, begin + _TRIANGLES_PER_BATCH)
@@ -138,9 +151,10 @@ def _triangle_centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> np.ndarray:
-    """Return the box of each leaf, (n, 6) float32 [m]: lower bounds, and upper bounds negated.
+    """Return the bounding box of each leaf, (n, 6) float32 [m].
 
-    `leaves` is the result of :func:`_order_into_leaves`.
+    A box has its lower bounds along x, y, z, and then its upper bounds negated. ``leaves`` is the
+    result of :func:`_order_into_leaves`.
     """
     slack = _BOX_SLACK * float(max(vertices.max(), -vertices.min()))
     boxes = np.empty((leaves.size // LEAF_TRIANGLES_MAX, 6), np.float32)
@@ -163,10 +177,10 @@ def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> 
 def _build_nodes(
     vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return :attr:`BoxTree.bounds` and :attr:`BoxTree.children` of all nodes.
+    """Build all nodes of the tree; return :attr:`BoxTree.bounds` and :attr:`BoxTree.children`.
 
-    Nodes are in the order of their levels, from those above the leaves to the root. `leaves` is the
-    result of :func:`_order_into_leaves`.
+    Nodes are in the order of their levels, from those above the leaves to the root. ``leaves`` is
+    the result of :func:`_order_into_leaves`.
     """
     boxes = _leaf_boxes(vertices, faces, leaves)
     triangle_count = (
@@ -199,10 +213,10 @@ def _build_nodes(
 
 
 def _order_into_leaves(centres: np.ndarray) -> np.ndarray:
-    """Sort triangles into leaves of neighbours; return the number of each slot's triangle, int32.
+    """Sort triangles into leaves of the tree; return the triangle number of each slot, int32.
 
-    Leaves of equal size follow each other, and the number of slots is a power of two. An empty slot
-    has the value m, the number of triangles.
+    A slot is a place for a triangle in a leaf, and a leaf holds triangles that are close in space.
+    The number of slots is a power of two. An empty slot has the value m, the number of triangles.
     """
     n_triangles, n_slots = len(centres), LEAF_TRIANGLES_MAX
     while n_slots < n_triangles:
@@ -218,7 +232,7 @@ def _order_into_leaves(centres: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _renumber_by_first_use(faces, triangle_order, n_vertices):
-    """Reorder triangles, and renumber vertices by their first use in that order.
+    """Put triangles into a new order, and renumber vertices in the order of their first use.
 
     The data of a leaf's triangles then lie together in memory.
 
@@ -257,7 +271,7 @@ def _renumber_by_first_use(faces, triangle_order, n_vertices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sort_into_halves(points, order):
-    """Sort indices of points so that halves, and halves of halves, are separated in space.
+    """Sort indices of points so that each half, and each half of a half, is compact in space.
 
     Parameters
     ----------
@@ -316,7 +330,9 @@ def _smaller(a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_nearest_triangles(tree, origins, directions, distance, face_index, distance_min=0.0):
-    """Find the nearest triangle of each ray of each bundle, if nearer than the known distance.
+    """Find the nearest triangle that each ray hits, if it is nearer than the known distance.
+
+    Rays come in bundles of one origin.
 
     Parameters
     ----------
@@ -377,7 +393,9 @@ def find_nearest_triangles(tree, origins, directions, distance, face_index, dist
 def _traverse_tree(
     tree, origin, directions, distance, face_index, scratch, tests_max, distance_min
 ):
-    """Find the nearest triangles of all rays of a bundle in one traversal; return False if aborted.
+    """Find the nearest triangles that the rays of a bundle hit; return False if aborted.
+
+    All rays traverse the tree together.
 
     Parameters
     ----------
@@ -456,9 +474,10 @@ def _traverse_tree(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _prepare_bundle(directions, shears, box_test):
-    """Compute the constants of a bundle's tests, and return the axis of its directions.
+    """Compute the constants of a bundle's box and triangle tests, and return its axis.
 
-    The axis is that of the largest component of every direction; -1 if the directions differ in it.
+    The axis (0, 1 or 2) is that along which the component of every direction is largest; -1 if the
+    directions differ in it.
 
     Parameters
     ----------
@@ -515,7 +534,7 @@ def _prepare_bundle(directions, shears, box_test):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _box_entry_distances(bounds, node, ox, oy, oz, box_test, distance_max, child_entry):
-    """Compute the smallest distance at which rays of a bundle may enter each child's box.
+    """Compute the smallest distance at which rays of a bundle may enter each box of a node.
 
     Parameters
     ----------
@@ -583,7 +602,7 @@ def _box_entry_distances(bounds, node, ox, oy, oz, box_test, distance_max, child
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_triangle(a, b, c, index, shears, distance_min, distance, face_index):
-    """Intersect one triangle with all rays of a bundle, and keep hits that are nearer than before.
+    """Intersect one triangle with all rays of a bundle, and keep hits nearer than those known.
 
     Parameters
     ----------

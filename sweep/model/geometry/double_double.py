@@ -17,38 +17,42 @@ from typing import NamedTuple
 import numpy as np
 
 _SPLIT_FACTOR = 2.0**27 + 1
-"""Factor of Veltkamp's splitting of a float64 into two numbers of half as many digits."""
+"""Factor in Veltkamp's method, which splits a float64 into two numbers of half as many digits each.
+"""
 
 
 class DoubleDouble(NamedTuple):
-    """Numbers, each the sum of two float64."""
+    """Numbers with twice the digits of float64, each stored as the sum of two float64."""
 
     high: np.ndarray
-    """The numbers, rounded to float64."""
+    """The numbers, each rounded to the nearest float64."""
     low: np.ndarray
-    """Remainders of the rounding."""
+    """The numbers minus their rounded values ``high``, as float64."""
 
     @classmethod
     def from_float64(cls, values: np.ndarray) -> DoubleDouble:
-        """Return float64 numbers as double-doubles."""
+        """Return float64 numbers as double-doubles, whose low part is 0."""
         return cls(values, np.zeros_like(values))
 
 
 def _two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Return the sum of two float64 numbers with its rounding error."""
+    """Return the rounded sum of two float64 numbers, and its exact rounding error."""
     total = a + b
     virtual_b = total - a
     return DoubleDouble(total, (a - (total - virtual_b)) + (b - virtual_b))
 
 
 def quick_two_sum(a: np.ndarray, b: np.ndarray) -> DoubleDouble:
-    """Return the sum of two float64 numbers with its rounding error, for abs(a) >= abs(b)."""
+    """Return the rounded sum of float64 numbers and its exact rounding error.
+
+    It is valid only if abs(a) >= abs(b).
+    """
     total = a + b
     return DoubleDouble(total, b - (total - a))
 
 
 def _split_digits(a: np.ndarray) -> DoubleDouble:
-    """Split float64 numbers into two summands, each of half as many digits."""
+    """Split float64 numbers into sums of two float64, each of half as many digits."""
     scaled = a * _SPLIT_FACTOR
     high = scaled - (scaled - a)
     return DoubleDouble(high, a - high)
@@ -92,7 +96,7 @@ def cross(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Return the vector product of two vectors (3, n)."""
 
     def permute(vector: DoubleDouble, axes: list[int]) -> DoubleDouble:
-        """Return the vector with its components in another order."""
+        """Return the vector with its components in the order of ``axes``."""
         return DoubleDouble(vector.high[axes], vector.low[axes])
 
     yzx, zxy = [1, 2, 0], [2, 0, 1]

@@ -30,14 +30,15 @@ class SurfaceMaterial:
     name: str
     """Name of the surface in the spec of the scene."""
     reflectance: float
-    """Reflectance, 0..1; `reflectance_law` defines its meaning."""
+    """Reflectance of the surface, 0..1. Its meaning depends on ``reflectance_law``."""
     reflectance_law: str = "lambert"
-    """Reflectance law, one of :data:`sweep.model.ground.REFLECTANCE_LAWS`."""
+    """Name of the law by which the reflectance depends on the angle of incidence
+    (:data:`sweep.model.ground.REFLECTANCE_LAWS`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangle mesh. Vertices are relative to an origin, so large coordinates keep their digits.
+    """Triangle mesh whose vertices are relative to an origin, which keeps the digits of positions.
 
     Raises
     ------
@@ -46,14 +47,15 @@ class Mesh:
     """
 
     vertices: np.ndarray
-    """(n, 3) float64 [m], relative to `origin`."""
+    """(n, 3) float64: positions of the vertices relative to ``origin`` [m]."""
     faces: np.ndarray
-    """(m, 3) int32: vertices of each triangle, in either winding, since both sides are visible."""
+    """(m, 3) int32: indices of each triangle's three vertices. Their order may be either winding,
+    since both sides are visible."""
     surface_index: np.ndarray
-    """(m,) int16: index of each triangle's surface in the scene."""
+    """(m,) int16: index of each triangle's surface material in the scene."""
     origin: np.ndarray
-    """(3,) float64 [m]: position of the vertices' zero, in the frame of the scene or of the
-    body."""
+    """(3,) float64 [m]: position, in the frame of the scene or of the body, of the point to which
+    ``vertices`` are relative."""
 
     def __post_init__(self):
         require_consistent_mesh(self.vertices, self.faces, self.surface_index)
@@ -69,7 +71,7 @@ class Mesh:
 
 
 def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """Merge several meshes of one frame into one mesh, in the order given."""
+    """Merge meshes whose coordinates are in one frame into one mesh, in the order given."""
     corners = [
         mesh.origin + corner_function(mesh.vertices, axis=0)
         for mesh in meshes
@@ -121,7 +123,7 @@ def require_consistent_mesh(
 
 
 def exact_centre(vertices: np.ndarray) -> np.ndarray:
-    """Return the centre of the bounding box, rounded so that subtracting it is exact.
+    """Return the centre of the vertices' bounding box, rounded so that subtracting it is exact.
 
     Along an axis it is zero if zero is no farther from the mesh than the mesh is large, since small
     coordinates would lose their last digits otherwise. Else it is rounded to a power of two not
@@ -138,12 +140,12 @@ def exact_centre(vertices: np.ndarray) -> np.ndarray:
 
 
 _GRAZING_SINE_MAX = 1e-6
-"""Sine of the angle between a ray and a facet, up to which rounding may make the ray lie in the
+"""Largest sine of the angle between a ray and a facet at which rounding may make the ray lie in the
 facet's plane."""
 
 
 def facet_normals(corners: np.ndarray) -> DoubleDouble:
-    """Compute the normals of facets, with lengths of twice the facets' areas.
+    """Compute the normals of triangles, each with a length of twice the triangle's area.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def plane_distances(
     ray_origin: DoubleDouble,
     ray_direction: DoubleDouble,
 ) -> DoubleDouble:
-    """Compute the distances of facets' planes along rays.
+    """Compute the distances along rays from their origins to the planes of facets (triangles).
 
     Parameters
     ----------

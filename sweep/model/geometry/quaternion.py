@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 _SMALL_HALF_ANGLE = 1e-4
-"""Half angle [rad] below which sin(x)/x is computed by its series, accurate to 1e-18 there."""
+"""Half angle x [rad] below which sin(x) / x is computed by its power series. The series is then
+accurate to 1e-18."""
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -20,44 +20,56 @@ from sweep.model.geometry.double_double import DoubleDouble, dot, subtract
 from sweep.model.geometry.mesh import Mesh, facet_normals, plane_distances
 
 _RAYS_PER_BATCH = 4096
-"""Number of rays processed together, so that intermediate results stay in the cache."""
+"""Number of rays that are processed in one step, so that intermediate results stay in the
+processor's cache."""
 
 
 class Pose(NamedTuple):
-    """Position and attitude of a body: x_world = attitude x_body + position."""
+    """Position and attitude of a body, which transform body coordinates to world coordinates.
+
+    x_world = attitude x_body + position, where the attitude rotates the vector.
+    """
 
     position: np.ndarray
-    """(3,), or (n, 3) for each bundle, float64 [m]."""
+    """Position of the body's frame in the world [m], float64: (3,), or (n, 3) with one for each
+    bundle of rays."""
     attitude: np.ndarray
-    """(4,) or (n, 4) float64: quaternion (w, x, y, z) from the body's frame to the world's."""
+    """Quaternion (w, x, y, z) from the body's frame to the world's, float64: (4,), or (n, 4) with
+    one for each bundle of rays."""
 
 
 class BundleHits(NamedTuple):
-    """First hits of n bundles of b beamlets."""
+    """First hits of n bundles of b beamlets (rays that sample a beam).
+
+    The reference beamlet of a bundle is the first that hits a body.
+    """
 
     range: np.ndarray
-    """(n,) float64 [m]: range R_0 of the reference beamlet, inf if all miss."""
+    """(n,) float64: range of the reference beamlet [m]; inf if all beamlets miss."""
     reference_beamlet: np.ndarray
-    """(n,) int64: beamlet that ranges are relative to, the first that hits; -1 if all miss."""
+    """(n,) int64: index of the first beamlet that hits a body, to whose range others are relative;
+    -1 if all miss."""
     normal: np.ndarray
-    """(n, 3) float64: unit normal where the reference beamlet hits, towards the origin; nan if all
-    miss."""
+    """(n, 3) float64: unit normal of the surface that the reference beamlet hits, on the side of
+    the ray's origin; nan if all beamlets miss."""
     range_offset: np.ndarray
-    """(n, b) float64 [m]: R_b - R_0, without the rounding of either range; nan for a miss."""
+    """(n, b) float64: range of each beamlet minus that of the reference beamlet [m]; nan for a
+    beamlet that misses. It is computed before either range is rounded."""
     is_hit: np.ndarray
     """(n, b) bool: True if the beamlet hits a body."""
     cos_incidence: np.ndarray
-    """(n, b) float64: cosine of the incidence angle, 0..1; nan for a miss."""
+    """(n, b) float64: cosine of the angle of incidence, 0..1; nan for a beamlet that misses."""
     surface_index: np.ndarray
-    """(n, b) int16: index of the surface, -1 for a miss."""
+    """(n, b) int16: index of the surface material that is hit; -1 for a beamlet that misses."""
     face_index: np.ndarray
-    """(n, b) int64: triangle in the body's mesh, -1 for a miss."""
+    """(n, b) int64: index, in the body's mesh, of the triangle that is hit; -1 for a beamlet that
+    misses."""
     body_index: np.ndarray
-    """(n, b) int16: index of the body, -1 for a miss."""
+    """(n, b) int16: index of the body that is hit; -1 for a beamlet that misses."""
 
 
 class RayCaster:
-    """Rigid bodies, numbered from 0, prepared for ray casting.
+    """Rigid bodies, numbered from 0, at which rays can be cast.
 
     Parameters
     ----------
@@ -71,7 +83,7 @@ class RayCaster:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the bodies' triangles and trees take [bytes]."""
+        """Memory that triangles and box trees of the bodies occupy [bytes]."""
         mesh_bytes = sum(
             mesh.vertices.nbytes + mesh.faces.nbytes + mesh.surface_index.nbytes
             for mesh in self.meshes
@@ -86,7 +98,7 @@ class RayCaster:
         poses: Sequence[Pose | None] | None = None,
         range_min: float = 0.0,
     ) -> BundleHits:
-        """Find the first hits of bundles of beamlets.
+        """Find the first hit of each ray (beamlet) of bundles from one origin each.
 
         Parameters
         ----------
@@ -172,7 +184,10 @@ class RayCaster:
         )
 
     def _first_hits(self, frames, origins, directions, range_min):
-        """Return the triangle and body that each beamlet hits first, (n, b) each; -1 for none."""
+        """Return the indices of the triangle and the body that each beamlet hits first.
+
+        Both are (n, b); -1 for a miss.
+        """
         shape = directions.shape[:2]
         distance, face_index = np.full(shape, np.inf), np.full(shape, -1)
         body_index = np.full(shape, -1, np.int16)
@@ -187,7 +202,7 @@ class RayCaster:
         return face_index, body_index
 
     def _intersect_facets(self, frames, origins, directions, rays, facets):
-        """Intersect m rays with the planes of the facets that they hit.
+        """Intersect m rays with the planes of the facets (triangles) that they hit.
 
         Parameters
         ----------
@@ -223,7 +238,10 @@ class RayCaster:
         return intersections
 
     def _mesh_frames(self, poses, n_bundles):
-        """Return the :class:`_MeshFrame` of each body at its pose; None is a body at rest."""
+        """Return the transformation from the world to each body's mesh, at the body's pose.
+
+        The pose of a body at rest in the world's frame is None.
+        """
         poses = [None] * len(self.meshes) if poses is None else poses
         return [
             _MeshFrame(
@@ -234,34 +252,34 @@ class RayCaster:
 
 
 class _RayIndices(NamedTuple):
-    """Indices of m rays in arrays (bundles, beamlets); a valid index of such an array."""
+    """Indices of m rays, which select elements of arrays (bundles, beamlets)."""
 
     bundle: np.ndarray
-    """(m,) int64: bundle of each ray."""
+    """(m,) int64: index of the bundle to which each ray belongs."""
     beamlet: np.ndarray
-    """(m,) int64: beamlet of each ray."""
+    """(m,) int64: index of each ray in its bundle."""
 
 
 class _HitFacets(NamedTuple):
-    """Facets that m rays hit."""
+    """Facets (triangles) that m rays hit."""
 
     face_index: np.ndarray
-    """(m,) int64: triangle in the body's mesh."""
+    """(m,) int64: index, in the body's mesh, of the triangle that each ray hits."""
     body_index: np.ndarray
-    """(m,) int16: body."""
+    """(m,) int16: index of the body that each ray hits."""
 
 
 class _FacetIntersections(NamedTuple):
-    """Intersections of m rays with the planes of facets."""
+    """Intersections of m rays with the planes of the facets (triangles) that they hit."""
 
     range_high: np.ndarray
-    """(m,): range, rounded to float64 [m]."""
+    """(m,): range at which each ray meets the plane, rounded to float64 [m]."""
     range_low: np.ndarray
-    """(m,): remainder of that rounding [m]."""
+    """(m,): exact range minus ``range_high`` [m]."""
     normal: np.ndarray
     """(3, m): unit normal of the facet in the world's frame, oriented by its winding."""
     cosine: np.ndarray
-    """(m,): scalar product of the ray's direction and the normal, -1..1."""
+    """(m,): cosine, -1..1, of the angle between the ray's direction and ``normal``."""
 
     @classmethod
     def empty(cls, n_rays: int) -> "_FacetIntersections":
@@ -270,14 +288,16 @@ class _FacetIntersections(NamedTuple):
 
 
 class _MeshFrame(NamedTuple):
-    """Transformation from the world's frame to a mesh's own, for n bundles of rays."""
+    """Transformation from the world's frame to the frame of a mesh, for n bundles of rays."""
 
     mesh_origin: np.ndarray
-    """(3,): the mesh's own origin in the body's frame [m]."""
+    """(3,): position in the body's frame of the point to which the mesh's vertices are relative
+    [m]."""
     rotation: np.ndarray | None
-    """(n, 3, 3): x_world = rotation x_body + position; None if the body's frame is the world's."""
+    """(n, 3, 3): rotation matrices from the body's frame to the world's; None if the frames are
+    equal."""
     position: np.ndarray | None
-    """(n, 3): position of the body [m]; None if the body's frame is the world's."""
+    """(n, 3): position of the body's frame in the world [m]; None if the frames are equal."""
 
     def to_mesh_origins(self, origins, ray_rows):
         """Transform origins of m rays to the mesh's frame.
@@ -313,7 +333,10 @@ class _MeshFrame(NamedTuple):
         )
 
     def _rotate_to_body(self, vector, ray_rows):
-        """Rotate vectors (3, m) of double-doubles from the world's frame to the body's."""
+        """Rotate double-double vectors (3, m) from the world's frame to the body's.
+
+        ``ray_rows`` (m,) selects the rotation of each.
+        """
         rotations = self.rotation[ray_rows].transpose(1, 2, 0)
         vector_column = DoubleDouble(vector.high[:, None], vector.low[:, None])
         return dot(vector_column, DoubleDouble.from_float64(rotations))
@@ -341,7 +364,10 @@ class _MeshFrame(NamedTuple):
         return np.ascontiguousarray(mesh_origins), directions
 
     def to_world(self, vector, ray_rows):
-        """Rotate vectors (3, m) from the body's frame to the world's."""
+        """Rotate vectors (3, m) from the body's frame to the world's.
+
+        ``ray_rows`` (m,) selects the rotation of each.
+        """
         if self.rotation is None:
             return vector
         x_axis, y_axis, z_axis = self.rotation[ray_rows].transpose(2, 1, 0)
@@ -350,7 +376,7 @@ class _MeshFrame(NamedTuple):
 
 
 def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
-    """Intersect m rays with the planes of facets of one mesh.
+    """Intersect m rays with the planes of the facets (triangles) of one mesh that they hit.
 
     Parameters
     ----------
@@ -359,7 +385,7 @@ def _intersect_mesh(mesh, frame, bundle, origins, directions, face_index):
     bundle : ndarray (m,) int
         Bundle of each ray.
     origins, directions : ndarray (m, 3)
-        Rays in the world's frame.
+        Origins [m] and directions of the rays in the world's frame.
     face_index : ndarray (m,) int
         Facet of each ray.
 

@@ -17,19 +17,21 @@ import numpy as np
 from sweep.model.geometry.quaternion import from_rotation_vector, multiply, rotate
 
 JITTER_KEY_DOMAIN = "sweep.jitter"
-"""Text in the hash of the random key of pointing jitter, so that it differs from other keys of the
-same seed."""
+"""Text that is hashed into the random key of pointing jitter, so that the key differs from others
+of the same seed."""
 
 
 def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) -> np.ndarray:
-    """Return unit vectors, evenly spaced on a cone around nadir, in the body frame, (n_beams, 3).
+    """Return unit vectors of beams evenly spaced on a cone around nadir, (n_beams, 3).
+
+    They are in the body frame.
 
     Parameters
     ----------
     n_beams : int
         Number of beams.
     half_angle : float
-        Angle from nadir [rad].
+        Angle of each beam from nadir [rad].
     azimuth : float
         Angle of the first beam about the vertical, from forward towards the left [rad].
     """
@@ -40,12 +42,12 @@ def cone_directions(n_beams: int, *, half_angle: float, azimuth: float = 0.0) ->
 
 
 def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
-    """Return the unit vectors of the beams of a two-axis steerer, in the body frame, (..., 3).
+    """Return unit vectors of beams steered about two axes, in the body frame, (..., 3).
 
     Parameters
     ----------
     angle_x, angle_y : ndarray
-        Angles towards forward and towards the left [rad], below 90 deg.
+        Angles of the beam from nadir towards forward and towards the left [rad], below 90 deg.
 
     Notes
     -----
@@ -58,7 +60,9 @@ def steered_directions(angle_x: np.ndarray, angle_y: np.ndarray) -> np.ndarray:
 
 
 def corner_directions(angle: float) -> np.ndarray:
-    """Return the four beams of :func:`steered_directions` with both angles at +-`angle` [rad].
+    """Return the directions of four beams, steered by +-`angle` [rad] from nadir about both axes.
+
+    The steerer is that of :func:`steered_directions`.
 
     Returns
     -------
@@ -69,7 +73,7 @@ def corner_directions(angle: float) -> np.ndarray:
 
 
 def stacked_angles(element_angles: Sequence[float]) -> np.ndarray:
-    """Return all angles that a stack of n steering elements reaches [rad], ascending, (2^n,).
+    """Return all deflections [rad] that a stack of n steering elements can give, ascending, (2^n,).
 
     Each element deflects the beam to one side or the other by its angle [rad], and deflections add.
     Elements of 15 and 7.5 deg reach -22.5, -7.5, 7.5 and 22.5 deg.
@@ -118,40 +122,42 @@ def square_patterns(element_angles: Sequence[float]) -> tuple[np.ndarray, np.nda
 
 
 class ScanShots(NamedTuple):
-    """Times and directions of n shots of a scanner."""
+    """Times, beams and directions of n shots of a scanner."""
 
     time: np.ndarray
-    """(n,): start of each measurement, from the first one of the scan [s]."""
+    """(n,): time from the scan's first measurement to the start of each measurement [s]."""
     beam_number: np.ndarray
-    """(n,) int64: number of the beam."""
+    """(n,) int64: number of the beam that fires each shot."""
     cycle_number: np.ndarray
-    """(n,) int64: number of the measurement cycle."""
+    """(n,) int64: number of the measurement cycle to which each shot belongs."""
     direction: np.ndarray
-    """(n, 3): unit vectors in the body frame."""
+    """(n, 3): unit vectors along the beams in the body frame."""
     direction_rate: np.ndarray
-    """(n, 3): rate of change of the direction in the body frame [1/s]."""
+    """(n, 3): time derivative of ``direction`` in the body frame [1/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class BeamCycle:
-    """Beams at fixed angles, fired in a repeated sequence of patterns."""
+    """Scan pattern of beams at fixed angles, fired in a repeated sequence of groups (patterns)."""
 
     directions: Sequence[Sequence[float]] | np.ndarray
-    """(b, 3): directions of the beams in the body frame, of any length above 0."""
+    """(b, 3): directions of the beams in the body frame; vectors of any length above 0."""
     patterns: Sequence[Sequence[int]] | np.ndarray
-    """(p, k): p patterns. Each measurement cycle fires the k beams of one pattern in their order,
-    and the next cycle those of the next pattern."""
+    """(p, k): indices of the k beams in each of p patterns. Each measurement cycle fires the beams
+    of one pattern in their order, and the next cycle those of the next pattern."""
     rate: float
     """Number of measurement cycles per second [Hz], > 0."""
     interval: float | None = None
-    """Time from one beam of a cycle to the next [s]. 0 fires all at once (several telescopes); None
-    spaces them evenly over the cycle (one steered beam)."""
+    """Time from one shot to the next of a measurement cycle [s]. With 0 all beams fire at once
+    (several telescopes). With None the shots are spaced evenly over the cycle (one steered beam).
+    """
     _unit_directions: np.ndarray = field(init=False, repr=False)
     """(b, 3): unit vectors along `directions`."""
     _pattern_table: np.ndarray = field(init=False, repr=False)
-    """(p, k) int64: `patterns` as an array."""
+    """(p, k) int64: indices of the k beams in each of p patterns, as an array."""
     _shot_interval: float = field(init=False, repr=False)
-    """`interval` [s], or what follows for None."""
+    """Time from one shot to the next of a measurement cycle [s]: ``interval``, or the even spacing
+    if that is None."""
 
     def __post_init__(self) -> None:
         directions, patterns = np.asarray(self.directions, float), np.asarray(self.patterns)
@@ -194,7 +200,7 @@ class BeamCycle:
         return _count_begun_shots(duration, self.rate, self.beams_per_cycle, self._shot_interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Return the shots of given numbers (n,), counted from 0."""
+        """Return times and directions of the shots with given numbers (n,), counted from 0."""
         patterns = self._pattern_table
         cycle_number, shot_in_cycle = np.divmod(
             np.asarray(shot_numbers, np.int64), self.beams_per_cycle
@@ -215,7 +221,8 @@ def _count_begun_shots(
 ) -> int:
     """Count the shots that begin within a duration [s] from time 0.
 
-    Cycles have a rate [Hz] and a number of shots, which are `interval` [s] apart.
+    Measurement cycles are repeated at ``cycle_rate`` [Hz]. Each has ``shots_per_cycle`` shots,
+    ``interval`` [s] apart.
     """
     if duration < 0:
         return 0
@@ -256,9 +263,10 @@ def raster_scan(
     rate: float,
     both_ways: bool = True,
 ) -> BeamCycle:
-    """Return a scan pattern of a grid of directions, one frame in each measurement cycle.
+    """Return a scan pattern over a grid of directions, scanned once in each measurement cycle.
 
-    Rows are scanned from aft forward, and each row from right to left.
+    One scan of the grid is a frame. Rows are scanned from aft forward, and each row from right to
+    left.
 
     Parameters
     ----------
@@ -282,20 +290,22 @@ def raster_scan(
 
 @dataclass(frozen=True)
 class LineScan:
-    """Fan of beams along the track that a mirror sweeps together from side to side."""
+    """Fan of beams, spread along the track, that a mirror sweeps together from side to side."""
 
     half_angle: float
-    """Largest angle of the sweep from nadir to each side [rad], 0 <= . < pi/2."""
+    """Largest angle from nadir that the sweep reaches on each side [rad], at least 0 and below
+    pi/2."""
     line_rate: float
-    """Number of lines per second [Hz]; a sweep in one direction is a line."""
+    """Number of lines per second [Hz]. A line is a sweep in one direction."""
     rate: float
     """Number of measurements per second of each beam [Hz]."""
     along: tuple[float, ...] = (0.0,)
-    """Fixed angle of each beam from nadir towards forward [rad]."""
+    """Fixed angle of each beam from nadir, towards forward [rad]."""
     wave: str = "triangle"
-    """Sweep angle over time: ``triangle`` for a constant rate, ``sine`` for a resonant mirror."""
+    """Shape of the sweep angle over time: ``triangle`` for a constant rate, ``sine`` for a resonant
+    mirror."""
     interval: float = 0.0
-    """Time from one beam of a measurement to the next [s]; 0 fires all at once."""
+    """Time from one beam to the next of a measurement cycle [s]. With 0 all beams fire at once."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.half_angle < math.pi / 2 and self.along):
@@ -317,7 +327,7 @@ class LineScan:
         return _count_begun_shots(duration, self.rate, self.n_beams, self.interval)
 
     def shots(self, shot_numbers: np.ndarray) -> ScanShots:
-        """Return the shots of given numbers (n,), counted from 0.
+        """Return times and directions of the shots with given numbers (n,), counted from 0.
 
         A measurement cycle is one shot of each beam.
         """
@@ -358,7 +368,10 @@ class LineScan:
         return np.asarray(self.half_angle * (1 - 2 * np.abs(1 - lines_scanned % 2)))
 
     def sweep_rate(self, times: np.ndarray) -> np.ndarray:
-        """Return the rate of the sweep angle at times [s], in rad/s; at an end, that after it."""
+        """Return the time derivative of the sweep angle at times [s], in rad/s.
+
+        At a turning point of the mirror it is that after the turn.
+        """
         lines_scanned = np.asarray(times, float) * self.line_rate
         if self.wave == "sine":
             return np.asarray(
@@ -369,7 +382,7 @@ class LineScan:
 
 
 ScanPattern = BeamCycle | LineScan
-"""Times and directions of a scanner's shots, by their number."""
+"""Pattern of a scanner: times and directions of its shots, as a function of their numbers."""
 
 
 def beamlet_rays(
@@ -379,7 +392,7 @@ def beamlet_rays(
     tangent_along: np.ndarray,
     sigma: float | np.ndarray,
 ) -> np.ndarray:
-    """Return unit vectors of all beamlets in the world frame, (n, b, 3).
+    """Return unit vectors of all beamlets (rays that sample a beam) in the world frame, (n, b, 3).
 
     Parameters
     ----------
@@ -410,7 +423,7 @@ def beamlet_rays(
 
 
 def transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors across each direction, (n, 3) each.
+    """Return two unit vectors perpendicular to each direction and to each other, (n, 3) each.
 
     First, second and `direction` (n, 3) form a right-handed system. For a beam near -z the first
     vector lies near x. Both are smooth functions of the direction except near x and -x, where no
@@ -431,16 +444,17 @@ def _vector_length(vectors: np.ndarray) -> np.ndarray:
 
 
 class PointingJitter(NamedTuple):
-    """Random pointing errors: each shot's beams rotate about the three body axes by normal angles.
+    """Random pointing errors: each shot's beams rotate about the three body axes.
 
-    The three angles are independent. Two of their combinations deflect a beam across its direction,
-    each with the standard deviation `sigma`. The third rotates the footprint about the beam.
+    The three angles are independent normal random numbers. Two of their combinations deflect a beam
+    across its direction, each with the standard deviation `sigma`. The third rotates the footprint
+    about the beam.
     """
 
     sigma: float
-    """Standard deviation of each angle [rad]."""
+    """Standard deviation of the rotation angle about each body axis [rad]."""
     seed: int
-    """Seed of the study, >= 0."""
+    """Seed of the study's random numbers, >= 0."""
 
     def perturb_attitude(self, attitude: np.ndarray, shot_numbers: np.ndarray) -> np.ndarray:
         """Rotate attitudes by the pointing errors of their shots.

@@ -1,7 +1,8 @@
 """Groups of adjacent bins at or above the threshold in noiseless spectra.
 
-A group of a spectrum without noise is the echo of a surface, or a sidelobe of a strong echo. Draws
-add noise to the strongest bin of each group (:mod:`sweep.model.pointcloud.returns`).
+A group is a run of adjacent bins whose magnitude reaches the threshold. It is the echo of a
+surface, or a sidelobe of a strong echo. Draws add noise to the strongest bin of each group
+(:mod:`sweep.model.pointcloud.returns`).
 """
 
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from sweep.model.preparation import Shots
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 STRONGEST_ROW, FIRST_ROW, LAST_ROW = range(3)
-"""Rows of a group's bins: the strongest, the first and the last."""
+"""Rows of the array of a group's bin numbers: strongest bin, first bin and last bin."""
 
 
 class BinGroups(NamedTuple):
@@ -29,33 +30,43 @@ class BinGroups(NamedTuple):
 
     Segments are in the order up, Doppler, down. Each group is the echo of a surface, or a sidelobe
     of a strong echo. Groups are listed strongest first. Elements without a group have bin -1 and
-    nan. If no bin reaches the threshold, the strongest bin is listed, because noise may lift it.
-    Echoes that are not searched for, or arrive after the record, have no group, but have the |X| of
-    a strongest bin.
+    nan. If no bin reaches the threshold, the strongest bin is listed, because noise may lift it. An
+    echo outside the search band, or one that arrives after the record, has no group. Its entry has
+    bin -1, but holds |X| of the strongest bin.
     """
 
     strongest_bin: np.ndarray
-    """(n, 3, groups) int64: strongest bin, 0..N/2; for a complex record periodic in N."""
+    """(n, 3, groups) int64: number of the group's strongest bin. For a real record it is 0..N/2,
+    with N the FFT size; for a complex record numbers are periodic in N."""
     first_bin: np.ndarray
-    """(n, 3, groups) int64: first bin of the group."""
+    """(n, 3, groups) int64: number of the first (lowest) bin of the group."""
     last_bin: np.ndarray
-    """(n, 3, groups) int64: last bin of the group."""
+    """(n, 3, groups) int64: number of the last (highest) bin of the group."""
     neighbour_magnitudes: np.ndarray
-    """(n, 3, groups, 3): |X| [V, summed over the record] below, at and above the strongest bin."""
+    """(n, 3, groups, 3): noiseless |X| [V, summed over the record] of the bin below the group's
+    strongest bin, of that bin, and of the bin above it."""
     pd: np.ndarray
-    """(n, 3, groups): probability of detection."""
+    """(n, 3, groups): probability that the group is detected in noise."""
     n_exempt: np.ndarray
-    """(n, 3): number of bins that cannot raise a false alarm."""
+    """(n, 3): number of bins of a segment that belong to echoes, and so cannot raise a false alarm.
+    """
     leakage: np.ndarray
-    """(n, 3): probability that leaked signal raises an additional group, over noise alone."""
+    """(n, 3): probability of a false peak raised by leaked signal (echo power far from its line),
+    in addition to false peaks of noise alone."""
 
     @property
     def magnitude(self) -> np.ndarray:
-        """|X| of the strongest bin [V, summed over the record], (n, 3, groups)."""
+        """Noiseless |X| of each group's strongest bin [V, summed over the record].
+
+        The result is (n, 3, groups).
+        """
         return self.neighbour_magnitudes[..., 1]
 
     def without_unused_groups(self) -> "BinGroups":
-        """Return the groups with as few groups a segment, at least one, as hold all that exist."""
+        """Return the groups without the trailing entries that no point and segment uses.
+
+        At least one entry remains.
+        """
         n_groups = max(int((self.strongest_bin >= 0).any(axis=(0, 1)).sum()), 1)
         return self._replace(
             **{
@@ -76,12 +87,14 @@ def list_bin_groups(
 ) -> BinGroups:
     """Return the strongest groups of each segment's spectrum without noise.
 
+    A group is a run of adjacent bins at or above the threshold.
+
     Parameters
     ----------
     shots
         Prepared shots.
     groups_max
-        Largest number of groups of a segment.
+        Largest number of groups that are listed for a segment.
     every_bin
         True to sum leakage bin by bin where it could be an integral (:func:`iter_spans`).
     with_leakage
@@ -94,10 +107,10 @@ def list_bin_groups(
 
 
 def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, BinGroups]:
-    """Return an array for bins of groups, and empty groups whose bins are views of it.
+    """Return an array for the bin numbers of groups, and empty groups whose bins are views of it.
 
-    The array is (3, points, 3, groups) int64, with the rows STRONGEST_ROW, FIRST_ROW and LAST_ROW
-    first.
+    The array is (3, points, 3 segments, groups) int64. Its first axis has the rows STRONGEST_ROW,
+    FIRST_ROW and LAST_ROW.
     """
     bin_rows = np.full((3, n_points, 3, groups_max), -1, np.int64)
     return bin_rows, BinGroups(
@@ -113,7 +126,9 @@ def allocate_bin_groups(n_points: int, groups_max: int) -> tuple[np.ndarray, Bin
 def find_groups_in_spans(
     shots: Shots, spans: BinSpans, bin_rows: np.ndarray, bin_groups: BinGroups
 ) -> None:
-    """Find the groups in the spans of bins of points, and write them into preallocated groups.
+    """Find groups of adjacent bins above the threshold, and write them into preallocated arrays.
+
+    The search covers spans: ranges of adjacent bins around the lines of each segment.
 
     Parameters
     ----------
@@ -173,9 +188,10 @@ def find_groups_in_spans(
 
 
 def _echo_bins_only(spans: BinSpans) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers of bins of spans, and |X|, without bins outside echoes that are not searched.
+    """Return the numbers of bins and |X| [V], with |X| set to 0 outside unsearched echoes.
 
-    Sidelobes of an echo that is not searched are no groups, but leakage.
+    This holds for segments whose strongest bin is outside the search band. Sidelobes of such an
+    echo are leaked signal and no groups.
     """
     n_bins, magnitudes = spans.n_bins.copy(), spans.magnitudes.copy()
     for s, j in np.argwhere(~spans.peak_is_searched):
@@ -204,7 +220,10 @@ def _fill_groups(
     neighbour_magnitudes,
     pd,
 ):
-    """Find the groups of every span, and write them into arrays with the shapes of BinGroups.
+    """Find groups in every span, and write them into arrays with the shapes of :class:`BinGroups`.
+
+    A group is a run of adjacent bins at or above the threshold. A span holds the adjacent bins
+    around the lines of a segment.
 
     Parameters
     ----------
@@ -275,9 +294,9 @@ def _fill_groups(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
-    """Return the magnitude at an index of a span; mirrored at DC and Nyquist, 0 outside the span.
+    """Return |X| of a bin given by its index in a span (adjacent bins from ``first_bin`` on).
 
-    The span begins at ``first_bin``.
+    Bins beyond DC or Nyquist are mirrored. Bins outside the span have magnitude 0.
     """
     if nyquist_bin > 0:
         bin_ = abs(first_bin + index)
@@ -287,10 +306,10 @@ def _mirrored_magnitude(magnitude, first_bin, index, nyquist_bin):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _list_groups(magnitude, is_echo, peak_index, threshold, bin_rows):
-    """List the strongest groups of a span in `bin_rows`, and return their number.
+    """List the strongest groups of adjacent bins at or above the threshold; return their number.
 
-    `bin_rows` (3, groups) holds indices in the span. Groups whose strongest bin is not ``is_echo``
-    are leaked signal, and omitted. If ``is_echo`` is empty, all groups may be echoes.
+    ``bin_rows`` (3, groups), the result, holds indices in ``magnitude``. Groups whose strongest bin
+    is not ``is_echo`` are leaked signal, and omitted. If ``is_echo`` is empty, none is omitted.
     """
     if not magnitude[peak_index] >= threshold:
         bin_rows[:, 0] = peak_index

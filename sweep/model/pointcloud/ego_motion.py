@@ -53,46 +53,57 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 DEPRESSION_SINE_MIN = 0.05
-"""Smallest sine of the angle below the horizontal at which a beam is assumed to meet level ground.
-"""
+"""Smallest sine of a beam's angle below the horizontal at which the instrument assumes that the
+beam meets level ground. Other beams are assumed to meet a surface that faces them."""
 
 
 class MotionPriors(NamedTuple):
-    """Standard deviations of slope and motion of surfaces, which an instrument does not know."""
+    """Prior standard deviations of the slope and motion of surfaces, which no instrument knows."""
 
     terrain_slope: float = 0.2
-    """Standard deviation of the slope of the surface that a beam meets, relative to level ground or
-    to a surface that faces the beam."""
+    """Standard deviation of the slope (rise over run) of the surface that a beam meets. Slopes are
+    relative to level ground, or to a plane across a beam that does not point down."""
     target_speed: float = 0.0
-    """Standard deviation of each component of that surface's velocity [m/s]."""
+    """Standard deviation of each component of the velocity [m/s] of the surface that a beam meets.
+    """
     target_acceleration: float = 0.0
-    """Standard deviation of that surface's acceleration along the beam [m/s^2]."""
+    """Standard deviation of the acceleration [m/s^2] along the beam of the surface that it meets.
+    """
 
 
 class EgoMotion(NamedTuple):
-    """Motion along n beams as the instrument knows it; arrays are (n,) unless noted."""
+    """Motion of an instrument along n beams, as the instrument knows it.
+
+    Arrays are (n,) unless noted. The slip is the closing speed minus the speed at which the range
+    to the ground falls. It is not 0 if ground slides under the beam.
+    """
 
     closing_speed: np.ndarray
-    """Speed [m/s] at which ground at rest approaches along the beam: the instrument's velocity on
-    the beam."""
+    """Component of the instrument's velocity along the beam [m/s]: the speed at which ground at
+    rest approaches."""
     acceleration: np.ndarray
-    """Rate of change of the closing speed [m/s^2]."""
+    """Time derivative of ``closing_speed`` [m/s^2]."""
     slip: np.ndarray
-    """Slip at range 0 [m/s]: closing speed minus the speed at which the range to level ground
+    """Slip [m/s] at range 0: closing speed minus the speed at which the range to level ground
     falls."""
     slip_per_range: np.ndarray
-    """Derivative of the slip with respect to the range [1/s]."""
+    """Derivative with respect to the range [(m/s)/m] of the slip, the closing speed minus the speed
+    at which the range falls."""
     slip_per_slope: np.ndarray
-    """(n, 3): derivative of the slip with respect to the surface's gradient, at range 0 [m/s]."""
+    """(n, 3): derivative of the slip at range 0 [m/s] with respect to the gradient (rise over run)
+    of the surface. The slip is the closing speed minus the speed at which the range falls."""
     slip_per_slope_per_range: np.ndarray
-    """(n, 3): derivative of ``slip_per_slope`` with respect to the range [1/s]."""
+    """(n, 3): derivative of ``slip_per_slope``, which is at range 0, with respect to the range
+    [(m/s)/m]."""
     slip_per_target_speed: np.ndarray
-    """Ratio of the standard deviation of the slip to that of one component of the target's
-    velocity."""
+    """Ratio of two standard deviations: of the slip by motion of the surface, and of one component
+    of the surface's velocity. The slip is the closing speed minus the speed at which the range
+    falls."""
     turn_rate: np.ndarray
-    """Rate at which the beam turns [rad/s]."""
+    """Angular speed at which the beam's direction turns [rad/s]."""
     priors: MotionPriors
-    """Prior standard deviations of unknown motion."""
+    """Prior standard deviations of what the instrument does not know: slope and motion of surfaces.
+    """
 
     def select(self, beams: np.ndarray) -> EgoMotion:
         """Return the motion along the beams with the given indices."""
@@ -101,22 +112,31 @@ class EgoMotion(NamedTuple):
         )
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the slip [m/s] at ranges (n, ...) [m], for level ground at rest."""
+        """Return the slip [m/s] of each beam at ranges (n, ...) [m], for level ground at rest.
+
+        The slip is the closing speed minus the speed at which the range falls.
+        """
         slip, per_range = (
             _align_with_ranges(v, distance) for v in (self.slip, self.slip_per_range)
         )
         return np.asarray(slip + per_range * distance)
 
     def approach_speed_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the speed [m/s] at which ranges (n, ...) [m] to level ground at rest fall."""
+        """Return the speed [m/s] at which the range to level ground at rest falls.
+
+        It depends on the range: ``distance`` (n, ...) holds ranges [m] of each beam.
+        """
         return np.asarray(_align_with_ranges(self.closing_speed, distance) - self.slip_at(distance))
 
     def slip_standard_error(self, distance: np.ndarray) -> np.ndarray:
         """Return the standard deviation [m/s] of the slip at ranges (n, ...) [m], by the priors.
 
+        The slip is the closing speed minus the speed at which the range falls.
+
         Notes
         -----
-        sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 + slope^2)).
+        The variance is slope^2 |d slip / d gradient|^2 + speed^2 (slip_per_target_speed^2 +
+        slope^2), with the priors ``terrain_slope`` as slope and ``target_speed`` as speed.
         """
         slope_deviation, speed_deviation, _ = self.priors
         at_range_0, per_range = self.slip_per_slope, self.slip_per_slope_per_range
@@ -138,7 +158,7 @@ class EgoMotion(NamedTuple):
 
     @property
     def acceleration_standard_error(self) -> np.ndarray:
-        """Standard deviation of the closing speed's rate of change by the priors [m/s^2], (n,)."""
+        """Standard deviation (n,) [m/s^2] of the acceleration along each beam, by the priors."""
         return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
 
 
@@ -163,7 +183,7 @@ def ego_motion_of_beams(
     acceleration: np.ndarray,
     priors: MotionPriors,
 ) -> EgoMotion:
-    """Return the motion along n beams of a moving instrument, as it knows it over level ground.
+    """Return the motion along n beams that an instrument assumes over level ground at rest.
 
     Parameters
     ----------
@@ -178,7 +198,8 @@ def ego_motion_of_beams(
 
     Notes
     -----
-    With the vertical z, u - V.d = V.z / d.z - V.d + R d'.z / d.z.
+    Let z be the vertical, R the range, and u the speed at which the range falls. Then
+    minus the slip is u - V.d = V.z / d.z - V.d + R d'.z / d.z.
     """
     closing_rate = _row_dot(acceleration, direction) + _row_dot(velocity, direction_rate)
     closing_speed = _row_dot(velocity, direction)
@@ -186,9 +207,10 @@ def ego_motion_of_beams(
     direction_z = np.where(meets_ground, direction[:, 2], -1.0)
 
     def slip_gradient(vector: np.ndarray) -> np.ndarray:
-        """Return the derivative (n, 3) of the slip by the surface's gradient.
+        """Return the derivative (n, 3) of the slip [m/s] with respect to the surface's gradient.
 
-        `vector` (n, 3) takes the place of W. The derivative is linear in it.
+        ``vector`` (n, 3) [m/s] is the velocity of the beam's foot, or a part of it; the derivative
+        is linear in it.
         """
         over_ground = vector * direction_z[:, None] - vector[:, 2:] * direction
         over_ground /= direction_z[:, None] ** 2

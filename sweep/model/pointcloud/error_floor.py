@@ -39,38 +39,43 @@ if TYPE_CHECKING:
     from sweep.model.pointcloud.eyepoints import Eyepoints
 
 KEY_DOMAIN = "sweep.error_floor"
-"""Text in the hash of the random keys of errors that several shots share."""
+"""Text that is hashed into the random keys of the errors shared by several shots."""
 
 INSTRUMENT_KEY_NUMBER = -1.0
-"""Number that takes the place of a beam's number in the random key of errors common to all
-beams."""
+"""Number used instead of a beam's number in the random key of the errors common to all beams."""
 
 
 class ErrorFloor(NamedTuple):
-    """Standard deviations of an instrument's errors; all 0 for an instrument without errors.
+    """Standard deviations of those errors of an instrument that do not depend on the echo.
+
+    All are 0 for an instrument without such errors.
 
     >>> ErrorFloor(clock=0.03, wavelength=0.04).velocity_scale_error
     0.05
     """
 
     pointing: float = 0.0
-    """Standard deviation of a beam's known direction, on each of two axes [rad]."""
+    """Standard deviation of the error of a beam's known direction, on each of two axes [rad]."""
     clock: float = 0.0
-    """Relative standard deviation of the sampling clock."""
+    """Standard deviation of the relative error of the sampling clock's frequency."""
     wavelength: float = 0.0
-    """Relative standard deviation of the known wavelength."""
+    """Standard deviation of the relative error of the known wavelength."""
     vibration: float = 0.0
-    """Standard deviation of the instrument's velocity along the beam [m/s]."""
+    """Standard deviation of the component of the instrument's velocity along the beam by vibration
+    [m/s]."""
     range_noise: float = 0.0
-    """Standard deviation of ranges [m]."""
+    """Standard deviation of an additional error of each measured range [m]."""
 
     @property
     def velocity_scale_error(self) -> float:
-        """Relative standard deviation of the error that scales all velocities of a draw."""
+        """Standard deviation of the relative error common to all velocities of a draw.
+
+        It combines the errors of clock and wavelength.
+        """
         return float(np.hypot(self.clock, self.wavelength))
 
     def velocity_error(self, radial_velocity: np.ndarray, speed_across: np.ndarray) -> np.ndarray:
-        """Return the standard errors of radial velocities [m/s] by the error floor.
+        """Return the standard errors of radial velocities [m/s] by the instrument's own errors.
 
         `radial_velocity` and `speed_across` are the instrument's velocity along and across the beam
         [m/s].
@@ -84,7 +89,7 @@ class ErrorFloor(NamedTuple):
 
 
 NO_ERROR_FLOOR = ErrorFloor()
-"""Error floor of an instrument without errors."""
+"""Standard deviations, all 0, of an instrument whose errors all depend on the echo."""
 
 
 def apply_error_floor(
@@ -98,8 +103,9 @@ def apply_error_floor(
 ) -> dict[str, np.ndarray]:
     """Add an instrument's errors to points, and to their standard errors.
 
-    Ranges and radial velocities change, both those by whole bins and those interpolated, and with
-    them standard errors, compensated velocities and positions. The truth does not change.
+    Errors are added to ranges and radial velocities, both those by whole bins and those
+    interpolated between bins. Standard errors, compensated velocities and positions follow. The
+    true values stay as they are.
 
     Parameters
     ----------
@@ -175,7 +181,10 @@ def apply_error_floor(
 
 
 def _draw_beam_normals(beam_numbers: np.ndarray, draw_numbers: np.ndarray, seed: int) -> np.ndarray:
-    """Draw two standard normal numbers for each beam and draw, (beams, draws, 2)."""
+    """Draw two standard normal random numbers for each beam and draw, (beams, draws, 2).
+
+    They are the beam's pointing errors on two axes, in standard deviations.
+    """
     keys = np.repeat(
         point_keys(beam_numbers[:, None], domain=KEY_DOMAIN, seed=seed), draw_numbers.size, axis=0
     )
@@ -191,9 +200,11 @@ def _scalar_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _transverse_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors across each direction (n, 3), which are continuous functions of it.
+    """Return two unit vectors perpendicular to each direction and to each other.
 
-    The three vectors are orthogonal. The result is a pair of arrays (n, 3).
+    ``direction`` holds unit vectors (n, 3).
+
+    The result is a pair of arrays (n, 3). Both vary continuously with the direction.
 
     References
     ----------

@@ -27,70 +27,78 @@ from sweep.model.preparation import Parameters, Shots
 from sweep.model.unsupported_shot import UnsupportedShotError
 
 TARGET_HEIGHT_PATH = "atmosphere.target_height"
-"""Path of the height of the target above the zero of atmospheric profiles [m]."""
+"""Dotted path of the parameter for the height of the target [m], above the height at which
+atmospheric profiles begin."""
 SOLAR_IRRADIANCE_PATH = "target.solar_irradiance"
-"""Path of the spectral irradiance of the sun on the target [W/m^3]."""
+"""Dotted path of the parameter for the spectral irradiance of the sun on the target [W/m^3]."""
 
 HIT_RANGE_MIN = 1e-3
-"""Range [m] below which rays pass through surfaces.
+"""Smallest range of a hit [m]. Rays pass through nearer surfaces.
 
 An instrument that stands on the ground, or in the plane of a wall, would otherwise see the surface
 at range 0, with an infinite echo.
 """
 
 _GRAZING_SINE_MIN = 0.01
-"""Smallest sine of the grazing angle with which the speed is computed at which a range falls."""
+"""Smallest sine of the angle between a ray and the surface that it hits. Smaller sines are replaced
+by it when the speed at which the range falls is computed."""
 
 
 class Eyepoints(NamedTuple):
-    """Geometry of n shots of b beamlets, in SI units and the world frame."""
+    """Geometry of n shots of a flight, each of b beamlets (rays that sample the beam).
+
+    Units are SI, and vectors are in the world frame. The reference beamlet of a shot is the first
+    one that hits a surface.
+    """
 
     time: np.ndarray
-    """(n,): start of the measurement [s]."""
+    """(n,): time at which the measurement of the shot begins [s]."""
     beam: np.ndarray
-    """(n,) int64: number of the beam."""
+    """(n,) int64: number of the scanner's beam that fires the shot."""
     cycle: np.ndarray
-    """(n,) int64: number of the measurement cycle."""
+    """(n,) int64: number of the measurement cycle to which the shot belongs."""
     position: np.ndarray
     """(n, 3): position of the instrument [m]."""
     velocity: np.ndarray
     """(n, 3): velocity of the instrument [m/s]."""
     direction: np.ndarray
-    """(n, 3): unit vector along the beam's axis, as commanded."""
+    """(n, 3): unit vector along the beam's axis, as commanded, in the world's frame."""
     range: np.ndarray
-    """(n,): range R_0 of the reference beamlet [m]; inf for a shot that hits nothing."""
+    """(n,): range of the reference beamlet, the first that hits a surface [m]; inf for a shot that
+    hits nothing."""
     offset: np.ndarray
-    """(n, b): range R_b - R_0 relative to the reference beamlet [m]; nan for a beamlet that misses.
-    """
+    """(n, b): range of each beamlet minus the range of the reference beamlet [m]; nan for a beamlet
+    that misses."""
     radial_velocity: np.ndarray
     """(n,): radial velocity of the reference beamlet [m/s], positive when closing; nan for a shot
     that hits nothing."""
     acceleration: np.ndarray
-    """(n,): rate at which the reference beamlet's radial velocity grows [m/s^2]; nan for a shot
-    that hits nothing."""
+    """(n,): time derivative of the reference beamlet's radial velocity [m/s^2], positive if the
+    closing speed rises; nan for a shot that hits nothing."""
     approach_speed: np.ndarray
     """(n,): speed at which the reference beamlet's range falls [m/s]; nan for a shot that hits
     nothing."""
     turn_rate: np.ndarray
-    """(n,): rate at which the reference beamlet's direction turns [rad/s], by scanner and platform.
-    """
+    """(n,): angular speed at which the reference beamlet's direction turns [rad/s], by scanner and
+    platform."""
     direction_rate: np.ndarray
-    """(n, 3): rate of change of the direction, as commanded [1/s]."""
+    """(n, 3): time derivative of the commanded ``direction`` [1/s]."""
     platform_acceleration: np.ndarray
-    """(n, 3): acceleration of the instrument [m/s^2]."""
+    """(n, 3): acceleration of the instrument in the world's frame [m/s^2]."""
     velocity_offset: np.ndarray
-    """(n, b): radial velocity relative to the reference beamlet's [m/s]; nan for a beamlet that
-    misses."""
+    """(n, b): radial velocity of each beamlet minus that of the reference beamlet [m/s]; nan for a
+    beamlet that misses."""
     cos_incidence: np.ndarray
     """(n, b): cosine of the angle of incidence, 0..1; nan for a beamlet that misses."""
     surface: np.ndarray
-    """(n, b) int16: number of the surface that is hit; -1 for a beamlet that misses."""
+    """(n, b) int16: index of the surface material that the beamlet hits; -1 for a beamlet that
+    misses."""
     weight: np.ndarray
-    """(b,): power fractions of the beamlets; they sum to 1."""
+    """(b,): fraction of the beam's power in each beamlet; the fractions sum to 1."""
 
     @property
     def has_target(self) -> np.ndarray:
-        """True for shots of which any beamlet hits a surface, (n,) bool."""
+        """Mask (n,) that is True for shots of which any beamlet hits a surface."""
         return np.isfinite(self.range)
 
     @property
@@ -100,7 +108,7 @@ class Eyepoints(NamedTuple):
 
     @property
     def platform_radial_velocity(self) -> np.ndarray:
-        """Velocity of the instrument along its commanded beams, (n,) [m/s]."""
+        """Component of the instrument's velocity along each commanded beam, (n,) [m/s]."""
         return _row_dot(self.velocity, self.direction)
 
     def select(self, selection: slice | np.ndarray) -> "Eyepoints":
@@ -125,9 +133,10 @@ def observe_eyepoints(
     bodies_rotate: bool = True,
     footprint_angles: Callable[[np.ndarray], beam.FootprintAngles] | None = None,
 ) -> Eyepoints:
-    """Compute the eyepoints of n shots of a flight by ray casting.
+    """Compute the geometry (eyepoints) of n shots of a flight by ray casting.
 
-    Shots depend only on their number, so any part of a flight can be computed alone.
+    The result of a shot depends on its number and not on other shots, so any part of a flight can
+    be computed alone.
 
     Parameters
     ----------
@@ -147,7 +156,7 @@ def observe_eyepoints(
         Motion of each of the caster's bodies; None for a body at rest.
     jitter
         Random pointing of the light of each shot. The instrument does not know it, so position,
-        velocity and `direction` of the result stay those commanded.
+        velocity and `direction` of the result are those without jitter.
     bodies_rotate
         False to neglect the velocity of surfaces by the rotation of their body.
     footprint_angles
@@ -233,7 +242,10 @@ def _require_finite(
     bundle: BundleHits,
     velocity: np.ndarray,
 ) -> None:
-    """Raise UnsupportedShotError for geometry that is not finite: loops over bins would not end."""
+    """Raise UnsupportedShotError if a shot's geometry is not finite.
+
+    Later loops over bins would not end for such a shot.
+    """
     is_hit = bundle.is_hit
     for label, is_wrong in (
         ("position", ~np.isfinite(state.position).all(axis=1)),
@@ -318,7 +330,7 @@ def _reference_beam_motion(
     body_states: Sequence[BodyState | None],
     bodies_rotate: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the motion along the reference beamlets of n shots.
+    """Compute acceleration, approach speed and turn rate along the reference beamlets of n shots.
 
     Parameters
     ----------
@@ -338,9 +350,10 @@ def _reference_beam_motion(
 
     Notes
     -----
-    V is the velocity of the instrument relative to the body that is hit. The body rotates with w
-    and is extended to the instrument. The beam d has the closing speed V.d, which grows by V'.d +
-    V.d'. It meets the surface, a plane with normal n, at a range that falls by (V + R (d' - w x
+    The body that is hit rotates with the angular velocity w, and is thought to extend to the
+    instrument. The velocity of the instrument relative to this extended body is V. The beam has the
+    direction d and the range R, and the surface has the normal n. A prime is a time derivative. The
+    closing speed V.d grows at the rate V'.d + V.d'. The range falls at the speed (V + R (d' - w x
     d)).n / d.n. Bodies are assumed to rotate at steady rates.
     """
     rows, reference = np.arange(len(ray_directions)), np.maximum(bundle.reference_beamlet, 0)
@@ -395,7 +408,7 @@ def prepare_eyepoint_shots(
     surfaces: Sequence[SurfaceMaterial],
     effects: Collection[str] = DEFAULT_EFFECTS,
 ) -> Shots:
-    """Prepare the shots of eyepoints, each of which hits a surface.
+    """Prepare for simulation the shots of given geometry (eyepoints), each of which hits a surface.
 
     Parameters
     ----------
@@ -416,7 +429,7 @@ def prepare_eyepoint_shots(
 def parameters_and_ground_of_eyepoints(
     eyepoints: Eyepoints, parameters: Parameters, surfaces: Sequence[SurfaceMaterial]
 ) -> tuple[Parameters, RayTracedGround]:
-    """Convert eyepoints to the parameters and footprints from which shots are prepared.
+    """Convert geometry of shots (eyepoints) to the parameters and footprints that simulate them.
 
     Range, velocities, reflectance and reflectance law follow from the eyepoints and the surfaces. A
     beamlet that misses returns no light.

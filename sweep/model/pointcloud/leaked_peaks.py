@@ -7,7 +7,8 @@ probability that it adds to noise,
 
     c_k(z) = (Q_1(a_k, z) - e^(-z^2 / 2)) / (1 - e^(-z^2 / 2)),
 
-at the threshold z = b. Both together leave the bin below any level z with the probability
+at the threshold z = b. Q_1 is Marcum's function, the probability that signal and noise together
+exceed z. Both together leave the bin below any level z with the probability
 
     (1 - e^(-z^2 / 2)) (1 - c_k(z)) = 1 - Q_1(a_k, z)
 
@@ -57,129 +58,158 @@ from sweep.model.spectrum.permanent_line import N_PHASES, line_bin_masks, line_o
 from sweep.model.spectrum.segment_spectra import BinSpans, iter_spans
 
 N_RATES = 2048
-"""Number of amplitudes at which rates are tabulated."""
+"""Number of signal amplitudes at which the rate -ln(1 - c) is tabulated. c is the probability that
+signal lifts a bin above the threshold."""
 
 CERTAIN_MARGIN_SIGMA = 12.0
-"""Amplitude above the threshold [sigma] from which a bin is certain to cross."""
+"""Amplitude above the threshold, in standard deviations of the noise, from which signal is taken to
+raise a bin above the threshold with certainty."""
 
 TABLE_AMPLITUDE_MIN_SIGMA = 1e-2
-"""Lowest tabulated amplitude [sigma]; below it rates are proportional to the amplitude squared."""
+"""Lowest signal amplitude, in standard deviations of the noise, at which rates -ln(1 - c) are
+tabulated. c is the probability that signal lifts a bin above the threshold. At lower amplitudes the
+rate is proportional to the amplitude squared."""
 
 LEAKAGE_MIN = 1e-9
-"""Probability of leakage in a segment below which no leaked peaks are drawn."""
+"""Smallest probability of a false peak by leaked signal in a segment for which such peaks are
+drawn."""
 
 LINE_RANDOM_OFFSET = 1 << 24
-"""Index of the first random number of the line of leaked light; lower indices belong to the echoes.
-"""
+"""Index of the first random number used for the line of leaked light. Lower indices of the same
+stream are used for signal leaked from echoes."""
 
 EDGE_RANDOM_OFFSET = 1 << 25
-"""Index of the first random number of the echo's bins next to leaked signal."""
+"""Index of the first random number used for the noise of an echo's outermost bins, which are next
+to bins of leaked signal."""
 
 LINE_BATCH_POINTS = 4
-"""Number of points processed at a time if leaked light has a line, which limits memory to 1e8
-numbers."""
+"""Number of points that are processed together if leaked light has a line. It limits memory to some
+1e8 numbers."""
 
 BISECTION_STEPS = 40
-"""Number of bisection steps for the magnitude of a raised peak; relative error 1e-11."""
+"""Number of bisection steps by which the magnitude of a false peak is computed, to a relative error
+of 1e-11."""
 
 LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
-"""Limits of the average over speckle in ln(power); the mean power is 1."""
+"""Limits of the integral over speckle, in ln(speckle power). The mean speckle power is 1."""
 
 LOG_POWER_MIN_FAINT = -5.0
-"""Lower limit for sums of rates up to FAINT_RATE_SUM_MAX at mean power, which are proportional to
-the power below it."""
+"""Lower limit, in ln(speckle power), of the integral over speckle for faint leaked signal, whose
+sum of rates is at most FAINT_RATE_SUM_MAX. The part below this limit is extrapolated."""
 FAINT_RATE_SUM_MAX = 0.1
-"""Largest sum of rates at mean power for which the average begins at LOG_POWER_MIN_FAINT."""
+"""Largest sum of a segment's rates -ln(1 - c), at mean speckle power, for which the integral over
+speckle begins at LOG_POWER_MIN_FAINT. c is the probability that a bin crosses the threshold."""
 
 LOG_POWER_STEP_MAX = 0.25
-"""Largest step of this average, which errs by 1e-8 of the mean for e^(2 t - e^t)."""
+"""Largest step in ln(speckle power) of the integral over speckle. The relative error of the mean is
+then 1e-8."""
 
 JOINING_RATE_MIN = 1e-2
-"""Rate of adjacent bins, at the power e^(2 BRIGHT_LOG_AMPLITUDE), below which the next bin joins no
-echo."""
+"""Smallest rate -ln(1 - c), in bright speckle, at which one more adjacent bin is considered part of
+an echo. c is the probability that leaked signal lifts the bin before it above the threshold."""
 BRIGHT_LOG_AMPLITUDE = math.log(4.0)
-"""ln(amplitude) of the bright speckle for which JOINING_RATE_MIN holds."""
+"""ln of the factor on the signal amplitude in bright speckle, at which JOINING_RATE_MIN is tested.
+"""
 
 FAINT_LEAKAGE_MAX = 1e-5
-"""Largest probability of leakage whose mean over speckle is computed as the sum of the means of its
-bins.
+"""Largest probability of a false peak by leaked signal that is computed as a sum of means over
+speckle, one of each bin.
 
-Two bins then hardly ever cross together, nor a bin together with the echo that it would join.
+So faint bins hardly ever cross the threshold together, or together with an adjacent echo.
 """
 
 MEAN_TABLE_STRIDE = 8
-"""Step, in tabulated amplitudes, between those at which a bin's mean over speckle is integrated."""
+"""Number of table steps between signal amplitudes at which the mean over speckle of a bin's
+crossing probability is integrated. Amplitudes between them are interpolated."""
 
 N_BOUND_POWERS = 5
-"""Number of speckle powers 1, 2, 4 .. at which upper bounds of the sum of rates are stored."""
+"""Number of speckle powers 1, 2, 4 .. (mean 1) at which upper bounds of the sum of a segment's
+rates -ln(1 - c) are stored. c is the probability that signal lifts a bin above the threshold."""
 
 EDGE_LOG_POWER_STEP = 0.75
-"""Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
+"""Step in ln(speckle power) between values at which the probability that an echo's outermost bin
+crosses the threshold is computed. It is interpolated between them."""
 EDGE_LOG_POWER_DEPTH = 3.0
-"""Largest -ln(power) at which the probability that an echo's outermost bin crosses is computed.
-For weaker echoes the probability at this value is used."""
+"""Largest -ln(speckle power) at which the probability that an echo's outermost bin crosses the
+threshold is computed. At lower powers the value at this power is used."""
 
 LOG_RATE_STEP_MAX = 0.5
-"""Largest step of ln(rate) between nodes; with larger steps the average errs by more than 1e-7."""
+"""Largest difference of ln(rate) between successive nodes of the integral over speckle; with more
+the mean errs by over 1e-7. The rate is -ln(1 - c), with c the probability that signal lifts a bin
+above the threshold."""
 
 
 class LeakageBins(NamedTuple):
     """Bins in which leaked signal may raise false peaks, by point and segment (m, 3).
 
-    A law is the table of rates for one threshold.
+    Leaked signal is echo power far from the echo's line. A bin crosses if its magnitude reaches the
+    threshold. The rate of a bin is -ln(1 - c), with c the probability that signal makes it cross. A
+    law is the table of rates for one threshold. sigma is the noise of a bin per quadrature.
     """
 
     bin_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment in the arrays from ``bins`` to
+    """(m, 3, 2) int64: begin and end of each segment's bins in the arrays from ``bins`` to
     ``exempt_neighbour_side``."""
     bins: np.ndarray
-    """(bins,) int64: bins with signal leaked from an echo, numbered as the strongest bins of
-    groups."""
+    """(bins,) int64: numbers of the bins with signal leaked from an echo, as
+    ``BinGroups.strongest_bin`` numbers bins."""
     log_amplitude: np.ndarray
-    """(bins,): ln(|X| / sigma)."""
+    """(bins,): ln of the leaked signal |X| over the noise sigma of a bin per quadrature."""
     group: np.ndarray
-    """(bins,) int64: index of the group (echo) with which each bin fades."""
+    """(bins,) int64: index of the echo (group of bins) with whose speckle each bin fades."""
     exempt_neighbour: np.ndarray
-    """(bins,): |X| / sigma of the neighbour that is exempt from false alarms; 0 without one."""
+    """(bins,): |X| / sigma of the adjacent bin that belongs to an echo, and so cannot raise a false
+    alarm; 0 if no adjacent bin does."""
     exempt_neighbour_side: np.ndarray
-    """(bins,) int64: 1 if that neighbour is above the bin, -1 if below."""
+    """(bins,) int64: 1 if the adjacent bin of the echo is above the bin, -1 if it is below."""
     rate_sum: np.ndarray
-    """(m, 3): upper bound on the sum of the rates of these bins at mean speckle power."""
+    """(m, 3): upper bound on the sum of rates -ln(1 - c) of a segment's bins at mean speckle power.
+    c is the probability that a bin crosses the threshold."""
     rate_sum_bounds: np.ndarray
-    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates at speckle powers 1, 2, 4 .."""
+    """(m, 3, N_BOUND_POWERS): upper bounds on the sum of rates -ln(1 - c) of a segment's bins. c is
+    the probability that a bin crosses the threshold. Bounds are for speckle powers of 1, 2, 4 ..
+    times the mean."""
     mean_probability_sum: np.ndarray
-    """(m, 3): sum of the probabilities, averaged over speckle, that these bins cross; nan if
-    unknown."""
+    """(m, 3): sum over a segment's bins of the probability, averaged over speckle, that leaked
+    signal lifts the bin above the threshold; nan if not computed."""
     line_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment in ``line_bins`` and ``line_log_amplitude``.
-    """
+    """(m, 3, 2) int64: begin and end of each segment's bins in ``line_bins`` and
+    ``line_log_amplitude``."""
     line_bins: np.ndarray
-    """(line bins,) int64: bins that the line of leaked light may raise."""
+    """(line bins,) int64: numbers of the bins that the line of light leaked in the circulator may
+    lift above the threshold."""
     line_log_amplitude: np.ndarray
-    """(N_PHASES, line bins): ln(|X| / sigma) at each phase of the line of leaked light."""
+    """(N_PHASES, line bins): ln(|X| / sigma) by the line of leaked light, at each of its phases.
+    sigma is the noise of a bin per quadrature."""
     line_rate_sum: np.ndarray
-    """(m, 3): sum over ``line_bins`` of the rates -ln(1 - c), with the crossing probability c. Of
-    the sums at all phases of the line of leaked light it is the largest."""
+    """(m, 3): sum over ``line_bins`` of the rates -ln(1 - c), with c the probability that the line
+    of leaked light lifts a bin above the threshold. It is the largest sum of all phases of the
+    line."""
     excluded_slice: np.ndarray
-    """(m, 3, 2) int64: begin and end of each segment in ``excluded_bins``."""
+    """(m, 3, 2) int64: begin and end of each segment's bins in ``excluded_bins``."""
     excluded_bins: np.ndarray
-    """(excluded,) int64: bins in which noise alone raises no peak."""
+    """(excluded,) int64: numbers of the bins in which no false peak of noise alone is drawn."""
     threshold_index: np.ndarray
-    """(m,) int64: index of each point's law."""
+    """(m,) int64: index of each point's threshold in the arrays with an axis of laws, such as
+    ``log_rates``."""
     log_rates: np.ndarray
-    """(laws, N_RATES): ln(rate) at evenly spaced ln(amplitude)."""
+    """(laws, N_RATES): ln of the rate -ln(1 - c) at evenly spaced ln(|X| / sigma), for each
+    threshold. c is the probability that signal lifts a bin above the threshold."""
     log_amplitude_grid: np.ndarray
-    """(laws, 2): first ln(amplitude) of ``log_rates``, and the step."""
+    """(laws, 2): first ln(|X| / sigma) at which ``log_rates`` is tabulated, and the step."""
     threshold_ratio: np.ndarray
-    """(laws,): threshold [sigma] of a single record that is equivalent to all looks."""
+    """(laws,): threshold [sigma] for one record that is equivalent to the combination of all looks
+    (records of a segment)."""
     amplitude_gain_max: float
-    """Factor on |X| / sigma in that equivalent record."""
+    """Factor from |X| / sigma in one look (record) to |X| / sigma in the single record that is
+    equivalent to all looks."""
     sidelobe_correlation: float
-    """Correlation of the noise of neighbouring bins in phase with the signal."""
+    """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
+    the signal."""
 
     @classmethod
     def empty(cls, n_points: int) -> "LeakageBins":
-        """Return no bins, for ``n_points`` points."""
+        """Return a record without bins of leaked signal, for ``n_points`` points."""
         no_slices, no_bins, sum_shape = (
             np.zeros((n_points, 3, 2), np.int64),
             np.empty(0, np.int64),
@@ -210,7 +240,10 @@ class LeakageBins(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "LeakageBins":
-        """Return the bins of selected points, by indices or a mask, without a copy of bins."""
+        """Return the record for selected points, by indices or a mask.
+
+        Arrays of bins are shared with this record, not copied.
+        """
         by_point = (
             "bin_slice",
             "rate_sum",
@@ -224,25 +257,30 @@ class LeakageBins(NamedTuple):
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
 
     def mean_leakage(self) -> np.ndarray:
-        """Return the mean probability of leakage over speckle and the line's phase, (m, 3)."""
+        """Return the probability of a false peak by leaked signal in each segment, (m, 3).
+
+        It is the mean over speckle and over the phase of the line of leaked light.
+        """
         leakage = np.empty(self.rate_sum.shape)
         _average_leakage(self, leakage)
         return leakage
 
 
 def find_leaking_points(shots: Shots, groups: BinGroups) -> np.ndarray:
-    """Return indices of points whose leakage exceeds LEAKAGE_MIN in any segment."""
+    """Return indices of points with a notable probability of a false peak by leaked signal.
+
+    It exceeds LEAKAGE_MIN in at least one segment.
+    """
     return np.flatnonzero((groups.leakage > LEAKAGE_MIN).any(axis=1))
 
 
 def fading_group_of_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> np.ndarray:
-    """Return the group with which each bin of leaked signal fades.
+    """Return the index of the group (echo) with whose speckle each bin of leaked signal fades.
 
-    It is the group whose strongest bin is nearest.
-
-    ``points`` are the indices of the points of ``spectra``. Bins of a complex record are periodic.
+    It is the group whose strongest bin is nearest. ``points`` are the indices of the points of
+    ``spectra``. Bins of a complex record are periodic.
     """
     bins, batch_index, segment = _leaked_bins(spectra)
     group_bins = groups.strongest_bin[points[batch_index], segment]
@@ -255,9 +293,9 @@ def fading_group_of_bins(
 def bins_without_noise_peaks(
     shots: Shots, groups: BinGroups, points: np.ndarray, spectra: NoiselessSpectra
 ) -> LeakageBins:
-    """List the bins of leaked signal, whose noise is drawn with the signal, as excluded bins.
+    """List the bins of leaked signal as bins in which noise alone raises no false peak.
 
-    In excluded bins noise alone raises no further peak. The result raises no leaked peaks; its
+    Their noise is drawn together with the signal instead. The result raises no leaked peaks. Its
     ``group`` holds the group of each listed bin.
     """
     return LeakageBins.empty(points.size)._replace(
@@ -270,7 +308,7 @@ def bins_without_noise_peaks(
 def iter_leakage_bins(
     shots: Shots, groups: BinGroups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakageBins]]:
-    """Yield indices of points in batches, with the bins of their leaked signal."""
+    """Yield indices of points in batches, with the bins in which leaked signal may raise peaks."""
     if shots.permanent_line is None:
         for spans in _iter_leaking_spans(shots, points):
             yield spans.point_numbers, _leakage_bins_of_spans(shots, groups, spans)
@@ -300,7 +338,7 @@ def find_groups_and_leakage_bins(
 ) -> tuple[BinGroups, list[tuple[np.ndarray, LeakageBins]]]:
     """Find groups of bins and bins of leaked signal together, for echoes in developed speckle.
 
-    The groups' probability of leakage is its mean over speckle. Shots with a search band or a line
+    The field ``leakage`` of the groups is a mean over speckle. Shots with a search band or a line
     of leaked light need two separate searches instead
     (:func:`sweep.model.pointcloud.bin_groups.list_bin_groups`, :func:`iter_leakage_bins`).
     """
@@ -315,7 +353,7 @@ def find_groups_and_leakage_bins(
 
 
 def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[BinSpans]:
-    """Yield spans of all bins of points that may leak."""
+    """Yield adjacent bins (spans) of points, down to a negligible magnitude of leaked signal."""
     magnitude_min = np.minimum(
         shots.threshold, _leaking_signal_ratio_min(shots) * shots.bin_noise_sigma
     )
@@ -325,7 +363,10 @@ def _iter_leaking_spans(shots: Shots, point_indices: np.ndarray) -> Iterator[Bin
 
 
 def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
-    """Return the |X| / sigma from which bins of points may leak, (n,)."""
+    """Return the |X| / sigma, (n,), from which a bin's leaked signal may raise a false peak.
+
+    It is infinite if the settings omit leaked signal.
+    """
     return np.broadcast_to(
         shots.negligible_signal_ratio if shots.detection_settings.includes_leakage else np.inf,
         shots.size,
@@ -333,7 +374,7 @@ def _leaking_signal_ratio_min(shots: Shots) -> np.ndarray:
 
 
 def _leakage_bins_of_spans(shots: Shots, groups: BinGroups, spans: BinSpans) -> LeakageBins:
-    """List the bins of leaked signal in spans of points."""
+    """List the bins of leaked signal in spans (adjacent bins), with tables of rates."""
     first_bin, n_bins, peak_index, span_start = (
         np.ascontiguousarray(array)
         for array in (spans.first_bin, spans.n_bins, spans.peak_index, spans.span_start)
@@ -393,7 +434,7 @@ def _fill_leakage_bins(
     exempt_neighbour,
     exempt_neighbour_side,
 ):
-    """List the bins of leaked signal in spans; return their number.
+    """List the bins of leaked signal in spans (adjacent bins of a segment); return their number.
 
     Parameters
     ----------
@@ -457,7 +498,11 @@ def _fill_leakage_bins(
 
 
 def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins) -> LeakageBins:
-    """Return listed bins of points completed by the tables and sums of their rates."""
+    """Add the tables and sums of rates -ln(1 - c) to a list of bins of leaked signal.
+
+    c is the probability that signal lifts a bin above the threshold. ``batch`` holds the indices of
+    the points of ``leakage_bins``.
+    """
     point_threshold_ratio = np.broadcast_to(shots.threshold / shots.bin_noise_sigma, shots.size)[
         batch
     ]
@@ -484,21 +529,31 @@ def _add_rate_tables(shots: Shots, batch: np.ndarray, leakage_bins: LeakageBins)
 
 
 class RateTables(NamedTuple):
-    """Tables of rates for one threshold, by ln(amplitude)."""
+    """Tables for one threshold, by ln(|X| / sigma) of the signal.
+
+    The rate is -ln(1 - c), with c the probability that signal lifts a bin above the threshold.
+    sigma is the noise of a bin per quadrature.
+    """
 
     log_rates: np.ndarray
-    """(N_RATES,): ln(rate)."""
+    """(N_RATES,): ln of the rate -ln(1 - c), with c the probability that signal lifts a bin above
+    the threshold."""
     log_amplitude_grid: np.ndarray
-    """(2,): first ln(amplitude), and the step."""
+    """(2,): first ln(|X| / sigma) of the tables, and the step."""
     linear_rates: np.ndarray
-    """(N_RATES,): rate."""
+    """(N_RATES,): rate -ln(1 - c), with c the probability that signal lifts a bin above the
+    threshold."""
     mean_probabilities: np.ndarray
-    """(N_RATES,): mean probability over speckle that a bin crosses; empty without speckle."""
+    """(N_RATES,): probability, averaged over speckle, that signal lifts a bin above the threshold,
+    by ln(|X| / sigma) at mean speckle power. Without speckle it has no elements."""
 
 
 @lru_cache(maxsize=64)
 def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> RateTables:
-    """Return the tables of a threshold [sigma], with means over speckle if ``in_speckle``."""
+    """Return :class:`RateTables` for a threshold [sigma].
+
+    Means over speckle are included if ``in_speckle``.
+    """
     log_rates, log_amplitude_grid = _log_rates(looks, np.array([threshold_ratio]))
     mean_probabilities = np.empty(0)
     if in_speckle:
@@ -516,9 +571,9 @@ def _tabulate_rates(looks: Looks, threshold_ratio: float, in_speckle: bool) -> R
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_mean_probabilities(log_rates, log_amplitude_grid, mean_probabilities):
-    """Compute the mean over speckle of a bin's probability to cross.
+    """Compute the probability, averaged over speckle, that signal lifts a bin above the threshold.
 
-    The amplitudes are each MEAN_TABLE_STRIDE-th of the table.
+    The signal amplitudes are every MEAN_TABLE_STRIDE-th of the table of rates.
     """
     quadrature = _make_speckle_quadrature(log_rates, log_amplitude_grid)
     rate_sums = np.empty(quadrature.weights.size)
@@ -543,10 +598,10 @@ def _leaked_bins(spectra: NoiselessSpectra) -> tuple[np.ndarray, np.ndarray, np.
 def _mask_leaked_light(
     shots: Shots, batch: np.ndarray, spectra: NoiselessSpectra, group: np.ndarray
 ) -> tuple[NoiselessSpectra, np.ndarray, LeakageBins]:
-    """Remove bins that a line of leaked light masks, and return the bins that this line raises.
+    """Remove bins that a line of leaked light masks, and list the bins that the line raises.
 
     Returns the reduced spectra, ``group`` of the remaining bins (:func:`fading_group_of_bins`), and
-    :class:`LeakageBins` whose fields ``line_*`` and ``excluded_*`` alone are set.
+    :class:`LeakageBins` with the fields ``line_*`` and ``excluded_*`` only.
     """
     is_kept = np.ones(spectra.leaked_index.size, bool)
     slices = np.zeros((3, batch.size, 3, 2), np.int64)  # slices of leaked, raised and masked bins
@@ -610,7 +665,11 @@ def _distinct_thresholds(threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _log_rates(looks: Looks, threshold_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate ``log_rates`` and ``log_amplitude_grid`` by threshold (laws,) [sigma]."""
+    """Tabulate ``log_rates`` and ``log_amplitude_grid`` of :class:`LeakageBins`.
+
+    ``threshold_ratio`` (laws,) holds the thresholds [sigma]. Several looks (records) count as they
+    are combined.
+    """
     log_rates, log_amplitude_grid = (
         np.empty((threshold_ratio.size, N_RATES)),
         np.empty((threshold_ratio.size, 2)),
@@ -630,9 +689,9 @@ def _log_rates(looks: Looks, threshold_ratio: np.ndarray) -> tuple[np.ndarray, n
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
-    """Compute ``log_rates`` (laws, N_RATES) and ``log_amplitude_grid`` (laws, 2) for single looks.
+    """Compute ``log_rates`` (laws, N_RATES) and ``log_amplitude_grid`` (laws, 2) for a single look.
 
-    ``threshold_ratio`` (laws,) is the threshold [sigma].
+    A look is one record of each segment. ``threshold_ratio`` (laws,) holds the thresholds [sigma].
     """
     for j in range(threshold_ratio.size):
         ratio = threshold_ratio[j]
@@ -654,9 +713,10 @@ def _fill_log_rates(threshold_ratio, log_rates, log_amplitude_grid):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
-    """Return the rate -ln(1 - c) of a bin, by interpolation of ``log_rates``.
+    """Return the rate -ln(1 - c) of a bin by interpolation, with c its probability of crossing.
 
-    ``log_amplitude`` is ln(|X| / sigma); ``log_rates`` are tabulated at ``log_amplitude_grid``.
+    ``log_amplitude`` is ln(|X| / sigma). ``log_rates`` are tabulated at ``log_amplitude_grid``.
+    Below the table the rate is proportional to the amplitude squared.
     """
     table_position = (log_amplitude - log_amplitude_grid[0]) / log_amplitude_grid[1]
     if table_position <= 0.0:
@@ -669,7 +729,9 @@ def _crossing_rate(log_amplitude, log_rates, log_amplitude_grid):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
-    """Compute the sums of rates in the fields of ``leakage_bins``, in place.
+    """Compute the fields of ``leakage_bins`` that are sums of rates -ln(1 - c), in place.
+
+    c is the probability that signal lifts a bin above the threshold.
 
     ``line_log_amplitude`` is converted from amplitudes to logarithms. ``linear_rates`` and
     ``mean_probabilities`` (laws, N_RATES) are those of :class:`RateTables`.
@@ -734,26 +796,32 @@ def _fill_rate_sums(leakage_bins, linear_rates, mean_probabilities):
 
 
 class SpeckleQuadrature(NamedTuple):
-    """Trapezoidal rule of the average over speckle, for one table of rates."""
+    """Trapezoidal rule for the mean over speckle, for one table of rates.
+
+    Nodes are values of ln(speckle power). The rate of a bin is -ln(1 - c), with c the probability
+    that signal lifts it above the threshold.
+    """
 
     node_stride: int
-    """Distance of nodes, in steps of the tabulated ln(amplitude)."""
+    """Distance of successive nodes of the rule, in steps of ln(amplitude) of the table of rates. A
+    node's ln(power) is twice its ln(amplitude)."""
     n_below_mean: int
-    """Number of nodes whose power is less than 1."""
+    """Number of nodes whose speckle power is below the mean, which is 1."""
     weights: np.ndarray
-    """(nodes,): weight of node i, at the power e^(2 node_stride step (i - n_below_mean))."""
+    """(nodes,): weights of the trapezoidal rule. Node i has the speckle power e^(2 node_stride step
+    (i - n_below_mean)), with the ``step`` of the table's ln(amplitude)."""
     interleaved_rates: np.ndarray
-    """(node_stride * columns,): rates at ln(amplitude), from ``n_below_mean`` strides below the
-    table on.
+    """(node_stride * columns,): rates -ln(1 - c) at ln(amplitude), from ``n_below_mean`` strides
+    below the table on.
 
-    The rate with the number node_stride c + p is at index p columns + c, so that the nodes of a bin
-    are adjacent.
+    The rate at the step node_stride c + p from there is at index p columns + c, so that the nodes
+    of a bin are adjacent in memory.
     """
 
 
 @njit(cache=True, error_model="numpy")
 def _make_speckle_quadrature(log_rates, log_amplitude_grid):
-    """Return the quadrature over speckle for one table of rates."""
+    """Return the trapezoidal rule for means over speckle, for one table of rates."""
     log_amplitude_step, log_rate_step_max = log_amplitude_grid[1], 0.0
     for k in range(1, log_rates.size):
         if log_rates[k] < 1.0:  # at higher rates a bin crosses at almost any power
@@ -791,9 +859,10 @@ def _make_speckle_quadrature(log_rates, log_amplitude_grid):
 
 @njit(cache=True, error_model="numpy")
 def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums):
-    """Add the rates of a bin at the last nodes to ``rate_sums``, by cubic interpolation.
+    """Add the rates -ln(1 - c) of a bin at the nodes of speckle power to ``rate_sums``.
 
-    ``log_amplitude`` is ln(|X| / sigma) at mean power.
+    ``log_amplitude`` is ln(|X| / sigma) at mean power. Only the last nodes, as many as
+    ``rate_sums`` has, are evaluated. Rates are interpolated by cubic polynomials.
     """
     power_fraction, table_position = (
         1.0,
@@ -851,7 +920,9 @@ def _add_rates_at_nodes(log_amplitude, log_amplitude_grid, quadrature, rate_sums
 
 @njit(cache=True, error_model="numpy")
 def _mean_leakage_from_rate_sums(rate_sums, weights):
-    """Return the mean over speckle of 1 - exp(-R), from the sums of rates R at the last nodes.
+    """Return the mean over speckle of the probability 1 - exp(-R) that any bin is raised.
+
+    R is the sum of the bins' rates. ``rate_sums`` holds it at the last nodes of speckle power.
 
     Terms below the first node continue as a geometric series. They are proportional to the power if
     all draws leak, else to its square.
@@ -870,7 +941,9 @@ def _mean_leakage_from_rate_sums(rate_sums, weights):
 def _evaluate_joining_bins(
     bin_index, bin_slice, leakage_bins, threshold_index, quadrature, is_evaluated, joining_rates
 ):
-    """Evaluate a bin next to an echo, and further bins that may join the echo with it.
+    """Compute the rates of false peaks in leaked bins next to an echo, unless they join the echo.
+
+    Adjacent crossing bins belong to the echo if the echo's outermost bin crosses the threshold.
 
     Parameters
     ----------
@@ -887,7 +960,8 @@ def _evaluate_joining_bins(
     is_evaluated
         (bins,) bool: True for bins that were evaluated before.
     joining_rates
-        Result: rates, at the last nodes, of a group in these bins that does not join the echo.
+        Result: rates -ln(1 - p) at the last nodes of speckle power. p is the probability of a peak
+        in these bins that does not join the echo.
 
     Returns
     -------
@@ -968,7 +1042,7 @@ def _evaluate_joining_bins(
 
 @njit(cache=True, error_model="numpy")
 def _crossing_probability(rate):
-    """Return 1 - e^-rate."""
+    """Return the probability 1 - e^-rate that a bin of a given rate crosses the threshold."""
     if rate < 1e-4:
         return rate * (1.0 - rate * (0.5 - rate / 6.0))
     return -math.expm1(-rate)
@@ -976,9 +1050,10 @@ def _crossing_probability(rate):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average_leakage(leakage_bins, leakage_probability):
-    """Compute the mean of the probability of leakage (m, 3) over speckle and the line's phase.
+    """Compute the probability of a false peak by leaked signal in each segment, (m, 3).
 
-    Each echo fades independently.
+    It is the mean over speckle, with which each echo fades independently, and over the phase of the
+    line of leaked light.
     """
     is_evaluated = np.zeros(leakage_bins.bins.size, np.bool_)
     no_quadrature = SpeckleQuadrature(1, 0, np.empty(0), np.empty(0))
@@ -1062,9 +1137,10 @@ def _average_leakage(leakage_bins, leakage_probability):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def insert_peak(peak, peak_bins, peak_ratios, n_peaks):
-    """Insert a peak (bin, |X| / sigma) into a list sorted by strength; return its new length.
+    """Insert a peak into a list sorted by strength, and return the new number of peaks.
 
-    A bin of -1 is ignored. If the list is full, its weakest peak is dropped.
+    ``peak`` holds the bin and |X| / sigma. A bin of -1 is ignored. If the list is full, its weakest
+    peak is dropped.
     """
     bin_, ratio = peak
     if bin_ < 0:
@@ -1093,7 +1169,7 @@ def draw_leaked_peaks(
     peak_bins,
     peak_ratios,
 ):
-    """Draw the leaked peaks of a segment, and insert them into the list of the strongest peaks.
+    """Draw the false peaks that leaked signal raises in a segment, and list the strongest.
 
     Parameters
     ----------
@@ -1108,7 +1184,7 @@ def draw_leaked_peaks(
     threshold_ratio
         Threshold [sigma].
     n_looks
-        Number of looks whose powers are averaged.
+        Number of looks (records of the segment) whose powers are averaged.
     interpolation
         Interpolator of the window, for the correlation of neighbours' noise.
     peak_bins, peak_ratios
@@ -1197,7 +1273,7 @@ def _draw_raised_bins(
     peak_ratios,
     n_peaks,
 ):
-    """Draw the raised bins of a range, insert their peaks, and return the list's new length.
+    """Draw which bins of leaked signal cross the threshold, list their peaks, and return the count.
 
     Adjacent raised bins make one peak. Peaks adjacent to a bin of the echo that crosses belong to
     the echo. Bins are skipped by exponential random numbers, as the module describes.
@@ -1209,7 +1285,7 @@ def _draw_raised_bins(
     first_random
         Index of the first random number of the segment's stream.
     bin_slice, bins, log_amplitude
-        Begin and end of the range; bins; ln(|X| / sigma).
+        Begin and end of the bins in the arrays; numbers of the bins; ln(|X| / sigma).
     group, exempt_neighbour
         Fields of :class:`LeakageBins`; empty for bins that do not fade and join no echo.
     fading_factors
@@ -1283,7 +1359,10 @@ def _draw_raised_bins(
 
 @njit(cache=True, error_model="numpy")
 def _added_crossing_probability(signal, threshold_ratio):
-    """Return c(z), the probability that signal raises a bin to a level that noise alone misses."""
+    """Return the probability c(z) that signal lifts a bin to a level z that noise alone misses.
+
+    ``signal`` and ``threshold_ratio`` (z) are amplitudes over the noise per quadrature.
+    """
     return marcum_q1_excess(signal, threshold_ratio) / -math.expm1(
         -0.5 * threshold_ratio * threshold_ratio
     )
@@ -1291,7 +1370,11 @@ def _added_crossing_probability(signal, threshold_ratio):
 
 @njit(cache=True, error_model="numpy")
 def _raised_magnitude(signal, threshold_ratio, probability):
-    """Return the magnitude z >= ``threshold_ratio`` [sigma] at which c(z) is ``probability``."""
+    """Return the magnitude z [sigma] at which c(z) of the module is ``probability``.
+
+    c(z) is the probability that ``signal`` lifts a bin to z, if noise alone does not. z is at least
+    ``threshold_ratio``.
+    """
     low, high = threshold_ratio, max(signal, threshold_ratio) + CERTAIN_MARGIN_SIGMA
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)

@@ -65,58 +65,68 @@ from sweep.model.pointcloud.error_floor import NO_ERROR_FLOOR, ErrorFloor
 from sweep.model.pointcloud.pairing import UNCONFIRMED_FLAG
 
 BEAMS_PER_BATCH = 1 << 14
-"""Largest number of beams, over all draws, that are solved together, so that intermediate arrays
-fit the cache."""
+"""Largest number of beams, summed over cycles and draws, that are solved together. Intermediate
+arrays then fit into the processor's cache."""
 
 GRAZING_SINE_MIN = 0.05
-"""Sine of the smallest grazing angle that the weights of points take into account, about 3 deg."""
+"""Smallest sine of the angle between beam and ground that the weights of ground points use. It is
+the sine of some 3 deg."""
 
 _CONDITION_NUMBER_MAX = 1e6
-"""Condition number of the equations above which the beams of a cycle count as coplanar. Below it,
-covariances show how weak a geometry is."""
+"""Largest condition number of a cycle's least-squares equations. Above it the beams count as
+coplanar, and no velocity is computed."""
 
 _INTERPOLATION_ERROR_MIN = 1e-6
-"""Smallest standard error of an interpolated value, over that of the value by whole bins."""
+"""Smallest standard error of a value interpolated between bins, as a fraction of the standard error
+of the value by whole bins."""
 
 _ONE_SIGMA_PROBABILITY = 0.8413447460685429
-"""Probability that a normal number is below one standard deviation."""
+"""Probability that a normal random number is below its mean plus one standard deviation."""
 
 _ROUNDING_ERROR = 1e-14
-"""Relative rounding error of squared standard errors, of which a part is subtracted."""
+"""Relative rounding error of a squared standard error. It limits the difference when a common part
+of the variance is subtracted."""
 
 _CONTRADICTION_PROBABILITY = 1e-4
-"""Probability that true errors make larger residuals. If it is below this limit, the covariance
-follows from the residuals, and not from the stated errors."""
+"""Probability of a larger chi-square by chance, below which residuals contradict the stated errors.
+The covariance then follows from the residuals."""
 
 STATUS_SOLVED = 0
-"""The solution uses all valid beams."""
+"""Status of a cycle whose solution uses all beams with a return."""
 STATUS_EXCLUDED = 1
-"""The solution uses all valid beams except one, which contradicts the others."""
+"""Status of a cycle whose solution omits one beam, because it contradicts all others."""
 STATUS_WITHHELD = 2
-"""No solution: beams contradict each other, and the false one cannot be identified."""
+"""Status of a cycle without a solution: its beams contradict each other, and the false beam cannot
+be identified."""
 STATUS_UNDETERMINED = 3
-"""No solution: beams are too few, or nearly coplanar."""
+"""Status of a cycle without a solution: its beams are too few, or nearly coplanar."""
 
 ArraysByName = Mapping[str, np.ndarray]
-"""Arrays by the name of their output variable."""
+"""Mapping from names of output variables to their arrays."""
 
 
 class FittedCycles(NamedTuple):
-    """Velocities or altitudes fitted to n cycles: the first fields of a `NavigationSolution`."""
+    """Velocities or altitudes fitted to n measurement cycles.
+
+    The fields are the first fields of :class:`NavigationSolution`.
+    """
 
     value: np.ndarray
-    """(n, 3) or (n,): velocity [m/s] or altitude [m]."""
+    """(n, 3) velocity of the instrument [m/s], or (n,) altitude [m]."""
     covariance: np.ndarray
     """(n, 3, 3) or (n,): covariance of the velocity's error [m^2/s^2], or variance of the
     altitude's error [m^2]."""
     chi_square: np.ndarray
-    """(n,): weighted sum of squared residuals; nan without a solution."""
+    """(n,): sum of squared residuals over their variances; nan without a solution."""
     degrees_of_freedom: np.ndarray
-    """(n,) int64: number of observations minus that of unknowns; 0 without a solution."""
+    """(n,) int64: number of observations minus number of unknowns; 0 without a solution."""
 
 
 class NavigationSolution(NamedTuple):
-    """Velocities or altitudes of cycles, in the frame of the directions; nan without a solution."""
+    """Velocities or altitudes of measurement cycles; nan for a cycle without a solution.
+
+    Vectors have the axes of the beam directions that were passed to the solver.
+    """
 
     value: np.ndarray
     """(..., 3): velocity of the platform relative to the ground [m/s]; or (...,): height above the
@@ -125,12 +135,13 @@ class NavigationSolution(NamedTuple):
     """(..., 3, 3): covariance of the velocity's error [m^2/s^2]; or (...,): variance of the
     altitude's error [m^2]."""
     chi_square: np.ndarray
-    """(...,): weighted sum of squared residuals; of all valid beams if the solution is withheld."""
+    """(...,): sum of squared residuals over their variances. For a withheld solution it is that of
+    the fit to all beams with a return."""
     degrees_of_freedom: np.ndarray
-    """(...,) int64: number of observations minus that of unknowns, the expectation of chi-square; 0
-    if undetermined."""
+    """(...,) int64: number of observations minus number of unknowns; 0 for an undetermined cycle.
+    It is the expectation of ``chi_square``."""
     is_used: np.ndarray
-    """(..., b) bool: True for beams in the solution."""
+    """(..., b) bool: True for beams whose measurements the solution uses."""
     status: np.ndarray
     """(...,) int8: STATUS_SOLVED, STATUS_EXCLUDED, STATUS_WITHHELD or STATUS_UNDETERMINED."""
 
@@ -159,19 +170,20 @@ def solve_velocity(
     standard_error
         (..., b): standard errors of the radial velocities [m/s].
     test_level
-        Probability of a false positive of the test for one false beam; None for no test. With five
-        beams the test can identify a false beam; with four it withholds the solution.
+        Probability with which the test for one false beam rejects a cycle of true beams; None for
+        no test. With five beams the test can identify a false beam; with four it withholds the
+        solution.
 
     Notes
     -----
-    Leading dimensions broadcast.
+    Leading dimensions of the arguments broadcast.
     """
     u, closing_speed, error, leading_shape = _flatten_cycles(
         direction, radial_velocity, standard_error
     )
 
     def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
-        """Fit velocities to selected cycles (k,) by selected beams (k, b)."""
+        """Fit the velocities of cycles with indices (k,), by the beams of a mask (k, b)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             design = np.where(is_used[..., None], u[cycles] / error[cycles, :, None], 0.0)
             residual = np.where(is_used, closing_speed[cycles] / error[cycles], 0.0)
@@ -209,7 +221,9 @@ def solve_altitude(
     relief: float = 0.0,
     test_level: float | None = None,
 ) -> NavigationSolution:
-    """Solve for the altitude above the plane through each cycle's ground points, with its variance.
+    """Solve for the altitude above the plane through each cycle's ground points.
+
+    The solution includes the variance of the altitude.
 
     Parameters
     ----------
@@ -220,9 +234,9 @@ def solve_altitude(
     standard_error
         (..., b): standard errors of the ranges [m].
     slope
-        Prior standard deviation of the ground's slope, whose mean is 0. It is weighed against the
-        points, whatever their number. 0 states level ground: two beams then check each other, and
-        three are enough to identify a false one.
+        Prior standard deviation of the ground's slope, whose mean is 0. The prior is an additional
+        observation in the fit, whatever the number of points. 0 states level ground: two beams then
+        check each other, and three are enough to identify a false one.
     offset
         (..., b, 3): position of the instrument when each beam fires, relative to the position whose
         altitude is solved for [m].
@@ -230,7 +244,8 @@ def solve_altitude(
         Standard deviation of heights about the plane [m], which is added to the errors of range.
         Without it real ground fails the test for a false beam.
     test_level
-        Level of the test for one false beam, as in :func:`solve_velocity`.
+        Probability with which the test for one false beam rejects a cycle of true beams; None for
+        no test.
 
     Notes
     -----
@@ -242,7 +257,7 @@ def solve_altitude(
     )
 
     def fit_cycles(cycles: np.ndarray, is_used: np.ndarray) -> FittedCycles:
-        """Fit altitudes to selected cycles (k,) by selected beams (k, b)."""
+        """Fit the altitudes of cycles with indices (k,), by the beams of a mask (k, b)."""
         is_used_by_beam = np.ascontiguousarray(is_used.T)
         plane_arguments = (
             np.where(is_used_by_beam, ground_points[..., cycles], 0.0),
@@ -283,15 +298,15 @@ def ground_gradient(
     offset: np.ndarray | None = None,
     relief: float = 0.0,
 ) -> np.ndarray:
-    """Return the gradient (..., 2) of the plane through the ground points of each cycle.
+    """Return the gradient (..., 2) along x and y of the plane through each cycle's ground points.
 
     Parameters
     ----------
     direction, range, standard_error, slope, offset, relief
         Arguments of :func:`solve_altitude`.
     is_used
-        (..., b) bool: beams whose points determine the plane, as of a solution. The gradient of a
-        cycle without any is 0.
+        (..., b) bool: True for beams whose points determine the plane. The gradient of a cycle
+        without such beams is 0.
     """
     ground_points, u, error, leading_shape = _ground_points(
         direction, range, standard_error, offset
@@ -312,7 +327,7 @@ def _ground_points(
     direction: np.ndarray, distance: np.ndarray, standard_error: np.ndarray,
     offset: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:  # fmt: skip
-    """Return the points of the ground that beams measure, with beams first and cycles last.
+    """Return the points of the ground that beams measure, with cycles along the last axis.
 
     Parameters
     ----------
@@ -372,7 +387,8 @@ def _covariance_scale(
 def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
     """Return True for solutions whose residuals contradict the stated errors, (...,) bool.
 
-    `chi_square` is then larger than true errors make it with `_CONTRADICTION_PROBABILITY`.
+    By chance, true errors give such a large ``chi_square`` with a probability of less than
+    ``_CONTRADICTION_PROBABILITY``.
     """
     return (degrees_of_freedom > 0) & (
         chi_square > chdtri(np.maximum(degrees_of_freedom, 1), _CONTRADICTION_PROBABILITY)
@@ -380,27 +396,29 @@ def _residuals_contradict(chi_square: np.ndarray, degrees_of_freedom: np.ndarray
 
 
 class _GroundPlane(NamedTuple):
-    """Plane through the ground points of n cycles; arrays are (n,) unless stated otherwise."""
+    """Planes fitted to the ground points of n cycles; arrays are (n,) unless stated otherwise."""
 
     height: np.ndarray
-    """Height of the platform above the plane [m]."""
+    """Height of the platform above the plane, along the vertical [m]."""
     variance: np.ndarray
-    """Variance of the height [m^2]."""
+    """Variance of the error of ``height`` [m^2]."""
     chi_square: np.ndarray
-    """Weighted sum of squared residuals."""
+    """Sum of squared residuals of the ground points over their variances."""
     gradient: np.ndarray
-    """(2, n): gradient along x and y."""
+    """(2, n): gradient (rise over run) of the plane along x and y."""
     n_fitted_slopes: np.ndarray
-    """Effective number of slopes, 0..2, that the points determine, in contrast to the prior."""
+    """Effective number, 0..2, of the plane's two slopes that the points determine. The prior
+    determines the rest."""
     point_variance: np.ndarray
-    """Harmonic mean of the variances of the points' heights, over the number of points [m^2]."""
+    """Harmonic mean of the height variances of the ground points, divided by the number of points
+    [m^2]."""
 
 
 def _fit_plane(
     ground_points: np.ndarray, directions: np.ndarray, errors: np.ndarray, is_used: np.ndarray,
     gradient: np.ndarray, slope: float, relief: float,
 ) -> _GroundPlane:  # fmt: skip
-    """Fit planes to n cycles' ground points by weighted least squares.
+    """Fit a plane to the ground points of each of n cycles by weighted least squares.
 
     Parameters
     ----------
@@ -459,7 +477,7 @@ def _fit_plane(
 def _flatten_cycles(
     direction: np.ndarray, value: np.ndarray, standard_error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Broadcast measurements of beams, and join their leading dimensions to one, of n cycles.
+    """Broadcast measurements of beams, and flatten their leading dimensions to one of n cycles.
 
     Parameters
     ----------
@@ -530,17 +548,18 @@ def _solve_without_false_beams(
     is_valid
         (n, b) bool: beams with a return.
     test_level
-        Level of the test for a false beam; None for no test.
+        Probability with which the test for a false beam rejects a cycle of true beams; None for no
+        test.
     leading_shape
         Leading dimensions of the result; their product is n.
 
     Notes
     -----
-    A cycle is suspect if its chi-square is larger than true beams make it with probability
-    `test_level`. Each beam is then excluded in turn. If exactly one such fit passes the same test,
-    that beam is false and that fit is the solution. Otherwise the solution is withheld. With one
-    degree of freedom every exclusion leaves an exact fit: a contradiction is noticed, but the false
-    beam is never identified.
+    A cycle is suspect if its chi-square exceeds the value that true beams exceed with the
+    probability `test_level`. Each beam is then excluded in turn. If exactly one such fit passes the
+    same test, that beam is false and that fit is the solution. Otherwise the solution is withheld.
+    With one degree of freedom every exclusion leaves an exact fit: a contradiction is noticed, but
+    the false beam is never identified.
     """
     is_used, n_beams = is_valid.copy(), is_valid.shape[1]
     fitted = fit_cycles(np.arange(len(is_valid)), is_used)
@@ -581,7 +600,7 @@ def solve_navigation(
     error_floor: ErrorFloor = NO_ERROR_FLOOR,
     motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
-    """Solve for the velocity and altitude of every cycle and draw.
+    """Solve for the instrument's velocity and altitude in every measurement cycle and draw.
 
     Parameters
     ----------
@@ -595,11 +614,12 @@ def solve_navigation(
     ground_slope, relief
         Standard deviations of slope and relief of the ground, as in :func:`solve_altitude`.
     test_level
-        Level of the test for one false beam; None or 0 for no test.
+        Probability with which the test for one false beam rejects a cycle of true beams; None or 0
+        for no test.
     pointing_jitter
-        Standard deviation of each angle of the pointing [rad].
+        Standard deviation of each angle of the pointing by jitter [rad].
     error_floor
-        Standard deviations of the instrument's other errors.
+        Standard deviations of the instrument's errors that do not depend on the echo.
     motion_priors
         Priors of unknown motion that the points' standard errors include.
 
@@ -648,25 +668,28 @@ _BEAM_MOTION_VARIABLES = (
     "platform_position", "platform_velocity", "beam_direction", "beam_turning",
     "platform_acceleration",
 )  # fmt: skip
-"""Names of variables in the order of the fields of :class:`BeamMotion`."""
+"""Names of the output variables that fill the fields of :class:`BeamMotion`, in their order."""
 
 
 class BeamMotion(NamedTuple):
-    """Motion of the instrument and of its beam in each shot, (..., 3) each, in the world's axes."""
+    """Motion of the instrument and of its beam in each shot.
+
+    Arrays are (..., 3), in the axes of the world frame.
+    """
 
     position: np.ndarray
-    """Position of the instrument [m]."""
+    """(..., 3): position of the instrument in the world's frame [m]."""
     velocity: np.ndarray
-    """Velocity of the instrument [m/s]."""
+    """(..., 3): velocity of the instrument in the world's frame [m/s]."""
     direction: np.ndarray
-    """Unit vector along the beam."""
+    """(..., 3): unit vector along the beam, away from the instrument."""
     direction_rate: np.ndarray
-    """Rate of change of the direction [1/s]."""
+    """(..., 3): time derivative of the beam's ``direction`` [1/s]."""
     acceleration: np.ndarray
-    """Acceleration of the instrument [m/s^2]."""
+    """(..., 3): acceleration of the instrument in the world's frame [m/s^2]."""
 
     def by_cycle(self, beams_per_cycle: int) -> "BeamMotion":
-        """Arrange the motion of n shots by cycles, (cycles, beams, 3) each."""
+        """Reshape the arrays (n, 3) of n shots to (cycles, beams, 3)."""
         return BeamMotion(*(values.reshape(-1, beams_per_cycle, 3) for values in self))
 
 
@@ -677,7 +700,10 @@ def _select_beams(
     error_floor: ErrorFloor,
     known_motion: EgoMotion,
 ) -> dict[str, np.ndarray]:
-    """Select the first trusted point of each shot and draw.
+    """Select the measured point of each shot and draw that navigation uses.
+
+    It is the first point that a Doppler peak confirms and whose value and standard error are
+    finite.
 
     Parameters
     ----------
@@ -688,18 +714,19 @@ def _select_beams(
     shots_per_cycle
         Number of shots in a cycle.
     error_floor
-        Standard deviations of the instrument's other errors.
+        Standard deviations of the instrument's errors that do not depend on the echo.
     known_motion
         Motion along the beams of these shots, as the instrument knows it.
 
     Returns
     -------
     dict of str to ndarray
-        Arrays (cycles, draws, beams), nan for a shot without a trusted point: ``range`` and
-        ``radial_velocity`` with their ``_standard_error``, without errors common to all beams or by
-        an unknown slip; ``radial_velocity_slip_error``, the error by an unknown slip [m/s];
-        ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats [s];
-        ``range_then``, the range at that time [m]. If pointing has an error, ``position``
+        Arrays (cycles, draws, beams), nan for a shot without such a point. The slip is the closing
+        speed minus the speed at which the range falls. Standard errors exclude errors common to all
+        beams and errors by an unknown slip. The names are ``range`` and ``radial_velocity``, and
+        both with ``_standard_error``; ``radial_velocity_slip_error``, the error by an unknown slip
+        [m/s]; ``velocity_per_slip``; ``delay``, the time from the shot's start to that of the beats
+        [s]; ``range_then``, the range at that time [m]. If pointing has an error, ``position``
         (cycles, draws, beams, 3) [m].
     """
     flags = point_arrays["flags"][shot_slice]
@@ -755,7 +782,7 @@ def _solve_cycles(
     beam_motion: BeamMotion, beams: dict[str, np.ndarray], test_arguments: dict,
     ground_arguments: dict, pointing_jitter: float, error_floor: ErrorFloor,
 ) -> list[tuple[str, str, NavigationSolution]]:  # fmt: skip
-    """Solve for velocity and altitude of cycles in all draws.
+    """Solve for the instrument's velocity and altitude in measurement cycles, in all draws.
 
     Parameters
     ----------
@@ -766,9 +793,9 @@ def _solve_cycles(
     test_arguments, ground_arguments
         Arguments ``test_level``, and ``slope`` and ``relief``, of :func:`solve_altitude`.
     pointing_jitter
-        Standard deviation of each angle of the pointing [rad].
+        Standard deviation of each angle of the pointing by jitter [rad].
     error_floor
-        Standard deviations of the instrument's other errors.
+        Standard deviations of the instrument's errors that do not depend on the echo.
 
     Returns
     -------
@@ -837,7 +864,10 @@ def _solve_cycles(
 def _slip_of_ground_gradient(
     beam_motion: BeamMotion, ranges: np.ndarray, gradient: np.ndarray
 ) -> np.ndarray:
-    """Return the slip over a plane minus that over level ground [m/s], (cycles, draws, beams).
+    """Return the slip over a sloping plane minus the slip over level ground [m/s].
+
+    The slip is the closing speed minus the speed at which the range falls. The result is (cycles,
+    draws, beams).
 
     Parameters
     ----------
@@ -850,8 +880,9 @@ def _slip_of_ground_gradient(
 
     Notes
     -----
-    With W = V + R d' and the normal n of the plane the result is W.z / d.z - W.n / d.n. It is 0 for
-    beams that do not point down at both planes.
+    Let V be the instrument's velocity, d the beam's direction, d' its time derivative, z the
+    vertical and n the normal of the plane. With W = V + R d' the result is W.z / d.z - W.n / d.n.
+    It is 0 for beams that do not point down at both planes.
     """
     _, velocity, direction, direction_rates, _ = beam_motion
     d_x, d_y, d_z = (direction[:, None, :, k] for k in range(3))

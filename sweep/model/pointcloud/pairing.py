@@ -47,31 +47,42 @@ from sweep.model.waveform import (
 )
 
 CONFIRMATION_TOLERANCE_BINS = 3.0
-"""Default mismatch [bins] up to which a Doppler peak confirms a pair.
+"""Default of the largest distance [bins] between a Doppler peak and the position that a pair of an
+up and a down peak predicts, at which the peak confirms the pair.
 
 Rounding to bins moves the prediction and the Doppler peak by half a bin each. Noise near the
-threshold moves them by as much again. A peak at a random position confirms one of the 16 readings
-with a probability of at most 16 (2 tolerance) / (N/2): 1.5e-3 at N = 2^17.
+threshold moves them by as much again. A pair has 16 readings (ways to read its beats as range and
+velocity), each with a predicted position. A peak at a random position confirms one of them with a
+probability of at most 16 (2 tolerance) / (N/2), with N the FFT size: 1.5e-3 at N = 2^17.
 """
 
 CHANCE_MATCH_PROBABILITY = 0.01
-"""Probability that a false Doppler peak selects the reading of an unconfirmed pair."""
+"""Probability that a false Doppler peak selects the reading of an unconfirmed pair. It sets how
+near a Doppler peak must be to the predicted position. A reading interprets beats as range and
+velocity."""
 
 _UNPAIRED_COST = 1e9
-"""Cost of an up peak without a down peak: larger than any sum of mismatches."""
+"""Cost [bins] of an up peak that stays without a down peak. It exceeds any sum of distances between
+Doppler peaks and their predicted positions."""
 
 TRUE_FLAG = 1
-"""Bit of a return whose range and velocity are those of a beamlet (:data:`FLAG_BITS`)."""
+"""Flag bit of a return whose range and velocity are those of a true surface, sampled by a beamlet
+(:data:`FLAG_BITS`)."""
 FALSE_ALARM_FLAG = 2
-"""Bit of a return with a false peak (:data:`FLAG_BITS`)."""
+"""Flag bit of a return with a peak of noise, or of leaked signal raised by noise
+(:data:`FLAG_BITS`)."""
 MISPAIRED_FLAG = 4
-"""Bit of a return whose peaks belong to different beamlets (:data:`FLAG_BITS`)."""
+"""Flag bit of a return whose up, Doppler and down peaks belong to different beamlets
+(:data:`FLAG_BITS`)."""
 MISREAD_FLAG = 8
-"""Bit of a return whose peaks were read as another range or velocity (:data:`FLAG_BITS`)."""
+"""Flag bit of a return whose peaks belong to one beamlet, but were converted to a wrong range or
+velocity (:data:`FLAG_BITS`)."""
 SIDELOBE_FLAG = 16
-"""Bit of a return with a peak that contains no beamlet's line (:data:`FLAG_BITS`)."""
+"""Flag bit of a return with a peak of signal that contains no beamlet's line, such as a sidelobe
+(:data:`FLAG_BITS`)."""
 UNCONFIRMED_FLAG = 32
-"""Bit of a return that no Doppler peak confirms (:data:`FLAG_BITS`)."""
+"""Flag bit of a return for which no Doppler peak is near the position that the up and down peak
+predict (:data:`FLAG_BITS`)."""
 FLAG_BITS = {
     "true": TRUE_FLAG,
     "false_alarm": FALSE_ALARM_FLAG,
@@ -80,7 +91,7 @@ FLAG_BITS = {
     "sidelobe": SIDELOBE_FLAG,
     "unconfirmed": UNCONFIRMED_FLAG,
 }
-"""Bits of a return's flags, by name.
+"""Bits of the flags of a return (a measured point), by name.
 
 Exactly one of the first five bits is set. They follow from a comparison with the truth.
 
@@ -88,32 +99,39 @@ Exactly one of the first five bits is set. They follow from a comparison with th
   the width of the peaks;
 - false alarm: one of its peaks is noise, or leaked signal raised by noise;
 - mispaired: its peaks are signal, but contain lines of no common beamlet;
-- misread: all its peaks contain lines of one beamlet, but the reading is wrong;
+- misread: all its peaks contain lines of one beamlet, but were converted to a wrong range or
+  velocity;
 - sidelobe: one of its peaks contains no beamlet's line;
 - unconfirmed, which the instrument knows: no Doppler peak is within the tolerance.
 """
 
 
 FALSE_PEAK = -1
-"""Group number of a false peak, which belongs to no group of bins."""
+"""Group number of a false peak, which belongs to no group of bins of an echo."""
 NO_PEAK = -2
-"""Group number that stands for no peak: no Doppler peak confirms, or the segment does not exist."""
+"""Group number that stands for a missing peak: no Doppler peak confirms the return, or the segment
+does not exist."""
 
 UP_COLUMN, DOPPLER_COLUMN, DOWN_COLUMN, READING_COLUMN = range(4)
-"""Columns of the pairs that :func:`pair_peaks` returns: index of the up peak, of the Doppler peak
-(-1 if the pair is unconfirmed) and of the down peak; and reading."""
+"""Columns of the pairs that :func:`pair_peaks` returns. They are the index of the up peak, of the
+Doppler peak (-1 if unconfirmed) and of the down peak, and the reading of the beats."""
 
 
 class ConfirmingPeak(NamedTuple):
-    """Doppler peak and reading that fit an up and a down peak best."""
+    """Doppler peak and reading of the beats that fit an up and a down peak best.
+
+    A reading is one way to interpret beats as range and velocity: far or fast target, folded at
+    Nyquist or not.
+    """
 
     cost: float
-    """Mismatch of the Doppler beat plus penalties for folds [bins]; inf if no peak fits."""
+    """Distance between the Doppler peak and its predicted position, plus penalties for folds at
+    Nyquist [bins]; inf if no peak fits."""
     doppler_index: int
-    """Index of the Doppler peak; -1 if no peak fits."""
+    """Index of the Doppler peak in the list of the segment's peaks; -1 if no peak fits."""
     reading: int
-    """Number of the reading, as of :func:`sweep.model.waveform.beats_of_reading`; -1 if no peak
-    fits."""
+    """Number of the way to read the beats as range and velocity
+    (:func:`sweep.model.waveform.beats_of_reading`); -1 if no peak fits."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -130,6 +148,8 @@ def pair_peaks(
 ):
     """Pair up and down peaks one to one, and return the numbers of confirmed and of all pairs.
 
+    A pair is confirmed by a Doppler peak near the position that it predicts.
+
     Parameters
     ----------
     up, doppler, down
@@ -138,7 +158,7 @@ def pair_peaks(
     doppler_prediction, fft_size, down_beat_sign, tolerance
         Arguments of :func:`find_confirming_peak`.
     two_beat_reading
-        Reading of pairs that no Doppler peak confirms.
+        Reading (way to interpret the beats) of pairs that no Doppler peak confirms.
     pairs
         (>= min(ups, downs), 4) int64; the result, with the columns UP_COLUMN to READING_COLUMN.
         Confirmed pairs come first, in the order of the up peaks.
@@ -198,6 +218,9 @@ def find_confirming_peak(
 ):
     """Find the Doppler peak and the reading that fit an up and a down peak best.
 
+    A reading is one way to interpret the beats as range and velocity: far or fast, folded at
+    Nyquist or not.
+
     Parameters
     ----------
     up, down
@@ -205,16 +228,16 @@ def find_confirming_peak(
     doppler
         (k,): positions of the Doppler peaks [bins].
     doppler_prediction
-        (3,): coefficient of the up beat, and of the down beat, in the predicted Doppler beat; and
-        the change of the Doppler beat by the instrument's motion between the segments [bins], which
-        is added to the tolerance.
+        (3,): coefficients of the up beat and of the down beat in the predicted Doppler beat, and a
+        mismatch [bins]. The mismatch is the shift of the Doppler beat by the instrument's motion
+        between the segments. It is added to the tolerance.
     fft_size
         FFT size N.
     down_beat_sign
         For complex records 1 if the down beat minus the up beat rises with the range, -1 if it
         falls; 0 for real records.
     tolerance
-        Largest mismatch [bins].
+        Largest distance of a Doppler peak from its predicted position [bins].
 
     Returns
     -------
@@ -314,9 +337,9 @@ def _match_pairs(cost):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def judge_return(groups, positions, group_bins, line_positions, beamlet_amplitude):
-    """Compare a return with the truth: return its flag and the beamlet nearest to its peaks.
+    """Compare a return's peaks with the truth; return its flag and the nearest beamlet.
 
-    The reading of its peaks is not compared here.
+    Range and velocity, to which the peaks are converted, are not compared here.
 
     Parameters
     ----------

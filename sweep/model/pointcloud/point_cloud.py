@@ -43,10 +43,12 @@ from sweep.model.unsupported_shot import UnsupportedShotError
 from sweep.model.waveform import STRONGEST_PEAK
 
 VALUES_PER_BATCH = 1 << 20
-"""Largest number of values in memory, besides the results, for shots that are computed together."""
+"""Largest number of values, besides the results, that are held in memory for the shots computed
+together."""
 
 _EMPTY_SHOT_RANGE = 1.0
-"""Range [m] that stands in for that of a shot that hits nothing, which returns no light."""
+"""Range [m] assumed for a shot that hits nothing, so that it can be simulated. Such a shot returns
+no light."""
 
 
 def simulate_cloud(
@@ -65,7 +67,7 @@ def simulate_cloud(
     estimates_ray_error: bool = False,
     motion_priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
-    """Simulate n shots of a flight: their probabilities, and the points that are reported.
+    """Simulate n shots of a flight: probabilities of detection, and the points that are reported.
 
     Parameters
     ----------
@@ -84,13 +86,14 @@ def simulate_cloud(
     methods
         Detectors and estimators for ``spectra``.
     returns_max
-        Largest number of groups in a segment, and of points of a shot and draw; ``surfaces_seen``
-        is at most this.
+        Largest number of groups (runs of adjacent bins above the threshold) in a segment, and of
+        points in a shot and draw. ``surfaces_seen`` is at most this number.
     effects, effect_flags
         Names of effects, and bit masks, as for
         :func:`sweep.model.evaluation.prepare_ray_traced_shots`.
     estimates_ray_error
-        True to estimate ``beamlets_error``, for which powers must add; otherwise it is nan.
+        True to estimate ``beamlets_error``, the error of probabilities and peaks by too few rays.
+        For this the beamlets must add in power. If False, it is nan.
     motion_priors
         Prior standard deviations of motion that the instrument does not measure; standard errors
         include them.
@@ -175,17 +178,18 @@ def simulate_cloud(
 
 
 class _PreparedBatch(NamedTuple):
-    """Prepared shots of a batch, and their spectra without noise."""
+    """Prepared shots of a batch, with their footprints and noiseless echoes."""
 
     shots: Shots
-    """Prepared shots, with all effects."""
+    """Prepared shots, with all simulated effects."""
     beamlet_table: BeamletTable
-    """Footprints of the shots."""
+    """Footprints of the shots, by beamlets (rays that sample the beam)."""
     bin_groups: BinGroups
-    """Groups of adjacent bins above the threshold; none for a shot without a target."""
+    """Runs of adjacent bins above the threshold in the noiseless spectra; none for a shot without a
+    target."""
     leakage_bins: list[tuple[np.ndarray, LeakageBins]] | None
-    """Indices of shots, and the bins in which leaked signal may raise false peaks; None if they
-    were not listed, or are too many to keep."""
+    """Pairs of indices of shots, and of the bins in which leaked signal may raise false peaks. It
+    is None if these bins were not listed, or are too many to keep."""
 
 
 def _prepare_batch(
@@ -197,7 +201,7 @@ def _prepare_batch(
     effect_flags: np.ndarray | None,
     keys: np.ndarray,
 ) -> _PreparedBatch:
-    """Prepare a batch of shots, and find the echoes and the leaked signal in their spectra.
+    """Prepare a batch of shots, and find echoes and leaked signal in their noiseless spectra.
 
     The arguments are those of :func:`simulate_cloud`; `groups_max` is its `returns_max`.
     """
@@ -287,10 +291,10 @@ def _statistics_before_draws(shots: Shots, bin_groups: BinGroups) -> dict[str, n
 def _cloud_points(
     eyepoints: Eyepoints, shot_returns: Returns, n_lines: int
 ) -> dict[str, np.ndarray]:
-    """Return points and their truth, (n, draws, returns[, 3]) by name of POINT_VARIABLES.
+    """Return points and their truth by name of POINT_VARIABLES, (n, draws, returns[, 3]).
 
-    `n_lines` is the number of lines of a shot in `shot_returns`: 1 if the effect of the footprint
-    is skipped, else that of the beamlets.
+    ``n_lines`` is the number of lines of a shot in ``shot_returns``. It is 1 if the effect of the
+    footprint is skipped, else the number of beamlets.
     """
     has_beamlet = shot_returns.beamlet >= 0
     shot = np.arange(len(has_beamlet))[:, None, None]

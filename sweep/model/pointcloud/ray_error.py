@@ -1,4 +1,4 @@
-"""Error by too few rays: the change of probabilities and peaks that more rays might make.
+"""Error of probabilities and peak magnitudes by sampling the beam with too few rays.
 
 If powers add, the power of the detected bin is a mean over the beam, P = sum_b w_b g_b. Here g_b is
 the power of the bin if all light went to beamlet b. A hexagonal lattice of whole shells is exact
@@ -42,63 +42,73 @@ from sweep.model.preparation import Shots
 from sweep.model.window import window_samples
 
 _CHIRP_SIGNS = 1.0, 0.0, -1.0
-"""Signs of the chirp rates of the up, Doppler and down segment."""
+"""Signs of the chirp rates (frequency slopes) of the up, Doppler and down segment."""
 
 _LOBE_REACH_BINS = 4
-"""Largest distance from a line in the table of its power [bins of fs/L]."""
+"""Largest distance from a line [bins of fs/L] at which the table of its power ends. fs is the
+sampling rate and L the number of samples of the record."""
 _LOBE_STEPS_PER_BIN = 1024
-"""Number of steps per bin in that table."""
+"""Number of entries per bin of fs/L in the table of a line's power by distance. fs is the sampling
+rate and L the number of samples of the record."""
 _WINDOW_SAMPLES = 1024
-"""Number of samples of the window from which that table is computed."""
+"""Number of samples of the window from which the table of a line's power by distance is computed.
+"""
 
 _NEIGHBOUR_DISTANCE_RATIO = 1.3
-"""Distance up to which beamlets of a lattice are neighbours, over that of the nearest. The second
-nearest are at 1.7."""
+"""Largest distance between beamlets that count as neighbours, in units of the lattice's smallest
+distance. The second smallest distance is 1.7."""
 
 _QUARTIC_RAYS_MIN = 37
-"""Smallest number of rays for which polynomials of degree 4 leave enough residuals."""
+"""Smallest number of rays for which polynomials of degree 4, and not 2, are subtracted. With fewer
+rays too few residuals would remain."""
 
 _UNAFFECTED_DISTANCE_SIGMA = 15.0
-"""Distance of a magnitude from the threshold [standard deviations of the noise] beyond which no
-probability changes (e^-112)."""
+"""Difference between magnitude and threshold, in standard deviations of the noise, beyond which a
+magnitude's error changes no probability. The density there is e^-112 of the largest."""
 
 _PROBABILITY_CHANGE_MIN = 1e-9
-"""Change of a probability below which the error of a shot is not computed."""
+"""Smallest effect on a result for which the error of a shot by too few rays is computed. It is a
+bound on the change of a probability of detection, or a relative change of a peak's magnitude."""
 
 
 class FoldedLattice(NamedTuple):
-    """Hexagonal lattice as h pairs of opposite beamlets; the central one forms a pair by itself."""
+    """Hexagonal lattice of beamlets, as h pairs of opposite beamlets about the central one.
+
+    The central beamlet is a pair by itself. Quantities that are odd about the beam's axis cancel in
+    a pair.
+    """
 
     beamlet: np.ndarray
-    """(h,) int64: index of the first beamlet of each pair."""
+    """(h,) int64: index of the first beamlet of each pair of opposite beamlets."""
     opposite_beamlet: np.ndarray
-    """(h,) int64: index of the second beamlet of each pair."""
+    """(h,) int64: index of the second beamlet of each pair of opposite beamlets."""
     inverse_weight: np.ndarray
-    """(h,): 1 over the power fraction of both beamlets of a pair together."""
+    """(h,): 1 divided by the fraction of the beam's power in both beamlets of a pair."""
     polynomials: np.ndarray
-    """(k, h): even polynomials of the positions, orthonormal under the power fractions of pairs."""
+    """(k, h): values at each pair of k even polynomials of the beamlets' position. They are
+    orthonormal with the power fractions of the pairs as weights."""
     weighted_polynomials: np.ndarray
-    """(k, h): polynomials times the power fractions of pairs."""
+    """(k, h): ``polynomials`` times the power fractions of the pairs."""
     density_change: np.ndarray
-    """(h,): relative change (u_b - w_b) / w_b from a beamlet's weight w_b to the beam's power u_b
-    about it."""
+    """(h,): relative difference (u - w) / w of two fractions of the beam's power: u in the area
+    about a beamlet, and w, the beamlet's weight."""
     first_neighbour: np.ndarray
-    """(m,) int64: first of two pairs of beamlets that are neighbours."""
+    """(m,) int64: index of the first of two neighbouring pairs of beamlets."""
     second_neighbour: np.ndarray
-    """(m,) int64: second of two pairs of beamlets that are neighbours."""
+    """(m,) int64: index of the second of two neighbouring pairs of beamlets."""
     neighbour_weight: np.ndarray
-    """(m,): sum of the products of the neighbours' power fractions, times h / (h - k) for the
-    roughness that k polynomials remove."""
+    """(m,): product of the power fractions of two neighbours, summed over both sides of the beam,
+    times h / (h - k). The factor replaces the roughness that k fitted polynomials remove."""
 
 
 def estimate_ray_error(
     shots: Shots, beamlet_table: BeamletTable, peak_bins: np.ndarray, magnitude: np.ndarray
 ) -> np.ndarray:
-    """Estimate how much more rays may change the results of shots, (n,), 0..1.
+    """Estimate the error of the results of shots by sampling the beam with too few rays.
 
-    The estimate is the larger of two errors. The first is that of the probabilities of detection,
-    summed over the segments. The second is that of a peak's magnitude, relative to the larger of
-    the magnitude and sigma.
+    The estimate (n,), 0..1, is the larger of two errors. The first is that of the probabilities of
+    detection, summed over the segments. The second is that of a peak's magnitude, relative to the
+    larger of the magnitude and sigma.
 
     Parameters
     ----------
@@ -143,15 +153,17 @@ def estimate_ray_error(
 
 
 def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Return an upper bound on the change of Marcum's Q_1(a, b) by a relative change of a^2.
+    """Return an upper bound on the change of Marcum's Q_1(a, b), a probability of detection.
+
+    ``relative`` is the relative change of a^2.
 
     `a` is the magnitude, and `b` the threshold, over the standard deviation of the noise per
     quadrature.
 
     Notes
     -----
-    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), with the value in the exponent, of those
-    that a takes, that is nearest to b.
+    dQ_1/d ln a <= sqrt(a b / (2 pi)) exp(-(a - b)^2 / 2), where the exponent takes the value of a
+    that is nearest to b.
     """
     distance = np.maximum(np.abs(a - b) - 0.5 * relative * a, 0.0)
     bound = 0.5 * relative * np.sqrt(a * b / (2 * math.pi)) * np.exp(-0.5 * distance**2)
@@ -159,9 +171,10 @@ def _pd_change_bound(a: np.ndarray, b: np.ndarray, relative: np.ndarray | float)
 
 
 def _magnitude_change(a: np.ndarray, relative: np.ndarray | float) -> np.ndarray:
-    """Return the change of a by a relative change of a^2, over the larger of a and 1.
+    """Return the change of a magnitude a, over the larger of a and 1.
 
-    `a` is a magnitude over the standard deviation of the noise per quadrature.
+    ``relative`` is the relative change of a^2. ``a`` is a magnitude over the standard deviation of
+    the noise per quadrature.
     """
     return np.asarray(0.5 * relative * np.minimum(a, 1.0))
 
@@ -252,7 +265,10 @@ def _bin_powers(
 
 @lru_cache(maxsize=16)
 def fold_lattice(n_beamlets: int) -> FoldedLattice:
-    """Return the folded lattice of ``n_beamlets`` beamlets in whole shells."""
+    """Return the hexagonal lattice of ``n_beamlets`` beamlets as pairs of opposite beamlets.
+
+    The beamlets fill whole shells of the lattice.
+    """
     from scipy.spatial import cKDTree  # slow to import
 
     offsets, weights = place_beamlets(n_beamlets)
@@ -300,10 +316,11 @@ def fold_lattice(n_beamlets: int) -> FoldedLattice:
 
 
 def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the beam's power in each beamlet's cell minus the beamlet's weight, (beamlets,).
+    """Return the fraction of the beam's power about each beamlet minus the beamlet's weight.
 
-    The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius share the power
-    outside of all cells, so that the sum of the result is 0.
+    The result is (beamlets,). The beam is Gaussian, and the cells about the beamlets have equal
+    areas. Beamlets at the largest radius share the power outside of all cells, so that the sum of
+    the result is 0.
 
     Parameters
     ----------
@@ -324,7 +341,9 @@ def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> np.ndarray:
-    """Return the values (k, h) of even polynomials at positions, orthonormal under the weights.
+    """Return the values (k, h) of k even polynomials at h positions.
+
+    They are orthonormal with the given weights.
 
     Parameters
     ----------
@@ -344,9 +363,10 @@ def _even_polynomials(offsets: np.ndarray, weights: np.ndarray, degree: int) -> 
 
 @lru_cache(maxsize=32)
 def _main_lobe_table(window_name: str) -> np.ndarray:
-    """Return |W(y) / W(0)|^2 at y = 0, 1, 2 .. steps, for windows of any length.
+    """Return the power |W(y) / W(0)|^2 of a line at distances y = 0, 1, 2 .. steps from its centre.
 
-    A bin of fs/L has `_LOBE_STEPS_PER_BIN` steps.
+    W is the transform of the window. A bin of fs/L has ``_LOBE_STEPS_PER_BIN`` steps, for windows
+    of any length L and any sampling rate fs.
     """
     w = window_samples(window_name, _WINDOW_SAMPLES)
     transform = np.abs(
@@ -360,7 +380,9 @@ def _main_lobe_table(window_name: str) -> np.ndarray:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_power_errors(powers, lattice, relative_errors):
-    """Compute the relative errors of the powers of m bins, as the module's description derives.
+    """Compute the relative errors of the powers of m bins by sampling the beam with too few rays.
+
+    The module's description derives them.
 
     Parameters
     ----------

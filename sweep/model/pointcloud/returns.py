@@ -11,10 +11,10 @@ interpolated position has a normal error of the reported standard error. ``noise
 bins of a group's echo, or, if only the strongest bin detects, to that bin and its two neighbours. A
 neighbour may then be the largest bin.
 
-Ranges and velocities are those at the shot's start, as the truth is. Range walk shifts the
-interpolated range by v_r (T_w + 2 t_0), and motion between segments shifts range and velocity. The
-measured velocity corrects both. The beats contain no information on the acceleration, or on ground
-that slides under the beam. The instrument's known motion corrects the points for both
+Ranges and velocities are those at the shot's start, as the truth is. Motion within a record (range
+walk) shifts the interpolated range. Motion between segments shifts range and velocity. The measured
+velocity corrects both. The beats contain no information on the acceleration, or on ground that
+slides under the beam. The instrument's known motion corrects the points for both
 (:mod:`sweep.model.pointcloud.ego_motion`). If segments have slopes other than 1, 0 and -1, a return
 is the fit of all its peaks.
 
@@ -130,20 +130,20 @@ from sweep.model.sampling.speckle_lines import (
 from sweep.model.spectrum.search_restriction import beamlet_line_positions
 
 BIN_COLUMN, POSITION_COLUMN, ERROR_COLUMN, RATIO_COLUMN = range(4)
-"""Columns of a peak: bin; position between bins and its standard error by noise [bins]; |X| /
-sigma."""
+"""Columns of the array of a peak: whole bin; position between bins [bins]; standard error of the
+position by noise [bins]; |X| over sigma, the noise of a bin per quadrature."""
 
 
 DRAWN_INDEPENDENT_BINS_MAX = 32.0
-"""Largest number of independent bins of an echo in developed speckle that are drawn."""
+"""Largest equivalent number of independent bins that are drawn for an echo in developed speckle."""
 
 CORRELATED_LOOKS_MAX = 32
-"""Largest number of looks for which partly common speckle is drawn. For more looks one amplitude is
-compared with the probability of detection."""
+"""Largest number of looks (records of a segment) for which partly correlated speckle is drawn look
+by look. For more looks one drawn amplitude is compared with the probability of detection."""
 
 
 class Returns(NamedTuple):
-    """Returns of each shot and draw, (n, draws, returns); nan for elements without a return.
+    """Returns (measured points) of each shot and draw, (n, draws, returns); nan without a return.
 
     Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, and a
     false up peak last. Units are those of :data:`sweep.model.outputs.POINT_VARIABLES`. Fields with
@@ -153,13 +153,14 @@ class Returns(NamedTuple):
     """
 
     range: np.ndarray
-    """Range by whole bins [m]."""
+    """Range computed from the whole bins of the peaks [m]."""
     range_interpolated: np.ndarray
-    """Range by interpolated positions [m]."""
+    """Range computed from positions of the peaks between bins [m]."""
     radial_velocity: np.ndarray
-    """Radial velocity by whole bins [m/s]."""
+    """Radial velocity computed from the whole bins of the peaks [m/s], positive when closing."""
     radial_velocity_interpolated: np.ndarray
-    """Radial velocity by interpolated positions [m/s]."""
+    """Radial velocity computed from positions of the peaks between bins [m/s], positive when
+    closing."""
     range_standard_error: np.ndarray
     """Standard error of ``range`` [m]."""
     range_interpolated_standard_error: np.ndarray
@@ -169,24 +170,30 @@ class Returns(NamedTuple):
     radial_velocity_interpolated_standard_error: np.ndarray
     """Standard error of ``radial_velocity_interpolated`` [m/s]."""
     snr: np.ndarray
-    """Measured power of the weaker of up and down peak, over the mean noise power of a bin."""
+    """Measured power of the weaker of the up and down peak, divided by the mean noise power of a
+    bin."""
     pd: np.ndarray
-    """Probability that up and down peak are both detected; nan with a false peak."""
+    """Probability that up and down segment both detect the echo of the return; nan if a peak is
+    false."""
     flags: np.ndarray
-    """uint8: bits of :data:`sweep.model.pointcloud.pairing.FLAG_BITS`; 0 without a return."""
+    """uint8: bits that compare the return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """int32: beamlet that a true or misread return measures, -1 otherwise."""
+    """int32: index of the beamlet whose surface a true or misread return measures; -1 for other
+    returns."""
     group: np.ndarray
-    """(n, draws, returns, 3) int8: index of the up, Doppler and down group; -1 for none or a false
-    peak."""
+    """(n, draws, returns, 3) int8: index of the group (adjacent bins above the threshold) of the
+    up, Doppler and down peak; -1 for no peak or a false peak."""
     range_per_slip: np.ndarray
-    """Change of the interpolated range [m] for 1 m/s of slip."""
+    """Shift of the interpolated range [m] by a slip of 1 m/s. The slip is the closing speed minus
+    the speed at which the range falls."""
     radial_velocity_per_slip: np.ndarray
-    """Change of the interpolated radial velocity [m/s] for 1 m/s of slip."""
+    """Shift of the interpolated radial velocity [m/s] by a slip of 1 m/s. The slip is the closing
+    speed minus the speed at which the range falls."""
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> "Returns":
-        """Return arrays (n, draws, returns) without returns."""
+        """Return arrays (n, draws, returns) that hold no returns."""
         arrays: dict[str, np.ndarray] = {
             "flags": np.zeros(shape, np.uint8),
             "beamlet": np.full(shape, -1, np.int32),
@@ -211,14 +218,14 @@ def draw_returns(
     motion: EgoMotion | None = None,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None = None,
 ) -> Returns:
-    """Draw returns of n prepared shots from their groups of bins.
+    """Draw the returns (measured points) of n prepared shots from their noiseless echoes.
 
     Parameters
     ----------
     shots
         Prepared shots.
     bin_groups
-        Groups in the noiseless spectra of the shots.
+        Groups (runs of adjacent bins above the threshold) in the noiseless spectra of the shots.
     keys
         (n, 2) uint64: random key of each shot.
     first_draw, draws
@@ -295,7 +302,8 @@ def draw_returns(
 
 
 _CIRCULAR_PSEUDO_VARIANCE_MAX = 1e-3
-"""Largest ratio of pseudo-variance to noise power for which a bin's noise counts as circular."""
+"""Largest ratio of |E[X^2]|, the pseudo-variance of a bin's complex noise X, to its power E[|X|^2],
+for which the noise counts as circular."""
 
 
 def _iter_spectra(
@@ -304,7 +312,7 @@ def _iter_spectra(
     in_noise: bool,
     known_leakage_bins: Sequence[tuple[np.ndarray, LeakageBins]] | None,
 ) -> Iterator[tuple[np.ndarray, NoiselessSpectra, LeakageBins]]:
-    """Yield indices of points, with noiseless spectra and bins of leaked signal, in parts."""
+    """Yield indices of points in parts, with their noiseless spectra and bins of leaked signal."""
     if in_noise:
         for indices, spectra in iter_noiseless_spectra(shots):
             yield indices, spectra, bins_without_noise_peaks(shots, bin_groups, indices, spectra)
@@ -340,49 +348,57 @@ def _iter_spectra(
 
 
 class DrawConfig(NamedTuple):
-    """Settings of drawing that are common to all points."""
+    """Settings for draws of peaks that are common to all points."""
 
     first_draw: int
-    """Number of the first draw."""
+    """Number of the first draw that is made."""
     in_noise: bool
-    """True if noise is drawn, False if draws are compared with probabilities."""
+    """True if noise is added to the bins of an echo; False if random numbers are compared with
+    probabilities of detection."""
     adds_powers: bool
-    """True if lines add as powers."""
+    """True if the lines of beamlets add in power, False if they add in amplitude."""
     has_doppler: bool
-    """True if there is a Doppler segment."""
+    """True if a shot has a Doppler segment, in which the frequency is constant."""
     nyquist_bin: int
-    """Half of the FFT size, N/2."""
+    """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
     down_beat_sign: float
-    """For a complex record, with bins -N/2..N/2 - 1: 1 if the down beat minus the up beat rises
-    with the range, else -1. 0 for a real record, with bins 1..N/2."""
+    """Sign for a complex record, with bins -N/2..N/2 - 1: 1 if the down beat minus the up beat
+    rises with the range, else -1. It is 0 for a real record, with bins 1..N/2. N is the FFT size.
+    """
     two_beat_reading: int
-    """Reading of up and down peak without a Doppler segment."""
+    """Number of the reading, the way to interpret an up and a down beat as range and velocity, that
+    is used without a Doppler segment."""
     real_fft_size: int
-    """FFT size N if noise at DC and Nyquist is real, else 0."""
+    """FFT size N if noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
     lobe_half_width: int
-    """Half-width of a main lobe [bins] if any bin of an echo detects it, else 0."""
+    """Half-width of the main lobe of a line [bins] if any bin of an echo may detect it; 0 if only
+    its strongest bin may."""
     noise_filter: NoiseFilter
-    """Filter of the noise of echoes' bins."""
+    """Filter that makes the correlated noise of an echo's bins from independent numbers."""
     noise_root: np.ndarray
-    """Result of :func:`sweep.model.sampling.draws.noise_covariance_root` for ``noise_filter``."""
+    """Matrix that makes the noise of adjacent bins from as many independent numbers
+    (:func:`sweep.model.sampling.draws.noise_covariance_root`)."""
     end_noise_filter: NoiseFilter
-    """Filter, like ``noise_filter``, of bins from DC or Nyquist on; without bins if no echo in
-    developed speckle is near."""
+    """Filter, like ``noise_filter``, for bins next to frequency 0 (DC) or Nyquist. It has no bins
+    if no echo in developed speckle is near either."""
     noise_pseudo_variance_ratio: np.ndarray
-    """(bins,): pseudo-variance ratio of the noise, from DC or Nyquist on, up to the last bin whose
-    noise is not circular; empty if no echo in developed speckle is near."""
+    """(bins,): ratio E[X^2] / E[|X|^2] of the complex noise X of bins, by their distance from
+    frequency 0 (DC) or Nyquist, up to the last bin with non-circular noise. It is empty if no echo
+    in developed speckle is near."""
     n_looks: int
-    """Number of looks whose powers are averaged or that vote; 1 for looks added in amplitude."""
+    """Number of looks (records of a segment) whose powers are averaged or that vote; 1 if looks are
+    added in amplitude."""
     has_independent_speckle: bool
-    """True if looks have different speckle, independent or partly common."""
+    """True if the speckle differs between looks (records of a segment), whether independent or
+    partly correlated."""
     votes_needed: int
-    """Number of looks that must detect; 0 if their mean power detects; -1 if one amplitude is
-    compared with the probability of detection, as more than CORRELATED_LOOKS_MAX looks have partly
-    common speckle."""
+    """Number of looks (records of a segment) that must detect an echo. It is 0 if the looks' mean
+    power detects. It is -1 if more than CORRELATED_LOOKS_MAX looks have partly correlated speckle;
+    one amplitude is then compared with the probability of detection."""
 
     @classmethod
     def from_shots(cls, shots: Shots, first_draw: int, in_noise: bool) -> "DrawConfig":
-        """Return the settings for draws of shots, from the draw `first_draw` on."""
+        """Return the settings for draws of prepared shots, from draw number ``first_draw`` on."""
         two_beat_reading = (
             waveform.FAST_READING
             if shots.detection_settings.two_beat_assumption == waveform.FAST_TARGET
@@ -419,57 +435,76 @@ class DrawConfig(NamedTuple):
 
 
 class DrawInputs(NamedTuple):
-    """Quantities of n points, by segment, that draws depend on."""
+    """Quantities of n points on which draws of their peaks depend.
+
+    Segments are up, Doppler and down. A group is a run of adjacent bins above the threshold without
+    noise. sigma is the noise of a bin per quadrature.
+    """
 
     group_bins: np.ndarray
-    """(n, 3, 3, groups) int64: STRONGEST_ROW, FIRST_ROW and LAST_ROW of the groups; -1 for none."""
+    """(n, 3 segments, 3 rows, groups) int64: bins of the groups of adjacent bins above the
+    threshold; -1 for none. The rows are STRONGEST_ROW, FIRST_ROW and LAST_ROW."""
     pd: np.ndarray
-    """(n, 3, groups): probability of detection."""
+    """(n, 3, groups): probability that a segment detects the group (adjacent bins above the
+    threshold)."""
     group_magnitudes: np.ndarray
-    """(n, 3, groups, 3): |X| [V] below, at and above the strongest bin."""
+    """(n, 3, groups, 3): noiseless |X| [V] of the bin below the group's strongest bin, of that bin,
+    and of the bin above it."""
     line_deviation_bins: np.ndarray
-    """(n, 3, groups): standard deviation [bins] of the lines in a group, weighted by power."""
+    """(n, 3, groups): standard deviation, weighted by power, of the positions of the beamlets'
+    lines in a group of adjacent bins [bins]."""
     line_positions: np.ndarray
-    """(n, 3, beamlets): position of each beamlet's line [bins, 0..N/2]. For a complex record it is
-    signed, and shifted by multiples of N to be nearest to the strongest group."""
+    """(n, 3, beamlets): position of each beamlet's line [bins], 0..N/2 with N the FFT size. For a
+    complex record it is signed, and shifted by a multiple of N to be nearest to the strongest
+    group."""
     beamlet_amplitude: np.ndarray
-    """(n, beamlets): relative amplitude of each beamlet."""
+    """(n, beamlets): amplitude of each beamlet's echo, up to a factor common to the beamlets of a
+    point."""
     noise_sigma: np.ndarray
-    """(n,): sigma, noise of a bin per quadrature [V]."""
+    """(n,): sigma, the standard deviation of a bin's noise per quadrature [V]."""
     threshold_ratio: np.ndarray
-    """(n,): threshold over sigma."""
+    """(n,): threshold divided by sigma, the noise of a bin per quadrature."""
     line_noise_ratio: np.ndarray
-    """(n,): noise of bins that hold lines, over sigma."""
+    """(n,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
+    per quadrature."""
     bin_thresholds: BinThresholds
-    """(n,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`."""
+    """(n,) in each field: threshold on |X| and noise of each point's bins
+    (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa_noise: np.ndarray
-    """(n, 3): probability of a false alarm by noise alone."""
+    """(n, 3): probability that noise alone raises a false alarm in a segment."""
     doppler_prediction: np.ndarray
-    """(n, 3): argument of :func:`sweep.model.pointcloud.pairing.find_confirming_peak`."""
+    """(n, 3): coefficients of the up and down beat in the predicted Doppler beat, and the effect of
+    known motion on it [bins] (:func:`sweep.model.pointcloud.pairing.find_confirming_peak`)."""
     down_pd_given_up: np.ndarray
-    """(n, 2, groups): pd of a group in the down segment, given that the up segment's group of the
-    same index is missed, or detected."""
+    """(n, 2, groups): probability that the down segment detects a group. Index 0 holds if the up
+    segment misses the group of the same number, index 1 if it detects it."""
     searched_range: np.ndarray
-    """(n, 3, 2) int64: first and last bin for false peaks."""
+    """(n, 3, 2) int64: first and last bin in which noise alone may raise a false peak."""
     line_grid: SpeckleLineGrid
-    """Lines of footprints in developed speckle; of no points without speckle."""
+    """Lines that represent the footprints in developed speckle; without speckle a grid of no
+    points."""
     line_centre: np.ndarray
-    """(n, 3, groups): mean position of the lines in a group [bins]."""
+    """(n, 3, groups): mean position of the beamlets' lines in a group of adjacent bins [bins]."""
     echo_fraction: np.ndarray
-    """(n, 3, groups): fraction of the echo in the mean power by which a group is detected."""
+    """(n, 3, groups): fraction, 0..1, of the echo in the mean power (echo plus noise) of the
+    amplitude that detects a group in speckle."""
     wander_deviation: np.ndarray
-    """(n, 3, groups): standard deviation of the group's position by speckle [bins] at |X| of one
-    sigma; 0 without speckle."""
+    """(n, 3, groups): standard deviation of a group's position by speckle [bins], if the peak's |X|
+    is sigma, the noise of a bin per quadrature. It is inversely proportional to |X|, and 0 without
+    speckle."""
     n_independent_bins: np.ndarray
-    """(n, 3, groups): equivalent number of independent bins of a group in developed speckle."""
+    """(n, 3, groups): equivalent number of independent bins by which a group in developed speckle
+    may be detected."""
     speckle_cholesky_factors: np.ndarray
-    """(n, 6): Cholesky factors of the correlation of the segments' speckle; 0 without speckle."""
+    """(n, 6): elements of the Cholesky factor of the correlation of speckle in the three segments;
+    0 without speckle."""
     look_covariance_root: np.ndarray
-    """(n, 3, looks, sets) complex: coefficients of independent sets of speckle in the speckle of
-    each look, for partly common speckle; otherwise without sets."""
+    """(n, 3, looks, sets) complex: coefficients by which independent sets of speckle are mixed into
+    the partly correlated speckle of looks (records of a segment). In other cases there are no sets.
+    """
 
     def select(self, indices: np.ndarray) -> "DrawInputs":
-        """Return the quantities of points with the given indices."""
+        """Return the quantities of the points with the given indices."""
         return DrawInputs(
             *(
                 v.select(indices) if isinstance(v, (SpeckleLineGrid, BinThresholds)) else v[indices]
@@ -479,28 +514,30 @@ class DrawInputs(NamedTuple):
 
 
 class DrawWorkspace(NamedTuple):
-    """Arrays that kernels write to within a draw, allocated once for all draws."""
+    """Arrays that compiled code writes to within a draw, allocated once for all draws."""
 
     noise: NoiseScratch
-    """Noise of an echo's bins."""
+    """Noise of an echo's bins over sigma, the standard deviation per quadrature."""
     bin_ratio: np.ndarray
-    """(bins,): |X| / sigma of an echo's bins."""
+    """(bins,): |X| of an echo's bins over sigma, the noise of a bin per quadrature."""
     bin_power: np.ndarray
-    """(bins,): power of an echo's bins over sigma^2."""
+    """(bins,): |X|^2 of an echo's bins over sigma^2, the noise power of a bin per quadrature."""
     pedestal_power: np.ndarray
-    """(bins,): power of the pedestal in an echo's bins, over that of noise."""
+    """(bins,): power of the phase-noise pedestal in an echo's bins, divided by the power of noise.
+    """
     all_echo: np.ndarray
-    """(bins,) bool: mask of an echo's bins, all True."""
+    """(bins,) bool: mask that marks all bins as bins of the echo (all True)."""
     false_bins: np.ndarray
-    """(groups + 1,) int64: bins of a segment's false peaks."""
+    """(groups + 1,) int64: numbers of the bins of a segment's false peaks."""
     false_ratios: np.ndarray
-    """(groups + 1,): |X| / sigma of a segment's false peaks."""
+    """(groups + 1,): |X| of a segment's false peaks over sigma, the noise of a bin per quadrature.
+    """
     peak_positions: np.ndarray
-    """(3,): positions of a return's peaks [bins]."""
+    """(3,): positions of the up, Doppler and down peak of a return [bins]."""
 
     @classmethod
     def allocate(cls, n_bins: int, groups_max: int) -> "DrawWorkspace":
-        """Allocate arrays for echoes of `n_bins` bins, and for `groups_max` groups of a segment."""
+        """Allocate arrays for echoes of ``n_bins`` bins and ``groups_max`` echoes of a segment."""
         return cls(
             NoiseScratch.allocate(n_bins),
             np.empty(n_bins),
@@ -514,25 +551,27 @@ class DrawWorkspace(NamedTuple):
 
 
 class DrawnPeaks(NamedTuple):
-    """Paired peaks of the draws of n points."""
+    """Peaks of n points, drawn and paired into returns (measured points)."""
 
     peaks: np.ndarray
-    """(n, draws, returns, 3, 4): up, Doppler and down peak of each return, with the columns
-    BIN_COLUMN to RATIO_COLUMN; nan for none."""
+    """(n, draws, returns, 3, 4): up, Doppler and down peak of each return; nan for none. The
+    columns are BIN_COLUMN to RATIO_COLUMN."""
     reading: np.ndarray
-    """(n, draws, returns) int64: reading of the peaks with the default slopes; -1 without a return.
-    """
+    """(n, draws, returns) int64: number of the reading, the way to interpret the beats as range and
+    velocity, for chirp slopes 1, 0 and -1; -1 without a return."""
     group: np.ndarray
-    """(n, draws, returns, 3) int8: group of the up, Doppler and down peak, FALSE_PEAK or NO_PEAK.
-    """
+    """(n, draws, returns, 3) int8: index of the group of adjacent bins to which the up, Doppler and
+    down peak belong, or FALSE_PEAK or NO_PEAK."""
     flags: np.ndarray
-    """(n, draws, returns) uint8: bits of FLAG_BITS; 0 without a return."""
+    """(n, draws, returns) uint8: bits that compare each return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`); 0 without a return."""
     beamlet: np.ndarray
-    """(n, draws, returns) int32: beamlet that a true or misread return measures, -1 otherwise."""
+    """(n, draws, returns) int32: index of the beamlet whose surface a true or misread return
+    measures; -1 for other returns."""
 
     @classmethod
     def empty(cls, bin_groups: BinGroups, draws: int) -> "DrawnPeaks":
-        """Return arrays without returns, for shots with these groups."""
+        """Return arrays without returns, for ``draws`` draws of shots with these groups of bins."""
         n, _, groups_max = bin_groups.strongest_bin.shape
         return cls(
             np.full((n, draws, groups_max, 3, 4), np.nan),
@@ -544,30 +583,35 @@ class DrawnPeaks(NamedTuple):
 
 
 class ListedReturns(NamedTuple):
-    """Returns of all points and draws, listed one after the other, (m,)."""
+    """Returns (measured points) of all shots and draws in one list of length m."""
 
     point: np.ndarray
-    """(m,) int64: index of the point."""
+    """(m,) int64: index of the shot to which each return belongs."""
     peaks: np.ndarray
-    """(m, 3, 4): up, Doppler and down peak, with the columns BIN_COLUMN to RATIO_COLUMN; nan for
-    none."""
+    """(m, 3, 4): up, Doppler and down peak of each return; nan for none. The columns are BIN_COLUMN
+    to RATIO_COLUMN."""
     reading: np.ndarray
-    """(m,) int64: reading of the peaks with the default slopes."""
+    """(m,) int64: number of the reading, the way to interpret the beats as range and velocity, for
+    chirp slopes 1, 0 and -1."""
     group: np.ndarray
-    """(m, 3) int8: group of the up, Doppler and down peak, FALSE_PEAK or NO_PEAK."""
+    """(m, 3) int8: index of the group of adjacent bins to which the up, Doppler and down peak
+    belong, or FALSE_PEAK or NO_PEAK."""
     flags: np.ndarray
-    """(m,) uint8: bits of FLAG_BITS."""
+    """(m,) uint8: bits that compare each return with the truth
+    (:data:`sweep.model.pointcloud.pairing.FLAG_BITS`)."""
     beamlet: np.ndarray
-    """(m,) int32: beamlet that a true or misread return measures, -1 otherwise."""
+    """(m,) int32: index of the beamlet whose surface a true or misread return measures; -1 for
+    other returns."""
 
 
 def make_draw_inputs(
     shots: Shots, bin_groups: BinGroups, motion: EgoMotion | None = None
 ) -> DrawInputs:
-    """Return the quantities of shots and their groups that draws depend on.
+    """Return the quantities of shots on which draws of their peaks depend.
 
-    ``motion`` is the known motion, as in :func:`draw_returns`. The groups' axis of the result has
-    only as many groups as the segment with the most.
+    ``bin_groups`` are the groups of adjacent bins above the threshold. ``motion`` is the known
+    motion of the instrument, as in :func:`draw_returns`. The result has as many groups as the
+    segment with the most.
     """
     bin_groups = bin_groups.without_unused_groups()
     line_positions, beamlet_amplitude = (
@@ -623,7 +667,7 @@ def make_draw_inputs(
 
 
 def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
-    """Return ``speckle_cholesky_factors`` of :class:`DrawInputs`, (n, 6)."""
+    """Return elements (n, 6) of the Cholesky factor of the correlation of the segments' speckle."""
     if shots.speckle.segment_correlations is None:
         return np.zeros((shots.size, 6))
     cholesky_factors = np.broadcast_to(
@@ -633,7 +677,10 @@ def _segment_cholesky_factors(shots: Shots) -> np.ndarray:
 
 
 def _look_covariance_roots(shots: Shots) -> np.ndarray:
-    """Return ``look_covariance_root`` of :class:`DrawInputs`, (n, 3, looks, sets) complex."""
+    """Return coefficients that mix independent speckle into that of each look, (n, 3, looks, sets).
+
+    A look is a record of a segment. The result is :attr:`DrawInputs.look_covariance_root`.
+    """
     n_looks = shots.looks.number
     if shots.speckle.look_speckle is None or n_looks > CORRELATED_LOOKS_MAX:
         return np.zeros((shots.size, 3, 1, 0), complex)
@@ -643,7 +690,7 @@ def _look_covariance_roots(shots: Shots) -> np.ndarray:
 def _n_independent_bins(
     shots: Shots, bin_groups: BinGroups, has_noncircular_bins: np.ndarray
 ) -> np.ndarray:
-    """Return the equivalent number of independent bins of each group, (n, 3, groups).
+    """Return the equivalent number of independent bins that detect each echo, (n, 3, groups).
 
     For the chirps it is that of :meth:`sweep.model.preparation.Shots.joint_detection_probability`;
     near DC and Nyquist it is 1.
@@ -714,9 +761,9 @@ def _speckle_draw_inputs(
 def _doppler_prediction(
     shots: Shots, motion: EgoMotion | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coefficients of up and down beat that predict the Doppler segment's beat.
+    """Return two coefficients, of the up and the down beat, that predict the Doppler beat.
 
-    The third value is the error of that prediction by the known motion [bins].
+    The third value is the mismatch of that prediction [bins] by the instrument's known motion.
     """
     _, doppler, down = shots.waveform.chirp_slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.waveform.carriers)
@@ -734,10 +781,11 @@ def _doppler_prediction(
 
 
 def _searched_ranges(shots: Shots) -> np.ndarray:
-    """Return ``searched_range`` of :class:`DrawInputs`, (n, 3, 2).
+    """Return the first and last bin in which noise alone may raise a false peak, (n, 3, 2).
 
-    For a complex record it is 0..N - 1. For a real record it contains the bins whose noise is
-    circular: all but a few next to DC and Nyquist, or 1..N/2 if noise is taken as circular in all.
+    N is the FFT size. For a complex record the bins are 0..N - 1. For a real record they are those
+    whose noise is circular: all but a few next to frequency 0 and Nyquist, or 1..N/2 if noise is
+    taken as circular in all. A search band narrows them.
     """
     first_searched, nyquist_bin = shots.first_searched_bin, shots.fft_size // 2
     last_searched = nyquist_bin - first_searched if shots.real_fft_size else nyquist_bin
@@ -757,26 +805,29 @@ def _searched_ranges(shots: Shots) -> np.ndarray:
 
 
 class Measurements(NamedTuple):
-    """Range and radial velocity of m returns.
+    """Range and radial velocity of m returns, with errors.
 
     The last axis of arrays (m, 2) has BIN_COLUMN, by whole bins, and POSITION_COLUMN, by positions
     between bins.
     """
 
     range: np.ndarray
-    """(m, 2): range [m]."""
+    """(m, 2): range of each return [m], by whole bins and by positions between bins."""
     radial_velocity: np.ndarray
-    """(m, 2): radial velocity [m/s]."""
+    """(m, 2): radial velocity of each return [m/s], by whole bins and by positions between bins."""
     range_error: np.ndarray
-    """(m, 2): standard error of the range by noise [m]."""
+    """(m, 2): standard error by noise of ``range`` [m], by whole bins and by positions between
+    bins."""
     velocity_error: np.ndarray
-    """(m, 2): standard error of the radial velocity by noise [m/s]."""
+    """(m, 2): standard error by noise of ``radial_velocity`` [m/s], by whole bins and by positions
+    between bins."""
     range_per_half_bin: np.ndarray
-    """(m,): change of the range by half a bin of the chirps [m]."""
+    """(m,): difference of range that shifts the beats of the chirps by half a bin [m]."""
     velocity_per_half_bin: np.ndarray
-    """(m,): change of the radial velocity by half a bin of the chirps [m/s]."""
+    """(m,): difference of radial velocity that shifts the beats of the chirps by half a bin [m/s].
+    """
     range_bias: np.ndarray | float
-    """(m,): measured range minus that at the shot's start [m]."""
+    """(m,): measured range minus the range at the shot's start, by motion within the shot [m]."""
 
 
 def measure_returns(
@@ -787,7 +838,10 @@ def measure_returns(
     *,
     from_three_bins: bool = True,
 ) -> Returns:
-    """Compute returns from paired peaks, and flag those that misread their common beamlet.
+    """Compute range and velocity of returns from paired peaks, and flag wrong conversions.
+
+    A return is misread if its peaks belong to one beamlet, but range or velocity is not that of
+    this beamlet.
 
     Parameters
     ----------
@@ -824,7 +878,10 @@ def _measure_listed_returns(
     motion: EgoMotion | None,
     from_three_bins: bool,
 ) -> Returns:
-    """Compute :func:`measure_returns` for m listed returns; the fields of the result are (m,)."""
+    """Compute the returns of :func:`measure_returns` for m returns in a list.
+
+    The fields of the result are (m,).
+    """
     uses_fit = shots.waveform.chirp_slopes != waveform.DEFAULT_CHIRP_SLOPES
     point, at_returns = listed_returns.point, partial(_values_at, shots, listed_returns.point)
     listed_returns = _add_drift_errors(shots, listed_returns, motion)
@@ -914,16 +971,16 @@ def _measure_listed_returns(
 
 
 def _values_at(shots: Shots, point: np.ndarray, values: np.ndarray | float) -> np.ndarray:
-    """Return the values (n,) of the points with the indices ``point`` (m,)."""
+    """Return the elements of values (n,), or of one common value, at the indices ``point`` (m,)."""
     return np.broadcast_to(values, shots.size)[point]
 
 
 def _wander_covariance(
     shots: Shots, inputs: DrawInputs, listed_returns: ListedReturns
 ) -> np.ndarray | None:
-    """Return the mean products [bins^2] of the errors of each return's peaks by speckle.
+    """Return the covariance [bins^2] of the errors of each return's three peaks by speckle.
 
-    They are (m, 3, 3) by segment, signed as the beats; None for shots without speckle.
+    It is (m, 3, 3) by segment, with the signs of the beats; None for shots without speckle.
     """
     line_gradients = shots.speckle.line_gradients
     if line_gradients is None:
@@ -974,9 +1031,10 @@ def _wander_covariance(
 def _add_drift_errors(
     shots: Shots, listed_returns: ListedReturns, motion: EgoMotion | None
 ) -> ListedReturns:
-    """Add the errors by the drift of lines within the record to the peaks' standard errors.
+    """Add to the peaks' standard errors those by the drift of lines within the record.
 
-    The drift is that of the known motion, if given, else that of the shots.
+    Lines drift because range and velocity change within the record. The drift follows from the
+    known motion, if given, else from the true motion of the shots.
     """
     if motion is not None:
         shots = replace(
@@ -1004,16 +1062,17 @@ def _add_drift_errors(
 
 
 _POSITION_ERROR_MAX_BINS = 0.5
-"""Largest error of a position between bins [bins]."""
+"""Largest standard error of a peak's position between bins, after the correction for late echoes
+[bins]."""
 
 
 def _correct_late_echoes(
     shots: Shots, listed_returns: ListedReturns, measurements: Measurements
 ) -> ListedReturns:
-    """Correct positions between bins for the samples that are missing before the echo arrives.
+    """Correct peak positions for the samples that lack the echo because it arrives late.
 
-    The instrument knows their number from the range by whole bins. No error exceeds half a bin,
-    because a position is always within one.
+    The instrument knows the number of these samples from the range by whole bins. No standard error
+    exceeds half a bin, because a position is always within one.
     """
     at_returns = partial(_values_at, shots, listed_returns.point)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(measurements.range[:, BIN_COLUMN])
@@ -1040,11 +1099,11 @@ def _correct_late_echoes(
 def _apply_motion_correction(
     shots: Shots, listed_returns: ListedReturns, measurements: Measurements, motion: EgoMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correct interpolated range and velocity for the known motion, in place.
+    """Correct interpolated ranges and velocities for the instrument's known motion, in place.
 
-    The standard deviation of the unknown motion is added to the standard errors
-    (:mod:`sweep.model.pointcloud.ego_motion`). Returns the changes of range [s] and velocity by 1
-    m/s of slip, (m,).
+    The standard deviation by unknown motion is added to the standard errors
+    (:mod:`sweep.model.pointcloud.ego_motion`). Returns the shifts (m,) of range [s] and of velocity
+    by a slip of 1 m/s. The slip is the closing speed minus the speed at which the range falls.
     """
     motion = motion.select(listed_returns.point)
     per_acceleration, per_slip = _response_to_motion(shots, listed_returns)
@@ -1072,10 +1131,10 @@ def _apply_motion_correction(
 def _response_to_motion(
     shots: Shots, listed_returns: ListedReturns
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the changes of range [m] and velocity [m/s] by motion that the beats do not show.
+    """Return the shifts of measured range [m] and velocity [m/s] by motion that the beats hide.
 
-    The first pair is for 1 m/s^2 of acceleration, the second for 1 m/s of slip, (m,) each. The slip
-    is the radial velocity minus the speed at which the range falls.
+    The first pair of arrays (m,) is for an acceleration of 1 m/s^2, the second for a slip of 1 m/s.
+    The slip is the radial velocity minus the speed at which the range falls.
     """
     carriers, chirp_rates = shots.beat_coefficients
     by_acceleration, by_slip = _beat_change_by_motion(shots)
@@ -1105,7 +1164,10 @@ def _response_to_motion(
 
 
 def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Return changes of the beats (3, n) [Hz] by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
+    """Return the shifts (3, n) of the beats [Hz] by 1 m/s^2 of acceleration and by 1 m/s of slip.
+
+    The slip is the radial velocity minus the speed at which the range falls.
+    """
     chirp_rates = shots.beat_coefficients[1]
     starts = np.array([np.broadcast_to(start, shots.size) for start in shots.motion.segment_starts])
     middle_time = shots.record_middle_time
@@ -1127,10 +1189,11 @@ def _beat_change_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 def _measure_by_reading(
     shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
-    """Measure range and velocity at mid-chirp by each return's reading of its up and down peak.
+    """Compute range and velocity at mid-chirp from the up and down peak of each return.
 
-    The errors of both peaks by common speckle are correlated. Their covariance reduces the variance
-    of the range, and adds to that of the velocity.
+    The reading of a return says how its beats are interpreted: far or fast target, folded at
+    Nyquist or not. Errors of both peaks by common speckle are correlated. Their covariance reduces
+    the variance of the range, and adds to that of the velocity.
     """
     at_returns = partial(_values_at, shots, listed_returns.point)
     carrier, bandwidth, duration, sample_rate = (
@@ -1186,7 +1249,7 @@ def _measure_by_reading(
 def _measure_by_fit(
     shots: Shots, listed_returns: ListedReturns, wander_covariance: np.ndarray | None
 ) -> Measurements:
-    """Measure range and velocity at the shot's start by the fit of each return's peaks."""
+    """Compute range and velocity at the shot's start by a fit of each return's peaks."""
     point = listed_returns.point
     bin_width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.waveform.carriers]
@@ -1195,7 +1258,7 @@ def _measure_by_fit(
     is_finite = np.isfinite(peaks[..., ERROR_COLUMN])
 
     def deviations_by_errors(errors: np.ndarray, points: np.ndarray) -> RangeVelocityDeviation:
-        """Return the deviations of range and velocity by errors of the beats [bins], (3, m)."""
+        """Return the standard deviations of range and velocity by errors (3, m) of beats [bins]."""
         up, doppler, down = errors * bin_width[points]
         return range_velocity_deviation(
             up=up,
@@ -1245,7 +1308,10 @@ def _add_wander_covariance(
     weights: np.ndarray,
     point_index: np.ndarray,
 ) -> RangeVelocityDeviation:
-    """Add the effect of covariances of beats (m, 3, 3) [Hz^2] to the deviations of fits."""
+    """Add the effect of speckle on the beats to the deviations of range and velocity.
+
+    ``beat_covariance`` (m, 3, 3) [Hz^2] is the covariance of the beats by speckle.
+    """
     carriers, chirp_rates = shots.beat_coefficients
     responses = []
     for unit in np.eye(3):
@@ -1274,7 +1340,7 @@ def _add_wander_covariance(
 def _draw_points(
     keys, rows, config, inputs, spectra, leakage_bins, interpolation, workspace, drawn_peaks
 ):
-    """Draw and pair the peaks of all segments, draws and points into returns.
+    """Draw the peaks of all segments, draws and points, and pair them into returns.
 
     Parameters
     ----------
@@ -1334,36 +1400,44 @@ def _draw_points(
 
 
 class GroupSpeckle(NamedTuple):
-    """Bins of a point's groups by segment, and their speckle in a draw."""
+    """Bins of a point's groups by segment, and their speckle in a draw.
+
+    A group is a run of adjacent bins above the threshold without noise: an echo.
+    """
 
     first_bin: np.ndarray
-    """(groups, 3) int64: first bin."""
+    """(groups, 3) int64: number of the first bin of each group of adjacent bins, by segment."""
     n_bins: np.ndarray
-    """(groups, 3) int64: number of bins; 0 if a segment lacks the group."""
+    """(groups, 3) int64: number of bins of each group; 0 for a segment without the group."""
     mean_power: np.ndarray
-    """(groups, 3, bins): mean power by the lines of the footprint."""
+    """(groups, 3, bins): mean power of each bin over speckle, for lines of a footprint with the
+    total power 1."""
     pseudo_variance_ratio: np.ndarray
-    """(groups, 3, bins): pseudo-variance over the mean power."""
+    """(groups, 3, bins): pseudo-variance E[A^2] of a bin's complex amplitude A over its mean power
+    E[|A|^2]."""
     rms_ratio: np.ndarray
-    """(groups, 3, bins): root mean square of the echo's |X| / sigma."""
+    """(groups, 3, bins): root mean square over speckle of the echo's |X|, over sigma, the noise of
+    a bin per quadrature."""
     amplitudes: np.ndarray
-    """(groups, looks, 3, bins): complex amplitudes of mean power 1; one look if all looks have the
-    same speckle."""
+    """(groups, looks, 3, bins): complex factors by speckle, of mean power 1, on the echo's bins in
+    each look (record); one look if all looks have the same speckle."""
     factor_rank: np.ndarray
-    """(groups,) int64: number of rows of ``factor`` in use; 0 if lines are drawn one by one."""
+    """(groups,) int64: number of rows of ``factor`` in use; 0 if the speckle is summed over the
+    lines of the footprint."""
     factor: np.ndarray
-    """(groups, rows, 3, bins): factors of the bins' covariance."""
+    """(groups, rows, 3, bins): factor of the covariance of the bins' speckle, by which the speckle
+    is drawn from few random numbers."""
     independent_amplitudes: np.ndarray
-    """(sets, 3, bins): independent amplitudes, which are mixed into looks with partly common
-    speckle."""
+    """(sets, 3, bins): independent complex factors by speckle, which are mixed into the partly
+    correlated speckle of looks (records of a segment)."""
     detection_weights: np.ndarray
-    """(groups, 3, bins): weights of the bins in the amplitude, of mean power 1, that is compared
+    """(groups, 3, bins): weights of the bins in one amplitude of mean power 1, which is compared
     with the probability of detection."""
 
 
 @njit(cache=True, error_model="numpy")
 def empty_group_speckle(groups_max):
-    """Return the record of a point whose echoes do not fade."""
+    """Return the speckle record of a point whose echoes do not fade."""
     bins = np.zeros((groups_max, 3), np.int64)
     no_amplitudes = np.zeros((groups_max, 1, 3, 0), np.complex128)
     powers = np.zeros((groups_max, 3, 0))
@@ -1385,7 +1459,7 @@ def empty_group_speckle(groups_max):
 
 @njit(cache=True, error_model="numpy")
 def prepare_group_speckle(i, config, inputs, spectra):
-    """Return the bins of a point's groups that are evaluated, with their mean powers."""
+    """Return the bins of a point's echoes for which speckle is drawn, with their mean powers."""
     groups_max, n_bins_max = inputs.group_bins.shape[3], 0
     first_bin, n_bins = np.zeros((groups_max, 3), np.int64), np.zeros((groups_max, 3), np.int64)
     for g in range(groups_max):
@@ -1497,7 +1571,7 @@ def prepare_group_speckle(i, config, inputs, spectra):
 def fill_detection_weights(
     point, group_and_segment, config, inputs, first_bin, mean_power, factor_rank, factor, weights
 ):
-    """Compute the detection weights (bins,) of a group and segment.
+    """Compute the weights (bins,) of an echo's bins in the amplitude that decides on its detection.
 
     With ``peak_bin`` only the strongest bin has a weight. If any bin detects, the bins are weighted
     as a lone line in the middle of the echo would fill them. The amplitudes of two segments then
@@ -1526,7 +1600,11 @@ def fill_detection_weights(
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
-    """Draw the speckle of a point's groups, and the factors (groups, 3) on their magnitudes."""
+    """Draw the speckle of a point's echoes, and set factors on their magnitudes.
+
+    ``speckle_factors`` (groups, 3), a result, has one row for each echo (group of adjacent bins)
+    and one column for each segment. The complex amplitudes are written into ``speckle``.
+    """
     for g in range(speckle.n_bins.shape[0]):
         speckle_factors[g] = 1.0
         if speckle.n_bins[g].max() == 0:
@@ -1574,7 +1652,10 @@ def draw_group_speckle(address, i, inputs, speckle, speckle_factors):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes):
-    """Mix independent amplitudes (sets, 3, bins) into amplitudes of looks (looks, 3, bins)."""
+    """Mix independent speckle into the correlated speckle of looks (records of each segment).
+
+    Independent amplitudes are (sets, 3, bins) complex, those of the looks (looks, 3, bins).
+    """
     look_amplitudes[:] = 0.0
     for look in range(look_amplitudes.shape[0]):
         for s in range(3):
@@ -1588,7 +1669,7 @@ def mix_look_amplitudes(covariance_root, independent_amplitudes, look_amplitudes
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def pair_into_returns(i, row_and_draw, config, inputs, peak_lists, pairs, workspace, drawn_peaks):
-    """Pair the peaks of one point and draw into returns, and judge each.
+    """Pair the peaks of one point and draw into returns, and compare each return with the truth.
 
     Parameters
     ----------
@@ -1683,7 +1764,7 @@ def draw_segment_peaks(
     peak_groups,
     is_up_detected,
 ):
-    """Draw the peaks of a segment in a draw, and return their number.
+    """Draw the peaks of one segment in one draw, and return their number.
 
     Parameters
     ----------
@@ -1704,7 +1785,8 @@ def draw_segment_peaks(
     peaks, peak_groups
         Results: (groups + 1, 4) peaks, and (groups + 1,) their groups or FALSE_PEAK.
     is_up_detected
-        (groups,) bool: groups detected in the up segment, which is drawn first and sets it.
+        (groups,) bool: True for groups detected in the up segment. The up segment is drawn first
+        and sets this array.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
@@ -1878,9 +1960,10 @@ def list_noisy_leaked_peaks(
 ):
     """List the strongest peaks of bins of leaked signal with their noise; return their number.
 
-    Adjacent bins that cross make one peak, in the largest bin. They belong to the echo if they are
-    adjacent to a crossing bin of the echo. ``speckle_factors`` (groups,) are factors on the groups'
-    magnitudes. ``bins`` and ``ratios``, the results, are the bins and |X| / sigma of the peaks.
+    Adjacent bins that reach the threshold make one peak, in the largest bin. They belong to the
+    echo if they are adjacent to a crossing bin of the echo. ``speckle_factors`` (groups,) are
+    factors on the groups' magnitudes. ``bins`` and ``ratios``, the results, are the bins and |X| /
+    sigma of the peaks.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     n_peaks, previous_bin, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
@@ -1929,7 +2012,10 @@ def draw_peak_bin(
     workspace,
     peak,
 ):
-    """Test a group's strongest bin with its noise; return True and set the peak if it crosses."""
+    """Add noise to an echo's strongest bin; if it reaches the threshold, set the peak.
+
+    Returns True if it does.
+    """
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
     line_noise_ratio = inputs.line_noise_ratio[i]
@@ -2004,7 +2090,7 @@ def draw_peak_bin(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
-    """Return the complex amplitude of a group's bin in a draw, from its rms magnitude."""
+    """Return the complex amplitude of a bin of an echo in a draw: rms magnitude times speckle."""
     if speckle.n_bins[group, segment] == 0:
         return complex(magnitude, 0.0)
     return magnitude * speckle.amplitudes[group, 0, segment, bin_index]
@@ -2014,7 +2100,9 @@ def speckled_amplitude(magnitude, speckle, group, segment, bin_index):
 def detect_in_speckle(
     address, point_and_segment, group, config, inputs, speckle, interpolation, workspace, peak
 ):
-    """Draw a group in developed speckle; return True and set its peak if it is detected.
+    """Draw an echo in developed speckle; return True and set its peak if it is detected.
+
+    The bins of the echo are a group of adjacent bins.
 
     The group's amplitude is a complex Gaussian number: echo plus noise, with ``echo_fraction`` of
     the mean power in the echo. The group is detected if its power exceeds the level that is
@@ -2138,12 +2226,13 @@ def detect_in_speckle(
 
 
 _OTHER_BINS_RANDOM_OFFSET = 1 << 22
-"""Index of the first random number of further independent bins of groups, group by group."""
+"""Index of the first random number used for the independent bins of echoes other than the
+strongest. Each echo has a range of indices."""
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_bin_pd):
-    """Return True if an independent bin of a group, other than its strongest bin, is detected.
+    """Return True if an echo is detected by an independent bin other than its strongest bin.
 
     ``single_bin_pd`` is the probability of detection of one bin. The last of the bins is a fraction
     of one.
@@ -2175,7 +2264,7 @@ def is_detected_by_other_bin(address, point_and_segment, group, inputs, single_b
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
-    """Draw the noise of adjacent bins over sigma.
+    """Draw the noise of adjacent bins over sigma, the standard deviation per quadrature.
 
     Parameters
     ----------
@@ -2205,7 +2294,7 @@ def draw_adjacent_noise(address, first_index, first_and_count, config, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True, forceinline=True)
 def is_near_end(first_bin, n_bins, config):
-    """Return True if any of adjacent bins has non-circular noise, near DC or Nyquist."""
+    """Return True if any of the adjacent bins has non-circular noise, near DC or Nyquist."""
     n_near_bins = config.noise_pseudo_variance_ratio.size
     return n_near_bins > 0 and (
         first_bin < n_near_bins or first_bin + n_bins - 1 > config.nyquist_bin - n_near_bins
@@ -2214,9 +2303,10 @@ def is_near_end(first_bin, n_bins, config):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_noise_near_end(address, first_index, first_and_count, config, noise):
-    """Draw the noise of :func:`draw_adjacent_noise` near DC or Nyquist.
+    """Draw the noise of adjacent bins near frequency 0 (DC) or Nyquist.
 
-    Bins beyond DC or Nyquist are complex conjugates of their mirror images.
+    The arguments are those of :func:`draw_adjacent_noise`. Bins beyond either end are complex
+    conjugates of their mirror images.
     """
     first_bin, n_bins = first_and_count
     last_bin = first_bin + n_bins - 1
@@ -2246,7 +2336,7 @@ def draw_noise_near_end(address, first_index, first_and_count, config, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_three_bin_noise(address, first_index, interpolation, noise):
-    """Draw the noise of three adjacent bins over sigma.
+    """Draw the noise of three adjacent bins over sigma, the standard deviation per quadrature.
 
     Parameters
     ----------
@@ -2295,9 +2385,9 @@ def draw_all_bins(
     workspace,
     peak,
 ):
-    """Test all bins of an echo with their noise; return True and set the peak if any crosses.
+    """Add noise to all bins of an echo; if any reaches the threshold, set the peak.
 
-    The peak is the largest of these bins.
+    Returns True if one does. The peak is the largest of these bins.
     """
     (a, b, draw), (i, s) = address, point_and_segment
     noise_sigma, threshold_ratio = inputs.noise_sigma[i], inputs.threshold_ratio[i]
@@ -2376,6 +2466,8 @@ def draw_all_bins(
 def store_peak(peak, bin_number, position, error, ratio, line_deviation, config, interpolation):
     """Write the columns of a peak, mirrored into 0..N/2 if it is beyond DC or Nyquist.
 
+    N is the FFT size.
+
     A peak of a complex record wraps from N/2 to -N/2. The error by the spread of lines
     (`line_deviation`, [bins]) is added to the `error` by noise.
     """
@@ -2400,10 +2492,11 @@ def store_peak(peak, bin_number, position, error, ratio, line_deviation, config,
 def draw_free_bin(
     uniform_number, group_bins, excluded_bins, searched_range, fft_size, down_beat_sign
 ):
-    """Draw a bin outside the groups, their neighbours and ``excluded_bins``, uniformly.
+    """Draw the bin of a false peak of noise, uniformly from those outside of all echoes.
 
-    The bin is between the first and last of ``searched_range``, inclusive. Bins of a complex
-    record, of N = ``fft_size`` bins, are periodic.
+    Echoes are the groups of bins in ``group_bins`` and their neighbours. Bins of ``excluded_bins``
+    are not drawn either. The bin is between the first and last of ``searched_range``, inclusive.
+    Bins of a complex record, of N = ``fft_size`` bins, are periodic.
     """
     first, last = searched_range
     n_groups = 0

@@ -1,4 +1,6 @@
-"""Returns of a flight's shots from full spectra, by a detector and an estimator, draw by draw.
+"""Returns (measured points) of a flight's shots from full spectra, draw by draw.
+
+A detector flags bins of the spectra, and an estimator computes positions of peaks.
 
 Spectra are those of :mod:`sweep.model.sampling.noisy_spectra`, as for grids. A shot is a point,
 with the echoes of all surfaces in its footprint. Adjacent flagged bins make a peak, and the
@@ -68,14 +70,16 @@ def draw_spectra_returns(
     draws: int = 1,
     motion: EgoMotion | None = None,
 ) -> Returns:
-    """Draw returns from full spectra, by the detector and estimator that the parameters name.
+    """Draw returns (measured points) from full noisy spectra by a detector and an estimator.
+
+    Parameters name the detector and the estimator.
 
     Parameters
     ----------
     shots
         Prepared shots.
     bin_groups
-        Groups in the noiseless spectra of the shots.
+        Groups (runs of adjacent bins above the threshold) in the noiseless spectra of the shots.
     keys
         (n, 2) uint64: random key of each shot.
     parameters
@@ -181,29 +185,35 @@ def draw_spectra_returns(
 
 
 class EchoBounds(NamedTuple):
-    """Bins of k echoes in a segment, as numbered after :func:`centre_bins`."""
+    """First and last bin of each of k echoes in a segment.
+
+    Bins have the indices that :func:`centre_bins` gives them.
+    """
 
     first_bin: np.ndarray
-    """(k,) int64: first bin of each echo."""
+    """(k,) int64: index of the first bin of each echo."""
     last_bin: np.ndarray
-    """(k,) int64: last bin of each echo."""
+    """(k,) int64: index of the last bin of each echo."""
 
 
 class FlaggedPeaks(NamedTuple):
-    """Peaks of flagged bins in one draw of a segment, strongest first."""
+    """Peaks in one draw of a segment, strongest first.
+
+    A peak is a run of adjacent bins that the detector flags.
+    """
 
     power: np.ndarray
-    """(bins,): |X|^2 of all bins of the draw [V^2]."""
+    """(bins,): |X|^2 of all bins of the segment's spectrum in the draw [V^2]."""
     strongest_bin: np.ndarray
     """(peaks,) int64: index of the strongest bin of each peak."""
     echo_number: list[int]
-    """(peaks,): number of each peak's echo; FALSE_PEAK for none."""
+    """Number, for each peak, of the echo to which it belongs; FALSE_PEAK for a peak of no echo."""
 
 
 def _echo_bin_bounds(
     point_spectra: PointSpectra, segment: int, signal: SegmentSignal | None
 ) -> EchoBounds:
-    """Return the bins of each echo of a point in a segment; no echoes without a signal."""
+    """Return first and last bin of each echo of a point in a segment; none without a signal."""
     echo_indices = point_spectra.echo_indices(segment)
     if signal is None or not echo_indices.size:
         return EchoBounds(np.empty(0, np.int64), np.empty(0, np.int64))
@@ -237,12 +247,14 @@ def list_flagged_peaks(
     point_spectra: PointSpectra,
     peaks_max: int,
 ) -> FlaggedPeaks:
-    """List the peaks of flagged bins in one draw of a segment, strongest first.
+    """List the peaks in one draw of a segment, strongest first.
+
+    A peak is a run of adjacent bins that the detector flags.
 
     Parameters
     ----------
     spectra
-        Complex spectra (1, bins) of each look [V].
+        Complex spectra (1, bins) of each look (record of the segment) [V].
     signal
         Signal of the segment without noise.
     echo_bounds

@@ -52,70 +52,81 @@ from sweep.model.spectrum.search_restriction import mean_line_positions
 from sweep.model.spectrum.segment_spectra import iter_spans
 
 PD_BOTH_CHIRPS = "pd_both_chirps"
-"""Name of the probability of a detection in both chirps. It is an additional output if any two
+"""Name of the output that holds the probability of a detection in both chirps. It exists if any two
 segments detect a shot."""
 
 _DRAWS_PER_STEP = 256
-"""Number of draws of a point whose random numbers are generated together."""
+"""Number of draws of one point whose random numbers are generated in one step."""
 
 
 class DrawRanges(NamedTuple):
-    """Ranges of consecutive draws of m points or prepared spectra, (m,) each."""
+    """Ranges of consecutive draws, one for each of m points or prepared spectra, (m,) each."""
 
     point_index: np.ndarray
-    """int64: index of the point to whose counts the draws are added."""
+    """(m,) int64: index of the point to whose counts the draws are added."""
     keys: np.ndarray
-    """(m, 2) uint64: random key of the point."""
+    """(m, 2) uint64: random key of the point, on which its random numbers depend."""
     first_draw: np.ndarray
-    """int64: number of the first draw."""
+    """(m,) int64: number of the first draw of the range."""
     end_draw: np.ndarray
-    """int64: number after the last draw."""
+    """(m,) int64: number of the last draw of the range, plus 1."""
 
 
 class CountConfig(NamedTuple):
-    """Settings and tables of counting that are common to all rows."""
+    """Settings and tables for counting detections and false alarms, common to all points."""
 
     in_noise: bool
-    """True if noise is drawn, False if draws are compared with probabilities."""
+    """True if noise is added to the bins of an echo; False if random numbers are compared with
+    probabilities of detection."""
     noise_filter: "NoiseFilter"
-    """Filter of the noise of echoes' bins; without bins if only the strongest bin detects."""
+    """Filter that makes the correlated noise of an echo's bins. It has no bins if only the
+    strongest bin may detect the echo."""
     sidelobe_correlation: float
-    """Correlation of the noise of neighbouring bins in phase with the signal."""
+    """Correlation coefficient of the noise of two adjacent bins, for the component in phase with
+    the signal."""
     pseudo_variance_ratio: np.ndarray
-    """(ratio rows, bins): pseudo-variance ratios near DC and Nyquist, as in
-    :class:`sweep.model.detection.echo_detection.SpeckleTable`."""
+    """(ratio rows, bins): ratio E[X^2] / E[|X|^2] of complex amplitudes X in bins near frequency 0
+    (DC) and Nyquist (:class:`sweep.model.detection.echo_detection.SpeckleTable`)."""
     nyquist_bin: int
-    """Half of the FFT size, N/2."""
+    """Number of the bin at the Nyquist frequency: N/2, with N the FFT size."""
 
 
 class CountInputs(NamedTuple):
-    """Quantities of m rows on which counts depend; segments are up, Doppler and down."""
+    """Quantities of m points on which counts of detections and false alarms depend.
+
+    Segments are up, Doppler and down. sigma is the noise of a bin per quadrature.
+    """
 
     threshold_ratio: np.ndarray
-    """(m,): threshold over sigma."""
+    """(m,): threshold divided by sigma, the noise of a bin per quadrature."""
     line_noise_ratio: np.ndarray
-    """(m,): noise of bins that hold lines, over sigma."""
+    """(m,): noise of bins that hold lines of the echo, divided by sigma, the noise of other bins
+    per quadrature."""
     bin_thresholds: BinThresholds
-    """(m,) each: :attr:`sweep.model.preparation.Shots.bin_thresholds`, for echoes that any bin may
-    detect."""
+    """(m,) in each field: threshold on |X| and noise of an echo's bins, if any bin may detect the
+    echo (:attr:`sweep.model.preparation.Shots.bin_thresholds`)."""
     pfa: np.ndarray
-    """(3, m): probability of a false alarm in bins that are not evaluated one by one."""
+    """(3, m): probability of a false alarm in those bins of each segment that are not drawn one by
+    one."""
     pd_otherwise: np.ndarray
-    """(3, m): probability of a detection without the condition of :func:`_draw_probabilities`;
-    unused if noise is drawn."""
+    """(3, m): probability that each segment detects the echo if the condition of
+    :func:`_draw_probabilities` is not met; unused if noise is drawn."""
     pd_if_condition: np.ndarray
-    """(3, m): probability of a detection with that condition; unused if noise is drawn."""
+    """(3, m): probability that each segment detects the echo if the condition of
+    :func:`_draw_probabilities` is met; unused if noise is drawn."""
     any_two: np.ndarray
-    """(m,) bool: True if any two segments detect a shot."""
+    """(m,) bool: True if a shot counts as detected by any two of its segments."""
     mixing: np.ndarray
-    """(6, m): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`;
-    (0, m) without speckle."""
+    """(6, m): Cholesky factor of the correlation of speckle in the three segments
+    (:meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`); (0, m)
+    without speckle."""
     ratio_row: np.ndarray
-    """(3, m) int64: row of ``CountConfig.pseudo_variance_ratio``; 0 far from DC and Nyquist."""
+    """(3, m) int64: row of ``CountConfig.pseudo_variance_ratio`` for each segment; 0 for an echo
+    far from frequency 0 and Nyquist."""
     line_grid: SpeckleLineGrid
-    """Lines of the footprints in developed speckle."""
+    """Lines that represent the footprints in developed speckle."""
     line_centre: np.ndarray
-    """(m, 3): mean position of the lines [bins]; (0, 3) without speckle."""
+    """(m, 3): mean position of the lines of each segment's echo [bins]; (0, 3) without speckle."""
 
 
 def count_by_probability(
@@ -124,7 +135,7 @@ def count_by_probability(
     outputs: Mapping[str, np.ndarray],
     counts: np.ndarray,
 ) -> None:
-    """Count detections and false alarms in draws that are compared with probabilities.
+    """Count detections and false alarms by comparing random numbers with their probabilities.
 
     Parameters
     ----------
@@ -167,7 +178,7 @@ def count_by_probability(
 def count_in_noise(
     draw_ranges: DrawRanges, batch_edges: np.ndarray, shots: Shots, counts: np.ndarray
 ) -> None:
-    """Count detections and false alarms in draws of the noise of shots.
+    """Count detections and false alarms by drawing the noise of prepared shots.
 
     Parameters
     ----------
@@ -223,24 +234,29 @@ class NoiseFilter(NamedTuple):
     """Filter that makes the noise of adjacent bins from independent normal numbers."""
 
     weights: np.ndarray
-    """(bins, NOISE_FILTER_TAPS): weights of the numbers of each bin; their squares sum to 1."""
+    """(bins, NOISE_FILTER_TAPS): weights with which each bin's noise is a sum of independent normal
+    numbers. The squares of a bin's weights sum to 1."""
     first_number: np.ndarray
-    """(bins,) int64: index of the first number of each bin, relative to that at the first bin."""
+    """(bins,) int64: index of the first independent number that each bin uses, minus the index at
+    the first bin."""
     real_fft_size: int
-    """FFT size N if the noise at DC and Nyquist is real, else 0."""
+    """FFT size N if the noise in the bins at frequency 0 (DC) and at Nyquist is real, else 0."""
 
 
 class NoiseScratch(NamedTuple):
-    """Noise of adjacent bins over sigma, and the independent numbers that it is made of."""
+    """Noise of adjacent bins over sigma, and the independent numbers from which it is made.
+
+    sigma is the standard deviation of a bin's noise per quadrature.
+    """
 
     in_phase: np.ndarray
-    """(k,): noise of each bin in phase with the signal."""
+    """(k,): component, over sigma, of each bin's noise in phase with the signal."""
     in_quadrature: np.ndarray
-    """(k,): noise of each bin in quadrature with the signal."""
+    """(k,): component, over sigma, of each bin's noise in quadrature with the signal."""
     number_in_phase: np.ndarray
-    """(k,): independent normal numbers that make ``in_phase``."""
+    """(k,): independent normal numbers of which ``in_phase`` is a filtered sum."""
     number_in_quadrature: np.ndarray
-    """(k,): independent normal numbers that make ``in_quadrature``."""
+    """(k,): independent normal numbers of which ``in_quadrature`` is a filtered sum."""
 
     @classmethod
     def allocate(cls, n_bins: int) -> "NoiseScratch":
@@ -281,15 +297,16 @@ def make_echo_noise_filter(
 
 
 ROOT_BINS_MAX = 16
-"""Largest number of adjacent bins whose noise is made from one independent number for each bin."""
+"""Largest number of adjacent bins whose correlated noise is made by a Cholesky factor, from one
+independent number for each bin."""
 
 
 def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
     """Return the triangular matrix (k, k) that makes the noise of k adjacent bins from k numbers.
 
-    It is the Cholesky factor of the covariance under a filter of :func:`make_echo_noise_filter`,
-    for at most ROOT_BINS_MAX bins. It is not valid at DC and Nyquist, for which
-    :func:`draw_bin_noise` is.
+    It is the Cholesky factor of the covariance that a filter of :func:`make_echo_noise_filter`
+    gives, for at most ROOT_BINS_MAX bins. Frequency 0 and Nyquist, where the noise is real, need
+    :func:`draw_bin_noise` instead.
     """
     weights, start = filter_rule.weights, filter_rule.first_number
     n_bins = min(weights.shape[0], ROOT_BINS_MAX)
@@ -314,12 +331,14 @@ def noise_covariance_root(filter_rule: NoiseFilter) -> np.ndarray:
 
 
 _REMAINDER_MIN = 1e-9
-"""Fraction of a bin's noise variance, unexplained by its neighbours, that is neglected below this.
-"""
+"""Smallest fraction of a bin's noise variance, not explained by the bins before it, that is not
+neglected."""
 
 
 def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return probabilities by segment (up, Doppler, down) that uniform numbers are compared with.
+    """Return the probabilities of events in each segment, with which random numbers are compared.
+
+    Segments are up, Doppler and down.
 
     Returns
     -------
@@ -368,7 +387,7 @@ def _draw_probabilities(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray) -> np.ndarray:
-    """Return the pd of the down segment given no detection, and given one, in the up segment.
+    """Return the probability of detection in the down segment, given the result in the up segment.
 
     Parameters
     ----------
@@ -378,7 +397,8 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
     Returns
     -------
     ndarray (2, ...)
-        (pd_down - pd_both) / (1 - pd_up), and pd_both / pd_up.
+        Without a detection in the up segment (pd_down - pd_both) / (1 - pd_up), with one pd_both /
+        pd_up.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         without_up = np.where(
@@ -390,58 +410,68 @@ def down_pd_given_up(pd_up: np.ndarray, pd_down: np.ndarray, pd_both: np.ndarray
 
 
 def threshold_and_line_noise_ratios(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Return threshold and noise under the lines, over the noise of any other bin, (n,) each."""
+    """Return the threshold and the noise in the echo's bins, both over sigma, (n,) each.
+
+    sigma is the noise per quadrature of a bin without signal.
+    """
     ratios = np.stack([shots.threshold, shots.line_noise_sigma]) / shots.bin_noise_sigma
     ratios = np.ascontiguousarray(np.broadcast_to(ratios, (2, shots.size)))
     return ratios[0], ratios[1]
 
 
 ECHO_NOISE_FIRST_INDEX = 1 << 24
-"""Stream index of the first random number of the noise of an echo's bins. Smaller indices are used
-by bins that are drawn one by one."""
+"""Index in the noise stream of the first random number for the noise of all bins of an echo. Lower
+indices are used for bins that are drawn one by one."""
 
 
 class NoiselessSpectra(NamedTuple):
     """Spectra without noise by point and segment, (m, 3), to which noise is added.
 
-    Bins of a segment are numbered from its ``first_bin``.
+    Bins of a segment are numbered from its ``first_bin``. sigma is the noise of a bin per
+    quadrature.
     """
 
     first_bin: np.ndarray
-    """int64: first bin that holds signal."""
+    """(m, 3) int64: number of the first bin that holds signal."""
     peak_index: np.ndarray
-    """int64: number of the bin with the largest magnitude."""
+    """(m, 3) int64: number of the bin with the largest magnitude, counted from ``first_bin``."""
     peak_ratio: np.ndarray
-    """Largest magnitude |X| / sigma; nan for a segment that does not exist."""
+    """(m, 3): largest |X| of the segment's bins over sigma, the noise of a bin per quadrature; nan
+    for a segment that does not exist."""
     has_real_noise: np.ndarray
-    """bool: True if the noise in the largest bin is real, as at DC and Nyquist."""
+    """(m, 3) bool: True if the noise in the bin with the largest magnitude is real, as at frequency
+    0 (DC) and Nyquist."""
     bins_start: np.ndarray
-    """int64: index of the segment's first bin in ``bin_ratios`` and ``is_echo``."""
+    """(m, 3) int64: index of the segment's first bin in ``bin_ratios`` and ``is_echo``."""
     n_bins: np.ndarray
-    """int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
+    """(m, 3) int64: number of the segment's bins in ``bin_ratios`` and ``is_echo``."""
     bin_ratios: np.ndarray
-    """(bins,): |X| / sigma of the bins of all segments."""
+    """(bins,): |X| over sigma, the noise of a bin per quadrature, of the bins of all points and
+    segments."""
     is_echo: np.ndarray
-    """(bins,) bool: True for bins of the echo."""
+    """(bins,) bool: True for bins that belong to an echo, of the bins of all points and segments.
+    """
     n_noise_bins: np.ndarray
-    """Equivalent number of independent bins that count for false alarms and hold noise alone."""
+    """(m, 3): equivalent number of independent bins that hold noise alone and may raise a false
+    alarm."""
     leaked_slice: np.ndarray
-    """(m, 3, 2) int64: index of the segment's first bin in the arrays of leaked signal, and the
-    index after the last; equal without leakage."""
+    """(m, 3, 2) int64: begin and end of each segment's bins in the arrays ``leaked_*`` and
+    ``exempt_neighbour_*``; equal without leaked signal."""
     leaked_index: np.ndarray
-    """(leaked,) int64: numbers of bins of leaked signal, which may raise a false alarm by
-    themselves."""
+    """(leaked,) int64: numbers, from ``first_bin``, of the bins with signal leaked from an echo.
+    With noise they may raise a false alarm."""
     leaked_ratio: np.ndarray
-    """(leaked,): |X| / sigma of the bins of leaked signal."""
+    """(leaked,): |X| of the bins of leaked signal over sigma, the noise of a bin per quadrature."""
     exempt_neighbour_ratio: np.ndarray
-    """(leaked,): |X| / sigma of the neighbour of a bin of leaked signal that is exempt from false
-    alarms; 0 without one."""
+    """(leaked,): |X| over sigma of the adjacent bin that belongs to an echo, and so cannot raise a
+    false alarm; 0 if no adjacent bin does."""
     exempt_neighbour_side: np.ndarray
-    """(leaked,) int64: 1 if the exempt neighbour is above the bin, -1 if it is below."""
+    """(leaked,) int64: 1 if the adjacent bin of the echo is above the bin of leaked signal, -1 if
+    it is below."""
 
     @classmethod
     def empty(cls, n_points: int) -> "NoiselessSpectra":
-        """Return spectra without bins, for draws that are compared with probabilities."""
+        """Return a record without bins, for draws that compare numbers with probabilities."""
         zeros, empty_slices = (
             np.zeros((n_points, 3), np.int64),
             np.zeros((n_points, 3, 2), np.int64),
@@ -538,7 +568,7 @@ def iter_noiseless_spectra(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count_draws(draw_ranges, batch_edges, config, inputs, spectra, counts):
-    """Add the detections and false alarms of each row's draws to the counts.
+    """Draw detections and false alarms of m points, and add them to the counts.
 
     Parameters
     ----------
@@ -703,7 +733,8 @@ def _mark_leakage_alarms(
 ):
     """Mark the draws in which bins of leaked signal, with their noise, raise a false alarm.
 
-    Crossing bins that are adjacent to an echo whose outermost bin crosses belong to the echo.
+    A bin crosses if its magnitude reaches the threshold. Crossing bins next to an echo whose
+    outermost bin crosses too belong to the echo.
 
     Parameters
     ----------
@@ -780,9 +811,9 @@ def _mark_leakage_alarms(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_factors(key, draw, group, mixing):
-    """Return the factors of a draw on a group's magnitudes in up, Doppler and down segment.
+    """Return the factors by speckle on an echo's magnitudes in up, Doppler and down segment.
 
-    Their mean square is 1. The arguments are as in :func:`speckle_amplitudes`.
+    Their mean square is 1. The arguments are those of :func:`speckle_amplitudes`.
     """
     up, doppler, down = speckle_amplitudes(key, draw, group, mixing)
     return (
@@ -794,7 +825,7 @@ def speckle_factors(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def speckle_amplitudes(key, draw, group, mixing):
-    """Return the complex amplitudes of a group of bins in a draw, of mean square 1.
+    """Return the complex factors by speckle on an echo in the three segments, of mean square 1.
 
     Parameters
     ----------
@@ -803,7 +834,7 @@ def speckle_amplitudes(key, draw, group, mixing):
     draw
         Number of the draw.
     group
-        Number of the group of bins.
+        Number of the echo (group of adjacent bins).
     mixing
         (6,): :meth:`sweep.model.detection.echo_detection.SegmentCorrelations.cholesky_factors`.
 
@@ -811,7 +842,7 @@ def speckle_amplitudes(key, draw, group, mixing):
     -------
     tuple
         Real and imaginary part in the up, Doppler and down segment. They are mixtures of three
-        independent circular normal amplitudes of the group.
+        independent circular normal amplitudes of the echo.
     """
     stream, root_half = philox.STREAM_SPECKLE, math.sqrt(0.5)
     a, b = philox.normal_pair(key[0], key[1], draw, stream, 3 * group)
@@ -840,7 +871,7 @@ def speckle_amplitudes(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_random_events(address, stream, probabilities, condition, random_words, is_marked):
-    """Mark the draws in which an event happens with a given probability.
+    """Mark draws in which a random number is below the probability of an event.
 
     `address` holds key, first draw and number of draws. A draw has the second of the
     `probabilities` if its `condition` is True, else the first. `condition` may be the same array as
@@ -873,12 +904,12 @@ def _echo_end_indices(point_and_segment, spectra):
 
 @njit(cache=True, error_model="numpy")
 def _draw_echo_amplitudes(address, row, spectra, line_grid, line_centres, segment_factors):
-    """Draw complex amplitudes (3, draws, bins) of an echo's bins in developed speckle.
+    """Draw the complex factors (3, draws, bins) of developed speckle on an echo's bins.
 
-    The amplitudes have mean power 1 and follow from the lines of the footprint. Bins that no line
-    reaches have the amplitude of the strongest bin. ``segment_factors`` (3, draws) is set to the
-    magnitude of the strongest bin's amplitude. ``line_grid`` and ``line_centres`` are those of
-    :class:`CountInputs`.
+    The first axis is the segment. The factors have mean power 1 and follow from the lines of the
+    footprint. Bins that no line reaches have the factor of the strongest bin. ``segment_factors``
+    (3, draws) is set to the magnitude of the strongest bin's factor. ``line_grid`` and
+    ``line_centres`` are those of :class:`CountInputs`.
     """
     line_centre = line_centres[row].copy()
     first_bin, n_bins_max = np.zeros(3, np.int64), 0
@@ -993,7 +1024,7 @@ def _mark_any_bin_crossings(
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
-    """Draw the noise of adjacent bins over sigma, correlated as window and padding make it.
+    """Draw the noise of adjacent bins over sigma, correlated by window and zero padding.
 
     Parameters
     ----------
@@ -1010,8 +1041,8 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
 
     Notes
     -----
-    At DC and Nyquist of a real record the noise is real, and bins on either side are complex
-    conjugates.
+    sigma is the standard deviation of a bin's noise per quadrature. At DC and Nyquist of a real
+    record the noise is real, and bins on either side are complex conjugates.
     """
     weights, start = filter_rule.weights, filter_rule.first_number
     real_fft_size = filter_rule.real_fft_size
@@ -1039,7 +1070,7 @@ def draw_bin_noise(address, first_index, first_bin, n_bins, filter_rule, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
-    """Draw the noise of adjacent bins in units of sigma, by a root of its covariance.
+    """Draw the noise of adjacent bins in units of sigma, by a Cholesky factor of its covariance.
 
     Parameters
     ----------
@@ -1076,7 +1107,7 @@ def draw_bin_noise_by_root(address, first_index, n_bins, root, noise):
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def _mark_crossings(address, stream, pair_index, crossing, random_words, is_marked):
-    """Mark the draws in which a bin, with its noise, reaches the threshold.
+    """Mark the draws in which signal plus noise of one bin reaches the threshold.
 
     ``pair_index`` is the stream index of the pair of numbers that make the noise. ``crossing``
     holds |X| / sigma; the noise's deviations in phase and in quadrature; the square of the
@@ -1100,6 +1131,8 @@ def _mark_crossings(address, stream, pair_index, crossing, random_words, is_mark
 def largest_noise_magnitude(n_bins, probability, n_looks):
     """Return the |X| / sigma that the largest of n noise bins exceeds with a given probability.
 
+    sigma is the standard deviation of a bin's noise per quadrature.
+
     Parameters
     ----------
     n_bins
@@ -1107,7 +1140,7 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
     probability
         Probability, 0..1.
     n_looks
-        Number of looks; |X| is then the root of their mean power.
+        Number of looks (records of a segment). |X| is the root of their mean power.
     """
     if not n_bins > 0.0:
         return 0.0
@@ -1119,9 +1152,10 @@ def largest_noise_magnitude(n_bins, probability, n_looks):
 
 @njit(cache=True, error_model="numpy")
 def gamma_upper_quantile(order, probability):
-    """Return the x that a Gamma variable exceeds with a probability: Q(n, x) = `probability`.
+    """Return the x that a Gamma variable exceeds with a given probability.
 
-    The order n is an integer; the scale is 1.
+    It solves Q(n, x) = ``probability``, with the regularised upper incomplete Gamma function Q. The
+    order n is an integer; the scale is 1.
     """
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(probability, 1e-300)))
     for _ in range(60):

@@ -105,90 +105,100 @@ AVERAGED_VALUE_NAMES = (
     "squared_range_bound",
     "squared_radial_velocity_bound",
 )
-"""Names of values that are averaged over draws: the fraction of bins with a false alarm, the number
-of false alarms, measured minus true range [m] and radial velocity [m/s], and the squares of their
-bounds."""
+"""Names of values that are averaged over draws. They are the fraction of bins with a false alarm,
+the number of false alarms, the errors of range [m] and radial velocity [m/s] (measured minus true),
+and the squares of their bounds [m^2, m^2/s^2]."""
 
 
 class SpectrumMethods(NamedTuple):
-    """Detectors and estimators by name; by default those of the package."""
+    """Detectors and estimators by name, as a study can select them.
+
+    By default they are those of the package.
+    """
 
     detectors: Mapping[str, Detector] = DETECTORS
-    """Detectors by name."""
+    """Detectors by name: functions that flag bins of a spectrum's power."""
     estimators: Mapping[str, Estimator] = ESTIMATORS
-    """Estimators of frequency by name."""
+    """Estimators by name: functions that compute the frequency of a peak."""
 
 
 class SegmentSignal(NamedTuple):
     """Spectrum of a segment of a point without noise, with the bins and the frequency of its echo.
 
-    Bins are stated by their index in the spectrum.
+    Bins are stated by their index in the spectrum. N is the FFT size.
     """
 
     spectrum: np.ndarray
-    """Complex spectrum [V]: (N/2 + 1,), or (N,) for a complex record."""
+    """Complex spectrum without noise [V]: (N/2 + 1,), or (N,) for a complex record, with N the FFT
+    size."""
     strongest_bin: int
-    """Index of the largest bin. DC and Nyquist are excluded if the noise of a real record counts as
-    circular in all bins."""
+    """Index of the bin with the largest magnitude. DC and Nyquist are excluded if the noise of a
+    real record counts as circular in all bins."""
     first_bin: int
-    """First bin that the signal occupies. The occupied bins begin with the first bin of half the
-    largest magnitude and end with the last, plus half a main lobe on either side."""
+    """Index of the first bin that the signal occupies. The occupied bins begin with the first bin
+    of half the largest magnitude and end with the last, plus half a main lobe on either side."""
     last_bin: int
-    """Last bin that the signal occupies. It is below ``first_bin`` if there is no echo, or if its
-    largest bin is not searched."""
+    """Index of the last bin that the signal occupies. It is below ``first_bin`` if there is no
+    echo, or if the strongest bin is outside the search band."""
     frequency: float
-    """Signed frequency [bins] of a lone tone with the same magnitudes about the largest bin."""
+    """Signed frequency [bins] of a pure tone whose magnitudes equal those of the signal about its
+    strongest bin."""
     cnr: float
-    """Carrier-to-noise ratio: power of the signal over that of the noise in the record, before the
-    FFT."""
+    """Carrier-to-noise ratio: signal power divided by noise power in the record, before the FFT."""
     segment: int
-    """The segment: 0 up, 1 Doppler, 2 down."""
+    """Number of the segment: 0 up, 1 Doppler, 2 down."""
     nearest_echo: np.ndarray | None = None
-    """(bins,) int64: number of the echo nearest to each bin; None with a single echo."""
+    """(bins,) int64: number of the echo nearest to each bin, if a shot has several; None with a
+    single echo."""
     echo_peaks: "EchoPeaks | None" = None
-    """Peaks of the echoes; None with a single echo."""
+    """Strongest bins and positions of the echoes, if a shot has several; None with a single echo.
+    """
     echo_half_width: int = 0
-    """Number of bins on either side of its strongest bin that each of several echoes occupies."""
+    """Number of bins on either side of an echo's strongest bin that the echo occupies, if a shot
+    has several echoes."""
     footprint_records: tuple[FootprintRecord, ...] | None = None
-    """Record of each echo in speckle. Empty if lines spread over more than a bin or the echo has no
-    samples; None before :func:`add_footprint_records`."""
+    """Record from which the speckle of each echo is drawn. The tuple is empty if lines spread over
+    more than a bin or the echo has no samples, and None before :func:`add_footprint_records`."""
     record_scalings: tuple[np.ndarray, ...] = ()
-    """(bins,) complex for each echo. The transform of a drawn record times these scalings gives the
-    factors of speckle on the bins of ``spectrum``."""
+    """(bins,) complex for each echo: factors from the transform of a drawn record to the speckle by
+    which the bins of ``spectrum`` are multiplied."""
     is_exempt: np.ndarray | None = None
-    """(bins,) bool: True for bins that raise no false alarm. These are ``first_bin`` to
+    """(bins,) bool: True for bins that cannot raise a false alarm. These are ``first_bin`` to
     ``last_bin``, and bins at or above the threshold with their neighbours
     (:func:`sweep.model.detection.echo_detection.mark_exempt_bins`)."""
 
 
 class EchoPeaks(NamedTuple):
-    """Peaks of k echoes in a segment."""
+    """Strongest bins and positions of k echoes in a segment."""
 
     strongest_bin: np.ndarray
-    """(k,) int64: index of the strongest bin."""
+    """(k,) int64: index of the bin with each echo's largest magnitude."""
     tone_position: np.ndarray
-    """(k,): position of a lone tone with the same magnitudes about that bin, as a fractional index.
-    """
+    """(k,): position, as a fractional index, of a pure tone whose magnitudes equal those of the
+    echo about its strongest bin."""
 
 
 class EchoWindow(NamedTuple):
-    """Bins of an echo whose speckle is drawn, by their index in the spectrum."""
+    """First, last, strongest and middle bin of an echo whose speckle is drawn.
+
+    Bins are stated by their index in the spectrum.
+    """
 
     strongest_bin: int
-    """Strongest bin of the echo."""
+    """Index of the strongest bin of the echo."""
     position: float
-    """Middle of the echo, as a fractional index."""
+    """Middle of the echo, as a fractional index in the spectrum."""
     first_bin: int
-    """First bin of the window."""
+    """Index of the first bin whose speckle is drawn."""
     last_bin: int
-    """Last bin of the window."""
+    """Index of the last bin whose speckle is drawn."""
 
 
 def noiseless_signal(
     shots: Shots, point: int, segment: int, echo_bins: Sequence[int] | np.ndarray = (),
     fixed_threshold: float = math.inf,
 ) -> SegmentSignal:  # fmt: skip
-    """Return the spectrum of a segment of a point without noise, and where its echoes are.
+    """Return the spectrum of a segment of a point without noise, and the bins of its echoes.
 
     Parameters
     ----------
@@ -319,7 +329,10 @@ def _exempt_bin_mask(
     last_bin: int,
     fixed_threshold: float,
 ) -> np.ndarray:
-    """Return :attr:`SegmentSignal.is_exempt` of a segment.
+    """Return a mask (bins,) of the bins of a segment that cannot raise a false alarm.
+
+    They are the bins of the echo, and bins of signal at or above the threshold with their
+    neighbours.
 
     Parameters
     ----------
@@ -352,12 +365,12 @@ def _exempt_bin_mask(
 
 
 def zero_frequency_index(shots: Shots) -> int:
-    """Return the index of the bin of frequency 0 in a spectrum of shots."""
+    """Return the index in a spectrum of the bin at frequency 0."""
     return int(shots.bin_indices(np.zeros((), int)))
 
 
 def centring_shift(shots: Shots, middle_index: int) -> int:
-    """Return the number of bins by which :func:`centre_bins` moves a bin upwards."""
+    """Return the number of bins by which :func:`centre_bins` moves a given bin upwards."""
     return 1 + shots.fft_size // 2 - middle_index if shots.complex_record else 0
 
 
@@ -365,8 +378,8 @@ def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarr
     """Rotate the bins of a complex record's spectrum until a given bin is in the middle.
 
     Bins about it are then adjacent, although the first bin of the spectrum follows its last. A 0 is
-    added at either end, in the place of DC and Nyquist of a real record. The bins of a real record
-    are returned unchanged.
+    added at either end, where a real record has DC and Nyquist. The bins of a real record are
+    returned unchanged.
 
     Parameters
     ----------
@@ -384,9 +397,10 @@ def centre_bins(shots: Shots, values: np.ndarray, middle_index: int) -> np.ndarr
 
 
 def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: int) -> float:
-    """Interpolate the position of a peak, as a fractional index, as if it were a lone tone.
+    """Return the position of a peak between bins, as a fractional index.
 
-    ``magnitude`` (bins,) is |X|, and ``peak_index`` its largest bin.
+    It is that of a pure tone whose magnitudes equal those about the peak. ``magnitude`` (bins,) is
+    |X|, and ``peak_index`` the index of its largest bin.
     """
     last_index = magnitude.size - 1
     if shots.complex_record:
@@ -402,7 +416,7 @@ def _interpolate_tone_position(shots: Shots, magnitude: np.ndarray, peak_index: 
 
 
 def _tone_phases(position: float, shots: Shots, first_sample: int) -> np.ndarray:
-    """Return the phase factors X / |X| (bins,) of a lone tone's spectrum; 1 where X is 0.
+    """Return the phase factors X / |X| (bins,) of a pure tone's spectrum X; 1 where X is 0.
 
     The tone is at a position, as a fractional index, and begins with sample ``first_sample``.
     """
@@ -446,7 +460,9 @@ def draw_signal_spectra(
     key: np.ndarray,
     draws: np.ndarray,
 ) -> np.ndarray:
-    """Draw complex spectra (m, bins) of the signal [V] with the laser's phase noise, without noise.
+    """Draw complex spectra (m, bins) of the signal [V] with the laser's phase noise.
+
+    No receiver noise is added.
 
     If the laser has no line width, all draws are equal, and there is one row.
 
@@ -633,7 +649,7 @@ def draw_bin_speckle(
 def add_footprint_records(
     shots: Shots, point: int, signal: SegmentSignal, line_grid: SpeckleLineGrid
 ) -> SegmentSignal:
-    """Return a signal with the fields that draws of its speckle need.
+    """Return a segment's signal with the records that draws of its speckle need.
 
     These are :attr:`SegmentSignal.footprint_records` and :attr:`SegmentSignal.record_scalings`.
     """
@@ -678,7 +694,10 @@ def add_footprint_records(
 def _draw_speckle_from_records(
     shots: Shots, signal: SegmentSignal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Draw the factors (m, bins) of :func:`draw_bin_speckle` from the records of the echoes."""
+    """Draw the factors (m, bins) by which speckle multiplies a segment's bins, from records.
+
+    Each echo has one :class:`FootprintRecord`.
+    """
     assert signal.footprint_records is not None
     factors = np.empty((draws.size, signal.spectrum.size), complex)
     for echo_number, record in enumerate(signal.footprint_records):
@@ -696,7 +715,9 @@ def _draw_speckle_from_records(
 def iter_look_spectra(
     point_spectra: "PointSpectra", segment: int, draws: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Draw and yield complex spectra (m, bins) of a segment with noise [V], look by look.
+    """Draw and yield complex noisy spectra (m, bins) of a segment [V], look by look.
+
+    A look is one record of the segment.
 
     If looks are added in amplitude, only their mean is yielded. ``draws`` (m,) int64 are the
     numbers of the draws.
@@ -730,7 +751,9 @@ def _draw_look_speckle(
     draws: np.ndarray,
     signal: SegmentSignal,
 ) -> np.ndarray:
-    """Draw the factors (m, bins) by which speckle multiplies the bins of one look.
+    """Draw the complex factors (m, bins) by which speckle multiplies the bins of one look.
+
+    A look is one record of the segment.
 
     The speckle of successive looks is equal, independent or correlated. Correlated speckle is a sum
     of independent realisations, with other coefficients in each look.
@@ -766,7 +789,7 @@ def _draw_look_speckle(
 
 
 class PointSpectra(NamedTuple):
-    """Noiseless signals of a point, with the detector and estimator that process its draws."""
+    """Noiseless signals of a point, with the detector and estimator for its noisy spectra."""
 
     shots: Shots
     """Prepared shots."""
@@ -775,28 +798,33 @@ class PointSpectra(NamedTuple):
     key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[SegmentSignal | None, ...]
-    """Signal of each segment; None for a segment that does not exist."""
+    """Noiseless signal of each segment, as of ``shots``; None for a segment that does not exist."""
     look_shots: list[Shots]
-    """Prepared shots as they are at the time of each look."""
+    """Prepared shots at the time of each look (record of each segment), while the target moves."""
     settings: SpectrumSettings
     """Settings of the spectra and of the detector."""
     detect: Detector
-    """Detector: a function of powers |X|^2 (m, bins) and the settings that returns flags (m, bins).
-    """
+    """Detector: a function of powers |X|^2 (m, bins) [V^2] and the settings, which returns a mask
+    (m, bins) of flagged bins."""
     estimate: Estimator
-    """Estimator of frequency: a function of spectra (m, bins), peak bins (m,) and the settings that
-    returns positions (m,)."""
+    """Estimator of frequency: a function of complex spectra (m, bins), indices of peak bins (m,)
+    and the settings, which returns positions (m,) as fractional indices."""
     signal_cache: dict[tuple[int, int], SegmentSignal]
-    """Signals that were computed for looks at which the target has moved, by segment and look."""
+    """Noiseless signals computed so far for later looks (records), by segment and look. The target
+    has moved between looks."""
     echo_bins: np.ndarray | None = None
-    """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
+    """(3, k) int64: indices of the strongest bins of the shot's k echoes in each segment, -1 for
+    none; None for a single echo."""
     line_grid: SpeckleLineGrid | None = None
-    """Speckle lines of the footprints of all shots."""
+    """Lines that represent the footprints of all shots in developed speckle."""
     fixed_threshold: float = math.inf
     """Threshold of the detector [V] if it is fixed; infinite for other detectors."""
 
     def get_signal_in_look(self, segment: int, look: int) -> SegmentSignal:
-        """Return the signal of a segment at the time of a look."""
+        """Return the noiseless signal of a segment at the time of a look.
+
+        A look is one record of the segment. The target moves between looks.
+        """
         shots, signal = self.look_shots[look], self.signals[segment]
         if shots is self.shots and signal is not None:
             return signal
@@ -811,36 +839,41 @@ class PointSpectra(NamedTuple):
         return self.signal_cache[segment, look]
 
     def echo_indices(self, segment: int) -> np.ndarray:
-        """Return indices of the echoes' strongest bins in a segment; empty if there is one echo."""
+        """Return the indices of the echoes' strongest bins in a segment.
+
+        The result is empty if the shot has a single echo.
+        """
         bins = np.empty(0, np.int64) if self.echo_bins is None else self.echo_bins[segment]
         bins = bins[bins >= 0]
         return self.shots.bin_indices(bins)
 
 
 class SegmentDetections(NamedTuple):
-    """Detections, false alarms and frequency of a segment in m draws, (m,) each."""
+    """Detections, false alarms and estimated frequency of a segment in m draws, (m,) each."""
 
     is_detected: np.ndarray
-    """(m,) bool: True if the detector flags a bin of the echo."""
+    """(m,) bool: True for draws in which the detector flags a bin of the echo."""
     n_false_groups: np.ndarray
-    """(m,) int64: number of groups of flagged bins outside the signal."""
+    """(m,) int64: number of runs of adjacent flagged bins outside the bins of the echo: false
+    alarms."""
     n_false_bins: np.ndarray
-    """(m,) int64: number of bins in these groups."""
+    """(m,) int64: number of flagged bins in these false alarms."""
     frequency: np.ndarray
-    """(m,): estimated frequency [bins], signed for a complex record."""
+    """(m,): estimated frequency of the echo [bins], signed for a complex record."""
     peak_offset: np.ndarray
-    """(m,): estimated position relative to the largest bin of the detected group [bins]."""
+    """(m,): estimated position minus the largest bin of the detected group of adjacent flagged bins
+    [bins]."""
     peak_power: np.ndarray
-    """(m,): |X|^2 [V^2] that errors by speckle are computed with. It is that of the bin which is
-    strongest without noise, but no less than the smaller of the peak's power and the squared
-    threshold."""
+    """(m,): |X|^2 [V^2] from which errors by speckle are computed. It is that of the bin which is
+    strongest without noise. It is at least the smaller of two values: the power of the peak, and
+    the squared threshold."""
 
 
 def prepare_point_spectra(
     shots: Shots, point: int, parameters: Parameters, key: np.ndarray, methods: SpectrumMethods,
     echo_bins: np.ndarray | None = None, line_grid: SpeckleLineGrid | None = None,
 ) -> PointSpectra:  # fmt: skip
-    """Return the point_spectra of one point of prepared shots.
+    """Return the noiseless signals of one point, with the detector and estimator of its parameters.
 
     Parameters
     ----------
@@ -913,12 +946,12 @@ def prepare_point_spectra(
 def flag_bins(
     spectra: Sequence[np.ndarray], point_spectra: PointSpectra, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Detect in the looks of a segment.
+    """Apply the detector to the spectra of a segment, and combine looks (records).
 
     Parameters
     ----------
     spectra
-        Complex spectra (m, bins) of each look [V].
+        Complex spectra (m, bins) of each look (record of the segment) [V].
     point_spectra
         Point to which the spectra belong.
     segment
@@ -948,7 +981,7 @@ def flag_bins(
 def estimate_positions(
     spectra: Sequence[np.ndarray], peak_bins: np.ndarray, point_spectra: PointSpectra
 ) -> np.ndarray:
-    """Estimate the positions (m,) of peaks, as fractional indices: the mean over the looks.
+    """Estimate the positions (m,) of peaks, as fractional indices, averaged over looks (records).
 
     ``spectra`` are the complex spectra (m, bins) of each look [V], and ``peak_bins`` (m,) the
     indices of the peaks.
@@ -967,7 +1000,7 @@ def detect_and_estimate(
     Parameters
     ----------
     spectra
-        Complex spectra (m, bins) of each look [V].
+        Complex spectra (m, bins) of each look (record of the segment) [V].
     signal
         Signal of the segment without noise.
     point_spectra
@@ -1108,9 +1141,9 @@ def count_detections(
 
 
 def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.ndarray:
-    """Return the bounds of range [m] and radial velocity [m/s] in each draw, (2, m).
+    """Return the smallest standard deviations of range [m] and velocity [m/s] by draw, (2, m).
 
-    They depend on the segments that are detected in the draw, `is_detected` (3, m).
+    They are bounds for the segments that are detected in a draw, ``is_detected`` (3, m).
     """
     bounds = np.empty((2, is_detected.shape[1]))
     bounds[...] = np.reshape(measurement_bound(point_spectra), (2, 1))
@@ -1126,7 +1159,7 @@ def _bounds_by_draw(point_spectra: PointSpectra, is_detected: np.ndarray) -> np.
 def _wander_variances(
     point_spectra: PointSpectra, detections: Sequence[SegmentDetections], is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return the mean square errors of range [m^2] and velocity [m^2/s^2] by speckle, (2, m).
+    """Return the mean square errors by speckle of range [m^2] and velocity [m^2/s^2], (2, m).
 
     `detections` are those of each segment, and `is_detected` (3, m) says which count.
     """
@@ -1257,12 +1290,12 @@ def _measurement_errors(
 
 
 def _carriers_at(shots: Shots, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the carriers of a point in the up, Doppler and down segment [Hz]."""
+    """Return the carrier (optical) frequencies of a point in the three segments [Hz]."""
     up, doppler, down = (_value_at(carrier, point) for carrier in shots.waveform.carriers)
     return up, doppler, down
 
 
 def _value_at(column: np.ndarray | float, point: int) -> np.ndarray:
-    """Return a point's value of an array (n,), or of one number that all points share."""
+    """Return the element of an array (n,) for a point; a single number is common to all points."""
     column = np.asarray(column)
     return np.asarray(column[point] if column.ndim else column)

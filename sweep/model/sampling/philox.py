@@ -25,30 +25,33 @@ from sweep.kernel_cache import multiply_high, njit
 # Streams, one for each physical cause. Causes that act in every segment have three: up, Doppler,
 # down. Every stored draw depends on these numbers: add numbers, never change any.
 STREAM_DETECTION = (1, 3, 2)
-"""Streams of the numbers that are compared with probabilities of detection, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers that are compared with
+probabilities of detection."""
 STREAM_FALSE_ALARM = (4, 6, 5)
-"""Streams of the numbers that are compared with probabilities of a false alarm by noise, and of the
-bins of such alarms, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the random numbers that decide on false
+alarms by noise and choose their bins."""
 STREAM_NOISE = (7, 9, 8)
-"""Streams of the noise in the bins of an echo, and in bins of leaked signal, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the noise in the bins of echoes and of
+leaked signal."""
 STREAM_NOISE_MAXIMUM = (10, 12, 11)
-"""Streams of the largest magnitude in bins of noise alone, and of its bin, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the largest magnitude in bins of noise
+alone, and of its bin."""
 STREAM_FOOTPRINT_PHASE = 13
-"""Stream of the phases of beamlets."""
+"""Stream number of the random phases of the beamlets' echoes."""
 STREAM_SPECKLE = 14
-"""Stream of the complex amplitudes of developed speckle."""
+"""Stream number of the random complex amplitudes of developed speckle."""
 STREAM_POINTING_JITTER = 16
-"""Stream of the pointing jitter of the beam."""
+"""Stream number of the random pointing of the beam by jitter."""
 STREAM_SCINTILLATION = 17
-"""Stream of scintillation by turbulence."""
+"""Stream number of the random intensity of the echo by turbulence (scintillation)."""
 STREAM_RECORD_NOISE = (18, 20, 19)
-"""Streams of the noise in the samples of a record, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the noise in the samples of a record."""
 STREAM_LASER_PHASE = (21, 23, 22)
-"""Streams of the random walk of the laser's phase, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of the random walk of the laser's phase."""
 STREAM_ERROR_FLOOR = 24
-"""Stream of an instrument's errors that do not depend on the echo."""
+"""Stream number of an instrument's random errors that do not depend on the echo."""
 STREAM_LEAKAGE = (25, 27, 26)
-"""Streams of false peaks by leaked signal, by segment."""
+"""Stream numbers, for up, Doppler and down segment, of false peaks by leaked signal."""
 
 _MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _MULTIPLIER_0, _MULTIPLIER_1 = (np.uint64(m) for m in _MULTIPLIERS)
@@ -62,40 +65,43 @@ _SHIFT_32, _SHIFT_12 = np.uint64(32), np.uint64(12)
 
 
 class DrawAddress(NamedTuple):
-    """Address of the random numbers of one draw of a point, for compiled code."""
+    """Address of the random numbers of one draw of a point: random key and number of the draw."""
 
     key_0: np.uint64
-    """First word of the point's random key (:func:`point_keys`)."""
+    """First 64-bit word of the point's random key (:func:`point_keys`)."""
     key_1: np.uint64
-    """Second word of the key."""
+    """Second 64-bit word of the point's random key (:func:`point_keys`)."""
     draw: np.int64
-    """Number of the draw."""
+    """Number of the draw, from 0."""
 
 
 class CounterIncrements(NamedTuple):
-    """Differences between the counters of successive columns in :func:`fill_words`."""
+    """Differences between the generator's counters for successive columns in :func:`fill_words`.
+
+    A counter contains the number of the draw and the number of the block (four random words).
+    """
 
     draw: int
-    """Difference of the numbers of the draws."""
+    """Number of the draw in the next column, minus that in this column."""
     block: int
-    """Difference of the numbers of the blocks."""
+    """Number of the block (four random words) in the next column, minus that in this column."""
 
 
 # Arguments of `fill_words` as constants, because numba compiles anew for each literal in a call.
 FIRST_BLOCK_NUMBER = np.int64(0)
-"""Number of the first block of a stream."""
+"""Number of the first block (four random words) of a stream."""
 DRAW_INCREMENTS = CounterIncrements(draw=1, block=0)
-"""Increments for the same block in successive draws."""
+"""Increments with which columns hold the same block (four random words) of successive draws."""
 BLOCK_INCREMENTS = CounterIncrements(draw=0, block=1)
-"""Increments for successive blocks of one draw."""
+"""Increments with which columns hold successive blocks (four random words) of one draw."""
 
 
 @njit(cache=True)
 def _philox_round(x0, x1, x2, x3, key0, key1):
-    """Return the four words of a counter after one of the ten rounds of Philox.
+    """Apply one of the ten rounds of Philox to the four words of a counter, and return them.
 
-    High words of 128-bit products are computed from 32-bit halves, because vector registers lack
-    such a product. The processor then computes several counters at once.
+    The high words of 128-bit products are computed from 32-bit halves, because vector registers
+    lack such a product. The processor then computes several counters at once.
     """
     low, high = x0 & _LOW_HALF_MASK, x0 >> _SHIFT_32
     middle = _MULTIPLIER_0_LOW * high + (_MULTIPLIER_0_LOW * low >> _SHIFT_32)
@@ -116,9 +122,9 @@ def _philox_round(x0, x1, x2, x3, key0, key1):
 
 @njit(cache=True)
 def four_words(key0, key1, draw, stream, block):
-    """Return the four random words (uint64) of a block, which is number `block` of its stream.
+    """Return the four random words (uint64) of block number ``block`` of a stream.
 
-    `key0` and `key1` are the random key of a point, and `draw` is the number of the draw.
+    ``key0`` and ``key1`` are the random key of a point, and ``draw`` is the number of the draw.
     """
     k0, k1 = np.uint64(key0), np.uint64(key1)
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
@@ -133,14 +139,14 @@ def four_words(key0, key1, draw, stream, block):
 
 @njit(cache=True)
 def fill_words(address, stream, block, increments, count, words):
-    """Fill columns of an array with the words of :func:`four_words`.
+    """Fill columns of an array with random words: those of one block (:func:`four_words`) each.
 
     Parameters
     ----------
     address
         Key of the point, and draw of the first column (:class:`DrawAddress`).
     stream
-        Stream of the physical cause.
+        Number of the stream: the physical cause.
     block
         Block of the first column.
     increments
@@ -152,8 +158,8 @@ def fill_words(address, stream, block, increments, count, words):
 
     Notes
     -----
-    All columns pass one round before any passes the next, which the processor vectorises: about six
-    times as fast.
+    Each round of the generator is applied to all columns before the next round. The processor
+    vectorises this loop, which is about six times as fast.
     """
     key_0, key_1, first_draw = address
     k0, k1, draw = np.uint64(key_0), np.uint64(key_1), np.uint64(first_draw)
@@ -189,16 +195,17 @@ def to_normals(word0, word1):
 
 @njit(cache=True)
 def uniform(key0, key1, draw, stream, index):
-    """Return one uniform number, 2^-53 .. 1 - 2^-53: number `index` of a stream in a draw.
+    """Return one uniform random number: number ``index`` of a stream in a draw.
 
-    A comparison with it cannot realise a probability below 2^-53 = 1.1e-16.
+    It is between 2^-53 and 1 - 2^-53. An event of a probability below 2^-53 = 1.1e-16 never happens
+    in a comparison with it.
     """
     return to_uniform(four_words(key0, key1, draw, stream, index >> 2)[index & 3])
 
 
 @njit(cache=True)
 def normal_pair(key0, key1, draw, stream, index):
-    """Return two standard normal numbers, pair number `index` of a stream in a draw.
+    """Return two standard normal random numbers: pair number ``index`` of a stream in a draw.
 
     They are made from the uniform numbers ``2 index`` and ``2 index + 1``.
     """
@@ -216,7 +223,7 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
     draws
         (m,) int64: number of the draw of each row.
     stream
-        Stream of the physical cause.
+        Number of the stream: the physical cause.
     count
         Number of uniform numbers in a row.
     """
@@ -227,9 +234,9 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, stream: int, count: int) -> np
 
 @njit(cache=True, nogil=True)
 def _fill_uniforms(keys, draws, stream, out):
-    """Fill the rows of `out` (m, count) with the uniform numbers of a stream; see :func:`uniforms`.
+    """Fill the rows of ``out`` (m, count) with the first uniform numbers of a stream.
 
-    The count is a multiple of 4.
+    The arguments are those of :func:`uniforms`. The count is a multiple of 4.
     """
     words = np.empty((4, out.shape[1] // 4), np.uint64)
     for i in range(draws.size):

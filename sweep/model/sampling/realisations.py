@@ -32,24 +32,28 @@ from sweep.model.outputs import (
 from sweep.model.preparation import Parameters, Shots
 
 DRAWS_PER_BATCH = 4096
-"""Largest number of draws that are prepared at once, over all points."""
+"""Largest number of draws, summed over points, that are prepared at once."""
 BEAMLETS_PER_BATCH = 1 << 19
-"""Largest number of beamlets in the draws that are prepared at once. Each takes some 100 bytes."""
+"""Largest number of beamlets, summed over draws, that are prepared at once. Each takes some 100
+bytes of memory."""
 
 
 class RealisedShots(NamedTuple):
-    """Prepared shots of m draws of points, (m,) each; the draws of a point are in order."""
+    """Prepared shots of m draws of points, (m,) each.
+
+    Each draw has its own random effects. The draws of a point are in the order of their numbers.
+    """
 
     point_indices: np.ndarray
-    """int64: index of the point."""
+    """(m,) int64: index of the point that each draw belongs to."""
     draw_numbers: np.ndarray
-    """int64: number of the draw."""
+    """(m,) int64: number of each draw."""
     shots: Shots
-    """Prepared shots of the m draws."""
+    """Prepared shots of the m draws, with their random effects."""
 
 
 def random_effects(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Return those of the named effects that are simulated by draws."""
+    """Return those of the named effects that are simulated by random draws."""
     return tuple(effect for effect in select_effects(effects) if effect.is_random)
 
 
@@ -106,9 +110,10 @@ def iter_realisations(
 def _realise_batch(
     parameters: dict[str, np.ndarray], effects: Collection[str], draw_keys: DrawAddresses
 ) -> Shots:
-    """Return prepared shots, with all effects, for one draw of each of m points of a category.
+    """Return prepared shots, with all effects, for m draws of points of one category.
 
-    `draw_keys` are the random keys and the numbers of the draws.
+    ``draw_keys`` holds the random key of each point and the number of each draw. Points of one
+    category share all settings that are words or sizes.
     """
     n_points, random = draw_keys.draw_numbers.size, random_effects(effects)
     for effect in random:
@@ -132,8 +137,7 @@ def zero_standard_errors(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndar
 class RunningMeans:
     """Means of values over the draws of n points, accumulated draw by draw.
 
-    A draw in which a value is nan does not count for this value. For log10 outputs the mean is the
-    logarithm of the mean of the numbers.
+    A nan does not count. For log10 outputs the mean is the logarithm of the mean of the numbers.
 
     Parameters
     ----------
@@ -149,11 +153,13 @@ class RunningMeans:
         self.n_values = np.zeros(shape, np.int64)
         self.mean = np.where(self._is_logarithm[:, None], -np.inf, np.zeros(shape))
         self.squared_deviations = np.zeros(shape)
-        """(names, n): sums of squared deviations from the means; for logarithms the sum of the
-        numbers over the largest number."""
+        """(names, n): sum over draws of squared deviations from the mean. For logarithms it is the
+        sum of the numbers over the largest number."""
 
     def add(self, point_indices: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-        """Add the values of m draws; those of one point must be in the order of their numbers.
+        """Add the values of m draws to the means.
+
+        The draws of one point must be in the order of their numbers.
 
         Parameters
         ----------
@@ -175,7 +181,7 @@ class RunningMeans:
     def moments(
         self, names: Sequence[str], point_indices: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return means, unbiased variances of a single draw, and numbers of draws.
+        """Return mean and unbiased variance of values over draws, and the numbers of draws.
 
         Parameters
         ----------
@@ -199,12 +205,15 @@ class RunningMeans:
             )
 
     def running_sums(self) -> np.ndarray:
-        """Return what further draws need in addition to the means, (n, N_RUNNING_SUMS)."""
+        """Return the sums, besides the means, from which further draws continue.
+
+        The result is (n, N_RUNNING_SUMS).
+        """
         arrays = self.n_values, self.squared_deviations[KEEPS_SPREAD], self.mean[IS_LOGARITHM]
         return np.concatenate(arrays).T
 
     def resume(self, results: Mapping[str, np.ndarray]) -> None:
-        """Continue from earlier results.
+        """Restore means and sums from the results of earlier draws, so that draws can be added.
 
         `results` are those of :meth:`results` by name, with the array of :meth:`running_sums` as
         RUNNING_SUMS. Points without draws have zeros there.
@@ -220,11 +229,14 @@ class RunningMeans:
         self.mean[...] = np.where(n_values > 0, mean, self.mean)
 
     def state(self) -> np.ndarray:
-        """Return the complete state, (3 * names, n), for :meth:`restore_state`."""
+        """Return all means, sums and counts as one array, for :meth:`restore_state`.
+
+        The result is (3 * names, n).
+        """
         return np.concatenate([self.n_values, self.mean, self.squared_deviations])
 
     def restore_state(self, state: np.ndarray) -> None:
-        """Restore a state that :meth:`state` returned."""
+        """Replace all means, sums and counts by an array that :meth:`state` returned."""
         self.n_values[...], self.mean[...], self.squared_deviations[...] = np.split(state, 3)
 
     def standard_errors(self) -> np.ndarray:

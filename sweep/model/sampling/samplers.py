@@ -59,24 +59,26 @@ from sweep.model.sampling.realisations import (
 )
 
 NOISE_DRAWS_PER_STEP = 1 << 16
-"""Number of draws of a point that are made at once if nothing but noise is random."""
+"""Number of draws of each point that are made in one step if nothing but noise is random."""
 RANDOM_EFFECT_DRAWS_PER_STEP_MIN = 16
-"""Smallest number of draws of a point that are made at once if random effects are simulated."""
+"""Smallest number of draws of each point that are made in one step if random effects are simulated.
+"""
 
 SPECTRUM_SAMPLES_PER_STEP = 1 << 18
-"""Largest number of samples of full spectra that are processed at once."""
+"""Largest number of samples, over all draws, of the full spectra that are processed at once."""
 
 FFT_SIZE_PATH = "instrument.processing.fft_size"
-"""Path of the FFT size."""
+"""Dotted path of the parameter for the FFT size."""
 
 SPECTRA_METHOD = "spectra"
-"""Name of the method of drawing that makes full spectra. The others are ``probabilities`` and
-``noise``."""
+"""Name of the method that draws full spectra with noise in every bin. The other methods are
+``probabilities`` and ``noise``."""
 
 PD_COUNT_ROWS = [
     list(DRAW_COUNT_OUTPUTS).index(name.replace("pd_", "n_detected_")) for name in PD_OUTPUTS
 ]
-"""Rows in `DRAW_COUNT_OUTPUTS` of the numbers of detections, in the order of `PD_OUTPUTS`."""
+"""Rows in the arrays of counts, whose order is that of ``DRAW_COUNT_OUTPUTS``, with the numbers of
+detections. The rows are in the order of ``PD_OUTPUTS``."""
 
 
 class PriorDraws(NamedTuple):
@@ -86,17 +88,17 @@ class PriorDraws(NamedTuple):
     """
 
     n_draws: np.ndarray
-    """(n,) int64: number of draws of each point."""
+    """(n,) int64: number of draws made so far of each point."""
     counts: np.ndarray
-    """(names, n, batches) int64: counts of events in each batch, in the order of
-    DRAW_COUNT_OUTPUTS."""
+    """(names, n, batches) int64: number of draws with each event, in the order of
+    DRAW_COUNT_OUTPUTS, in each batch of draws."""
     means: Mapping[str, np.ndarray]
     """Means (n,) by the names of outputs, and RUNNING_SUMS (n, columns). They are used for points
     with random effects or full spectra."""
 
 
 class Sampler(ABC):
-    """Draws of n points so far, as counts and sums to which further draws can be added.
+    """Counts and sums of the draws of n points made so far, to which further draws are added.
 
     Parameters
     ----------
@@ -127,10 +129,16 @@ class Sampler(ABC):
 
     @abstractmethod
     def draws_per_step(self, n_points: int) -> int:
-        """Return how many draws of each of `n_points` points are made at once, in a few seconds."""
+        """Return the number of draws of each of ``n_points`` points that are made in one step.
+
+        A step takes a few seconds.
+        """
 
     def draw(self, point_indices: np.ndarray, n_draws: int) -> None:
-        """Add `n_draws` draws to selected points, all of which have as many draws so far."""
+        """Add ``n_draws`` draws to each selected point.
+
+        All selected points must have the same number of draws so far.
+        """
         first_draw = self.batch_edges[0] + self.n_draws[point_indices[0]]
         counts = np.zeros(
             (len(DRAW_COUNT_OUTPUTS), point_indices.size, self.batch_edges.size - 1), np.int64
@@ -143,28 +151,29 @@ class Sampler(ABC):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Make draws `first_draw` to `end_draw` - 1 and add their events to the counts.
+        """Make the draws ``first_draw`` to ``end_draw`` - 1 of points, and count their events.
 
-        `counts` (names, points, batches) int64 has the order of DRAW_COUNT_OUTPUTS.
+        The counts are added to ``counts`` (names, points, batches) int64, in the order of
+        DRAW_COUNT_OUTPUTS.
         """
 
     @abstractmethod
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return the half-widths of the confidence intervals of pd, (4, points).
+        """Return the half-widths of the confidence intervals of detection probabilities.
 
-        Rows are in the order of PD_OUTPUTS; nan for a segment that does not exist. `error_budget`
-        states the confidence.
+        The result is (4, points), in the order of PD_OUTPUTS; nan for a segment that does not
+        exist. ``error_budget`` states the confidence.
         """
 
     @abstractmethod
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return outputs, their standard errors and half-widths, (n,) by name.
+        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name.
 
         The running sums that further draws need are included, (n, columns).
         """
 
     def select_parameters(self, point_indices: np.ndarray | int) -> dict[str, Any]:
-        """Return the parameters of selected points by dotted path."""
+        """Return the values of all parameters for selected points, by dotted path."""
         return {
             path: v[point_indices] if isinstance(v, np.ndarray) and v.ndim else v
             for path, v in self.parameters.items()
@@ -175,7 +184,10 @@ class Sampler(ABC):
         return np.asarray(self.counts.sum(axis=-1)[PD_COUNT_ROWS])
 
     def count_half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return half-widths (4, points) of the fractions of draws with a detection."""
+        """Return half-widths of the confidence intervals of fractions of detections, (4, points).
+
+        They follow from the counts of draws alone. Rows are in the order of PD_OUTPUTS.
+        """
         counts, n = self.n_detected()[:, point_indices], self.n_draws[point_indices]
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
         interval = COUNT_INTERVALS[error_budget.interval](
@@ -184,13 +196,20 @@ class Sampler(ABC):
         return interval_half_width(counts / n, interval)
 
     def half_width_excess(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Return each point's largest half-width minus the tolerance, at least 0, (points,)."""
+        """Return by how much each point's largest half-width exceeds the tolerance, (points,).
+
+        The half-widths are those of the confidence intervals of detection probabilities. The result
+        is at least 0.
+        """
         widths = self.half_widths(point_indices, error_budget)
         excess = widths - error_budget.select(point_indices, self.n_draws.size).tolerance
         return np.fmax.reduce(excess, axis=0, initial=0.0)
 
     def accuracy_outputs(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Return numbers of draws, half-widths and excess (n,) by the names of ACCURACY_OUTPUTS."""
+        """Return numbers of draws, half-widths and their excess over the tolerance, (n,) by name.
+
+        The names are those of ACCURACY_OUTPUTS.
+        """
         point_indices = np.arange(self.n_draws.size)
         widths = zip(PD_OUTPUTS, self.half_widths(point_indices, error_budget), strict=True)
         return {
@@ -201,12 +220,17 @@ class Sampler(ABC):
 
 
 def never_stop() -> bool:
-    """Return False. It is a `should_stop` with which all draws are made."""
+    """Return False, so that drawing goes on until all draws are made.
+
+    It is the default of ``should_stop``.
+    """
     return False
 
 
 def stopping_checks(batch_size: int, draws_max: int) -> Iterator[int]:
-    """Yield the numbers of draws at which half-widths are tested, in rising order.
+    """Yield the numbers of draws at which accuracy is tested, in rising order.
+
+    Accuracy is the half-width of the confidence intervals of detection probabilities.
 
     The first numbers are one batch apart. Later numbers grow by a quarter, rounded to whole
     batches. The last is `draws_max`.
@@ -233,7 +257,7 @@ def simulate_draws(
     prior_draws: PriorDraws | None = None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> dict[str, np.ndarray]:
-    """Simulate draws with all effects and return outputs, their errors, and counts of draws.
+    """Simulate draws of points with all effects, and return outputs, their errors and counts.
 
     Parameters
     ----------
@@ -301,7 +325,7 @@ def draw_until_accurate(
     error_budget: ErrorBudget | None,
     should_stop: Callable[[], bool] = never_stop,
 ) -> None:
-    """Add draws to points until each meets the tolerance, or has the last number of draws.
+    """Add draws to points until each meets the tolerance, or has the largest number of draws.
 
     Parameters
     ----------
@@ -340,7 +364,7 @@ def draw_until_accurate(
 
 
 class DetectionSampler(Sampler):
-    """Sampler of detections, by comparing random numbers with probabilities or by drawing noise."""
+    """Sampler of detections in draws, by probabilities or by noise in the bins of echoes."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -356,7 +380,7 @@ class DetectionSampler(Sampler):
             self._running_means.resume(prior_draws.means)
 
     def draws_per_step(self, n_points: int) -> int:
-        """Implement :meth:`Sampler.draws_per_step`."""
+        """Return the number of draws of each point that are made in one step."""
         return (
             NOISE_DRAWS_PER_STEP
             if self._running_means is None
@@ -366,7 +390,10 @@ class DetectionSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Implement :meth:`Sampler.count_draws`, and add draws of random effects to the means."""
+        """Make draws of points and count their events; add draws of random effects to the means.
+
+        The arguments are those of :meth:`Sampler.count_draws`.
+        """
         point_parameters, keys = self.select_parameters(point_indices), self.keys[point_indices]
         if self._running_means is not None:
             for members, draw_numbers, shots in iter_realisations(
@@ -396,7 +423,10 @@ class DetectionSampler(Sampler):
             )
 
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Implement :meth:`Sampler.half_widths`."""
+        """Return the half-widths of the confidence intervals of detection probabilities.
+
+        The result is (4, points), in the order of PD_OUTPUTS.
+        """
         confidence = error_budget.select(point_indices, self.n_draws.size).confidence
         if self._running_means is not None:
             mean, variance, n_draws = self._running_means.moments(PD_OUTPUTS, point_indices)
@@ -410,7 +440,7 @@ class DetectionSampler(Sampler):
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Implement :meth:`Sampler.results`."""
+        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
         if self._running_means is None:
             outputs = self._outputs | zero_standard_errors(self._outputs)
         else:
@@ -421,7 +451,7 @@ class DetectionSampler(Sampler):
 
 
 class SpectraSampler(Sampler):
-    """Sampler whose draws are full spectra, processed by a detector and an estimator."""
+    """Sampler whose draws are full noisy spectra, processed by a detector and an estimator."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, methods: SpectrumMethods,
@@ -454,7 +484,7 @@ class SpectraSampler(Sampler):
                 self._statistic_means.restore_state(statistic_sums)
 
     def draws_per_step(self, n_points: int) -> int:
-        """Implement :meth:`Sampler.draws_per_step`.
+        """Return the number of draws of each point that are made in one step.
 
         The result is a multiple of the number of draws that a detector processes together. So a
         detector gets the same draws together, however draws are divided into steps.
@@ -467,7 +497,10 @@ class SpectraSampler(Sampler):
     def count_draws(
         self, point_indices: np.ndarray, first_draw: int, end_draw: int, counts: np.ndarray
     ) -> None:
-        """Implement :meth:`Sampler.count_draws`, and add measured values to the running means."""
+        """Make draws of points and count their events; add measured values to the means.
+
+        The arguments are those of :meth:`Sampler.count_draws`.
+        """
         for column, point in enumerate(point_indices):
             for point_spectra, draws in self._iter_point_spectra(
                 int(point), int(first_draw), int(end_draw)
@@ -481,7 +514,7 @@ class SpectraSampler(Sampler):
     def _iter_point_spectra(
         self, point: int, first_draw: int, end_draw: int
     ) -> Iterator[tuple[PointSpectra, np.ndarray]]:
-        """Yield the spectra of a point, prepared, with the numbers of the draws that share them."""
+        """Yield the noiseless signals of a point with the numbers of the draws that share them."""
         point_parameters = self.select_parameters(point)
         if self._shot_of_point:
             point_spectra = prepare_point_spectra(
@@ -508,9 +541,10 @@ class SpectraSampler(Sampler):
                 yield point_spectra, np.array([draw_number])
 
     def _nan_for_missing_segments(self) -> np.ndarray:
-        """Return nan for outputs of segments that do not exist, else 0, (4, n).
+        """Return terms (4, n) that, added to outputs, set those of missing segments to nan.
 
-        Rows are in the order of PD_OUTPUTS.
+        A term is nan for a segment that does not exist, else 0. Rows are in the order of
+        PD_OUTPUTS.
         """
         is_direct = np.asarray(self.parameters["instrument.receiver.architecture"]) == "direct"
         segment_orders = np.asarray(
@@ -526,14 +560,17 @@ class SpectraSampler(Sampler):
         return zero_or_nan
 
     def half_widths(self, point_indices: np.ndarray, error_budget: ErrorBudget) -> np.ndarray:
-        """Implement :meth:`Sampler.half_widths`."""
+        """Return the half-widths of the confidence intervals of detection probabilities.
+
+        The result is (4, points), in the order of PD_OUTPUTS.
+        """
         return (
             self.count_half_widths(point_indices, error_budget)
             + self._nan_for_missing_segments()[:, point_indices]
         )
 
     def results(self, error_budget: ErrorBudget) -> dict[str, np.ndarray]:
-        """Implement :meth:`Sampler.results`."""
+        """Return outputs, standard errors and half-widths of confidence intervals, (n,) by name."""
         values, statistics = self._value_means, self._statistic_means.results()
         n, mean, squared_deviations, error = (
             dict(zip(AVERAGED_VALUE_NAMES, part, strict=True))

@@ -68,26 +68,26 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 QUADRATURE_NODE_COUNTS = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Possible numbers of nodes of a Gaussian quadrature, which are the numbers of lines along one
-coordinate of the beam."""
+"""Possible numbers of nodes of a Gaussian quadrature. A footprint is represented by as many lines
+along one coordinate of the beam."""
 
 _QUADRATURE_PHASE_MAX = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
-"""Largest phase per standard deviation of the beam [rad] that each number of nodes integrates with
-an error of 1e-3."""
+"""Largest slope of a phase [rad per standard deviation of the beam] for which a Gaussian quadrature
+errs by at most 1e-3. There is one value for each number of nodes in QUADRATURE_NODE_COUNTS."""
 
 _LINE_WEIGHT_MIN = 1e-6
-"""Power fraction below which a line is omitted."""
+"""Smallest fraction of the beam's power for which a line of the footprint is included."""
 
 ECHO_NUMBER_STRIDE = 1 << 24
-"""Count of random numbers that are reserved for an echo; those of echo g begin at (1 + g) times it.
-"""
+"""Number of indices of random numbers that are reserved for each echo. Those of echo g (0, 1, ..)
+begin at (1 + g) times this number."""
 
 LOOK_DRAW_STRIDE = np.int64(1 << 48)
-"""Offset that is added to the number of the draw for each further look, whose random numbers
-differ. """
+"""Offset added to the number of a draw for each further look (record of a segment), so that looks
+have different random numbers."""
 
 _FIRST, _SECOND = 0, 1
-"""Indices of the beam's coordinates y and x, as rotated by :func:`_rotate_to_steepest`."""
+"""Indices of the beam's two coordinates, y and x, as rotated by :func:`_rotate_to_steepest`."""
 
 
 class SpeckleLineGrid(NamedTuple):
@@ -98,37 +98,42 @@ class SpeckleLineGrid(NamedTuple):
     """
 
     line_shift: np.ndarray
-    """(n, 3, 2): shift of a line per standard deviation of the beam [bins], by segment and
-    coordinate; positive towards higher bins."""
+    """(n, 3, 2): derivative of a line's frequency [bins] with respect to its distance from the
+    beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate of the
+    beam; positive values are towards higher bins."""
     phase: np.ndarray
-    """(n, 3, 2): phase of a line per standard deviation of the beam [rad], by segment and
-    coordinate, relative to the up segment."""
+    """(n, 3, 2): derivative of the phase of a line's amplitude [rad] with respect to its distance
+    from the beam's axis [standard deviations of the beam]. Axes are point, segment and coordinate
+    of the beam. Phases are relative to the up segment."""
     quadrature_index: np.ndarray
-    """(n, 2) int64: index of the quadrature of each coordinate in :data:`QUADRATURE_NODE_COUNTS`.
-    """
+    """(n, 2) int64: index, in :data:`QUADRATURE_NODE_COUNTS`, of the Gaussian quadrature along each
+    coordinate of the beam."""
     peak_search_bins: np.ndarray
-    """(n,) int64: number of bins on either side of the strongest bin in which the peak is searched.
-    """
+    """(n,) int64: number of bins on either side of the strongest noiseless bin among which the peak
+    of a draw is searched."""
     node: np.ndarray
-    """(quadratures, nodes): nodes of each quadrature [standard deviations of the beam], padded with
-    0."""
+    """(quadratures, nodes): nodes of each Gaussian quadrature [standard deviations of the beam],
+    padded with 0."""
     weight: np.ndarray
-    """(quadratures, nodes): weights of the nodes, whose sum is 1 for each quadrature."""
+    """(quadratures, nodes): weights of the nodes of each Gaussian quadrature; they sum to 1."""
     n_nodes: np.ndarray
-    """(quadratures,) int64: number of nodes of each quadrature."""
+    """(quadratures,) int64: number of nodes of each Gaussian quadrature, without padding."""
     window_transform: np.ndarray
-    """(m,): window transform G, sampled at 0, 1, 2 .. over ``samples_per_bin``."""
+    """(m,): transform of the window, sampled at distances from the line of 0, 1, 2 .. times 1 /
+    ``samples_per_bin`` bins."""
     samples_per_bin: float
-    """Number of samples of ``window_transform`` per bin of fs/N."""
+    """Number of samples of ``window_transform`` per bin of fs/N, with the sampling rate fs and the
+    FFT size N."""
     transform_reach_bins: float
-    """Distance from a line up to which bins receive its light [bins of fs/N]."""
+    """Largest distance [bins of fs/N] at which a line contributes to a bin. fs is the sampling rate
+    and N the FFT size."""
     nyquist_bin: int
-    """N/2 if bins near DC and Nyquist contain the conjugate images of lines, as those of a real
-    record do; else 0."""
+    """Half of the FFT size if bins near DC and Nyquist also contain the conjugate images of lines,
+    as in a real record; else 0."""
 
     @classmethod
     def empty(cls) -> "SpeckleLineGrid":
-        """Return a grid of no points."""
+        """Return a grid of lines for no points."""
         no_gradients, no_indices = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
         no_table = np.zeros((0, 0))
         return cls(
@@ -146,7 +151,7 @@ class SpeckleLineGrid(NamedTuple):
         )
 
     def select(self, points: np.ndarray) -> "SpeckleLineGrid":
-        """Return the lines of selected points, by their indices."""
+        """Return the lines of the points with the given indices."""
         if not self.line_shift.shape[0]:
             return self
         return self._replace(
@@ -159,7 +164,10 @@ class SpeckleLineGrid(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _quadrature_tables() -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of all quadratures, (quadratures, nodes) each, padded with zeros."""
+    """Return the nodes and weights of all Gaussian quadratures, (quadratures, nodes) each.
+
+    Rows are padded with zeros.
+    """
     node, weight = np.zeros((2, QUADRATURE_NODE_COUNTS.size, QUADRATURE_NODE_COUNTS[-1]))
     for row, n_nodes in enumerate(QUADRATURE_NODE_COUNTS.tolist()):
         node[row, :n_nodes], weight[row, :n_nodes] = gaussian_quadrature(n_nodes)
@@ -167,7 +175,10 @@ def _quadrature_tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 def speckle_line_grid(shots: "Shots") -> SpeckleLineGrid:
-    """Return the speckle lines of shots; without developed speckle those of no points."""
+    """Return the lines that represent the footprints of shots in developed speckle.
+
+    Without developed speckle the result has no points.
+    """
     gradients = shots.speckle.line_gradients
     _, window_transform = transform_table(shots.window)
     node, weight = _quadrature_tables()
@@ -227,7 +238,7 @@ def _rotate_to_steepest(
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
 
     def rotate(vectors: np.ndarray) -> np.ndarray:
-        """Rotate vectors (n, 3, 2) by the angle of their point."""
+        """Rotate each point's vectors, (n, 3, 2) in all, by the angle of the point."""
         first, second = vectors[..., 0], vectors[..., 1]
         return np.stack([cosine * first + sine * second, cosine * second - sine * first], axis=-1)
 
@@ -235,7 +246,10 @@ def _rotate_to_steepest(
 
 
 def folding_signs(shots: "Shots") -> np.ndarray:
-    """Return -1 for segments whose bin falls as the beat rises, by folding, else 1, (n, 3)."""
+    """Return -1 for segments whose bin falls as the beat frequency rises, else 1, (n, 3).
+
+    A bin falls if the beat is folded at Nyquist or at frequency 0.
+    """
     signs = np.ones((shots.size, 3))
     if shots.complex_record:
         return signs
@@ -251,9 +265,9 @@ def folding_signs(shots: "Shots") -> np.ndarray:
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def interpolate_transform(distance, grid):
-    """Interpolate the window transform G at a distance from the line [bins of fs/N].
+    """Interpolate the window's transform at a distance from a line [bins of fs/N].
 
-    `grid` is a :class:`SpeckleLineGrid`.
+    fs is the sampling rate and N the FFT size. ``grid`` is a :class:`SpeckleLineGrid`.
     """
     table_position = abs(distance) * grid.samples_per_bin
     k = int(table_position)
@@ -266,13 +280,18 @@ def interpolate_transform(distance, grid):
 
 @njit(cache=True, error_model="numpy")
 def nearest_image_position(position, nyquist_bin):
-    """Return the position [bins] of a line's image at DC or Nyquist, whichever is nearer."""
+    """Return the position [bins] of a line's mirror image at frequency 0 or Nyquist.
+
+    It is the image at whichever of the two is nearer.
+    """
     return -position if position < 0.5 * nyquist_bin else 2.0 * nyquist_bin - position
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_variance):
-    """Compute the mean powers of bins in speckle, for an echo whose lines have the total power 1.
+    """Compute the mean powers over speckle of an echo's bins.
+
+    The lines of the echo have the total power 1.
 
     Parameters
     ----------
@@ -348,7 +367,9 @@ def mean_bin_powers(grid, point, echo_centre, first_bin, mean_power, pseudo_vari
 def draw_bin_amplitudes(
     address, echo_number, grid, point, echo_centre, first_bin, mean_power, amplitudes
 ):
-    """Draw the complex amplitudes of bins in speckle, of mean power 1, line by line.
+    """Draw the complex amplitudes by speckle of an echo's bins, as sums over its lines.
+
+    The amplitudes have mean power 1.
 
     Parameters
     ----------
@@ -368,8 +389,8 @@ def draw_bin_amplitudes(
     Notes
     -----
     Amplitudes are equation (1) of the module over the root of ``mean_power``. Their phases refer to
-    the middle of the record. All segments have the same amplitudes z. Bins that no line reaches are
-    0.
+    the middle of the record. All segments have the same amplitudes of the lines. Bins that no line
+    reaches are 0.
     """
     amplitudes[:] = 0.0
     key_0, key_1, draw = address
@@ -426,16 +447,16 @@ def draw_bin_amplitudes(
 
 
 FACTORED_BINS_MAX = 48
-"""Largest number of bins, over all segments, whose amplitudes are drawn by a factor of their
-covariance. Those of more bins are drawn line by line."""
+"""Largest number of bins, summed over segments, whose speckle is drawn by a factor of its
+covariance. For more bins it is summed over the lines of the footprint."""
 
 _RESIDUAL_POWER_MAX = 1e-8
-"""Fraction of a bin's mean power that a factor of the covariance may omit."""
+"""Largest fraction of a bin's mean power that a factor of the covariance of speckle may omit."""
 
 
 @njit(cache=True, error_model="numpy")
 def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, factor):
-    """Factor the covariance of the amplitudes of bins in speckle, and return its rank.
+    """Factor the covariance of the speckle amplitudes of an echo's bins, and return its rank.
 
     Draws by the factor (:func:`draw_factored_amplitudes`) have the distribution of those by
     :func:`draw_bin_amplitudes`, and take fewer random numbers.
@@ -536,7 +557,7 @@ def factor_bin_covariance(grid, point, echo_centre, first_bin, mean_power, facto
 
 @njit(cache=True, error_model="numpy", borrows=True)
 def draw_factored_amplitudes(address, echo_number, factor, rank, amplitudes):
-    """Draw the complex amplitudes of bins in speckle by a factor of their covariance.
+    """Draw the complex amplitudes by speckle of an echo's bins, by a factor of their covariance.
 
     Parameters
     ----------
@@ -579,7 +600,9 @@ def draw_segment_bin_amplitudes(
     draws: np.ndarray,
     echo_number: int = 0,
 ) -> np.ndarray:
-    """Draw the complex amplitudes of adjacent bins in speckle, of mean power 1, in one segment.
+    """Draw the complex amplitudes by speckle of adjacent bins of an echo in one segment.
+
+    The amplitudes have mean power 1.
 
     Parameters
     ----------
@@ -623,8 +646,9 @@ def draw_segment_bin_amplitudes(
 
 
 RECORD_LINE_DEVIATION_MAX_BINS = 1.0
-"""Largest standard deviation of the positions of a footprint's lines [bins of fs/L] for which draws
-use a :class:`FootprintRecord`."""
+"""Largest standard deviation of the positions of a footprint's lines for which draws use a
+:class:`FootprintRecord` [bins of fs/L]. fs is the sampling rate and L the number of samples of the
+record."""
 
 
 class FootprintRecord(NamedTuple):
@@ -632,20 +656,20 @@ class FootprintRecord(NamedTuple):
 
     The record is that of a lone tone at the middle of the echo, times a factor that varies slowly
     from sample to sample. The factor is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b .
-    (y, x) (n - middle) / N)``, represented by a series of Chebyshev polynomials in the sample
-    number n.
+    (y, x) (n - middle) / N)``, with the symbols of the module and the sample number n. It is
+    represented by a series of Chebyshev polynomials in n.
     """
 
     series_coefficients: np.ndarray
-    """(lines, k) complex: coefficients of each line's part of the series, for an amplitude z of 1.
-    """
+    """(lines, k) complex: coefficients of each line's part of the Chebyshev series, for a line of
+    amplitude 1."""
     series_positions: np.ndarray
-    """(L,): argument of the polynomials at each sample, -1..1 over the samples that contain the
-    echo."""
+    """(L,): argument of the Chebyshev polynomials at each of the L samples. It is -1..1 over the
+    samples that contain the echo."""
     windowed_tone: np.ndarray
-    """(L,) complex: windowed record of the lone tone, of amplitude 1."""
+    """(L,) complex: windowed record of a pure tone of amplitude 1 at the middle of the echo."""
     mean_bin_power: np.ndarray
-    """(N,): mean power of each bin of the record's transform."""
+    """(N,): mean power over speckle of each bin of the record's transform, with N the FFT size."""
 
     @classmethod
     def from_line_grid(
@@ -658,7 +682,7 @@ class FootprintRecord(NamedTuple):
         first_sample: int,
         fft_size: int,
     ) -> "FootprintRecord":
-        """Prepare the record of a point in a segment.
+        """Prepare the record from which the speckle of a point's echo in a segment is drawn.
 
         Parameters
         ----------
@@ -747,22 +771,25 @@ class FootprintRecord(NamedTuple):
 
 
 _RELATIVE_POWER_MIN = 1e-14
-"""Mean power of a bin, over the largest of all bins, below which float64 does not resolve it."""
+"""Smallest mean power of a bin, relative to the largest of all bins, that float64 resolves."""
 
 
 class _LineTable(NamedTuple):
-    """Lines of one point in one segment, (lines,) each, in the order of `draw_bin_amplitudes`."""
+    """Lines of one point in one segment, (lines,) each.
+
+    They are in the order in which :func:`draw_bin_amplitudes` draws their amplitudes.
+    """
 
     offset: np.ndarray
-    """Position relative to the middle of the echo [bins]."""
+    """Frequency of each line minus that of the middle of the echo [bins]."""
     phase: np.ndarray
-    """Phase relative to the up segment [rad]."""
+    """Phase of each line's amplitude, relative to the up segment [rad]."""
     weight: np.ndarray
-    """Fraction of the power."""
+    """Fraction of the echo's power in each line."""
 
 
 def _line_table(line_grid: SpeckleLineGrid, point: int, segment: int) -> _LineTable:
-    """Return the lines of a point in a segment, as a table."""
+    """Return the frequencies, phases and weights of the lines of a point in a segment."""
     first_quadrature, second_quadrature = line_grid.quadrature_index[point]
     y, x = (
         line_grid.node[quadrature_index, : line_grid.n_nodes[quadrature_index]]
@@ -795,13 +822,16 @@ def _draw_line_amplitudes(address, first_number, amplitudes):
 
 
 def _n_chebyshev_coefficients(phase_max: float) -> int:
-    """Return how many Chebyshev coefficients represent exp(i x), |x| <= phase_max, within 1e-7."""
+    """Return the number of Chebyshev coefficients that represent exp(i x) within 1e-7.
+
+    x is real, with |x| <= ``phase_max`` [rad].
+    """
     return 9 + math.ceil(1.5 * phase_max)
 
 
 @lru_cache(maxsize=64)
 def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and a matrix by which a Chebyshev series is fitted to a function.
+    """Return the nodes and the matrix that fit a Chebyshev series to a function.
 
     Returns
     -------
@@ -819,7 +849,7 @@ def _chebyshev_nodes_and_matrix(n_coefficients: int) -> tuple[np.ndarray, np.nda
 
 
 _SERIES_SAMPLES_PER_BATCH = 128
-"""Number of samples at which a Chebyshev series is evaluated together, in vector registers."""
+"""Number of samples at which a Chebyshev series is evaluated in one step, in vector registers."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -870,7 +900,7 @@ def wander_covariance(
     relative_power: np.ndarray,
     echo_fraction: np.ndarray,
 ) -> np.ndarray:
-    """Return the covariance of the wander of peaks by speckle in two segments, [bins^2], (m,).
+    """Return the covariance (m,) of peak positions in two segments as speckle moves them [bins^2].
 
     Parameters
     ----------
@@ -890,8 +920,9 @@ def wander_covariance(
 
     Notes
     -----
-    Let t be the difference of the two phase gradients. The correlation of the amplitudes A_1 and
-    A_2 is rho = exp(-t.t / 2) (v_1 v_2)^(1/2). The means of Y_1 and Y_2 given both amplitudes are
+    Symbols are those of the module, with 1 and 2 for the two segments. Let t be the difference of
+    the two phase gradients. The correlation of the amplitudes A_1 and A_2 is rho = exp(-t.t / 2)
+    (v_1 v_2)^(1/2). The means of Y_1 and Y_2 given both amplitudes are
 
         E[Y_1] = -i t rho k (A_2 - rho A_1),   E[Y_2] = i t rho k (A_1 - rho A_2),
         k = 1 / (1 - rho^2),
@@ -930,24 +961,27 @@ class SpecklePeaks(NamedTuple):
     """Detected peaks of m echoes in developed speckle, (m, 3) by segment; nan without a peak."""
 
     offset: np.ndarray
-    """Interpolated position, relative to the bin about which it was estimated [bins]."""
+    """(m, 3): interpolated position of the peak, minus the bin about which it was estimated [bins].
+    """
     folding_sign: np.ndarray
-    """-1 if the segment's bin falls as its beat rises (:func:`folding_signs`), else 1."""
+    """(m, 3): -1 if the segment's bin falls as its beat frequency rises (:func:`folding_signs`),
+    else 1."""
     relative_power: np.ndarray
-    """Power q^2 of the peak bin over its mean power, both with noise."""
+    """(m, 3): power of the peak bin in this draw, divided by its mean over draws; both include
+    noise."""
     echo_fraction: np.ndarray
-    """Fraction v of the echo in the mean power of the peak bin, 0..1."""
+    """(m, 3): fraction, 0..1, of the echo in the mean power of the peak bin; the rest is noise."""
 
 
 WANDER_MAX_BINS = 1.5
-"""Limit of the wander of a peak [bins] if only the bin that is strongest without noise is tested
-(``peak_bin``)."""
+"""Limit on the standard deviation by which speckle moves a peak [bins], if only the bin that is
+strongest without noise is tested (``peak_bin``)."""
 
 
 SEGMENT_PAIRS_WITH_SELF = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
 """All pairs of segments (0 up, 1 Doppler, 2 down), including each segment with itself."""
 CHIRP_PAIRS_WITH_SELF = (0, 0), (0, 2), (2, 2)
-"""Pairs of the up and down segment alone, including each segment with itself."""
+"""All pairs of the two chirp segments (0 up, 2 down), including each segment with itself."""
 
 
 def position_error_moments(
@@ -956,7 +990,9 @@ def position_error_moments(
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = SEGMENT_PAIRS_WITH_SELF,
 ) -> np.ndarray:
-    """Return second moments E[e_i e_j] of the errors e of peak positions by speckle, [bins^2].
+    """Return the second moments E[e_i e_j] of errors of peak positions by speckle [bins^2].
+
+    e_i is the error in segment i.
 
     Parameters
     ----------
@@ -978,10 +1014,12 @@ def position_error_moments(
     Notes
     -----
     An error is the sum of two parts: the wander, by equation (3) and :func:`wander_covariance`, and
-    the error by the shape of the peak (:class:`PeakShapeErrors`). Re V has the mean b^2 and the
-    variance b^4 (v / q^2 + v^2 / q^4), with the peak's power q^2 and its echo fraction v. If only
-    the strongest bin is tested, the wander's deviation is divided by sqrt(1 + variance /
-    WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the variance.
+    the error by the shape of the peak (:class:`PeakShapeErrors`). The real part of the complex
+    variance V of :class:`PeakShapeErrors` has the mean b^2 and the variance b^4 (v / q^2 + v^2 /
+    q^4). Here b is the spread of the lines [bins], q^2 the peak's power over its mean, and v the
+    echo fraction. If only the strongest bin is tested, the wander's deviation is divided by sqrt(1
+    + variance / WANDER_MAX_BINS^2). The mean over L looks of independent speckle has 1 / L of the
+    variance.
     """
     squared_shift = (gradients.line_shift**2).sum(axis=-1)
     has_peak = np.isfinite(peaks.relative_power) & np.isfinite(peaks.offset)
@@ -1031,8 +1069,8 @@ def position_error_moments(
 
 
 _TEST_DISPLACEMENT_BINS = 0.05
-"""Displacement of tones [bins] by which errors of peak shapes are computed as numerical
-derivatives. """
+"""Displacement of pure tones [bins] with which numerical derivatives of the peak's shape are
+computed."""
 
 
 class PeakShapeErrors(NamedTuple):
@@ -1040,8 +1078,11 @@ class PeakShapeErrors(NamedTuple):
 
     Notes
     -----
-    To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2). The real and
-    imaginary part of the complex shift s each have the variance |b|^2 v / (2 q^2), and
+    A is the amplitude of the echo, G(x) the window's transform at the distance x, and b the spread
+    of the lines along the beam's coordinate y [bins]. To second order in b the bin at the distance
+    x is A (G - s G' + (V + s^2) G'' / 2). In units of its mean, the power of the peak is q^2, and v
+    is the fraction of the echo in this mean. Lines have weights a^2 and random amplitudes z. The
+    real and imaginary part of the complex shift s each have the variance |b|^2 v / (2 q^2), and
 
         V = sum a z b^2 y^2 / A - s^2.
 
@@ -1050,15 +1091,16 @@ class PeakShapeErrors(NamedTuple):
     """
 
     imaginary_shift_error: np.ndarray
-    """Mean error by the imaginary part of the complex shift s [bins]."""
+    """Mean error of the peak position [bins] by the imaginary part of the complex shift s."""
     error_per_variance: np.ndarray
-    """Error over Re V, the real part of the lines' complex variance [1/bins]."""
+    """Error of the peak position [bins] per Re V [bins^2], the real part of the lines' complex
+    variance."""
 
     @classmethod
     def from_offset(
         cls, offset: np.ndarray, variance: np.ndarray, shots: "Shots"
     ) -> "PeakShapeErrors":
-        """Return the errors of peaks at an offset from their strongest bin.
+        """Return the errors of the positions of peaks at given offsets from their strongest bin.
 
         Parameters
         ----------
@@ -1083,7 +1125,7 @@ class PeakShapeErrors(NamedTuple):
 def _peak_shape_error_table(
     window: Window, fft_size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tabulate the errors of :class:`PeakShapeErrors` by the peak's offset.
+    """Tabulate errors of peak positions by deformed peaks, by the peak's offset from its bin.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Errors of range and radial velocity by speckle wander: peaks move as the speckle changes."""
+"""Errors of range and radial velocity because peaks move with the speckle of the echo."""
 
 import numpy as np
 from scipy.special import exp1
@@ -8,13 +8,14 @@ from sweep.model.preparation import Shots
 from sweep.model.sampling.speckle_lines import SpecklePeaks, folding_signs, position_error_moments
 
 NEGATIVE_LOG_PD_MAX = 700.0
-"""-ln of the smallest probability of detection that differs from 0."""
+"""Largest -ln(pd) that is used, with the probability of detection pd. Smaller probabilities count
+as e^-700."""
 
 
 def wander_variance(
     shots: Shots, point_indices: np.ndarray, peaks: SpecklePeaks, is_detected: np.ndarray
 ) -> np.ndarray:
-    """Return the mean square errors by speckle of m measurements, (2, m).
+    """Return the mean square errors by speckle of range and velocity of m measurements, (2, m).
 
     Parameters
     ----------
@@ -36,8 +37,9 @@ def wander_variance(
 
     Notes
     -----
-    J M J' with the second moments M of the peaks' positions (:func:`position_error_moments`) and
-    the derivatives J of range and velocity by those positions.
+    The result is the diagonal of J M J'. M holds the second moments of the errors of the peaks'
+    positions (:func:`position_error_moments`). J holds the derivatives of range and velocity by
+    these positions, and J' is its transpose.
     """
     if shots.speckle.line_gradients is None:
         return np.zeros((2, point_indices.size))
@@ -64,7 +66,9 @@ def wander_variance(
 
 
 def mean_wander_variance(shots: Shots, pd: np.ndarray, snr: np.ndarray) -> np.ndarray:
-    """Return the mean square errors by speckle of n points, averaged over detected echoes, (2, n).
+    """Return the mean square errors by speckle of range and velocity of n points, (2, n).
+
+    They are averages over detected echoes.
 
     Parameters
     ----------
