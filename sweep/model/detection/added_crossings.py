@@ -37,7 +37,7 @@ SERIES_TERMS_MAX = 800
 """Size of the array of coefficients of the crossing series, and so the largest number of terms."""
 
 JOINED_PROBABILITY_MIN = 1e-9
-"""Limit for counting the bins beside an echo that may join it by crossing the threshold. The count
+"""Limit for counting the bins next to an echo that may join it by crossing the threshold. The count
 ends where the probability that all bins so far cross falls to this limit."""
 
 EDGE_NOISE_DEVIATION_MIN = 0.01
@@ -302,10 +302,10 @@ def exclude_bins_joining_echo(
 ):
     """Remove crossings that join an echo from the bins' crossing probabilities, in place.
 
-    Adjacent bins above the threshold count as one group. A bin beside an echo may thus join the
-    echo's group, and is no false peak then. The probability of the first bin beside an echo becomes
-    that of a separate group in all bins that may join the echo. The other bins' probabilities
-    become 0.
+    Adjacent bins above the threshold count as one group. A bin next to an echo may thus join the
+    echo's group, and is no false peak then. The probability of the first bin next to an echo
+    becomes that of a separate group in all bins that may join the echo. The other bins'
+    probabilities become 0.
 
     Parameters
     ----------
@@ -363,7 +363,7 @@ def exclude_bins_joining_echo(
 
 @njit(cache=True, error_model="numpy")
 def _count_joining_bins(probabilities, first_index, step, n_bins):
-    """Return how many bins beside an echo may join it by crossing the threshold, 1 .. ``n_bins``.
+    """Return how many bins next to an echo may join it by crossing the threshold, 1 .. ``n_bins``.
 
     The bins start at ``first_index`` and go on by ``step``, 1 or -1. The count ends where all of
     them cross with a probability of at most :data:`JOINED_PROBABILITY_MIN`.

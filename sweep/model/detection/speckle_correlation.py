@@ -122,7 +122,7 @@ def peak_bin_correlation(window: Window, gradients: LinePairGradients) -> np.nda
 
     It is mu of equation (3) of the module's description. If the phase varies too fast across the
     beam for the quadrature, the result is |mu| for a Gaussian window transform of the same
-    half-width. That is close to 0 then.
+    half-width, which is close to 0.
     """
     from sweep.model.detection.speckle_correlation_integral import (
         fill_peak_bin_correlation,  # a compiler is slow to import

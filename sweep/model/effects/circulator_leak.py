@@ -2,9 +2,9 @@
 
 A fraction 1 / I of the transmitted light P_tx (I is the isolation) reaches the detector over a path
 d longer than the local oscillator's, with the delay tau = d / c. It is present in every record.
-Below, q is the elementary charge, M the detector's gain, F its excess noise factor, Re its
-responsivity, B_e the electrical bandwidth, eta the mixing efficiency, P_lo the power of the local
-oscillator, S the chirp rate:
+The detector has the gain M, the excess noise factor F, the responsivity Re and the electrical
+bandwidth B_e. q is the elementary charge, eta the mixing efficiency, P_lo the power of the local
+oscillator and S the chirp rate.
 
 - **A line** (:mod:`sweep.model.spectrum.permanent_line`). It beats with the local oscillator as an
   echo does. Its photocurrent is i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0

@@ -126,7 +126,7 @@ class Effect:
     """Physical effect, with its error bound and its change of the shots; compared by identity.
 
     A deterministic effect has `apply`. A random one has `perturb_parameters` or `perturb_shots`,
-    called for each draw (random realisation). An effect of the scene alone has none of them.
+    which change each draw (random realisation). An effect of the scene alone has none of them.
     """
 
     name: str
