@@ -3,7 +3,7 @@
 A fraction 1 / I of the transmitted light P_tx (I is the isolation) reaches the detector over a path
 d longer than the local oscillator's, with the delay tau = d / c. It is present in every record.
 The detector has the gain M, the excess noise factor F, the responsivity Re and the electrical
-bandwidth B_e. q is the elementary charge, eta the mixing efficiency, P_lo the power of the local
+bandwidth B_e. The elementary charge is q, eta the mixing efficiency, P_lo the power of the local
 oscillator and S the chirp rate.
 
 - **A line** (:mod:`sweep.model.spectrum.permanent_line`). It beats with the local oscillator as an
