@@ -165,12 +165,15 @@ class InterruptHandler:
                 self.announce_stop()
 
     def _seconds_to_deadline(self) -> float | None:
-        """Return the time to the deadline [s]; None if there is none."""
+        """Return the time until running blocks are stopped [s]; None if no deadline is set."""
         deadline = self._deadline
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
 
     def _unhandled_signals(self, receiver: socket.socket) -> list[int]:
-        """Return arrived signals that the main thread has not handled; discard wake-up bytes."""
+        """Return signals that have arrived but that the main thread has not handled yet.
+
+        Bytes by which Python announces signals to the watcher thread are discarded.
+        """
         try:
             signal_bytes = receiver.recv(_SIGNAL_BYTES_MAX, socket.MSG_PEEK)
             unhandled = [
@@ -185,7 +188,10 @@ class InterruptHandler:
         return unhandled
 
     def _is_handled_in_time(self, receiver: socket.socket, n_signals: int) -> bool:
-        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`. Return True once a signal is handled."""
+        """Wait up to `SIGNAL_HANDLING_SECONDS_MAX`.
+
+        Return True once the main thread handles a signal.
+        """
         deadline = time.monotonic() + SIGNAL_HANDLING_SECONDS_MAX
         while time.monotonic() < deadline:
             if (
@@ -210,7 +216,7 @@ class InterruptHandler:
             self.announce_stop()
 
     def _exit_process(self, exit_code: int) -> None:
-        """Print a last message and end the process from the watcher thread; never returns."""
+        """Print a last message and end the process from the watcher thread. This never returns."""
 
         def print_last_words() -> None:
             self._listener.end()

@@ -1,4 +1,4 @@
-"""Workers on this machine and on machines reached by SSH, and settings of all clusters."""
+"""Workers on this machine and on machines reached by SSH, and settings that all clusters share."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def make_security(cluster: ClusterConfig) -> Security | None:
-    """Return the TLS security of client, scheduler and workers; None without certificates.
+    """Return the TLS security of client, scheduler and workers; None if there are no certificates.
 
-    Client, scheduler and workers then refuse connections without a certificate.
+    With TLS they refuse connections without a certificate.
     """
     from distributed import Security
 
@@ -95,7 +95,7 @@ def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
 
 
 def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
-    """Return Dask's options for the addresses of a scheduler in this process and its dashboard."""
+    """Return Dask's options for a scheduler in this process: its addresses and its dashboard."""
     options: dict[str, Any] = {
         "port": scheduler.port,
         "dashboard": shows_dashboard(scheduler),
@@ -107,12 +107,12 @@ def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
 
 
 def shows_dashboard(scheduler: SchedulerConfig) -> bool:
-    """Return True if a dashboard is asked for."""
+    """Return True if the configuration asks for Dask's dashboard."""
     return scheduler.dashboard != NO_DASHBOARD
 
 
 def dashboard_address(scheduler: SchedulerConfig) -> str:
-    """Return the address of a scheduler's HTTP server, on the loopback interface.
+    """Return the address of a scheduler's HTTP server, on this machine's loopback interface.
 
     The port is the requested one; any free port if that is taken, or if no dashboard is asked for.
     """
@@ -156,7 +156,7 @@ def isolate_spawned_workers() -> Iterator[None]:
 def start_local_cluster(
     cluster: LocalClusterConfig, bounds: WorkerBounds, *, processes: bool
 ) -> Any:
-    """Start workers on this machine; OSError, RuntimeError or ImportError if they can't start."""
+    """Start workers on this machine. OSError, RuntimeError or ImportError is raised on failure."""
     import dask
     from distributed import LocalCluster, Security
 
@@ -197,7 +197,10 @@ def start_local_cluster(
 
 
 def _make_worker_class_without_pages() -> type:
-    """Return a class of thread workers whose HTTP server, which Dask requires, has no page."""
+    """Return a class of workers in threads that serves no web page.
+
+    Dask requires an HTTP server of each worker.
+    """
     from distributed import Worker
 
     class WorkerWithoutPages(Worker):
@@ -208,7 +211,7 @@ def _make_worker_class_without_pages() -> type:
 
 
 def dashboard_link(dask_cluster: Any) -> str:
-    """Return the URL of the dashboard of a cluster that was started here."""
+    """Return the URL of the dashboard of a cluster that this process started."""
     from distributed.utils import format_dashboard_link
 
     return str(
@@ -219,9 +222,9 @@ def dashboard_link(dask_cluster: Any) -> str:
 
 
 def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
-    """Return the memory at which Dask restarts a worker [bytes].
+    """Return the memory use at which Dask restarts a worker [bytes].
 
-    By default it is an equal share of 90 % of the machine's memory.
+    By default it is the worker's equal share of 90 % of the machine's memory.
     """
     from distributed.system import MEMORY_LIMIT
 
@@ -234,7 +237,10 @@ def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> in
 
 
 def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
-    """Start workers on all machines; OSError or RuntimeError if one can't be reached."""
+    """Start workers on all machines by SSH.
+
+    OSError or RuntimeError is raised if one can't be reached.
+    """
     import asyncssh
     from distributed import Scheduler, SpecCluster
 
@@ -255,9 +261,9 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return Dask's specification of the workers on each machine, by its name.
+    """Return Dask's specification of the workers, by the name of each worker.
 
-    The workers are distributed evenly.
+    The workers are distributed evenly over the machines.
     """
     from distributed.deploy.ssh import Worker
 
@@ -281,7 +287,7 @@ def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dic
 
 
 def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Return the arguments of `asyncssh.connect`."""
+    """Return the keyword arguments of `asyncssh.connect` for one machine."""
     options = {
         "username": cluster.user,
         "client_keys": cluster.identity and [cluster.resolve_path(cluster.identity)],
@@ -291,7 +297,10 @@ def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
-    """Return the arguments of the nannies on the machines, all of them representable in JSON."""
+    """Return the arguments of the nannies, the processes that start and watch workers.
+
+    All of them can be written as JSON.
+    """
     security = security_settings(cluster)
     return {
         "nthreads": cluster.worker.threads,
@@ -304,7 +313,7 @@ def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
 
 
 class Certificates(NamedTuple):
-    """Files of a cluster's self-signed certificate."""
+    """Paths of the files of a cluster's self-signed TLS certificate."""
 
     ca: Path
     certificate: Path
@@ -312,9 +321,9 @@ class Certificates(NamedTuple):
 
 
 def make_certificates(directory: Path) -> Certificates:
-    """Create a certificate for Dask, valid for a year, that only its owner can read.
+    """Create a TLS certificate for Dask, valid for a year, in files that only their owner can read.
 
-    ClusterError if that is not possible.
+    ClusterError is raised if that fails.
     """
     from distributed import Security
 
