@@ -414,8 +414,7 @@ def _is_on_axis(spec: AnySpec, path: str) -> bool:
 
 
 def _fixed_beamlets_reason(spec: AnySpec) -> str:
-    """Return why the scene, not the accuracy, sets the number of beamlets; '' if accuracy sets it.
-    """
+    """Return why the scene, not the accuracy, sets the number of beamlets; '' if it does not."""
     if spec.parameters()["footprint.phases"] == "coherent":
         return "with coherent phases it is part of the scene, as the thesis has it"
     if spec.instrument.receiver.architecture == "direct":

@@ -77,7 +77,7 @@ _logger = logging.getLogger("sweep.scheduler")
 
 @dataclass
 class ThroughputEstimator:
-    """Estimator of the number of blocks per task, from the times of the blocks so far."""
+    """Estimator of a suitable number of blocks per task, from the times of blocks so far."""
 
     n_blocks: int = 0
     work_seconds: float = 0.0
@@ -456,9 +456,10 @@ class TaskDispatcher:
         self._resend_counts.update(blocks)
 
     def _verify_receipts(self, task_result: TaskResult) -> None:
-        """Keep only receipts whose blocks are visible in the store; check the others again later.
+        """Keep only receipts of blocks that this process sees in the store.
 
-        A block that does not appear in time is sent again, and its worker is excluded.
+        The others are checked again later. A block that does not appear in time is sent again, and
+        its worker is excluded.
         """
         now = time.monotonic()
         pending = [

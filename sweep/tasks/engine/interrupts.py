@@ -99,7 +99,7 @@ class InterruptHandler:
             self._watcher = None
 
     def announce_stop(self) -> None:
-        """Print, once, that the run stops when running blocks are written."""
+        """Print once that the run stops when the blocks being computed are written."""
         with self._announce_lock:
             if not self._is_announced:
                 self._is_announced = True
@@ -124,7 +124,10 @@ class InterruptHandler:
     # Methods of the watcher thread
 
     def _start_watcher(self) -> None:
-        """Start the watcher thread, unless an event loop of the caller already receives signals."""
+        """Start the thread that watches for signals.
+
+        It is not started if an event loop of the caller already receives signals.
+        """
         receiver, sender = socket.socketpair()
         receiver.setblocking(False)
         sender.setblocking(False)
@@ -202,7 +205,10 @@ class InterruptHandler:
         return False
 
     def _react_to_stalled_signals(self, unhandled: list[int], *, is_repeated: bool) -> None:
-        """React to signals that compiled code holds up: print a message, or end the process."""
+        """React to signals that can't be handled while compiled code runs.
+
+        Print a message, or end the process.
+        """
         if set(unhandled) == {HANGUP_SIGNAL}:
             return
         is_asked_again = self.is_stopping or is_repeated

@@ -65,7 +65,7 @@ class _JobWithStatus:
 
 
 class _ResubmittingCluster:
-    """Cluster that forgets rejected jobs, so that others are submitted later."""
+    """Cluster of batch jobs that forgets rejected ones, so that others are submitted later."""
 
     worker_spec: dict[str, Any]
     workers: dict[str, Any]
@@ -170,10 +170,10 @@ def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
 
 
 def worker_lifetime(walltime: float) -> tuple[float, float]:
-    """Return the mean time after which a worker leaves its job, and its spread to each side [s].
+    """Return the mean time after which a worker leaves its job, and the largest deviation [s].
 
-    The last worker leaves when 5 % of the walltime is left, at least a minute, but at most a
-    quarter of a very short walltime.
+    Workers leave at different times. The last one leaves when 5 % of the job's time limit is left,
+    at least a minute, but at most a quarter of a very short limit.
     """
     reserve = max(0.05 * walltime, min(60.0, walltime / 4))
     return walltime - 1.5 * reserve, reserve / 2

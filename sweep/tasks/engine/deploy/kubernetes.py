@@ -115,7 +115,7 @@ def _is_resolvable_host(name: str) -> bool:
 
 
 def connection_protocol(cluster: KubernetesClusterConfig) -> str:
-    """Return the protocol between scheduler, workers and client."""
+    """Return the protocol of connections between scheduler, workers and client: TLS or TCP."""
     return "tls" if cluster.security else "tcp"
 
 

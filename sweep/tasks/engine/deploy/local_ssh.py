@@ -63,7 +63,11 @@ ADAPTIVE_TARGET_DURATION = "1s"
 
 
 def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of workers: thread limits, safe path, and the user's."""
+    """Return the environment variables of workers.
+
+    They limit threads, restrict the import path to safe folders, and include the user's own
+    variables.
+    """
     dask_variables = {
         f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
         for name, setting in DASK_CONFIG.items()
@@ -261,7 +265,7 @@ def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
 
 
 def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
-    """Return Dask's specification of the workers, by the name of each worker.
+    """Return Dask's specification of the workers on each machine, by the machine's name.
 
     The workers are distributed evenly over the machines.
     """
