@@ -92,7 +92,7 @@ LISTING_THREADS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
-    """Record of a block that a worker has written."""
+    """Record of a stored block: number, points, size, digest, times, and process that wrote it."""
 
     block: int
     points: int

@@ -268,7 +268,7 @@ class RunOptions:
         return not needs_workers and execution == Execution()
 
     def _first_option_of_workers(self) -> str:
-        """Return the name of an option that only workers can serve; '' if none is set."""
+        """Return the name of the first set option that only worker processes can serve, or ''."""
         is_set = {
             "workers": self.workers is not None,
             "client": self.client is not None,

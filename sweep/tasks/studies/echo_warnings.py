@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from sweep.tasks.studies.grid_study import GridStudy
 
 ECHO_LOSS_WARNING_DB = 3.0
-"""Loss of an echo's power above which a warning is given [dB]."""
+"""Loss of an echo's power above which a warning is given [dB].
+
+Power is lost if the echo arrives after its record has begun.
+"""
 
 PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MAX = 0.125, 0.3
 """Limits above which the laser's random walk of phase changes pd by more than 0.02.
@@ -92,7 +95,7 @@ ECHO_PARAMETERS = (
     beam.FOCUS_PATH,
     beam.COUPLING_PATH,
 )
-"""Parameters that determine when echoes arrive, and how they are read."""
+"""Dotted paths of the parameters that determine when echoes arrive and how beats are used."""
 
 
 PHASE_ESTIMATOR_LOSS_MAX = 0.03
@@ -341,7 +344,7 @@ def _is_misread(
 
 
 def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Yield warnings about echoes that a study misses, records in part, or misreads."""
+    """Yield warnings about echoes that a study misses, records in part, or interprets wrongly."""
     is_flight = isinstance(study, FlightStudy)
     diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
     if not diagnosis.range.size:
@@ -520,7 +523,7 @@ def _fraction_text(mask: np.ndarray) -> str:
 
 
 def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
-    """Return the ranges of the marked points as text: 'from x on' if all beyond are marked.
+    """Return the ranges of marked points as text: 'from x on' if all larger ranges are marked.
 
     Points that are ``is_absent`` are ignored.
     """

@@ -113,7 +113,7 @@ class EyepointStudy(BlockStudy):
         return self.count_rays(self.n_points)
 
     def count_rays(self, n_shots: int) -> int:
-        """Return the number of rays of `n_shots` shots in complete cycles."""
+        """Return the number of rays of `n_shots` shots, which make complete measurement cycles."""
         return n_shots * self.n_beamlets + n_shots // self.shots_per_cycle
 
     def store_attributes(self) -> dict[str, Any]:
@@ -199,7 +199,10 @@ class EyepointStudy(BlockStudy):
         return np.asarray(shot_numbers[shot_numbers < self.n_points])
 
     def shot_numbers_of_sampled_cycles(self, n_tiles: int) -> np.ndarray:
-        """Return the numbers of all shots of cycles that overlap `n_tiles` tiles of the flight."""
+        """Return the numbers of all shots in cycles that overlap `n_tiles` tiles of the flight.
+
+        A tile is a run of consecutive shots whose effects are planned together.
+        """
         cycle_numbers = np.unique(
             self.shot_numbers_of_sampled_tiles(n_tiles) // self.shots_per_cycle
         )
@@ -268,9 +271,9 @@ def build_world(spec: SceneSpec) -> BuiltScene:
 def height_above_surface(
     world: BuiltScene, position: np.ndarray, time: float | np.ndarray
 ) -> np.ndarray:
-    """Return the height of positions (n, 3) above the surface below them at times (n,) [m].
+    """Return the height of positions (n, 3) above the surface straight below them [m].
 
-    inf if nothing is below a position.
+    `times` (n,) are in s. The result is inf if nothing is below a position.
     """
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from sweep.spec.scene_sections import BuiltScene
 
 SAMPLED_RAYS_PER_SCANNER = 1 << 17
-"""Number of rays per scanner, spread over the flight, that sample its hits."""
+"""Number of rays per scanner, spread over the flight, that sample what the scanner hits."""
 
 MISSED_SHOTS_FRACTION_MAX = 0.01
 """Fraction of a scanner's shots without a hit above which a warning is given."""
 
 _N_SAMPLED_TIMES = 65
-"""Number of times at which the positions of the platform and of moving objects are sampled."""
+"""Number of times in a flight at which platform and moving objects are located."""
 
 
 class ScannerHits(NamedTuple):

@@ -87,7 +87,7 @@ GEOMETRY_OUTPUTS = SHOT_VARIABLES | CYCLE_VARIABLES
 
 @cache
 def flag_array_attributes() -> dict[str, dict[str, Any]]:
-    """Return the CF attributes of arrays of flags and of categories, by the name of the array."""
+    """Return CF convention attributes of arrays of flags and of categories, by array name."""
     from sweep.model.pointcloud.navigation import (
         STATUS_EXCLUDED,
         STATUS_SOLVED,
@@ -234,7 +234,10 @@ class FlightStudy(ExtendableStudy):
         return list(self.scanner_grids.values())
 
     def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
-        """Return True if a tighter tolerance computes shots more closely, other than by effects."""
+        """Return True if a smaller tolerance changes shots by more than the choice of effects.
+
+        The number of rays, or of the steps of computation, may depend on it too.
+        """
         return bool(
             self.spec.is_ray_number_set_by_tolerance
             or has_numerics_set_by_tolerance(self.spec.parameters())
@@ -390,7 +393,10 @@ class FlightStudy(ExtendableStudy):
     def plan_effects(
         self, flight_block: FlightBlock, eyepoints: Eyepoints, tile_numbers: np.ndarray
     ) -> ShotEffectPlan | None:
-        """Plan the effects of shots by the rising numbers of their tiles, (n,)."""
+        """Choose the effects of shots, given the rising numbers (n,) of their tiles.
+
+        A tile is a run of consecutive shots whose effects are chosen together.
+        """
         return plan_shot_effects(
             eyepoints,
             tile_numbers,
@@ -490,7 +496,7 @@ class FlightStudy(ExtendableStudy):
         shot_numbers: np.ndarray,
         effect_flags: np.ndarray,
     ) -> Results:
-        """Return the points of shots, by their eyepoints, numbers and effect flags."""
+        """Return the points of shots, given their geometry (eyepoints), numbers and effects."""
         from sweep.model.pointcloud.error_floor import apply_error_floor
         from sweep.model.pointcloud.point_cloud import simulate_cloud
         from sweep.model.sampling.philox import point_keys
@@ -556,7 +562,7 @@ class FlightStudy(ExtendableStudy):
         rows: np.ndarray,
         draw_slice: slice,
     ) -> Results:
-        """Return the navigation of complete cycles from the points of their shots in some draws."""
+        """Return velocity and altitude of complete measurement cycles, for some draws."""
         from sweep.model.pointcloud.navigation import solve_navigation
 
         row_index = slice(None) if rows.size == len(results["flags"]) else rows
@@ -577,7 +583,7 @@ class FlightStudy(ExtendableStudy):
         )
 
     def _read_reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
-        """Return the results of a block from the smaller study, for shots with equal effects."""
+        """Return a block's results in the smaller study, for shots with the same effects."""
         assert self.reuse_source is not None
         reuse_source, (scanner_grid, flight_block) = (
             self.reuse_source,
@@ -651,7 +657,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
-        """Errors of the instrument that do not decrease with the strength of the echo."""
+        """Standard deviations of instrument errors that do not decrease with a stronger echo."""
         from sweep.model.pointcloud.error_floor import ErrorFloor
 
         stated = self.spec.error_floor
@@ -675,7 +681,7 @@ class FlightStudy(ExtendableStudy):
 
     @cached_property
     def ray_error_budget(self) -> ErrorBudget | None:
-        """Accuracy that sets the number of rays of each shot; None if the number is given."""
+        """Accuracy from which each shot's number of rays follows; None if the number is given."""
         return (
             ErrorBudget.from_parameters(self.spec.parameters())
             if self.spec.is_ray_number_set_by_tolerance
@@ -722,7 +728,7 @@ class FlightStudy(ExtendableStudy):
 
 
 def _iter_missing_draws(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
-    """Yield groups of rows that lack the same draws, and a slice of these draws."""
+    """Yield groups of shots that lack the same draws, by index, and a slice of these draws."""
     patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
     for pattern_number, pattern in enumerate(patterns):
         rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
@@ -769,9 +775,10 @@ def plan_shot_effects(
     rotating: bool,
     rays_by_tolerance: bool = False,
 ) -> ShotEffectPlan | None:
-    """Plan the effects of a flight's shots at one point of the axes; None if no shot hits anything.
+    """Choose the effects of a flight's shots at one point of the axes.
 
-    ``tile_of_shot`` (n,) is the rising number of the tile of each shot.
+    ``tile_of_shot`` (n,) is the rising number of each shot's tile, a run of shots with common
+    effects. The result is None if no shot hits anything.
     """
     from sweep.model.effects.planning import plan_effects
     from sweep.model.pointcloud.eyepoints import parameters_and_ground_of_eyepoints

@@ -1,4 +1,4 @@
-"""Plan of a study before it runs: points, blocks, bytes, time, memory and effects."""
+"""Plan of a study before it runs: numbers of points and blocks, size, time, memory and effects."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ CHUNK_WRITE_SECONDS = 2e-3
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerPlan:
-    """Plan of one scanner of a flight."""
+    """Plan of one scanner of a flight: numbers of shots and rays, and computing times."""
 
     name: str
     n_cycles: int
@@ -97,7 +97,7 @@ class StudyPlan:
 
     @property
     def cpu_seconds(self) -> float:
-        """Estimated time of the study on one core [s]."""
+        """Estimated computing time of the whole study on one core [s]."""
         return self.n_points * self.seconds_per_point
 
 
@@ -218,7 +218,7 @@ def _choose_timed_blocks(study: GridStudy) -> list[int]:
 
 
 class TimedRound(NamedTuple):
-    """Time of one round of measurement."""
+    """Number of points in one round of time measurement, and the time that they took."""
 
     n_points: int
     seconds_by_part: tuple[float, ...]  # time of each part of the work [s]
@@ -258,7 +258,10 @@ def _sampled_indices_of_block(study: GridStudy, block: int, n_geometries: int) -
 
 
 def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
-    """Return the number of points computed, and the estimated time of their omitted draws [s]."""
+    """Compute points to measure their time.
+
+    Return the number of points, and the estimated time of draws that were left out [s].
+    """
     spec, extrapolated_seconds = study.spec, 0.0
     local_indices = _sampled_indices_of_block(study, block, n_geometries)
     parameters = study.grid.parameters_of_block(block)
@@ -274,7 +277,7 @@ def _compute_timed_points(study: GridStudy, block: int, n_geometries: int) -> tu
 
 
 class PointTimes(NamedTuple):
-    """Processor time of some points."""
+    """Processor time that some points took, and an estimate for draws that were left out."""
 
     measured_seconds: float  # measured time [s]
     extrapolated_seconds: float
@@ -383,7 +386,7 @@ EFFECT_COST_ROUND_SECONDS = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class EffectRow:
-    """Simulation, largest change and cost of one effect in a study."""
+    """Row of a table of effects: where one effect is simulated, what it changes, and its cost."""
 
     name: str
     mode: str
@@ -396,7 +399,7 @@ class EffectRow:
 
 @dataclass(frozen=True, kw_only=True)
 class EffectsTable:
-    """Table of all effects of a study."""
+    """Table of all effects of a study: where each is simulated, what it changes, and its cost."""
 
     rows: tuple[EffectRow, ...]
     tolerance: float
@@ -537,7 +540,7 @@ def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
 
 
 class _TileEffects(NamedTuple):
-    """Effects of m tiles."""
+    """Simulated and omitted effects of m tiles (boxes of points, or runs of shots)."""
 
     n_simulated: np.ndarray  # (effects, m): number of points at which an effect is simulated
     change_bounds: np.ndarray  # (effects, m): bound of the change by an effect
@@ -605,7 +608,7 @@ def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarra
 
 
 class _PointSample(NamedTuple):
-    """Points of a tile, with all effects of its plan."""
+    """Points of a tile (box of neighbouring points) to be timed, with all effects chosen for it."""
 
     parameters: Mapping[str, ParameterValue]
     n_points: int
@@ -650,13 +653,13 @@ def _seconds_of_points(
 
 
 Stopwatch = Callable[[], float]
-"""Function that does some work once and returns its time [s]."""
+"""Function that does some work once and returns the time that it took [s]."""
 
 
 def _grid_effect_cost(
     spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
 ) -> float:
-    """Return the fraction of the time of points that an effect takes."""
+    """Return the fraction of the computing time of grid points that an effect takes."""
 
     def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
         parameters, n_points, effect_names = sample_tile(tile)
@@ -760,7 +763,7 @@ def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
 def _flight_effect_cost(
     study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
 ) -> float:
-    """Return the fraction of the time of shots that an effect takes."""
+    """Return the fraction of the computing time of shots that an effect takes."""
     no_flags, effect_flag = np.uint32(0), np.uint32(1 << EFFECT_NAMES.index(effect_name))
 
     def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
@@ -819,7 +822,10 @@ def _seconds_of_cycles(
 def _tile_grid_indices(
     effect_planner: EffectPlanner, tile: int, n_max: int | None = None
 ) -> np.ndarray:
-    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid."""
+    """Return the indices of a tile's points, or of `n_max` of them, in C order over the grid.
+
+    A tile is a box of neighbouring points whose effects are chosen together.
+    """
     tile_size = effect_planner.tiles.count_block_points(tile)
     local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
     return effect_planner.tiles.grid_indices(tile, local_indices)
