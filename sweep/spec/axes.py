@@ -518,7 +518,7 @@ _NUMBER_OF_VALUES_RULE = NumericRule(
 
 @dataclass(frozen=True)
 class Progression:
-    """Exact arithmetic progression ``start + increment * i`` for ``i = 0 .. number - 1``."""
+    """Arithmetic progression ``start + increment * i``, i = 0 to number - 1, in exact numbers."""
 
     start: Fraction
     """First value."""

@@ -16,7 +16,7 @@ from sweep.spec.sections import MODEL_BY_SECTION
 from sweep.units import read_unit
 
 LISTED_VALUES_MAX = 8
-"""Maximum number of values that a list shows in full."""
+"""Largest number of values of a field that a line of differences lists in full."""
 SHOWN_CHARACTERS_MAX = 200
 """Largest number of characters of a text that a line of differences shows."""
 SCENE_SECTION_MODELS: spec_fields.ModelClasses = (

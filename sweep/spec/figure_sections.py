@@ -22,9 +22,9 @@ from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
 from sweep.units import QuantityError, read_number
 
 CoordinateSelection = str | int | float | tuple[str | int | float, ...]
-"""One value or several values of a coordinate, as written."""
+"""One value, or several values, of a coordinate, as written in a spec."""
 PublishedNumbers = tuple[Any, ...]
-"""Numbers as published, in nested tuples."""
+"""Numbers from a publication for comparison, in nested tuples of SI values."""
 CropLimits = tuple[float, ...]
 """Lower and upper limit of a scene's coordinate [m], or of time [s]."""
 
@@ -115,7 +115,10 @@ class FigureBase(SpecSection):
     """Base of all figures and tables."""
 
     FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
-    """Names of the fields whose values make up the file name; other entries are used literally."""
+    """Names of the fields whose values make up the file name.
+
+    Entries that name no field are used as they are.
+    """
 
     name: str = declare.text_field(
         "Stem of the picture's file name",
@@ -233,10 +236,13 @@ FIGURE_QUANTITIES = (
     *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ_DIM not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
-"""Quantities of shots and of points that a figure can show."""
+"""Names of the quantities of shots and of points that a scene's figure can show."""
 
 SEVERAL_SURFACES_KEYWORD = "several_surfaces"
-"""Keyword for the first shot whose footprint has several surfaces, in place of a shot's number."""
+"""Word that may replace a shot's number in a figure.
+
+It selects the first shot whose footprint has several surfaces.
+"""
 _VIEW_DIRECTION_RULE = ChoiceRule(
     description="Direction from which the cloud is seen",
     options=("oblique", "above", "side", "front"),
@@ -390,10 +396,10 @@ SceneFigure = Annotated[
 # Checks of figures
 
 _COORDINATE_FIELDS = ("x", "y", "by", "rows", "columns")
-"""Fields of a grid's figure that hold the name of a coordinate."""
+"""Fields of a grid's figure whose value is the name of a coordinate."""
 
 NAVIGATION_SHOTS_MIN = 3
-"""Minimum number of shots per cycle for a navigation solution."""
+"""Minimum number of shots in a measurement cycle from which a velocity can be computed."""
 
 
 def grid_figure_findings(

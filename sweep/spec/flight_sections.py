@@ -21,7 +21,7 @@ from sweep.spec.rules import JsonObject, ListRule, Rule, read_element
 from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
-"""Components of a vector in SI units."""
+"""Components of a vector along x, y and z, in SI units."""
 TimeSpan = tuple[float, float]
 """Start and stop of a time interval [s]."""
 
@@ -144,7 +144,7 @@ class Orientation(SpecSection):
 
 
 class NadirAttitude(SpecSection):
-    """Level attitude: a beam along -z points straight down."""
+    """Level attitude. A beam along the body's -z axis points straight down."""
 
     kind: Literal["nadir"]
     heading: float | str = declare.angle_field(
@@ -193,7 +193,7 @@ class SpinningAttitude(Orientation):
 
 
 class TabulatedAttitude(SpecSection):
-    """Attitude from a table, that of the waypoints by default."""
+    """Attitude from a table of times and attitudes, by default the table of waypoints."""
 
     kind: Literal["track"]
     file: str | None = declare.file_path_field(
@@ -284,7 +284,7 @@ class Platform(RigidMotion):
     )  # fmt: skip
 
     def read_time_origin(self, files: SpecFiles) -> Decimal:
-        """Return the time of the flight's start in the tables of waypoints [s], exactly.
+        """Return the exact time in the tables of waypoints at which the flight begins [s].
 
         This is the first time of the path's table, or 0 if the path is not given by a table.
         """
@@ -326,19 +326,19 @@ class Platform(RigidMotion):
 # Scan patterns
 
 BEAMS_MAX = 10_000
-"""Maximum number of beams of a scanner, and of directions along each side of a raster."""
+"""Maximum number of beams of a scanner; also of directions along each side of a raster scan."""
 STEERING_ANGLES_RULE = ListRule(
     description="Angles of a beam towards forward and towards the left",
     element_rule=declare.quantity_rule("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
     length_min=2,
     length_max=2,
 )
-"""Rule of a beam given by two steering angles [rad]."""
+"""Rule of a beam's direction that is given by two steering angles [rad]."""
 _DIRECTION_VECTOR_RULE = ListRule(
     description="Direction of a beam in the body frame",
     element_rule=declare.quantity_rule("Component", "", "-1", "-1e9", "1e9"),
 )
-"""Rule of a beam given by the three components of its direction in the body frame."""
+"""Rule of a beam's direction that is given by three components in the body frame."""
 
 
 class BeamDirectionsRule(Rule):
@@ -373,7 +373,7 @@ def beam_rule(beam: object) -> ListRule:
 
 
 _NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
-"""Smallest and largest angle between a beam and nadir."""
+"""Smallest and largest angle between a beam and the downward vertical (nadir), with units."""
 _CYCLE_RATE_FIELD = declare.frequency_field("Measurement cycles a second")
 _INTERVAL_FIELD_ZERO_BY_DEFAULT = declare.duration_field(
     "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
@@ -448,7 +448,7 @@ class CornersScanner(SpecSection):
 
 
 class SquaresScanner(SpecSection):
-    """One beam steered by stacked elements along squares; a cycle is a square."""
+    """One beam steered by stacked elements along squares; a measurement cycle is one square."""
 
     kind: Literal["squares"]
     elements: Vector = declare.list_field(
@@ -465,7 +465,7 @@ class SquaresScanner(SpecSection):
 
 
 class RasterScanner(SpecSection):
-    """One beam steered over a grid of directions; a cycle is a frame."""
+    """One beam steered over a grid of directions; a measurement cycle is one pass over the grid."""
 
     kind: Literal["raster"]
     columns: int = declare.integer_field("Directions across", "32", at_most=str(BEAMS_MAX))
@@ -483,7 +483,7 @@ class RasterScanner(SpecSection):
 
 
 class LineScanner(SpecSection):
-    """Beams swept together from side to side; a cycle is one measurement of each beam."""
+    """Beams swept together from side to side; a measurement cycle has one shot of each beam."""
 
     kind: Literal["line"]
     half_angle: float = declare.angle_field(

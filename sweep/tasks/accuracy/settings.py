@@ -160,8 +160,7 @@ class SettingLadder:
 
     @property
     def reference(self) -> AccuracySetting:
-        """Most accurate setting, to whose results the results of all other settings are compared.
-        """
+        """Most accurate setting, to whose results the results of all others are compared."""
         return self.settings[-1]
 
 
@@ -285,8 +284,7 @@ def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
 
 
 def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
-    """Return settings with fixed numbers of beamlets, in a lattice and, over a plane, along a line.
-    """
+    """Return settings with fixed numbers of beamlets, in a lattice or, over a plane, on a line."""
     for n_beamlets in TRIED_BEAMLET_COUNTS:
         if not is_flight or n_beamlets <= FIXED_RAYS_PER_SHOT_MAX:
             yield AccuracySetting(

@@ -110,7 +110,7 @@ PHASE_ESTIMATORS = ("jacobsen", "candan")
 
 
 class EchoDiagnosis(NamedTuple):
-    """Arrival and reading of the echoes of n points."""
+    """Arrival of the echoes of n points, and whether their beats give a false range or velocity."""
 
     range: np.ndarray
     """Range of the target (n,) [m]."""

@@ -137,7 +137,10 @@ def default_block_points(n_points: int, cpu_seconds_per_point: float) -> int:
 
 
 def block_points_limit(spec: GridSpec, n_points: int) -> int:
-    """Return the largest number of points of a block: as specified, or less if points take long."""
+    """Return the largest number of points of a block.
+
+    It is as specified, or less if points take long.
+    """
     cpu_seconds_per_point = worst_cpu_seconds_per_point(spec)
     requested_points = spec.storage.block_points or default_block_points(
         n_points, cpu_seconds_per_point

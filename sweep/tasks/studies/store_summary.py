@@ -198,7 +198,10 @@ def iter_block_values(
 
 @dataclass
 class ScannerRow:
-    """Echoes of a scanner at one point of the axes, in the committed blocks."""
+    """Numbers of true and false points of one scanner at one point of the axes.
+
+    Only stored blocks count.
+    """
 
     label: str
     n_shots: int = 0  # number of shots times draws

@@ -407,7 +407,7 @@ class EffectsTable:
     tile_fraction: float  # fraction of the tiles that were planned
 
     def warnings(self) -> Iterator[str]:
-        """Yield warnings about disabled effects that exceed the tolerance."""
+        """Yield a warning for each disabled effect that changes results beyond the tolerance."""
         for row in self.rows:
             if row.mode == "off" and row.change_bound > self.tolerance:
                 yield (
