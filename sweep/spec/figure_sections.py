@@ -26,7 +26,7 @@ CoordinateSelection = str | int | float | tuple[str | int | float, ...]
 PublishedNumbers = tuple[Any, ...]
 """Numbers from a publication for comparison, in nested tuples of SI values."""
 CropLimits = tuple[float, ...]
-"""Lower and upper limit of a scene's coordinate [m], or of time [s]."""
+"""Lower and upper limit of a scene's coordinate [m], or of time [s], that a figure shows."""
 
 
 def _read_coordinate_selection(raw_value: object) -> dict[str, CoordinateSelection]:
@@ -130,7 +130,7 @@ class FigureBase(SpecSection):
 
     @property
     def file_stem(self) -> str:
-        """Stem of the picture's file name: `name`, else the values of `FILE_NAME_PARTS`."""
+        """File name of the picture without suffix: `name`, or the values of `FILE_NAME_PARTS`."""
         words = [
             getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
         ]
@@ -552,7 +552,10 @@ def _figure_variable_findings(
 
 
 def _spectra_variable_findings(figure: Any, location: Location) -> Iterator[Finding]:
-    """Yield a finding if a figure shows a closed form: studies of whole spectra store none."""
+    """Yield a finding if a figure shows a closed-form result that the study does not store.
+
+    Studies that draw whole spectra store no such results.
+    """
     stored_variables = (
         outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_COUNT_OUTPUTS
     )
@@ -601,7 +604,10 @@ def _figure_scanner_findings(
 
 
 def _allows_navigation(raw_scanner: object) -> bool:
-    """Return True if a scanner has enough shots per cycle for navigation, or can't be read."""
+    """Return True if a scanner has enough shots per cycle to compute a velocity.
+
+    The result is also True if the scanner can't be read.
+    """
     scanner = validate_or_none(AnyScanner, raw_scanner)
     try:
         return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN

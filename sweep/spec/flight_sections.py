@@ -144,7 +144,7 @@ class Orientation(SpecSection):
 
 
 class NadirAttitude(SpecSection):
-    """Level attitude. A beam along the body's -z axis points straight down."""
+    """Level attitude: a beam along -z points straight down."""
 
     kind: Literal["nadir"]
     heading: float | str = declare.angle_field(
@@ -193,7 +193,7 @@ class SpinningAttitude(Orientation):
 
 
 class TabulatedAttitude(SpecSection):
-    """Attitude from a table of times and attitudes, by default the table of waypoints."""
+    """Attitude from a table, that of the waypoints by default."""
 
     kind: Literal["track"]
     file: str | None = declare.file_path_field(
@@ -448,7 +448,7 @@ class CornersScanner(SpecSection):
 
 
 class SquaresScanner(SpecSection):
-    """One beam steered by stacked elements along squares; a measurement cycle is one square."""
+    """One beam steered by stacked elements along squares; a cycle is a square."""
 
     kind: Literal["squares"]
     elements: Vector = declare.list_field(
@@ -465,7 +465,7 @@ class SquaresScanner(SpecSection):
 
 
 class RasterScanner(SpecSection):
-    """One beam steered over a grid of directions; a measurement cycle is one pass over the grid."""
+    """One beam steered over a grid of directions; a cycle is a frame."""
 
     kind: Literal["raster"]
     columns: int = declare.integer_field("Directions across", "32", at_most=str(BEAMS_MAX))
@@ -483,7 +483,7 @@ class RasterScanner(SpecSection):
 
 
 class LineScanner(SpecSection):
-    """Beams swept together from side to side; a measurement cycle has one shot of each beam."""
+    """Beams swept together from side to side; a cycle is one measurement of each beam."""
 
     kind: Literal["line"]
     half_angle: float = declare.angle_field(

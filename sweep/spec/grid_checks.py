@@ -559,7 +559,7 @@ def _narrowest_impossible_beam(
 
 
 def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
-    """Convert the waist [m] of a beam to its divergence [rad], or vice versa by the same law."""
+    """Convert a beam's waist radius [m] to its full divergence [rad], or the reverse."""
     return float(
         beam.divergence_from_waist(
             waist_or_divergence, parameters[beam.WAVELENGTH_PATH], parameters[beam.QUALITY_PATH]
@@ -579,7 +579,10 @@ def _argmax_of_product(
 
 
 def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
-    """Return ``power * log(values)``; infinite where a value is 0."""
+    """Return ``power * log(values)``, a term in the logarithm of a product of powers.
+
+    It is infinite where a value is 0.
+    """
     with np.errstate(divide="ignore"):
         return np.asarray(power * np.log(values))
 
@@ -587,7 +590,10 @@ def _exponent_times_log(power: float, values: np.ndarray) -> np.ndarray:
 # Looks
 
 VOTING_LOOKS_MAX = 64
-"""Maximum number of looks of a shot whose detections are combined by votes."""
+"""Maximum number of looks of a shot whose detections are combined by votes.
+
+A look is one record of each segment (chirp).
+"""
 
 
 def _exceeds_one(number: np.ndarray) -> np.ndarray:
@@ -1055,7 +1061,8 @@ def _changed_spectrum_method_paths(grid: GridValues) -> list[str]:
 def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
     """Yield mistakes in the cells of CFAR detectors, which compare a bin with neighbouring bins.
 
-    The number of cells is odd or exceeds the spectrum, or the rank exceeds the number of cells.
+    The number of training cells is odd, the cells exceed the spectrum, or the rank exceeds the
+    cells.
     """
     training, guard, rank = (
         grid.parameter_values(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)

@@ -219,10 +219,7 @@ class Ground(Material, ABC):
 
 
 class PlacedGround(Ground):
-    """Base of grounds without coordinates of their own.
-
-    `position` places the middle of the grid.
-    """
+    """Base of grounds whose grid has no coordinates: `position` places its middle."""
 
     position: Vector = declare.position_field(
         "Position of the grid's middle; heights are relative to its z", default=(0.0, 0.0, 0.0)
@@ -377,7 +374,7 @@ class ImageGround(PlacedGround):
 
 
 def _nodes_per_side(side: float, step: float) -> int:
-    """Return the number of nodes in steps of `step` [m] along a grid of at least `side` [m]."""
+    """Return the number of nodes, `step` [m] apart, of a grid side that is at least `side` [m]."""
     return math.ceil(side / step * (1 - 1e-12)) + 1
 
 

@@ -687,7 +687,7 @@ _CHIRP_TIME_RULE = NumericRule(
     at_least="-1e6 s",
     at_most="1e6 s",
 )
-"""Rule of a time [s] since the start of the chirp, in a table of the chirp's frequency error."""
+"""Rule of a time [s] in the up-chirp, in a table of the sweep's frequency error."""
 _FREQUENCY_ERROR_RULE = NumericRule(
     description="Frequency error",
     si_unit="Hz",

@@ -425,8 +425,9 @@ _CLIPPING_NOTE = "what lies beyond is clipped and reported as invalid"
 class Interface(SpecSection):
     """Reports of the unit according to its interface control document.
 
-    They are no part of the study's identity. ``sweep export --as reports`` makes reports from
-    stored points, without a new simulation.
+    No part of the study's identity.
+
+    ``sweep export --as reports`` makes reports from stored points, without a new simulation.
     """
 
     range_quantum: float | None = declare.length_field(

@@ -204,7 +204,7 @@ class Receiver(SpecSection):
 
 
 class Detector(SpecSection):
-    """Method that decides which bins of drawn spectra contain an echo."""
+    """Detector applied to the bins of drawn spectra."""
 
     kind: str = declare.field_with_rule(
         ChoiceOrFunctionRule(
@@ -230,7 +230,7 @@ class Detector(SpecSection):
 
 
 class Estimator(SpecSection):
-    """Method that estimates the frequency of a detected peak between bins of drawn spectra."""
+    """Estimator of the frequency of a detected peak between bins of drawn spectra."""
 
     kind: str = declare.field_with_rule(
         ChoiceOrFunctionRule(
@@ -253,9 +253,9 @@ def _search_limit_field(description: str, *rule_arguments: str) -> Any:
 
 
 class SearchBand(SpecSection):
-    """Ranges and radial velocities in which echoes are searched.
+    """Band of ranges and radial velocities in which echoes are searched.
 
-    They select bins by the beat frequencies that they give.
+    It selects bins by their beats.
     """
 
     min_range: float | None = _search_limit_field("Smallest range searched", "m", "10 m", "0 m")
@@ -456,7 +456,7 @@ class Atmosphere(SpecSection):
 
 @add_effect_modes
 class Effects(SpecSection):
-    """Mode of each physical effect: simulated where the tolerance requires it, always, or never."""
+    """Modes of physical effects: simulated if the tolerance requires it, always or never."""
 
 
 def _tolerance_share_field(description: str) -> Any:
@@ -540,7 +540,7 @@ class Draws(SpecSection):
 
     @property
     def is_adaptive(self) -> bool:
-        """True if each point is drawn until its accuracy is met."""
+        """True if each point is drawn until its statistical error is within the tolerance."""
         return self.limit > 0
 
 

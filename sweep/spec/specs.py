@@ -118,7 +118,7 @@ _N_ACCELERATION_SAMPLES = 1000
 FILE_DIGESTS_KEY = "files"
 """Key in the JSON of a stored spec under which the digests of files are held, by path."""
 _SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
-"""Sections that `to_yaml_mapping` writes without the fields that have their default values."""
+"""Sections to which `to_yaml_mapping` adds no defaults for fields that the spec does not state."""
 _AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
 """Rule of the field `axes`, which is read by `read_axes` before pydantic validates the spec."""
 

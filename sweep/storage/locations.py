@@ -76,7 +76,7 @@ FIRST_CONTACT_RETRY_CONFIG = {
 CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
 ObjectVersion = Any
-"""Tag (ETag or version) by which an object store identifies one version of an object."""
+"""Tag (ETag or version) by which an object store tells versions of one object apart."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -544,18 +544,21 @@ _LEFTOVER_NAME_PATTERN = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
     r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
-"""Hidden names that dead processes leave; earlier versions wrote no host, or no start id."""
+"""Pattern of the hidden names of files that interrupted processes leave.
+
+Earlier versions of sweep wrote no host, or no start time of the process, into such names.
+"""
 
 #: Start id of a process that exists, but is hidden from other users.
 HIDDEN_PROCESS_START_ID = -1
 
 
 PID_MAX = 2**31 - 1
-"""Largest process id that an operating system assigns."""
+"""Largest process number that an operating system assigns."""
 
 
 def process_start_id(pid: int) -> int:
-    """Return the start time of a process, which distinguishes it from others with the same id.
+    """Return the start time of a process, which tells it from others with the same number.
 
     The unit is clock ticks since the machine was booted on Linux, and 0.01 s since the epoch on
     other systems. Changes of the clock do not alter it. Return 0 if no such process runs, and
@@ -599,7 +602,10 @@ def resolve_links(location: Location) -> Location:
 
 
 def eyepoint_store_location(store: Location, geometry_id: str) -> Location:
-    """Return the path of a geometry's eyepoint store, in a folder next to the study's store."""
+    """Return the path of the store with a flight's shot geometry (eyepoints).
+
+    It is in a folder next to the store of the study.
+    """
     return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
 
@@ -813,7 +819,10 @@ def remedy_for_write_error(error: OSError, place: object, otherwise: str) -> str
 
 
 def _has_no_free_inodes(path: Path) -> bool:
-    """Tell whether the disk of a path, which need not exist, has no free inodes."""
+    """Return True if the disk of a path has no free inodes, so that no file can be created.
+
+    The path need not exist.
+    """
     while not path.exists() and path != path.parent:
         path = path.parent
     with suppress(OSError):

@@ -65,7 +65,10 @@ def describe_chunk_damage(content: bytes) -> str:
 
 
 def describe_shard_damage(content: bytes, n_chunks: int) -> str:
-    """Return the damage of a shard in words, '' if the checksums of its index and chunks match."""
+    """Return what is wrong with a shard (a file of many chunks), in words; '' if it is undamaged.
+
+    The checksums of its index and of its chunks are checked.
+    """
     index_bytes = n_chunks * _SHARD_INDEX_ENTRY_BYTES + _CHECKSUM_BYTES
     if damage := describe_chunk_damage(content[-index_bytes:]):
         return damage
@@ -77,10 +80,11 @@ def describe_shard_damage(content: bytes, n_chunks: int) -> str:
 
 
 class ChunkBlockMap:
-    """Map from the chunks of a store to the blocks that write them, from its root document.
+    """Map from the chunks of a store's arrays to the blocks that write them.
 
-    The chunks of the outputs of a group form a grid, and each block has one position in it. An
-    array that lacks a dimension of this grid is written by the blocks at position 0 along it.
+    It follows from the root document. The chunks of the outputs of a group form a grid, and each
+    block has one position in it. An array that lacks a dimension of this grid is written by the
+    blocks at position 0 along it.
     """
 
     def __init__(self, location: Location) -> None:
@@ -159,7 +163,10 @@ def _chunk_counts_by_dim(node: dict[str, Any]) -> dict[str, int]:
 
 
 def _block_dim_names(node: dict[str, Any]) -> list[str]:
-    """Return the dimension names of an array, with `cycle` for `shot`: blocks divide both alike."""
+    """Return the dimension names of an array, with `cycle` in place of `shot`.
+
+    Blocks divide both dimensions in the same way.
+    """
     return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
 
 
@@ -273,7 +280,10 @@ class VerifiedStore(WrapperStore[Any]):
 
 
 _loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
-"""Event loops of Zarr in which a read has failed; other reads may still be pending there."""
+"""Event loops of Zarr in which a read has failed.
+
+Other reads may still be pending in these loops when Python exits.
+"""
 
 
 @atexit.register

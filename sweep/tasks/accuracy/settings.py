@@ -151,7 +151,9 @@ class AccuracySetting:
 
 @dataclass(frozen=True)
 class SettingLadder:
-    """All settings that are compared, the reference (the most accurate) last, with notes on them.
+    """All settings that are compared, with notes.
+
+    The last one is the most accurate, the reference.
     """
 
     settings: tuple[AccuracySetting, ...]

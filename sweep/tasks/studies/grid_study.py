@@ -462,7 +462,7 @@ class GridStudy(ExtendableStudy):
         }
 
     def constant_arrays(self) -> list[ArrayLayout]:
-        """Return the coordinates of the axes, and the sizes of batches of draws."""
+        """Return the arrays known in advance: axis coordinates, and sizes of batches of draws."""
         arrays = axis_coordinate_layouts(self.spec.axes)
         if draws_per_batch := batch_sizes(self.spec):
             batch_attributes = cf_attributes("1", "draws in the batch")
