@@ -65,9 +65,9 @@ class ChartLine:
     style_index: int = 0
     """Number that selects colour, dash and marker."""
     low: np.ndarray | None = None
-    """Lower ends of a band about the line (n,)."""
+    """Lower end of a band about the line at each position (n,), such as a confidence interval."""
     high: np.ndarray | None = None
-    """Upper ends of a band about the line (n,)."""
+    """Upper end of a band about the line at each position (n,), such as a confidence interval."""
     style: str = "line"
     """Style of the line.
 
@@ -75,7 +75,7 @@ class ChartLine:
     line) or ``area`` (stacked on the areas before it).
     """
     points_per_value: int = 1
-    """Number of points of the study whose mean each value is."""
+    """Number of points of the study whose mean each value of the line is."""
     hover_texts: Sequence[str] = ()
     """Texts that a page shows when the reader points at a value."""
 
@@ -103,7 +103,7 @@ class ColourScale:
     high: float
     """Highest value of the scale."""
     is_log: bool
-    """True if the scale is logarithmic."""
+    """True if colours depend on the logarithm of the value."""
     label: str
     """Label of the scale, with units."""
 
@@ -154,7 +154,7 @@ class ChartSizeLimits:
     """Limits of the size of a chart."""
 
     parts_max: int
-    """Largest number of parts of the study, each of which has a panel."""
+    """Largest number of parts of the study that are shown. Each part has a panel."""
     columns_max: int
     """Largest number of columns of a row of heat maps."""
     rows_max: int
@@ -168,16 +168,22 @@ class ChartSizeLimits:
 SHEET_SIZE_LIMITS = ChartSizeLimits(
     parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_per_row=2
 )
-"""Limits of charts on sheets. A heat map has no more cells than pixels, so that no cell is lost."""
+"""Limits of charts on sheets (matplotlib figures).
+
+A heat map has no more cells than pixels, so that no cell is lost.
+"""
 
 LINES_PER_PANEL_MAX = 8
 """Largest number of lines in a panel; further lines are omitted."""
 
 REDUCED_LINE_INTERVALS = 500
-"""Number of values to which a line is reduced, if it has more than twice as many points."""
+"""Number of values to which a long line is reduced.
+
+Lines with at most twice as many points are kept.
+"""
 
 _LOG_SCALE_DECADES_MIN = 3
-"""Decades between the median and the largest value above which a colour scale is logarithmic."""
+"""Number of decades between median and largest value, above which a colour scale is logarithmic."""
 
 _LARGEST_IS_WORST_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 """Prefixes of the names of variables whose largest value is the worst one."""

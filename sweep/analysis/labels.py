@@ -11,7 +11,7 @@ import numpy as np
 from sweep.messages import counted as counted
 
 KILOMETRE_DISPLAY_MIN = 1000.0
-"""Median of distances [m] above which they are shown in km."""
+"""Median of the distances on an axis above which they are shown in km [m]."""
 
 _SYMBOL_BY_UNIT = {"deg": "°", "urad": "µrad", "um": "µm", "us": "µs", "uW": "µW", "m s-1": "m/s"}
 """Symbols of units in labels, by the units' names in stores, if they differ."""
@@ -33,7 +33,7 @@ _SI_PREFIX_BY_EXPONENT = {
 """SI prefixes by exponent of ten."""
 
 _PREFIXABLE_UNITS = ("m", "s", "Hz", "W", "rad", "A", "ohm")
-"""Units that take an SI prefix."""
+"""Units that may be written with an SI prefix, such as mm."""
 
 
 def display_factor_and_units(values: np.ndarray, units: str) -> tuple[float, str]:

@@ -27,7 +27,7 @@ CELL_MEAN, CELL_LOWEST, CELL_HIGHEST = "mean", "lowest", "highest"
 """Names of the statistics of the points in a cell of a figure."""
 
 SUMMED_VALUES_MAX = 2**20
-"""Largest number of values in a partial sum."""
+"""Largest number of values that one partial sum adds up. The partial sums are then added."""
 
 
 @dataclass(frozen=True)
@@ -318,10 +318,13 @@ PUBLISHED_CUTS = (
     (GRAZING_ANGLE_PATH, "85 deg"),
     (RANGE_PATH, "3500 m"),
 )
-"""Cuts of the published figures: path and value of the fixed parameter."""
+"""Cuts of the published figures through range and grazing angle.
+
+Each has the dotted path and the value of the parameter that is fixed.
+"""
 
 AVERAGED_RANGE_MIN = "5 m"
-"""Smallest range of the points that means of false alarms include.
+"""Smallest range of points over which false alarms are averaged [m].
 
 At shorter ranges the shot noise of the echo matters ([T] 4.2).
 """

@@ -50,12 +50,15 @@ CHART_PARTS_MAX = 6
 """Largest number of parts of a study among which the reader of a chart can choose."""
 
 NOISE_BUDGET_POINTS = 24
-"""Number of points along a coordinate, or of shots along a flight, in a chart of noise sources."""
+"""Number of points at which a chart of noise sources is computed.
+
+They are points along a coordinate of a grid, or shots along a flight.
+"""
 
 ROC_POINT_PDS = (0.999, 0.9, 0.5, 0.1, 0.01)
-"""Probabilities of detection by which points are chosen for ROC curves.
+"""Probabilities of detection for which points are chosen, whose ROC curves are drawn.
 
-The point with the closest pd to each value is chosen.
+The point whose pd is closest to each of these is chosen.
 """
 
 ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
@@ -84,7 +87,7 @@ _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
 
 @dataclass(frozen=True)
 class GridProfile:
-    """Points of one part of a study along its main coordinate, or its only point."""
+    """Points of one part of a study along the coordinate that charts show, or the only point."""
 
     label: str
     """Name of the part."""
@@ -181,9 +184,9 @@ _PFA_FUNCTION_BY_ALARM = {
     "in a bin": lambda bin_probability, bins: bin_probability,
     "in both chirps": lambda p, bins: noise_false_alarms.segment_pfa(p, bins) ** 2,
 }
-"""Functions that convert the false-alarm probability of a bin, by the kind of false alarm.
+"""Functions that give the probability of each kind of false alarm, by the name of the kind.
 
-Their arguments are this probability and the number of independent bins.
+Their arguments are the false-alarm probability of one bin, and the number of independent bins.
 """
 
 
@@ -393,16 +396,19 @@ def false_alarm_chart(
 
 
 REPORTED_PD_LEVEL = 0.9
-"""Level of pd by which a report states the maximum range and counts points."""
+"""Probability of detection that a report requires within the maximum range.
+
+The report also counts the points that reach it.
+"""
 
 UNBROKEN_LABEL = "kept all the way"
-"""Label of the maximum range up to which pd never falls below the level."""
+"""Label of the maximum range up to which pd is never below the chosen level."""
 
 LIMIT_VARIABLE_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
 """Variables of :func:`.detection_limits.limit` with the two kinds of maximum range, by label."""
 
 INTERVAL_END_LABELS = {"low": "lower end", "high": "upper end"}
-"""Column names for the ends of the interval of the maximum range."""
+"""Column names for the lower and the upper end of the confidence interval of the maximum range."""
 
 MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {REPORTED_PD_LEVEL:g}"
 """Heading of the chart or table of the maximum range."""

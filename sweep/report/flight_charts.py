@@ -71,7 +71,7 @@ PAGE_CLOUDS_MAX = 8
 """Largest number of clouds on a page: scanners times positions along the study's axes."""
 
 TERRAIN_SIDE_NODES_MAX = 90
-"""Largest number of terrain nodes along a side of the drawn terrain."""
+"""Largest number of nodes of the drawn terrain along each of its sides."""
 
 TERRAIN_LOWERING_FRACTION = 0.012
 """Depth by which the drawn terrain is lowered, as a fraction of its horizontal size.
@@ -83,9 +83,10 @@ CAMERA_FIELD_OF_VIEW = math.radians(45)
 """Vertical field of view of plotly's camera [rad]."""
 
 VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
-"""Fraction of the field of view that the points' box fills, and least width-to-height ratio.
+"""Framing of the points of a cloud in plotly's view.
 
-The rest of the field of view is for labels. The ratio is that of a plot on a phone.
+The first is the fraction of the field of view that the points' box fills; the rest is for labels.
+The second is the least width-to-height ratio of the plot, that of a phone.
 """
 
 CAMERA_POSITION_BY_VIEW = {

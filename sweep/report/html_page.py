@@ -44,7 +44,7 @@ PLOTLY_DASH_STYLES = (
 """Dash styles of lines in plotly's notation. Lines then differ not only by colour."""
 
 _COLOUR_MAP_SPANS = {"light": (0.0, 0.75), "dark": (0.3, 1.0)}
-"""Part of the colour map, 0..1, that contrasts with a light and with a dark page."""
+"""Parts of the colour map, within 0..1, that contrast with a light page and with a dark page."""
 
 _GROUND_COLOURS = {"light": ("#8a8a86", "#f2f1ec"), "dark": ("#1b1d20", "#6d7176")}
 """Colours of the darkest and the brightest terrain, on a light and on a dark page."""

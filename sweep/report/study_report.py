@@ -60,7 +60,7 @@ PAGE_SIZE_LIMITS = ChartSizeLimits(
     cells_max=400_000,
     maps_per_row=1,
 )
-"""Limits of charts on a page.
+"""Limits of the charts on a page: parts, rows, columns and cells.
 
 The limit of cells applies to all heat maps of the page together, which keeps it to a few megabytes.
 """

@@ -23,7 +23,7 @@ import numpy as np
 from sweep.scenes.terrain import Terrain
 
 _ALIGNMENT_TOLERANCE_CELLS = 1e-3
-"""Offset of two grids from a whole number of cells up to which they count as one grid [cells]."""
+"""Largest deviation from whole cells of the offset of two grids that count as one [cells]."""
 
 _ADJACENT_GAP_MAX_CELLS = 2.0
 """Largest gap between two grids that count as adjacent [cells of the coarser grid]."""

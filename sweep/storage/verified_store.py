@@ -57,7 +57,7 @@ class DamagedChunkError(ValueError):
 
 
 def describe_chunk_damage(content: bytes) -> str:
-    """Return the damage of a chunk in words, '' if its CRC32C at the end matches."""
+    """Return what is wrong with a chunk, in words; '' if the CRC32C checksum at its end matches."""
     if not content:
         return "is empty"
     checksum = google_crc32c.value(content[:-_CHECKSUM_BYTES]).to_bytes(_CHECKSUM_BYTES, "little")
@@ -104,7 +104,7 @@ class ChunkBlockMap:
             self.n_blocks += math.prod(chunks_by_dim.values())
 
     def _block_grid_shape(self, group: str) -> dict[str, int]:
-        """Return the number of chunks along each divided dimension of a group's outputs."""
+        """Return the number of chunks of a group's outputs along each dimension cut into blocks."""
         chunks_by_dim: dict[str, int] = {}
         for name, node in self._arrays.items():
             if name.rpartition("/")[0] != group or self._is_in_template(name, node):
@@ -142,7 +142,7 @@ class ChunkBlockMap:
         return first_block + index
 
     def chunks_per_shard(self, chunk_name: str) -> int:
-        """Return the capacity of a chunk's shard file [chunks]; 0 if the file is a single chunk."""
+        """Return how many chunks a chunk's file (shard) may hold; 0 if it is a single chunk."""
         name_match = CHUNK_NAME_PATTERN.fullmatch(chunk_name)
         node = self._arrays.get(name_match[1]) if name_match else None
         if node is None or node["codecs"][0]["name"] != "sharding_indexed":

@@ -23,15 +23,16 @@ from sweep.analysis.answers.probability import (
 LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
 """Flags of the outcomes of a search for a limit."""
 LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
-"""Names of these flags, separated by spaces, for the CF attribute `flag_meanings`."""
+"""Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
 
 _PD_PLUS_MISS_ERROR_MAX = 1e-6
-"""Largest deviation from 1 of pd plus the probability of a miss, by rounding and averaging."""
+"""Largest deviation from 1, by rounding and averaging, of pd plus the probability of a miss."""
 
 _NORMAL_DEVIATE_MAX = 38.0
-"""Largest magnitude of a normal deviate, used for a pd of 0 or 1.
+"""Largest magnitude of a normal deviate, which stands for a pd of 0 or 1.
 
-It corresponds to a probability near the smallest positive float.
+The normal deviate of pd is the argument at which the normal distribution function equals pd. This
+one corresponds to a probability near the smallest positive float.
 """
 
 
@@ -248,7 +249,7 @@ def _limits_along_dimension(
 def _smallest_chosen_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
     """Return the smallest of the chosen steps along a dimension; infinity if none is chosen.
 
-    A step is a position along the dimension: 0, 1, 2, and fractions between.
+    A step is an index along the dimension, which may lie between two integers.
     """
     return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
 

@@ -30,7 +30,7 @@ from sweep.model.window import Window, direct_transform, get_window
 from sweep.spec import GridSpec
 
 _SEGMENT_NAMES = ("up", "doppler", "down")
-"""Names of the segments of a shot, as parts of variable names."""
+"""Names of the segments (chirps) of a shot, as they occur in names of variables."""
 _INSTRUMENT_PATH_PREFIX = "instrument."
 """Beginning of the dotted paths of all instrument parameters."""
 _PATH_BY_PARAMETER = {
@@ -43,10 +43,10 @@ _PATH_BY_PARAMETER = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
-"""Dotted paths of the instrument parameters on which the bounds depend, without `instrument.`."""
+"""Dotted paths, without `instrument.`, of the parameters on which Cramer-Rao bounds depend."""
 
 _RANDOM_EFFECT_NAMES = {effect.name for effect in EFFECTS if effect.is_random}
-"""Names of the effects that are drawn at random."""
+"""Names of the effects that are simulated by random draws."""
 
 _GROUPING_PARAMETERS = (
     "architecture",
@@ -57,7 +57,7 @@ _GROUPING_PARAMETERS = (
     "delay",
     "sample_rate",
 )
-"""Parameters by which points are grouped; the bounds of a group are computed together."""
+"""Parameters that are equal at points whose Cramer-Rao bounds are computed together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:

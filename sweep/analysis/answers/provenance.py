@@ -34,7 +34,7 @@ from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 RELATIVE_VALUE_TOLERANCE = 1e-9
-"""Largest relative difference at which a value counts as a value of an axis."""
+"""Largest relative difference at which a coordinate's value counts as a value of a study's axis."""
 
 
 def compute_answer_per_study(
@@ -308,7 +308,7 @@ def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
 
 
 _SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
-"""Attributes of datasets that a join sums over its designs."""
+"""Attributes of datasets that are summed when studies are joined."""
 
 
 def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
@@ -441,4 +441,7 @@ def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence
 
 
 _FILL_VALUE_BY_DTYPE_KIND = {"i": -1, "u": 0, "b": False}
-"""Values for the points that a design lacks, by NumPy's kind of data type; nan for other kinds."""
+"""Values for points that one of the joined studies lacks, by NumPy's kind of data type.
+
+For other kinds the value is nan.
+"""

@@ -41,9 +41,9 @@ MISSING_POINT_COLOUR = "0.6"
 """Colour of points whose value is not known, or whose category has no colour of its own."""
 
 OUTLIER_MARGIN_FRACTION = 0.25
-"""Distance beyond the 0.5 % or 99.5 % quantile from which values do not extend a colour scale.
+"""Distance beyond the 0.5 % or 99.5 % quantile above which a value does not extend a colour scale.
 
-It is a fraction of the span between both quantiles.
+It is a fraction of the difference between both quantiles.
 """
 
 
@@ -250,7 +250,7 @@ TICK_SPACING_MIN_X_INCHES, TICK_SPACING_MIN_Y_INCHES = 0.42, 0.25
 """Least spacing of legible ticks on horizontal and vertical axes [inches]."""
 
 OFFSET_LABEL_COORDINATE_MIN = 1e5
-"""Magnitude of coordinates [m] above which an axis shows differences from a round number."""
+"""Magnitude of coordinates above which axis labels are differences from a round number [m]."""
 
 
 def marker_area(positions: np.ndarray, width: float, height: float) -> float:

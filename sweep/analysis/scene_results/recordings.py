@@ -80,7 +80,7 @@ LOG_QUANTITIES = ("pfa_up", "pfa_down")
 """Quantities that are shown on a logarithmic scale: probabilities of false alarms."""
 
 POINT_KIND_BITS = {name: bit for name, bit in FLAG_BITS.items() if name != "unconfirmed"}
-"""Bits of a point's flags by the kind of point that they stand for.
+"""Bits of a point's flags that say of which kind the point is, by the name of the kind.
 
 Each point has exactly one of these bits.
 """
@@ -163,7 +163,7 @@ ValueLimits = tuple[float, ...]
 """Lowest and highest value of a quantity."""
 
 UNLIMITED_VALUES: ValueLimits = (-np.inf, np.inf)
-"""Limits that every finite value keeps."""
+"""Limits that exclude no finite value."""
 
 
 def within_limits_mask(
@@ -550,10 +550,10 @@ CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2
 """Largest numbers of points, shots without a point, and path positions in a picture."""
 
 BOX_MARGIN_FRACTION = 0.04
-"""Margin around the points of a picture, as a fraction of the longest side of their box."""
+"""Margin around the points of a picture, relative to the longest side of their box."""
 
 CoordinateBox = dict[str, tuple[float, float]]
-"""Lowest and highest value of x, y and z [m]."""
+"""Lowest and highest value of each of x, y and z [m], the bounds of a picture."""
 
 
 @dataclass(frozen=True)
