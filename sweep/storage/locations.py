@@ -52,10 +52,10 @@ DRAFT_SUFFIX = ".partial"
 #: Attribute that marks a packed copy of a store: its files are shards of many chunks.
 PACKED_ATTRIBUTE = "packed"
 
-#: Concurrent requests to an object store. A request takes milliseconds, mostly waiting.
+#: Number of requests to an object store at a time. A request takes milliseconds, mostly waiting.
 CONCURRENT_REQUESTS_MAX = 16
 
-#: Retries after HTTP status 500 and above, timeouts and lost connections.
+#: How often a request is repeated after HTTP status 500 and above, timeouts and lost connections.
 RETRY_CONFIG = {
     "max_retries": 8,
     "retry_timeout": timedelta(seconds=90),
@@ -66,7 +66,7 @@ RETRY_CONFIG = {
     },
 }
 
-#: Retries at the first contact, when a wrong address is likelier than a transient fault.
+#: How often the first request is repeated. A wrong address is then likelier than a transient fault.
 FIRST_CONTACT_RETRY_CONFIG = {
     **RETRY_CONFIG,
     "max_retries": 3,
@@ -534,10 +534,10 @@ def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
 #: Suffix of the hidden name of a store that will replace another once it is complete.
 STAGING_SUFFIX = ".next"
 
-#: Age at which a draft of another host counts as abandoned [s].
+#: Age above which a draft (unfinished file) of another host counts as abandoned [s].
 ABANDONED_DRAFT_AGE_SECONDS = 86400.0
 
-#: Largest lag of a file server's clock that is tolerated [s].
+#: Largest time by which a file server's clock may be behind this machine's [s].
 CLOCK_SKEW_SECONDS_MAX = 60.0
 
 _LEFTOVER_NAME_PATTERN = re.compile(
@@ -549,7 +549,7 @@ _LEFTOVER_NAME_PATTERN = re.compile(
 Earlier versions of sweep wrote no host, or no start time of the process, into such names.
 """
 
-#: Start id of a process that exists, but is hidden from other users.
+#: Start time that stands for a process that exists, but is hidden from other users.
 HIDDEN_PROCESS_START_ID = -1
 
 

@@ -67,7 +67,7 @@ from sweep.storage.size_checks import (
 #: Manifest: journal file with the digest of each object that a store has before any results.
 MANIFEST_FILE = "template.jsonl"
 
-#: Version of the layout of stores.
+#: Version of the layout of stores: of their groups, arrays, attributes and journal.
 LAYOUT_VERSION = 5
 
 #: Level of the zstd compression of every array chunk.

@@ -44,7 +44,7 @@ CHUNK_NAME_PATTERN = re.compile(r"(.+)/c((?:/\d+)*)")
 #: Dimensions along which the shots of a flight are divided into blocks; they vary fastest.
 CYCLE_DIM, SHOT_DIM = "cycle", "shot"
 
-#: Time that abandoned reads have to be cancelled when the program ends [s].
+#: Time in which reads that nobody waits for are cancelled when the program ends [s].
 PENDING_READS_TIMEOUT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4

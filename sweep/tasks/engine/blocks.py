@@ -26,7 +26,8 @@ import numpy as np
 Results = dict[str, np.ndarray]
 """Arrays of results, by the name of the output variable."""
 
-#: Fill value of an array by the kind of its dtype; the integers that are stored are not negative.
+#: Fill value of arrays by the kind of their data type (NumPy code). Stored integers are not
+#: negative.
 FILL_VALUE_BY_DTYPE_KIND = {"f": float("nan"), "i": -1, "u": 0}
 
 
@@ -266,6 +267,6 @@ class BlockGrid:
         )
 
 
-#: Largest number of blocks of a study: a run keeps some 30 bytes per block in memory, and a block
-#: is stored in one file per array.
+#: Largest number of blocks of a study. A run keeps some 30 bytes per block in memory, and a block
+#: is one file per array in the store.
 BLOCKS_PER_STUDY_MAX = 2 * 10**7

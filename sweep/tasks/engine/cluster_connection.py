@@ -28,7 +28,7 @@ from sweep.tasks.engine.text_streams import make_dask_logs_patient
 if TYPE_CHECKING:
     from distributed import Client, Security
 
-#: Time in which a scheduler must respond [s].
+#: Time in which a Dask scheduler must respond to a new client [s].
 CONNECT_TIMEOUT_SECONDS = 15.0
 
 

@@ -37,32 +37,35 @@ if TYPE_CHECKING:
     from dask.typing import Key
     from distributed import Client, Future
 
-#: Intended time of a task [s]: long compared with its overhead of 3-9 ms, short compared with a
-#: study.
+#: Intended duration of a task [s]. It is long compared with a task's overhead of 3-9 ms, and short
+#: compared with a study.
 TARGET_TASK_SECONDS = 2.0
 BLOCKS_PER_TASK_MAX = 1000
 
-#: Largest rate of tasks [1/s], a third of what a scheduler can handle. With more than 200 worker
-#: threads tasks are longer to keep to it.
+#: Largest number of tasks per second, a third of what a scheduler can handle [1/s]. With more than
+#: 200 worker threads tasks are made longer to stay below it.
 TASKS_PER_SECOND_MAX = 100.0
 
-#: Age at which the count of worker threads is updated [s].
+#: Interval at which the worker threads of a cluster are counted again [s].
 WORKER_THREADS_REFRESH_SECONDS = 2.0
 
-#: Time without a response after which a worker is silent [s]; longer if its blocks take long.
+#: Time without a result after which a worker counts as silent [s]. It is longer if blocks take
+#: long.
 WORKER_SILENCE_SECONDS = 30.0
 
-#: Largest time after which files that a worker has written are visible here [s]: NFS of Linux
-#: caches folders for as long.
+#: Largest time until files that a worker has written are visible to this process [s]. NFS clients
+#: on Linux cache folders for as long.
 FILE_VISIBILITY_SECONDS_MAX = 60.0
 
-#: Time without a response after which a stall is reported [s]; longer if tasks take longer.
+#: Time without any result after which a message says that the run stalls [s]. It is longer if tasks
+#: take long.
 STALL_REPORT_SECONDS = 60.0
 
-#: Largest delay of the first response that is not a stall, as workers compile the model [s].
+#: Time for the first result of a run before a message says that it stalls [s]. Workers compile the
+#: model before it.
 COMPILATION_SECONDS_MAX = 600.0
 
-#: Multiple of the expected time of a task after which a stall is reported.
+#: Time without any result after which a stall is reported, as a multiple of a task's expected time.
 STALL_TASK_DURATION_FACTOR = 5.0
 
 #: Largest numbers of tasks and of workers that a summary of the state lists.

@@ -22,28 +22,28 @@ from typing import Any
 from sweep.messages import EXIT_INCOMPLETE, STORE_PLACEHOLDER, is_run_as_command, suggested_call
 from sweep.tasks.engine.progress import Progress
 
-#: Signals that end a run after its running blocks; a second one ends it at once.
+#: Signals that end a run once its running blocks are written. A second such signal ends it at once.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 #: Signal of a closed terminal, which may arrive several times; None on systems without it.
 HANGUP_SIGNAL = getattr(signal, "SIGHUP", None)
 
-#: Time in which the main thread must handle a signal [s].
+#: Time in which the main thread must handle a signal before the watcher thread reacts [s].
 SIGNAL_HANDLING_SECONDS_MAX = 2.0
 
 #: Time after SIGTERM in which running blocks must end [s]; batch systems mostly kill after 30 s.
 SIGTERM_GRACE_SECONDS = 15.0
 
-#: Interval at which the watcher checks whether a signal was handled [s].
+#: Interval at which the watcher thread checks whether a signal was handled [s].
 SIGNAL_POLL_SECONDS = 0.1
 
-#: Time limit of the last message of a process, for example to a stopped terminal [s].
+#: Time limit for writing a process's last message, for example to a stopped terminal [s].
 EXIT_MESSAGE_SECONDS_MAX = 1.0
 
 #: Largest number of signals that are read at once, one byte each.
 _SIGNAL_BYTES_MAX = 4096
 
-#: Byte that wakes the watcher and is no signal.
+#: Byte that wakes the watcher thread and stands for no signal.
 _WAKE_BYTE = b"\0"
 
 

@@ -77,13 +77,13 @@ LOG_FILE_NAMES = (RECEIPTS_FILE, FAILURE_LOG_FILE, SESSION_LOG_FILE)
 
 RECIPE_FILE = "recipe.json"
 
-#: Recipe key of the path of the store that this one extends, and takes results from.
+#: Key, in a store's recipe, of the path of the store that this one extends and takes results from.
 EXTENDED_STORE_KEY = "extends"
 
-#: Recipe key of the digests of the user's modules at the start of the first run.
+#: Key, in a store's recipe, of the digests of the user's modules at the start of the first run.
 USER_MODULE_DIGESTS_KEY = "code"
 
-#: Recipe key of the id of the study whose store this one will replace; '' without one.
+#: Key, in a store's recipe, of the id of the study whose store this one will replace; '' if none.
 REPLACED_STUDY_ID_KEY = "replaces"
 
 #: Number of folders on disk that are listed at once; listing on a file server is mostly waiting.
@@ -374,7 +374,7 @@ def _mark_existing_chunks(
         os.close(descriptor)
 
 
-#: Prefix of the names of checkpoints; the number of the block follows.
+#: Prefix of the file names of checkpoints (saved parts of blocks). The number of the block follows.
 CHECKPOINT_FILE_PREFIX = "begun-"
 
 
@@ -504,7 +504,8 @@ LOCK_FILE = "lock"
 #: Largest number of attempts to acquire a lock in an object store against other processes.
 LOCK_ATTEMPTS_MAX = 5
 
-#: Time between heartbeats [s], and age beyond which a holder on another host may be dead [s].
+#: Two times of the heartbeats by which a lock's holder shows that it runs [s]. The first is the
+#: time between heartbeats. The second is the age above which a holder on another host may be dead.
 HEARTBEAT_INTERVAL_SECONDS = 10.0
 HEARTBEAT_AGE_SECONDS_MAX = 120.0
 

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 #: Time between lines of progress without a terminal [s].
 PROGRESS_LINE_INTERVAL_SECONDS = 30.0
 
-#: Rate at which a bar is drawn [Hz]; each time takes some ms of the driver.
+#: Number of times per second that a progress bar is drawn [Hz]. Each time takes some ms.
 BAR_REFRESH_RATE_HZ = 4.0
 
-#: Width of a terminal from which a bar shows workers and bytes too [columns].
+#: Width of a terminal from which a progress bar shows workers and bytes too [columns].
 WIDE_TERMINAL_COLUMNS_MIN = 100
 
-#: Time before an activity is shown [s]; most activities are over by then.
+#: Duration of an activity before a message about it is shown [s]. Most activities are shorter.
 ACTIVITY_SHOWN_AFTER_SECONDS = 2.0
 
 _logger = logging.getLogger("sweep")

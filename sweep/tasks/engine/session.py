@@ -86,17 +86,17 @@ if TYPE_CHECKING:
 #: Value of the option `scheduler` that selects serial computation in this process.
 SERIAL_SCHEDULER_OPTION = "none"
 
-#: Number of failed blocks, without any success, after which a run stops.
+#: Number of failed blocks, while no block has succeeded, after which a run stops.
 MAX_INITIAL_FAILURES = 20
 
-#: Time for which a run waits for the scan of existing chunks [s]. After that it trusts the log, and
-#: the scan goes on during the run.
+#: Time for which a run waits for the search for missing chunks [s]. Afterwards it trusts the log of
+#: receipts, and the search goes on during the run.
 CHUNK_SCAN_TIMEOUT_SECONDS = 2.0
 
-#: Time without a worker after which a warning is given [s].
+#: Time without any connected worker after which a warning is given [s].
 NO_WORKER_WARNING_SECONDS = 20.0
 
-#: Fields of receipts that a run adds up.
+#: Fields of the receipts of blocks that a session sums.
 SUMMED_RECEIPT_FIELDS = ("points", "reused_points", "bytes", "seconds", "write_seconds")
 
 _logger = logging.getLogger("sweep.session")

@@ -84,13 +84,13 @@ ROOT_DOCUMENT_FILE = "zarr.json"
 
 MANIFEST_PATH = f"{JOURNAL_DIR}/{MANIFEST_FILE}"
 
-#: Object that marks a store in an object store as incompletely created or removed.
+#: Name of the object that marks a store in an object store as created or removed only in part.
 UNFINISHED_MARKER_FILE = "partial"
 
 #: Largest number of foreign files that an error message names.
 FOREIGN_FILES_IN_MESSAGE_MAX = 5
 
-#: Compression of the chunks, and their checksum.
+#: Codecs that compress a chunk and add its checksum.
 CHUNK_CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
 _ZSTD_ENCODER = Zstd(level=ZSTD_LEVEL)
@@ -603,7 +603,7 @@ def is_block_visible(
     return (store_path / chunk_paths[-1]).size() > 0
 
 
-#: Distributions whose version can change a result or its stored bytes.
+#: Python packages whose version can change a result, or the bytes in which it is stored.
 VERSIONED_DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 

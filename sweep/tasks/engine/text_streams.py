@@ -19,7 +19,7 @@ from typing import Any
 #: Descriptors of standard input, output and error.
 STANDARD_DESCRIPTORS = (0, 1, 2)
 
-#: Time for which a write waits for a reader that has stopped [s].
+#: Time for which a flush waits for a reader that has stopped [s].
 READER_PATIENCE_SECONDS = 0.3
 
 #: Time without any text after which the writer thread ends [s].

@@ -34,23 +34,23 @@ from sweep.tasks.engine.progress import CodeError, StoreError
 
 ReturnValue = TypeVar("ReturnValue")
 
-#: Errors of the storage: every further block would raise them too.
+#: Errors of the storage that every further block would raise too, so that a run stops.
 STORAGE_ERRNOS = {
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
     errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
 }  # fmt: skip
 
-#: Time after which the results of an unfinished block are saved, and the block is put back for
-#: another task [s]. As much is lost if a worker dies, and Ctrl-C waits for as long.
+#: Time after which an unfinished block is saved and left to another task [s]. So much work is lost
+#: if a worker dies, and Ctrl-C waits for as long.
 CHECKPOINT_INTERVAL_SECONDS = 10.0
 
-#: Time in which a thread must return from compiled code after its time limit [s].
+#: Time after a block's time limit in which its thread must return from compiled code [s].
 INTERRUPT_GRACE_SECONDS = 10.0
 
-#: Interval of checks of the scheduler, the lock and the clock while no result arrives [s].
+#: Interval at which scheduler, lock and clock are checked while no result arrives [s].
 IDLE_POLL_SECONDS = 0.5
 
-#: Number of studies that a worker keeps open.
+#: Largest number of studies whose stores a worker keeps open.
 OPEN_STUDIES_MAX = 4
 
 

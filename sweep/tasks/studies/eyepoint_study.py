@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec
     from sweep.spec.scene_sections import BuiltScene
 
-#: Largest numbers of shots and beamlets of a block, which contains complete cycles.
+#: Largest numbers of shots and of beamlets (rays) in a block of complete measurement cycles.
 SHOTS_PER_BLOCK_MAX = 4096
 BEAMLETS_PER_BLOCK_MAX = 1 << 20
 
-#: Number of beamlets above which rays are cut into several blocks, for all cores of a machine: they
-#: take some half a second.
+#: Number of beamlets (rays) above which they are cut into several blocks, so that all cores have
+#: work. So many take some half a second.
 DEFAULT_BLOCK_BEAMLETS_MIN = 1 << 17
 
-#: Largest number of beamlets that are cast at once, which bounds memory if cycles are long.
+#: Largest number of beamlets (rays) that are cast at once. It limits memory if cycles are long.
 RAYS_PER_CAST_MAX = 1 << 18
 
 #: Number of nodes of a scene's map along the longer side, and least number along the shorter side.
@@ -54,10 +54,10 @@ MAP_NODES_MIN = 16
 FLIGHT_SAMPLE_POINTS = 512
 MAP_MARGIN_FRACTION = 0.08
 
-#: Height of the viewpoint of the map above the scene and the flight [m].
+#: Height above scene and flight from which rays are cast down to map the ground [m].
 MAP_VIEWPOINT_CLEARANCE = 1.0
 
-#: Largest distance from the ground of a platform that stands on it [m].
+#: Largest height above ground at which a platform counts as standing on it [m].
 GROUND_CONTACT_DISTANCE_MAX = 1e-6
 
 #: Sizes of the model's dimensions of vectors and matrices.

@@ -74,11 +74,11 @@ if TYPE_CHECKING:
     flags.
     """
 
-#: Domain of the keys of draws. The key of a shot is its number, so the draws of a flight are the
-#: same at every point of the axes and for every instrument.
+#: Text from which, with the seed, the random numbers of a flight's draws follow. The key of a shot
+#: is its number, so the draws are the same at every point of the axes and for every instrument.
 FLIGHT_KEY_DOMAIN = "sweep.flight"
 
-#: Smallest number of shots of a cycle for a velocity vector.
+#: Smallest number of shots in a measurement cycle from which a velocity vector is computed.
 NAVIGATION_SHOTS_PER_CYCLE_MIN = 3
 
 #: Outputs of the geometry of shots and cycles, which do not depend on the axes.
@@ -191,7 +191,7 @@ class ScannerGrid(ParameterGrid, BlockGrid):
         return self.flight_block(self.block_at((*axis_indices, 0, 0)))
 
 
-#: Largest number of shots of a scanner, times draws and points of the axes.
+#: Largest product of a scanner's shots, draws and points of the axes.
 DRAWN_SHOTS_MAX = 10**10
 
 

@@ -102,17 +102,17 @@ def _text_hash(word: str) -> int:
     return int.from_bytes(digest, "little") >> 2
 
 
-#: Names of the arrays of simulated effects, and of the error bound of the omitted ones.
+#: Names of the arrays with the simulated effects, and with the error bound of the omitted ones.
 EFFECTS_ARRAY, EFFECTS_ERROR_ARRAY = "effects", "effects_error"
 
-#: Largest number of points of a tile: small enough for similar points, large enough for cheap
-#: planning.
+#: Largest number of points of a tile, a box of points whose effects are chosen together. It is
+#: small enough for similar points, and large enough for cheap planning.
 POINTS_PER_TILE_MAX = 1024
 
-#: Number of points that are planned at once, and number per tile in the preview of tiles.
+#: Number of points whose effects are planned at once, and number per tile in a first, rough plan.
 POINTS_PER_PLAN_MAX, PREVIEW_POINTS_PER_TILE = 1 << 14, 64
 
-#: Numeric parameters that are constant within a tile: sizes of records, and accuracy.
+#: Numeric parameters whose values must be equal in a tile: sizes of records, and accuracy.
 PARAMETERS_CONSTANT_IN_TILE = (
     "instrument.processing.fft_size",
     "instrument.processing.sample_rate",
@@ -649,7 +649,8 @@ NON_PHYSICAL_PARAMETER_PREFIXES = (
     "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS_PATH
 )  # fmt: skip
 
-#: Domain of the keys of draws, which makes their random streams differ from any others of the seed.
+#: Text from which, with the seed, the random numbers of a grid's draws follow. They differ from all
+#: other random numbers of the same seed.
 GRID_KEY_DOMAIN = "sweep.draws"
 
 

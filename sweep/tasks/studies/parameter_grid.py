@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 ParameterValue = float | int | str | np.ndarray
 
-#: Parameters that change the positions of the lines of beamlets. Any other parameter only scales
-#: the lines or changes how they are evaluated, which is cheap once the positions are known.
+#: Parameters that change the frequencies of spectral lines. Any other parameter only scales lines
+#: or changes how they are evaluated, which is cheap once their frequencies are known.
 GEOMETRIC_PARAMETERS = (
     "target.range",
     "target.grazing_angle",
@@ -35,7 +35,7 @@ TOLERANCE_PARAMETER = "accuracy.tolerance"
 SHOTS_PER_TILE = 256
 
 #: Largest time of a block by :func:`worst_cpu_seconds_per_point` [s], which is lost if a worker
-#: dies. It also bounds the counts of draws, one per point and batch, to some 100 MB.
+#: dies. It also limits the counts of draws, one per point and batch, to some 100 MB.
 BLOCK_CPU_SECONDS_MAX = 60.0
 
 #: Default size of a block [points], and number of blocks above which blocks grow instead. A block

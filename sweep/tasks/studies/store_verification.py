@@ -69,7 +69,7 @@ from sweep.tasks.studies.study_loading import AnyStudy
 if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
 
-#: Number of blocks that are read at once, and number of threads that read them.
+#: Number of blocks that are read for checking at once, and number of threads that read them.
 BLOCKS_PER_READ_BATCH = 256
 READER_THREADS = 4
 
@@ -453,7 +453,8 @@ def _refuse_unproven_study(
             )
 
 
-#: Largest size of a shard of complete chunks before compression [bytes]; each thread holds one.
+#: Largest size of a shard (file of several chunks) before compression [bytes]. Each thread holds
+#: one.
 SHARD_BYTES_MAX = 64 << 20
 
 

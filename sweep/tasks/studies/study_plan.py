@@ -45,20 +45,20 @@ if TYPE_CHECKING:
     from sweep.spec import GridSpec, SceneSpec
     from sweep.tasks.engine.blocks import Results
 
-#: Time limit of measuring the time per point [s], and number of blocks that are measured.
+#: Limits of measuring the time per point: duration of the measurement [s], and number of blocks.
 POINT_TIMING_SECONDS = 1.0
 TIMED_BLOCKS_MAX = 16
 
 #: Approximate time limit of measuring one scanner [s].
 SCANNER_TIMING_SECONDS = 0.5
 
-#: Largest number of draws of a point that are measured.
+#: Largest number of draws of a point whose time is measured.
 TIMED_DRAWS_MAX = 1000
 
-#: Largest number of draws of whole spectra that are measured.
+#: Largest number of draws of whole spectra whose time is measured.
 TIMED_SPECTRA_MAX = 10
 
-#: Time of worker processes to start, and of a worker or thread to write a chunk [s].
+#: Estimated times for a plan [s]: of starting worker processes, and of writing one chunk.
 WORKER_START_SECONDS = 3.0
 CHUNK_WRITE_SECONDS = 2e-3
 
@@ -380,7 +380,7 @@ EFFECT_COST_ROUNDS_MAX, EFFECT_COST_ROUNDS_MIN = 5, 3
 #: about twice the error of the median.
 EFFECT_COST_SPREAD_MAX = 0.1
 
-#: Sufficient time of a round of measuring an effect's cost [s].
+#: Duration of a round of measuring an effect's cost after which no more work is added [s].
 EFFECT_COST_ROUND_SECONDS = 0.1
 
 

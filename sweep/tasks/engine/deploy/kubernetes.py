@@ -19,10 +19,10 @@ SCHEDULER_PORT = 8786
 #: Time in which the scheduler's pod must be ready [s]; an image may have to be fetched first.
 POD_READY_SECONDS_MAX = 600.0
 
-#: Folder of certificates in the pods.
+#: Folder in which pods find the TLS certificates.
 CERTIFICATE_FOLDER = "/etc/sweep-tls"
 
-#: HTTP routes of the scheduler that the operator reads the state of workers from.
+#: HTTP routes of the scheduler from which the Dask operator reads the state of workers.
 SCHEDULER_HTTP_ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 
 

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from distributed import Security
 
 
-#: Module that a worker runs on start.
+#: Name of the Python module that a worker runs when it starts.
 PRELOAD_MODULE = "sweep.tasks.preload"
 
-#: Environment variables that limit libraries with threads of their own to one per worker slot.
+#: Environment variables that limit the threads of numerical libraries to one per worker thread.
 SINGLE_THREAD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -36,8 +36,8 @@ SINGLE_THREAD_VARIABLES = {
     "NUMBA_NUM_THREADS": "1",
 }
 
-#: Environment variable that removes the working directory from Python's search path: a file
-#: `socket.py` there would be run by every worker.
+#: Environment variable that removes the working directory from Python's search path. Otherwise
+#: every worker would run a file `socket.py` in that directory.
 SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
 
 #: Settings of Dask that reduce its self-monitoring, and disable the pause near the memory limit. By
@@ -131,7 +131,7 @@ def dashboard_address(scheduler: SchedulerConfig) -> str:
 
 WORKER_MEMORY_BYTES_MIN = 1 << 30
 
-#: Time after which a worker without a heartbeat is ended and restarted.
+#: Time without a sign of life from a worker after which it is ended and restarted.
 WORKER_TTL = "2 minutes"
 
 
