@@ -63,7 +63,7 @@ class ChartLine:
     name: str = ""
     """Name in the legend."""
     style_index: int = 0
-    """Number that selects colour, dash and marker."""
+    """Number that selects the line's colour, dash and marker from the common lists."""
     low: np.ndarray | None = None
     """Lower end of a band about the line at each position (n,), such as a confidence interval."""
     high: np.ndarray | None = None
@@ -77,7 +77,7 @@ class ChartLine:
     points_per_value: int = 1
     """Number of points of the study whose mean each value of the line is."""
     hover_texts: Sequence[str] = ()
-    """Texts that a page shows when the reader points at a value."""
+    """Texts that a page shows when the reader points at a value of the line, one per value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,9 @@ class HeatMap:
     """Map of values over two coordinates, shown by colours."""
 
     x: np.ndarray
-    """Positions of the columns along the horizontal axis."""
+    """Positions of the columns of cells along the horizontal axis."""
     y: np.ndarray
-    """Positions of the rows along the vertical axis."""
+    """Positions of the rows of cells along the vertical axis."""
     values: np.ndarray
     """Values (rows, columns); nan where missing."""
     contour_levels: Sequence[float] = ()
@@ -110,10 +110,17 @@ class ColourScale:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Panel of a chart: lines or a heat map over two axes, for one choice of each facet."""
+    """Panel of a chart: lines or a heat map over two axes.
+
+    It belongs to one choice of each facet, a property by which panels differ, such as the part of
+    the study.
+    """
 
     facet_choices: Mapping[str, str]
-    """Choice of each facet at which a page shows the panel, by the facet's name."""
+    """Choice of each facet at which a page shows the panel, by the facet's name.
+
+    A facet is a property by which panels differ, such as the part of the study.
+    """
     x: ChartAxis
     """Horizontal axis."""
     y: ChartAxis
@@ -125,7 +132,10 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """Title of the panel: its choices of facets, separated by commas."""
+        """Title of the panel: its choices of facets, with commas.
+
+        A facet is a property by which panels differ, such as the part of the study.
+        """
         return ", ".join(filter(None, self.facet_choices.values()))
 
 
@@ -142,7 +152,11 @@ class Chart:
     panels: Sequence[Panel]
     """Panels in order."""
     facet_labels: Mapping[str, str] = field(default_factory=dict)
-    """Labels of the controls by which the reader of a page selects a panel, by facet."""
+    """Labels of the controls with which a reader selects a panel.
+
+    There is one control for each facet, a property by which panels differ, such as the part of the
+    study.
+    """
     colour_scale: ColourScale | None = None
     """Colour scale of all heat maps; None for charts of lines."""
     panels_per_row: Sequence[int] = ()

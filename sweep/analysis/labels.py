@@ -114,7 +114,7 @@ def describe_value_extent(values: np.ndarray) -> str:
 
 
 def source_note(attributes: Mapping[Any, Any], counted_unit: str) -> str:
-    """Return a text that names the study of a picture, the model version and missing progress.
+    """Return a text that names a picture's study, the model version, and what is not computed yet.
 
     `attributes` are those of the store. `counted_unit` is the unit of progress: ``points`` or
     ``blocks``.

@@ -52,7 +52,7 @@ class BinGroup:
 
 @dataclass(frozen=True)
 class SegmentSpectrum:
-    """Spectrum of a segment of n bins, with its detections."""
+    """Spectrum of one segment (chirp) of a shot, with n bins, and its detections."""
 
     name: str
     """Display name of the segment."""
@@ -71,7 +71,7 @@ class SegmentSpectrum:
     carrier_frequency: float
     """Carrier frequency of the segment [Hz]."""
     bin_groups: tuple[BinGroup, ...]
-    """Groups of bins above the threshold: the detections."""
+    """Groups of adjacent bins above the threshold. Each group is one detection."""
     snr: float
     """Signal-to-noise ratio of the signal's strongest bin."""
     pd: float
@@ -85,16 +85,16 @@ class SegmentSpectrum:
 
 @dataclass(frozen=True)
 class SimulatedShot:
-    """Simulated shot: parameters, prepared shot, spectra, and reported range and velocity."""
+    """One simulated shot: parameters, spectra with detections, reported range and velocity."""
 
     label: str
     """Label of the shot in figures and tables."""
     parameters: ParameterValues
     """Parameters of the shot."""
     prepared_shot: shot_model.Shots
-    """Prepared shot, as an array of one shot."""
+    """All that the shot's spectra depend on (lines, noise, threshold), as arrays of one shot."""
     outputs: dict[str, float]
-    """Outputs of the model, by variable name."""
+    """Results of the model for the shot, by the name of the output variable."""
     segments: tuple[SegmentSpectrum, ...]
     """Spectra of the segments that the shot has."""
     reported_range: float
@@ -165,7 +165,7 @@ def simulate_prepared_shot(
     label: str = "",
     seed: int | None = None,
 ) -> SimulatedShot:
-    """Simulate one prepared shot of a grid or a scene.
+    """Simulate one shot of a grid or a scene, given all that its spectra depend on.
 
     Parameters and result are those of :func:`simulate_shot`.
     """
@@ -286,7 +286,7 @@ def draw_noise_spectrum(
 
 
 def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, ...]:
-    """Return the groups of adjacent bins whose magnitudes reach the threshold."""
+    """Return the groups of adjacent bins whose magnitudes are at or above the threshold."""
     bins_above = np.flatnonzero(magnitude >= threshold)
     runs = (
         np.split(bins_above, np.flatnonzero(np.diff(bins_above) > 1) + 1) if bins_above.size else []
@@ -319,8 +319,9 @@ def range_or_velocity_at(
 
     Notes
     -----
-    The unfolded frequency is f, the carrier f_c, and the Doppler ratio beta = 2 v / c. The slope of
-    the segment is s times the chirp rate S. Then
+    The unfolded frequency is f, the carrier f_c, and the Doppler ratio beta = 2 v / c, with the
+    radial velocity v and the speed of light c. The slope of the segment is s times the chirp rate
+    S. The range R, or the velocity v, is
 
         R = c (f_c beta - f) / (2 s S (1 + beta)) for a chirp, v = c f / (2 f_c) for s = 0.
     """

@@ -65,10 +65,13 @@ ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
 """Probabilities of a false alarm in a bin at which ROC curves are computed."""
 
 ROC_DRAWS = 400
-"""Number of draws for the ROC curve of a point with random effects."""
+"""Number of draws with which the ROC curve of a point with random effects is simulated."""
 
 PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
-"""Name of the variable for false alarms in both chirps by noise or leakage."""
+"""Name of the variable for false alarms in both chirps, by noise or by leakage.
+
+Leakage is signal in the window's sidelobes.
+"""
 
 _LABEL_BY_ALARM = {
     "pfa_bin": "noise, one bin",
@@ -104,7 +107,7 @@ class GridProfile:
         return CoordinateAxis.from_points(self.points, self.coordinate_name)
 
     def evenly_spread_indices(self, n_max: int) -> np.ndarray:
-        """Return at most ``n_max`` evenly spread indices along the profile."""
+        """Return at most ``n_max`` evenly spread indices of points along the profile."""
         if self.coordinate is None:
             return np.zeros(1, int)
         size = self.coordinate.values.size
@@ -253,9 +256,9 @@ def _roc_indices(profile: GridProfile) -> np.ndarray:
 def noise_budget_of_grid(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart:
-    """Return the chart of the shares of noise sources at the ADC, along each profile of a grid.
+    """Return the chart of the noise at the ADC, along each part (profile) of a grid.
 
-    `n_omitted` is the number of omitted profiles.
+    It shows the share of each noise source. `n_omitted` is the number of omitted profiles.
     """
     panels = []
     for profile in profiles:
@@ -340,9 +343,10 @@ def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart
 def false_alarm_chart(
     results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
 ) -> Chart | None:
-    """Return the chart of false alarms by noise and leakage, along each profile of a grid.
+    """Return the chart of false alarms by noise and by leakage, along each part of a grid.
 
-    It is None for a grid with a single point. `n_omitted` is the number of omitted profiles.
+    Leakage is signal in the window's sidelobes. The result is None for a grid with a single point.
+    `n_omitted` is the number of omitted parts (profiles).
     """
     if profiles[0].coordinate is None:
         return None

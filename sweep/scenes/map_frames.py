@@ -50,7 +50,7 @@ _METRES_BY_HEIGHT_UNIT = (
 
 
 class MetresPerUnit(NamedTuple):
-    """Length on the ground of one unit of a map's coordinates [m]."""
+    """Length on the ground of one unit of a map's coordinates [m], eastwards and northwards."""
 
     east: float
     """Metres on the ground per unit of the map's coordinates eastwards."""
@@ -110,7 +110,7 @@ class MapFrame:
 
 
 def metric_projection_wkt_of_crs(wkt: str) -> str:
-    """Return a coordinate reference system as WKT if it is a map projection in metres, else ''.
+    """Return a reference system as WKT if it is a map projection in metres, else ''.
 
     `wkt` is the reference system. Its vertical part is removed if heights are not in metres.
     """
@@ -341,9 +341,9 @@ def _checked_map_frame(
 
 
 def _largest_scale_error(factors: MetresPerUnit, scales: np.ndarray) -> float:
-    """Return the largest relative error of a map's scale against scales measured on the ground.
+    """Return the largest relative difference between a map's scale and its scale on the ground.
 
-    `scales` (n, 2) are metres per unit eastwards and northwards at n points.
+    `scales` (n, 2) are metres on the ground per unit eastwards and northwards at n points.
     """
     return float(np.abs(np.array(factors) / scales - 1).max())
 

@@ -189,7 +189,7 @@ class _FlatPolygons(NamedTuple):
     area: np.ndarray
     """Areas (m,) of the polygons."""
     non_planarity: np.ndarray
-    """Largest departures (m,) of corners from the mean plane, over the square root of the area."""
+    """Largest distance (m,) of a corner from the mean plane, over the square root of the area."""
     is_convex: np.ndarray
     """Mask (m,) of the strictly convex polygons."""
     is_empty: np.ndarray

@@ -97,8 +97,8 @@ class MartianRockLaw:
     -----
     The fraction of the ground under rocks of at least diameter D (in metres) is
     ``F(D) = k exp(-q D)`` with ``q = 1.79 + 0.152/k`` [1]_. A rock covers ``pi D^2 / 4``, so that
-    the number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The fraction k under
-    rocks of any size is 0.02 to 0.2 at the landing sites.
+    the number per area is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``, with the exponential
+    integral E1. The fraction k under rocks of any size is 0.02 to 0.2 at the landing sites.
 
     References
     ----------
@@ -541,7 +541,8 @@ class MeanTreeDimensions:
     -----
     Leaves have random positions and the spherical distribution of leaf angles: every direction of a
     leaf's normal is equally likely. The probability of a gap along a ray is therefore Beer's law
-    ``exp(-G * density * path)`` with ``G = 1/2`` [1]_ [2]_.
+    ``exp(-G * density * path)``. The density is that of leaf area per volume, and ``G = 1/2`` is
+    the mean area of a leaf across the ray over its own area [1]_ [2]_.
 
     References
     ----------

@@ -517,7 +517,8 @@ def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> s
     Returns
     -------
     str
-        Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D).
+        Sentence with the beam's divergence and the limit 4 M^2 lambda / (pi D), for beam quality
+        M^2, wavelength lambda and aperture diameter D.
     """
     for conditions in (
         {beam.COUPLING_PATH: _condition_equal_to(beam.APERTURE)},

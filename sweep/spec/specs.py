@@ -824,8 +824,9 @@ class SceneSpec(BaseSpec):
 
         Notes
         -----
-        Acceleration a changes the Doppler frequency 2 v / lambda by 2 a T / lambda within a record
-        of duration T. A bin is 1 / T wide, so that the drift is 2 a T^2 / lambda bins. The result
+        At the radial velocity v and wavelength lambda the Doppler frequency is 2 v / lambda. An
+        acceleration a changes it by 2 a T / lambda within a record of duration T. A bin is 1 / T
+        wide, so that the drift is 2 a T^2 / lambda bins. The result
         is 0 below `WARNED_LINE_DRIFT_BINS_MIN`, and for ground without developed speckle.
         """
         p = self.parameters()

@@ -49,7 +49,7 @@ def is_ignorable_file(name: str) -> bool:
 
 
 def is_draft_file(name: str) -> bool:
-    """Tell from its name whether a file is a draft that sweep did not finish writing."""
+    """Return True if a file's name shows that sweep has not finished writing the file (a draft)."""
     return bool(_DRAFT_FILE_NAME_PATTERN.fullmatch(name))
 
 

@@ -111,7 +111,7 @@ class ObjectPath:
         )
 
     def joinpath(self, *others: str) -> ObjectPath:
-        """Return the path with further parts appended to its key."""
+        """Return the path whose key is this key with further parts appended."""
         return self / "/".join(others)
 
     @property
@@ -479,7 +479,7 @@ def file_sizes_below(location: Location) -> dict[str, int]:
 
 
 def derived_files_dir(location: Location) -> Path:
-    """Return the folder for files derived from a store.
+    """Return the folder for files made from a store, such as figures.
 
     It is the folder of a store on disk, and the current folder for one in an object store.
     """
@@ -610,7 +610,7 @@ def eyepoint_store_location(store: Location, geometry_id: str) -> Location:
 
 
 def staging_path_for(path: Path) -> Path:
-    """Return the path at which the replacement of a store is built until it is complete."""
+    """Return the path at which a new store is built before it replaces the store at a path."""
     return path.with_name(f".{path.name}{STAGING_SUFFIX}")
 
 
@@ -713,10 +713,10 @@ def recover_interrupted_replace(location: Location) -> None:
 
 
 def store_fingerprint(location: Location) -> tuple[int, ...] | None:
-    """Return a fingerprint of the store at a location; no other store ever has the same.
+    """Return numbers that identify the store at a location; no other store ever has the same.
 
-    It consists of device, inode, size and times of the store's root document. Return None in an
-    object store, or if the document can't be opened.
+    They are device, inode, size and times of the store's root document. Return None in an object
+    store, or if the document can't be opened.
     """
     if not isinstance(location, Path):
         return None

@@ -678,14 +678,17 @@ class FileLog:
         return True
 
     def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
-        """Rewrite the log without the lines for which ``is_sound`` is false."""
+        """Write the log again, without the lines for which ``is_sound`` is false."""
         if self._path.is_dir() or not all(map(is_sound, iter_raw_lines(self._path))):
             lines = iter_raw_lines(self._path)
             atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
 
 
 class ObjectLog:
-    """Append-only log in an object store: objects under a key, numbered in order of writing."""
+    """Append-only log in an object store: a series of objects under one key.
+
+    They are numbered in the order of writing.
+    """
 
     def __init__(self, path: ObjectPath) -> None:
         self._path = path
@@ -856,9 +859,10 @@ class ReceiptTotals:
 
 
 def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
-    """Return the totals of a store's receipts; damaged lines are ignored.
+    """Return the totals of the receipts in a store's log; damaged lines are ignored.
 
-    ``since``: time from which recent points and their workers are counted [s since the epoch].
+    ``since`` is the time from which recent points and their workers are counted [s since the
+    epoch].
     """
     totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):

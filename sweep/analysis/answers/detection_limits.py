@@ -1,9 +1,10 @@
 """Limits along an axis at which pd falls below a level: maximum range, minimum grazing angle.
 
-Between two grid points the position is interpolated in the normal deviate z, defined by pd =
-Phi(z). The Marcum function Q_1(a, b) is close to Phi(a - b). Therefore z follows the signal's
-amplitude and is almost linear, while pd bends from 1 to 0. Near pd = 1 the probability of a miss, 1
-- pd, supplies the digits.
+Between two grid points the limit is interpolated in the normal deviate z of pd. It is defined by
+pd = Phi(z), with the normal distribution function Phi. A steady signal gives pd = Q_1(a, b), the
+Marcum function of signal a and threshold b over the noise, which is close to Phi(a - b). Therefore
+z follows the signal's amplitude and is almost linear, while pd bends from 1 to 0. Near pd = 1 the
+probability of a miss, 1 - pd, supplies the digits.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sweep.analysis.answers.probability import (
 )
 
 LIMIT_FOUND, LEVEL_NEVER_REACHED, LEVEL_NEVER_LOST, LIMIT_NOT_COMPUTED = range(4)
-"""Flags of the outcomes of a search for a limit."""
+"""Flags of the outcome of a search for the coordinate at which pd falls below a level."""
 LIMIT_REASON_MEANINGS = "found never_reached never_lost not_computed"
 """Names of the outcomes of a limit search, for the CF attribute `flag_meanings`."""
 
@@ -37,7 +38,9 @@ one corresponds to a probability near the smallest positive float.
 
 
 def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Return the normal deviate z of a probability of detection, pd = Phi(z).
+    """Return the normal deviate z of a probability of detection pd.
+
+    It is defined by pd = Phi(z), with the normal distribution function Phi.
 
     Parameters
     ----------
@@ -124,8 +127,8 @@ def limit(
 
     Notes
     -----
-    Between the last value at the level and the next value below it, the normal deviate z, defined
-    by pd = Phi(z), is interpolated linearly.
+    Between the last value at the level and the next value below it, the normal deviate z of pd is
+    interpolated linearly. It is defined by pd = Phi(z), with the normal distribution function Phi.
     """
     level = parse_pd_level(pd)
     coord = find_coordinate(dataset, along)

@@ -405,9 +405,10 @@ def window_tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
-    """Return a spline of a window's main lobe, |W(delta)| / W(0), accurate to 1e-8.
+    """Return a spline of a window's main lobe, relative to its peak, accurate to 1e-8.
 
-    The offset delta from the peak is 0 to 1/2, in bins of sample rate over window length.
+    The main lobe is the magnitude of the window's Fourier transform near its peak. The argument is
+    the distance from the peak, 0 to 1/2, in bins of sample rate over window length.
     """
     taper, bin_offsets = get_window(window_name, length), np.linspace(0.0, 0.5, 33)
     return CubicSpline(bin_offsets, np.abs(direct_transform(taper, bin_offsets)) / taper.sum)

@@ -38,9 +38,15 @@ class ErrorTally:
     mean_error: np.ndarray
     """Mean error of the solutions in each altitude bin, by component (bins, m)."""
     squared_deviation: np.ndarray
-    """Sum of the squared deviations of errors from their mean (bins, m)."""
+    """Sum of squared deviations of errors from their mean, by altitude bin (bins, m).
+
+    The second dimension is the component of the solution.
+    """
     mean_stated_variance: np.ndarray
-    """Mean of the variances that the solutions state (bins, m)."""
+    """Mean variance that solutions state for themselves, by altitude bin (bins, m).
+
+    The second dimension is the component of the solution.
+    """
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
         """Return the tally of both, by the method of Chan, Golub and LeVeque (1983).

@@ -111,9 +111,9 @@ def false_point_legend_marker() -> Line2D:
 def choose_colours(
     quantity: str, values: np.ndarray, *, is_trusted: np.ndarray, surfaces: Sequence[str]
 ) -> ContinuousColourScale | CategoryColours:
-    """Return the colours for the values of a quantity: continuous, or by category.
+    """Return the colours for the values of a quantity: a continuous scale, or one per category.
 
-    ``is_trusted`` is a mask of the values that determine the ends of a continuous scale, and
+    ``is_trusted`` is a mask of the values that determine the ends of a continuous scale.
     ``surfaces`` are the names of the surfaces.
     """
     if quantity in CATEGORICAL_QUANTITIES:
@@ -147,7 +147,7 @@ def _colour_scale_ends(values: np.ndarray) -> tuple[float, float]:
 def _continuous_colour_scale(
     quantity: str, values: np.ndarray, is_trusted: np.ndarray
 ) -> ContinuousColourScale:
-    """Return a continuous colour scale that spans the trusted values, without outliers."""
+    """Return a colour scale that spans the values of trusted points, without far outliers."""
     finite_values = values[np.isfinite(values)]
     trusted_values = values[is_trusted & np.isfinite(values)]
     trusted_values = trusted_values if trusted_values.size else finite_values

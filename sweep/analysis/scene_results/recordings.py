@@ -188,7 +188,10 @@ class Recording:
     dataset: xr.Dataset
     """Arrays of the scanner at this position."""
     flags_chunk_folder: Location | None = None
-    """Folder with the chunks of the array `flags` at this position; None for a packed store."""
+    """Folder with the stored chunks of the array `flags` for this scanner and position.
+
+    Chunks in it show which shots are computed. It is None for a packed store.
+    """
 
     @property
     def n_shots(self) -> int:
@@ -350,8 +353,8 @@ class Recording:
 def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
     """Return the number of the first shot that has true points on two surfaces in a draw.
 
-    If there is none, the result is the first shot whose spectrum without noise has two groups of
-    bins above the threshold, or None.
+    If there is none, it is the first shot whose spectrum without noise has two groups of adjacent
+    bins above the threshold. If there is none either, the result is None.
     """
     fallback_shot = None
     for shot_slice in recording.iter_shot_slices():
@@ -385,7 +388,7 @@ def select_rows_within(
 
 
 class ThinnedRows:
-    """Rows appended part by part, of which every n-th is kept to stay below a largest number.
+    """Rows collected part by part. If they are too many, only every n-th row is kept.
 
     The step n is a power of two.
     """
@@ -426,7 +429,7 @@ class AxisPosition:
     label: str
     """Coordinates of the position, as text."""
     open_axes: tuple[str, ...]
-    """Names of the axes along which the request admits several values."""
+    """Names of the axes along which the request leaves several values to choose from."""
 
     def open_recording(self, tree: xr.DataTree, scanner: str) -> Recording:
         """Return the recording of a scanner at this position."""
@@ -558,14 +561,14 @@ CoordinateBox = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of a picture, with the flight path and dropouts (shots without a point)."""
+    """Points of a picture, with the flight path and dropouts (shots that gave no point)."""
 
     points: ColumnArrays
     """Columns of the points: x, y, z, flags, and the requested quantities."""
     path: ColumnArrays
     """Columns x, y and z of the flight path [m]; empty if it was not requested."""
     thinned_points: ThinnedRows
-    """Points before the box was applied, with the number of all points."""
+    """Points before those outside the box were left out, with the number of all points."""
     thinned_dropouts: ThinnedRows
     """Positions of the dropouts, with the number of all dropouts."""
     n_outside: int

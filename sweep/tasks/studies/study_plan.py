@@ -556,7 +556,7 @@ def _make_effects_table(
     effect_cost: Callable[[str, np.ndarray], float],
     tile_fraction: float,
 ) -> EffectsTable:
-    """Return the table of effects from the effects of the tiles."""
+    """Return the table of effects, given the simulated and omitted effects of each tile."""
     effect_modes = spec.effect_modes()
     rows = tuple(
         EffectRow(
@@ -581,7 +581,7 @@ def _make_effects_table(
 
 
 def _time_range_text(times: np.ndarray) -> str:
-    """Return a range of times as text."""
+    """Return the first and the last of some times in a flight as text."""
     first, last = times.min(), times.max()
     return f"time {first:.4g} s" if first == last else f"time {first:.4g}..{last:.4g} s"
 
@@ -799,7 +799,7 @@ def _flight_effect_cost(
 
 
 def _select_evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
-    """Return at most `n_max` items, evenly spaced from the first to the last."""
+    """Return at most `n_max` of the items, evenly spaced from the first to the last."""
     positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
     return [sequence[k] for k in positions]
 
