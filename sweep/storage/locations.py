@@ -615,7 +615,7 @@ def staging_path_for(path: Path) -> Path:
 
 
 def final_path_for(path: Path) -> Path:
-    """Return the final path of a store: its own, or that of the store that it will replace."""
+    """Return the path that a complete store has: its own, or that of the store it replaces."""
     staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
     return path.with_name(staging_match[1]) if staging_match else path
 

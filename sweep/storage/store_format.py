@@ -341,7 +341,7 @@ def read_study_id(path: Location) -> str:
 
 
 def repair_hint(path: Location) -> str:
-    """Return a hint how to restore the objects of a store's manifest; '' without a manifest."""
+    """Return advice on how to restore damaged objects in a store's manifest; '' if it has none."""
     if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
         return ""
     if read_manifest_attributes(path):

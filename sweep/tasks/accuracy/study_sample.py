@@ -360,10 +360,7 @@ class GridSample(StudySample):
         return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
 
     def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
-        """Compute the points of a part with one setting.
-
-        Measure the time on more points of the same blocks.
-        """
+        """Compute a part with one setting. Measure the time on more points of the same blocks."""
         point_indices = self.point_indices[part]
         trial = self._run_setting(setting, point_indices)
         if n_timed_points == 1:

@@ -587,7 +587,10 @@ def _time_range_text(times: np.ndarray) -> str:
 
 
 def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
-    """Return the smallest box of the grid that contains the tiles, in the user's units."""
+    """Return the smallest box of the grid that contains given tiles, in the user's units.
+
+    A tile is a box of neighbouring points whose effects are chosen together.
+    """
     slices = [effect_planner.tiles.block_slices(tile) for tile in tiles.tolist()]
     words = []
     for k, axis in enumerate(spec.axes):
@@ -713,7 +716,7 @@ def reproducible_time_fraction(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]
 
 
 class _ShotSample(NamedTuple):
-    """Arguments of :meth:`FlightStudy.simulate_shots`, for complete cycles of a scanner."""
+    """Arguments of :meth:`FlightStudy.simulate_shots` for some cycles of a scanner, to be timed."""
 
     flight_block: FlightBlock
     shot_arrays: Results
@@ -736,7 +739,10 @@ class _ShotSample(NamedTuple):
 
 
 def _sample_flight_shots(study: FlightStudy) -> list[_ShotSample]:
-    """Sample cycles spread over the flight of each scanner, at the ends of the axes."""
+    """Sample measurement cycles spread over the flight of each scanner.
+
+    They are taken at the first and at the last point of all axes.
+    """
     axis_corners = {
         tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
         for end_factor in (0, 1)
