@@ -6,8 +6,8 @@ frequency.
 
 Many close lines are replaced by a few. The spectrum is band-limited as a function of a line's
 position. Lines within +-h bins are therefore equivalent to J lines at Chebyshev nodes, with J about
-8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has an error of about 2
-J_J(pi h t). This is negligible except at the record's ends, where most windows are small. The
+8 + 1.3 pi h. In the sample of the record at t, -1 .. 1, a series of J terms has an error of about
+2 J_J(pi h t). This is negligible except at the record's ends, where most windows are small. The
 window weighs the error.
 """
 
